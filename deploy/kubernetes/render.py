@@ -1,12 +1,13 @@
-"""Writes ``dentine.yaml``, the Kubernetes manifests of the system that ``compose.yaml`` describes; the compose file is the one source of its values.
+"""Writes ``dentine.yaml``, the Kubernetes manifests of the system that ``compose.yaml`` describes; the compose file is
+the one source of its values.
 
     python deploy/kubernetes/render.py            writes the file
     python deploy/kubernetes/render.py --check    exit status 1 where the file is not what would be written
 
-What differs between the two is said here: each service is a Deployment of one pod (the worker of two, a fixed number, as
-Dask's scaling under load loses work), each volume a claim, each network a policy that lets in only pods of the same network
-(``front``: whoever asks the api), and ``secrets`` the first container of the api's pod. The other pods start again until it
-has made what they need.
+What differs between the two is said here: each service is a Deployment of one pod (the worker of two, a fixed number,
+as Dask's scaling under load loses work), each volume a claim, each network a policy that lets in only pods of the same
+network (``front``: whoever asks the api), and ``secrets`` the first container of the api's pod. The other pods start
+again until it has made what they need.
 """
 
 from __future__ import annotations

@@ -1,11 +1,13 @@
 """Dentin as a blend shape made from the enamel's outer surface (teeth 2018 Eq. 5, Fig. 4).
 
-V = B0 + Σ c_m (B_m − B0). B0 is the outer surface offset 0.1 mm inward, the most dentin there can be. Enamel grows from nothing at the cervical line
-with about the square root of height (the micro-CT incisor's wall: 1.25 mm √s to 0.1 mm, s the height as a part of the crown's), and so do the walls'
-modes, which at the top thicken it to 1.8 mm. The buccal one moves dentin inward along its axis, where the tooth is thin 0.75 of the way to the
-middle at most, so that opposite walls never meet; the proximal one makes it narrower, most at its sides, which cannot fold it. At an edge or a cusp dentin
-ends lower rather than thinner: the third mode moves it down by 2 mm and less below. What a mode would move out of the crown, which is hollow behind
-and narrows downwards, is kept at the base's depth. Each V with 0 <= c <= 1 lies in a box whose corners are kept inside the enamel.
+V = B0 + Σ c_m (B_m − B0). B0 is the outer surface offset 0.1 mm inward, the most dentin there can be. Enamel grows from
+nothing at the cervical line with about the square root of height (the micro-CT incisor's wall: 1.25 mm √s to 0.1 mm, s
+the height as a part of the crown's), and so do the walls' modes, which at the top thicken it to 1.8 mm. The buccal one
+moves dentin inward along its axis, where the tooth is thin 0.75 of the way to the middle at most, so that opposite
+walls never meet; the proximal one makes it narrower, most at its sides, which cannot fold it. At an edge or a cusp
+dentin ends lower rather than thinner: the third mode moves it down by 2 mm and less below. What a mode would move out
+of the crown, which is hollow behind and narrows downwards, is kept at the base's depth. Each V with 0 <= c <= 1 lies in
+a box whose corners are kept inside the enamel.
 """
 
 from __future__ import annotations
@@ -102,7 +104,8 @@ def _kept_inside(points_mm: NDArray[np.float64], grid: SignedDistanceGrid) -> ND
 
 
 def _height(points_mm: NDArray[np.float64], crown: ToothDimensions | None) -> NDArray[np.float64]:
-    # Of points in the canonical frame's axes: 0 at the cervical line and on the root, 1 at the edge. The line rises on the proximal sides.
+    # Of points in the canonical frame's axes: 0 at the cervical line and on the root, 1 at the edge. The line rises on
+    # the proximal sides.
     across, up = points_mm[:, 0], points_mm[:, 2]
     top, bottom = up.max(), np.full(len(up), up.min())
     if crown is not None:
@@ -113,7 +116,8 @@ def _height(points_mm: NDArray[np.float64], crown: ToothDimensions | None) -> ND
 
 
 def _side(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    # How far the proximal mode moves points in the canonical frame's axes: as the square of their place between the middle and the side.
+    # How far the proximal mode moves points in the canonical frame's axes: as the square of their place between the
+    # middle and the side.
     up, middle = points_mm[:, 2], np.median(points_mm[:, 0])
     across = points_mm[:, 0] - middle
     edges = np.linspace(up.min(), up.max(), SLICES + 1)
@@ -125,7 +129,8 @@ def _side(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces: int) -> Mesh:
-    # A surface net at the base's depth: closed by construction and evenly spaced, unlike the scan's own triangles moved inward.
+    # A surface net at the base's depth: closed by construction and evenly spaced, unlike the scan's own triangles moved
+    # inward.
     corners = outer.vertices_mm[outer.faces]
     area = float(
         np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
@@ -170,7 +175,8 @@ def _room_mm(start: NDArray[np.float64], inward: NDArray[np.float64], grid: Sign
 def _shallowest_corner_mm(
     start: NDArray[np.float64], modes: NDArray[np.float64], grid: SignedDistanceGrid
 ) -> NDArray[np.float64]:
-    # Depth is concave where the surface is convex, so a box's corners bound its inside; the edges' middles guard the lingual hollow.
+    # Depth is concave where the surface is convex, so a box's corners bound its inside; the edges' middles guard the
+    # lingual hollow.
     weights = np.stack(np.meshgrid(*[(0.0, 0.5, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
     return np.asarray(np.min([grid.depth_mm(start + np.tensordot(c, modes, axes=1)) for c in weights], axis=0))
 

@@ -15,8 +15,9 @@ CANDIDATES = 6
 class SurfaceDistance:
     """Closest points on a mesh.
 
-    A KD-tree over surface samples proposes triangles, and the closest point on each of them is exact. The proposal can miss the best triangle by a
-    distance error of at most ``spacing_mm``² / (2 distance), which vanishes against the enamel's 0.1 to 1.5 mm.
+    A KD-tree over surface samples proposes triangles, and the closest point on each of them is exact. The proposal can
+    miss the best triangle by a distance error of at most ``spacing_mm``² / (2 distance), which vanishes against the
+    enamel's 0.1 to 1.5 mm.
     """
 
     def __init__(self, mesh: Mesh, spacing_mm: float = 0.1) -> None:
@@ -53,7 +54,8 @@ class SignedDistanceGrid:
         axes = [low[k] + pitch_mm * np.arange(shape[k]) for k in range(3)]
         inside = _inside_columns(mesh, axes)
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        # Exact closest points in a shell around the surface; deeper points inherit the closest point of the nearest shell point (about pitch² / depth too far).
+        # Exact closest points in a shell around the surface; deeper points inherit the closest point of the nearest
+        # shell point (about pitch² / depth too far).
         from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
         shell = binary_dilation(inside, iterations=2) & ~binary_erosion(inside, iterations=2)
@@ -103,7 +105,8 @@ def _sample_triangles(corners: NDArray[np.float64], spacing_mm: float) -> tuple[
 
 
 def _inside_columns(mesh: Mesh, axes: list[NDArray[np.float64]]) -> NDArray[np.bool_]:
-    # Parity of surface crossings below each grid point along z. Columns are shifted by an irrational part of a cell so that none hits an edge or a vertex.
+    # Parity of surface crossings below each grid point along z. Columns are shifted by an irrational part of a cell so
+    # that none hits an edge or a vertex.
     xs, ys, zs = axes
     pitch = xs[1] - xs[0]
     xs, ys = xs + pitch * 1e-4 * np.sqrt(2), ys + pitch * 1e-4 * np.sqrt(3)

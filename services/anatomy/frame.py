@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from services.core.geometry import Mesh
 
 ELONGATED = 1.3
-"""Ratio of the two largest principal spreads above which a mesh holds enough root for its long axis to be the tooth's axis."""
+"""Ratio of the two largest principal spreads above which a mesh holds enough root for its long axis to be the tooth's
+axis."""
 WHOLE_ROOT = 2.1
-"""Length over largest diameter above which a mesh holds a whole root: 2.4 to 3.4 with one, 1.4 to 1.8 with a stub of 4 mm."""
+"""Length over largest diameter above which a mesh holds a whole root: 2.4 to 3.4 with one, 1.4 to 1.8 with a stub of 4
+mm."""
 END = 0.1
 """Share of the length that counts as an end."""
 
@@ -49,12 +51,14 @@ class ToothFrame:
 
 
 def estimate_frame(outer: Mesh, viewpoints_mm: NDArray[np.float64]) -> ToothFrame:
-    """Canonical frame of an incisor, canine or premolar whose FDI number is not known, from its shape and from where it is seen.
+    """Canonical frame of an incisor, canine or premolar whose FDI number is not known, from its shape and from where it
+    is seen.
 
-    The occlusal axis is the mesh's long axis where there is a root: away from the end to which a whole root tapers, or from the blunter end, which is
-    that of a root cut short. For a bare crown it points from the centre of volume to that of the outline, because a front tooth thins towards its edge.
-    Molars are not known by it; ``jaw_frames`` knows all by their numbers. Buccal is the direction of the cameras across that axis. Mesial is y × z, which
-    for the other half of the jaw is distal; the blend modes do not tell them apart.
+    The occlusal axis is the mesh's long axis where there is a root: away from the end to which a whole root tapers, or
+    from the blunter end, which is that of a root cut short. For a bare crown it points from the centre of volume to
+    that of the outline, because a front tooth thins towards its edge. Molars are not known by it; ``jaw_frames`` knows
+    all by their numbers. Buccal is the direction of the cameras across that axis. Mesial is y × z, which for the other
+    half of the jaw is distal; the blend modes do not tell them apart.
 
     Args:
         viewpoints_mm: camera centres (N, 3).
@@ -72,7 +76,8 @@ def estimate_frame(outer: Mesh, viewpoints_mm: NDArray[np.float64]) -> ToothFram
         axis = principal[:, 2]
         axis = axis if _leads_to_the_crown(middles - centroid, areas, axis) else -axis
     else:
-        # Divergence theorem for the centre of volume; triangles weighted by their area seen along the view for the centre of the outline.
+        # Divergence theorem for the centre of volume; triangles weighted by their area seen along the view for the
+        # centre of the outline.
         volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
         solid = np.average(corners.sum(axis=1) / 4, axis=0, weights=volumes)
         outline = np.average(middles, axis=0, weights=np.abs(normals @ view))

@@ -15,7 +15,9 @@ Field = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 def surface_net(
     field: Field, low_mm: NDArray[np.float64], high_mm: NDArray[np.float64], pitch_mm: float, level: float
 ) -> Mesh:
-    """Surface where ``field`` equals ``level``, oriented outward from the larger values; they must not touch the bounds."""
+    """Surface where ``field`` equals ``level``, oriented outward from the larger values; they must not touch the
+    bounds.
+    """
     shape = np.ceil((high_mm - low_mm) / pitch_mm).astype(int) + 1
     index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1)
     value = (field((low_mm + pitch_mm * index).reshape(-1, 3)) - level).reshape(tuple(shape))

@@ -1,7 +1,9 @@
-"""Canonical frames of teeth whose FDI numbers are known: of one from its shape, of several from the arch that they form and from each one's shape.
+"""Canonical frames of teeth whose FDI numbers are known: of one from its shape, of several from the arch that they form
+and from each one's shape.
 
-The shape is compared with the average tooth of its kind (``matching``). It tells the occlusal direction of a crown with some root to a few degrees, but hardly
-buccal from lingual where cusps are alike; there a single tooth turns towards the cameras and the tooth of a jaw out of the arch.
+The shape is compared with the average tooth of its kind (``matching``). It tells the occlusal direction of a crown with
+some root to a few degrees, but hardly buccal from lingual where cusps are alike; there a single tooth turns towards the
+cameras and the tooth of a jaw out of the arch.
 """
 
 from __future__ import annotations
@@ -25,10 +27,11 @@ TURNS = 576
 KEPT = 40
 """Of these, that are matched closely."""
 COARSE, MEDIUM, CLOSE = (80, 4), (80, 6), (300, 20)
-"""Points of the average crown and rounds of closest points: from every turn, for the turns of an arch, and to the end."""
+"""Points of the average crown and rounds of closest points: from every turn, for the turns of an arch, and to the
+end."""
 VIEW_MM = 0.4
-"""Misfit that a tooth is given for turning its back to the cameras. Misfits come to 1.0 to 1.4 mm on real crowns with roots; the same crown with its front
-for its back adds -0.05 to 0.35, one upside down 0.4 to 0.7."""
+"""Misfit that a tooth is given for turning its back to the cameras. Misfits come to 1.0 to 1.4 mm on real crowns with
+roots; the same crown with its front for its back adds -0.05 to 0.35, one upside down 0.4 to 0.7."""
 ARCH_TURNS = 24
 """About the line of the teeth's middles: four front teeth, or those of one side, hardly leave it."""
 WORST_ARCH_MM = 6.0
@@ -36,23 +39,26 @@ WORST_ARCH_MM = 6.0
 ARCH_SHARE = 0.25
 """Misfit of shape that the same misfit of middles counts as: real arches are some millimetres wider or narrower."""
 FREE_DRIFT_DEG = 15.0
-"""By which a tooth's match may turn away from the arch's at no cost: half a step between turns, and how teeth stand in an arch."""
+"""By which a tooth's match may turn away from the arch's at no cost: half a step between turns, and how teeth stand in
+an arch."""
 DRIFT_MM_PER_DEG = 1 / 30
 DOUBTFUL_MM, MUCH_LESS = 0.8, 0.5
-"""Misfit, both ways, from which a tooth's number is doubted, and the share of it that another kind must come to. Phantom teeth come to 0.3 by their own
-kind and to 1.1 to 1.5 by another family's; real bare crowns to 1.6 whichever kind they are compared with, and nothing can be said of them."""
+"""Misfit, both ways, from which a tooth's number is doubted, and the share of it that another kind must come to.
+Phantom teeth come to 0.3 by their own kind and to 1.1 to 1.5 by another family's; real bare crowns to 1.6 whichever
+kind they are compared with, and nothing can be said of them."""
 KINDS = (1, 3, 4, 6)
 """Places from the midline that stand for their families."""
 KEPT_OF_KIND = 8
 LARGEST_OWN_TURN_DEG = 40.0
-"""Of a tooth's own match against the arch: upper incisors lean by 20 degrees, last molars by 30; beyond, the arch is believed."""
+"""Of a tooth's own match against the arch: upper incisors lean by 20 degrees, last molars by 30; beyond, the arch is
+believed."""
 
 
 def tooth_frame(tooth: Tooth, viewpoints_mm: Array) -> ToothFrame:
     """Canonical frame of a single tooth.
 
-    With some root its axes are found to within 10 degrees or so; a bare crown of a premolar or molar, which is as wide as it is high, may be taken
-    for one that lies on its side.
+    With some root its axes are found to within 10 degrees or so; a bare crown of a premolar or molar, which is as wide
+    as it is high, may be taken for one that lies on its side.
 
     Args:
         viewpoints_mm: camera centres (N, 3).
@@ -77,7 +83,10 @@ def number_told(tooth: Tooth) -> str:
     if misfits_mm[likest] > MUCH_LESS * own_mm:
         return ""
     shape, named = upper_tooth(likest).name, upper_tooth(place).name
-    return f"Tooth {tooth.fdi} is shaped like a {shape} and not like a {named}; give its right FDI number, as dentin's shape follows from it."
+    return (
+        f"Tooth {tooth.fdi} is shaped like a {shape} and not like a {named}; give its right FDI number, as dentin's"
+        " shape follows from it."
+    )
 
 
 def _misfit_mm(tooth: Tooth, fdi: int) -> float:
@@ -104,7 +113,8 @@ def jaw_frames(teeth: Sequence[Tooth], viewpoints_mm: Array) -> tuple[ToothFrame
 
 
 def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
-    # The arch's pose first: of the turns about the line of middles, the one in which middles and shapes are nearest to the average's.
+    # The arch's pose first: of the turns about the line of middles, the one in which middles and shapes are nearest to
+    # the average's.
     numbers, matches = tuple(tooth.fdi for tooth in teeth), [CrownMatch(tooth.fdi, tooth.outer) for tooth in teeth]
     middles = np.array([middle_mm(tooth.outer) for tooth in teeth])
     nominal, nominal_axes = nominal_places(numbers)
@@ -130,7 +140,8 @@ def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
 
 
 def _arch_turns(best: Array, middles_mm: Array, nominal_mm: Array) -> tuple[Array, Array]:
-    # Rotations (K, 3, 3) into the arch's frame, and how far each leaves the middles off the average's, root mean square, mm.
+    # Rotations (K, 3, 3) into the arch's frame, and how far each leaves the middles off the average's, root mean
+    # square, mm.
     from scipy.spatial.transform import Rotation
 
     line = np.linalg.svd(middles_mm, full_matrices=False)[2][0]

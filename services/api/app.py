@@ -46,8 +46,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     """Build the application over ``settings.data``; its lifespan frames the time in which jobs run.
 
     Args:
-        run: in place of the stages and their workers. ``app.state.darken`` asks all that lights a dome to stop, from any thread,
-            and waits for nothing but that.
+        run: in place of the stages and their workers. ``app.state.darken`` asks all that lights a dome to stop, from
+            any thread, and waits for nothing but that.
         doors: where each stage is entered.
     """
     from fastapi import FastAPI

@@ -1,4 +1,7 @@
-"""Which data folder a database belongs to. With another one a server would run jobs without their captures, and give receipts for files that it never had."""
+"""Which data folder a database belongs to.
+
+With another one a server would run jobs without their captures, and give receipts for files that it never had.
+"""
 
 from __future__ import annotations
 
@@ -39,12 +42,15 @@ def require_own_folder(engine: sql.Engine, data: Path) -> None:
         engine.dispose()
         what = f"The database belongs to another data folder than {data}, which has none of its jobs' files"
         raise SettingsError(
-            f"{what}; give a database and the folder that belong together, or write {owner} into {file} if that folder is lost for good."
+            f"{what}; give a database and the folder that belong together, or write {owner} into {file} if that folder"
+            " is lost for good."
         )
 
 
 def keep_password_apart(url: str, data: Path) -> str:
-    """The URL without its password, which is put into a private file of the data folder: the URL travels inside tasks, no secret does."""
+    """The URL without its password, which is put into a private file of the data folder: the URL travels inside tasks,
+    no secret does.
+    """
     password = parse_database_url(url).password
     if password is None:
         return url

@@ -1,4 +1,5 @@
-"""The description of the REST API that is kept beside the code: ``python -m services.api.openapi`` writes it again after a change.
+"""The description of the REST API that is kept beside the code: ``python -m services.api.openapi`` writes it again
+after a change.
 
 Whoever changes a route sees in one file what changes for clients, and a test fails until it is written.
 """

@@ -37,11 +37,15 @@ if TYPE_CHECKING:
 
 
 def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[StageName, str] = DOORS) -> None:
-    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens. ``run`` and ``doors`` as in ``create_app``.
+    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens.
+
+    ``run`` and ``doors`` as in ``create_app``.
 
     Raises:
-        PlatformError: the port is taken, another server uses the data folder, it cannot be written, or the api extra is not installed.
-        SettingsError: other machines reach the server and access is open, or the database belongs to another data folder.
+        PlatformError: the port is taken, another server uses the data folder, it cannot be written, or the api extra is
+            not installed.
+        SettingsError: other machines reach the server and access is open, or the database belongs to another data
+            folder.
     """
     refuse_open_network(settings)
     os.umask(PRIVATE)
@@ -123,7 +127,8 @@ def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
 
 
 def _listen(settings: ServerSettings) -> socket.socket:
-    # asyncio sends small answers at once (TCP_NODELAY) only where the protocol is named; else each waits some 40 ms for an acknowledgement
+    # asyncio sends small answers at once (TCP_NODELAY) only where the protocol is named; else each waits some 40 ms for
+    # an acknowledgement
     listener = socket.socket(
         socket.AF_INET6 if ":" in settings.host else socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP
     )

@@ -21,7 +21,9 @@ Rows = list[dict[str, Any]]
 
 
 def error_against_time(rows: Rows) -> Figure:
-    """One panel per benchmark, or per parameter of one, log-log, this engine first; ``rows`` are as ``Row.model_dump`` gives them."""
+    """One panel per benchmark, or per parameter of one, log-log, this engine first; ``rows`` are as ``Row.model_dump``
+    gives them.
+    """
     panels: dict[tuple[str, str], Rows] = {}
     for row in rows:
         panels.setdefault((row["benchmark"].removesuffix(SUMMARY), row.get("parameter") or ""), []).append(row)
@@ -49,7 +51,8 @@ def draw_errors(axes: Axes, rows: Rows, *, by: str = "peer", lines: bool = True)
 
     Args:
         by: field that tells them apart.
-        lines: also draw for everyone what more or fewer paths give from the most efficient point, error = 1 / sqrt(efficiency x time).
+        lines: also draw for everyone what more or fewer paths give from the most efficient point, error = 1 /
+            sqrt(efficiency x time).
     """
     drawn = [row for row in rows if row["error"] > 0 and row["seconds"] > 0]
     for number, one in enumerate(sorted({row[by] for row in drawn}, key=lambda one: (one != OURS, one))):

@@ -1,7 +1,7 @@
 """Levenberg–Marquardt with Huber's weights, for some hundreds of unknowns and thousands of residuals.
 
-SciPy's trust region on the same problems took 10 to 50 times as long with a robust loss (it rescales rows by the loss's second
-derivative, which is 0 beyond the threshold, and crawls there); reweighting does not (Holland & Welsch 1977).
+SciPy's trust region on the same problems took 10 to 50 times as long with a robust loss (it rescales rows by the loss's
+second derivative, which is 0 beyond the threshold, and crawls there); reweighting does not (Holland & Welsch 1977).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-12, 1e8
 """As a share of each unknown's own curvature."""
 DAMPING_STEP = 10.0
 SMALL_DECREASE = 1e-9
-"""Of the cost, relative: of R residuals of one σ a step that gains less moves no unknown by more than √(10⁻⁹ R) of its ±, 0.003 of 9,000."""
+"""Of the cost, relative: of R residuals of one σ a step that gains less moves no unknown by more than √(10⁻⁹ R) of its
+±, 0.003 of 9,000."""
 
 
 def solve_reweighted(
@@ -44,7 +45,8 @@ def solve_reweighted(
         scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float64).tiny))
         scaled = normal * np.outer(scale, scale)
         before, gained = _cost(off, huber), 0.0
-        # More damping until a step gains; with the most none does, and the unknowns are as good as rounding lets them be.
+        # More damping until a step gains; with the most none does, and the unknowns are as good as rounding lets them
+        # be.
         while damping <= MAX_DAMPING:
             step = -scale * np.linalg.solve(scaled + damping * np.eye(len(values)), scale * side)
             tried = residuals(values + step)

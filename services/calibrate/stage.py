@@ -1,4 +1,6 @@
-"""The doors of calibration: ``run`` registers the scan of a raw folder, ``calibrate`` is the whole of a job of kind calibration."""
+"""The doors of calibration: ``run`` registers the scan of a raw folder, ``calibrate`` is the whole of a job of kind
+calibration.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ def run(spec: JobSpec, context: StageContext) -> Registration:
     Pictures of a refusal stay in the job's folder, which the message names.
 
     Raises:
-        CaptureInputError: something is missing or contradicts, or the pose is not to be believed. MeshError: the scan cannot be
-            made solid. JobCancelledError.
+        CaptureInputError: something is missing or contradicts, or the pose is not to be believed. MeshError: the scan
+            cannot be made solid. JobCancelledError.
     """
     from services.calibrate.registration.register import PICTURES, register_folder
 
@@ -48,13 +50,15 @@ def run(spec: JobSpec, context: StageContext) -> Registration:
 
 
 def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Calibrate the rig of ``spec.capture``, a raw folder, as ``dentine calibrate`` does, and publish the record as the asset.
+    """Calibrate the rig of ``spec.capture``, a raw folder, as ``dentine calibrate`` does, and publish the record as the
+    asset.
 
-    The report lies in the job's folder, where those of other kinds lie. A calibration beyond its limits is published all the
-    same, with what to photograph again; jobs that name it refuse it.
+    The report lies in the job's folder, where those of other kinds lie. A calibration beyond its limits is published
+    all the same, with what to photograph again; jobs that name it refuse it.
 
     Raises:
-        CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy. JobCancelledError.
+        CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy.
+            JobCancelledError.
     """
     from services.calibrate.session.report import write_report
     from services.calibrate.session.run import CALIBRATION, RESIDUALS, write_session

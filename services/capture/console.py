@@ -4,9 +4,10 @@
 
     python -m services.capture.console '{"address": "host:port", ...}'    DomeCommand lines in, DomeAnswer lines out
 
-Commands run side by side, so that ALL OFF and the status wait for nobody; one at a time drives the dome. The process ends with its standard input, that is
-with whoever started it, kill -9 included, and leaves the dome dark. A light that it holds goes dark by itself when its time is over, which is kept here and by
-the controller's strobe, and within the watchdog period if this process is killed.
+Commands run side by side, so that ALL OFF and the status wait for nobody; one at a time drives the dome. The process
+ends with its standard input, that is with whoever started it, kill -9 included, and leaves the dome dark. A light that
+it holds goes dark by itself when its time is over, which is kept here and by the controller's strobe, and within the
+watchdog period if this process is killed.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ TICK_S = 0.1
 PATIENCE_S = 1.0
 """How long a command waits for another one that drives the dome."""
 DOSE_S = 1e4
-"""Light adds up over this time (IEC 62471), so that a limit is for all lights by hand since the dome was last left dark for so long."""
+"""Light adds up over this time (IEC 62471), so that a limit is for all lights by hand since the dome was last left dark
+for so long."""
 SHARED_LIMITS = ("watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s")
 """A preflight's rig may ask for less than the server allows, never for more."""
 SIMULATED_LIGHTS = 155
@@ -159,7 +161,8 @@ class Console:
             self._budget.spent_s.clear()
 
     def _require_wanted(self, command: DomeCommand) -> None:
-        # Before the watchdog is armed, which would undo ALL OFF, and after it: what comes later is refused light by the controller.
+        # Before the watchdog is armed, which would undo ALL OFF, and after it: what comes later is refused light by the
+        # controller.
         with self._ordering:
             is_overtaken = command.number < self._newest_off
         if is_overtaken:

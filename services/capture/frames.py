@@ -90,7 +90,8 @@ class FrameStore:
                 os.fsync(journal.fileno())
         except OSError as problem:
             raise StoreError(
-                f"Frame {frame.index} cannot be stored in {self._folder} ({problem.strerror}); free the disk and run the job again, it resumes there."
+                f"Frame {frame.index} cannot be stored in {self._folder} ({problem.strerror}); free the disk and run"
+                " the job again, it resumes there."
             ) from problem
         self.acknowledged[frame.index] = frame
 
@@ -133,7 +134,9 @@ class FrameStore:
 
 
 def _intact(folder: Path, header: str) -> Iterator[Acknowledged]:
-    """Journal lines whose shards are as acknowledged; torn and damaged lines and frames are left out, to be captured again."""
+    """Journal lines whose shards are as acknowledged; torn and damaged lines and frames are left out, to be captured
+    again.
+    """
     text = (folder / JOURNAL).read_text()
     assert text.startswith(header)
     for row in text.split("\n")[1:-1]:
@@ -170,7 +173,10 @@ def _fsync(path: Path) -> None:
 
 
 def _link_shards(source: Path, target: Path, line: Acknowledged) -> None:
-    """Adopt a frame's shards without copying. A stalled older attempt replaces files and never changes them, so links are safe."""
+    """Adopt a frame's shards without copying.
+
+    A stalled older attempt replaces files and never changes them, so links are safe.
+    """
     for name, _, _ in line.shards:
         path = target / ARRAY / name
         path.parent.mkdir(parents=True, exist_ok=True)

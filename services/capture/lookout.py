@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 LOOK_EVERY_S = 0.05
-"""A tenth of the half second within which a cancel must have darkened the dome; a look costs one question to the file system."""
+"""A tenth of the half second within which a cancel must have darkened the dome; a look costs one question to the file
+system."""
 
 
 @contextmanager

@@ -4,8 +4,8 @@
 
     black ... black | tracking | light 0 ... light k-1 | tracking | light k ... | tracking
 
-A tracking frame has all lights on at 1/lights of the level, so that it is as bright as the mean single light and costs no more
-dose. The subject's motion is measured between tracking frames, whose light does not change.
+A tracking frame has all lights on at 1/lights of the level, so that it is as bright as the mean single light and costs
+no more dose. The subject's motion is measured between tracking frames, whose light does not change.
 """
 
 from __future__ import annotations
@@ -45,23 +45,29 @@ def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
         lights: lights to capture, indices 0 to lights - 1 of the dome.
 
     Raises:
-        SettingsError: the level is below one register step, or an exposure is longer than a light may be on. ExposureLimitError: the plan passes a
-            dose limit.
+        SettingsError: the level is below one register step, or an exposure is longer than a light may be on.
+            ExposureLimitError: the plan passes a dose limit.
     """
     if rig.black_frames > MAX_BLACK_FRAMES:
         raise SettingsError(
-            f"rig.black_frames {rig.black_frames} are more than {MAX_BLACK_FRAMES}, which average all noise away; lower it."
+            f"rig.black_frames {rig.black_frames} are more than {MAX_BLACK_FRAMES}, which average all noise away;"
+            " lower it."
         )
     frames = tuple(_frame(rig, lights, index, light) for index, light in enumerate(_order(rig, lights)))
     require_exposure(frames, lights, rig)
     if (on_s := rig.settle_s + rig.exposure_s) > MAX_ON_TIME_S:
-        what = f"rig.exposure_s {rig.exposure_s:g} s with rig.settle_s is longer than a light may be on at once ({MAX_ON_TIME_S:g} s)"
+        what = (
+            f"rig.exposure_s {rig.exposure_s:g} s with rig.settle_s is longer than a light may be on at once"
+            f" ({MAX_ON_TIME_S:g} s)"
+        )
         raise SettingsError(f"{what}; shorten it by {on_s - MAX_ON_TIME_S:.3g} s.")
     return frames
 
 
 def preflight_frames(plan: Sequence[PlannedFrame]) -> tuple[PlannedFrame, ...]:
-    """What a preflight lights: every light for a glimpse, then one whole frame, with all lights on where the plan has such frames."""
+    """What a preflight lights: every light for a glimpse, then one whole frame, with all lights on where the plan has
+    such frames.
+    """
     glimpses = (frame.model_copy(update={"on_s": GLIMPSE_S}) for frame in plan if frame.light is not None)
     return (*glimpses, next((frame for frame in plan if frame.kind == "tracking"), plan[-1]))
 

@@ -40,7 +40,8 @@ def preflight(
         offset = abs(float(image.mean()) - cameras.black_level)
         if offset > BLACK_TOLERANCE * full_scale:
             raise RigError(
-                f"Camera {camera} reads {image.mean():.1f} counts in the dark instead of {cameras.black_level}; darken the room or correct the black level."
+                f"Camera {camera} reads {image.mean():.1f} counts in the dark instead of {cameras.black_level}; darken"
+                " the room or correct the black level."
             )
 
     raise_if_unwanted()
@@ -51,7 +52,8 @@ def preflight(
         fraction = clipped_fraction(image, cameras.bits)
         if fraction > CLIPPED_FRACTION:
             findings.append(
-                f"Camera {camera} clips {fraction:.1%} of its pixels in a {lit.kind} frame; lower rig.level or rig.exposure_s."
+                f"Camera {camera} clips {fraction:.1%} of its pixels in a {lit.kind} frame; lower rig.level or"
+                " rig.exposure_s."
             )
         if float(image.max()) - cameras.black_level < 2 * BLACK_TOLERANCE * full_scale:
             findings.append(f"Camera {camera} sees no light in a {lit.kind} frame; open its shutter or check its aim.")

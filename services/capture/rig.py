@@ -1,4 +1,6 @@
-"""A rig ready to be used: what its files say, the frames planned for it, and its dome and cameras while they are open."""
+"""A rig ready to be used: what its files say, the frames planned for it, and its dome and cameras while they are
+open.
+"""
 
 from __future__ import annotations
 
@@ -106,13 +108,17 @@ def _require_sensor(sensor: SimulatedCameraSpec) -> None:
     """
     full_scale = 2**sensor.bits - 1
     if not 0 <= sensor.black_level < full_scale / 2:
-        what = f"rig.simulation.black_level {sensor.black_level} does not lie between 0 and half of the {full_scale} counts of {sensor.bits} bits"
+        what = (
+            f"rig.simulation.black_level {sensor.black_level} does not lie between 0 and half of the {full_scale}"
+            f" counts of {sensor.bits} bits"
+        )
         raise SettingsError(f"{what}; lower it.")
     if not 0 <= sensor.seed < 2**63:
         raise SettingsError(f"rig.simulation.seed {sensor.seed} is no seed; give a whole number from 0 to 2**63 - 1.")
     if sensor.motion_px > MAX_MOTION_PX:
         raise SettingsError(
-            f"rig.simulation.motion_px {sensor.motion_px:g} is more than {MAX_MOTION_PX:g} pixels, which no subject moves; lower it."
+            f"rig.simulation.motion_px {sensor.motion_px:g} is more than {MAX_MOTION_PX:g} pixels, which no subject"
+            " moves; lower it."
         )
 
 

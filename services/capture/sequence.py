@@ -66,7 +66,10 @@ def capture_frames(
             StageEvent(
                 stage="capture",
                 kind="progress",
-                message=f"Frame {frame.index + 1} of {len(plan)}: {f'light {name}' if name else frame.kind}{_clipping(images, cameras)}",
+                message=(
+                    f"Frame {frame.index + 1} of {len(plan)}:"
+                    f" {f'light {name}' if name else frame.kind}{_clipping(images, cameras)}"
+                ),
                 done=len(store.acknowledged) / len(plan),
                 data={"frame": frame.index, "kind": frame.kind, "light": name, "remaining_s": round(remaining_s, 3)},
             )

@@ -65,7 +65,8 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     )
 
     with rig.in_use() as (dome, cameras), interrupting(context.raise_if_cancelled, dome.interrupt):
-        # The watchdog is armed from here on: an ALL OFF before it has left its cancel, one after it is refused light by the dome.
+        # The watchdog is armed from here on: an ALL OFF before it has left its cancel, one after it is refused light by
+        # the dome.
         context.raise_if_cancelled()
         for finding in preflight(plan, dome, cameras, spec.rig, context.raise_if_cancelled):
             context.report(StageEvent(stage="capture", kind="log", message=finding))

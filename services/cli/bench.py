@@ -29,7 +29,8 @@ _BENCHMARKS = MappingProxyType(
         "transport-stack": "services.bench.transport.stack:run",
     }
 )
-"""Name -> ``module:function``; the function takes ``quick``, returns JSON values, and may also take ``case``, and ``keep``, which stores unfinished rows."""
+"""Name -> ``module:function``; the function takes ``quick``, returns JSON values, and may also take ``case``, and
+``keep``, which stores unfinished rows."""
 
 
 def bench(
@@ -83,7 +84,8 @@ def _draw(module: Any, rows: list[dict[str, Any]], png: Path) -> None:
         from services.bench.plots import error_against_time, write_png
     except ModuleNotFoundError as missing:
         print(
-            f"{png} was not drawn, as {missing.name} is missing; install the extra bench, pip install 'dentine[bench]'.",
+            f"{png} was not drawn, as {missing.name} is missing; install the extra bench, pip install"
+            " 'dentine[bench]'.",
             file=sys.stderr,
         )
         return

@@ -1,4 +1,6 @@
-"""``dentine scheduler`` and ``dentine worker``: Dask's own commands, with TLS as the settings say and workers that are checked."""
+"""``dentine scheduler`` and ``dentine worker``: Dask's own commands, with TLS as the settings say and workers that are
+checked.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
             bool, typer.Option("--captures-only", help="Run captures and nothing else, so that none waits for a fit.")
         ] = False,
     ) -> None:
-        """Run Dask workers for a server's jobs; takes the options of `dask worker`, first of all the scheduler's address.
+        """Run Dask workers for a server's jobs; takes the options of `dask worker`, first of all the scheduler's
+        address.
 
         A worker runs every stage but captures, once it has shown that it can; with `--resources DOME=1` captures too.
         """

@@ -90,7 +90,9 @@ def require_apart(spec: JobSpec, out: Path) -> None:
 
 @contextmanager
 def cancelling_on_signals(out: Path) -> Iterator[None]:
-    """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at once."""
+    """Turn the first Ctrl-C or SIGTERM into a cancel request, so that the lights go off first; a second one stops at
+    once.
+    """
     from services.core.files.folders import require_folder
     from services.pipeline.stages import request_cancel, withdraw_cancel
 

@@ -37,8 +37,11 @@ def simulate_slab_command(
     layers: Annotated[
         str | None,
         typer.Option(
-            help="Instead of one slab: JSON list of {sigma, alpha, beta, g1, g2, thickness_mm}, first layer lit; a phase function may be "
-            "table: {angles_rad, values} instead of beta, g1, g2."
+            help=(
+                "Instead of one slab: JSON list of {sigma, alpha, beta, g1, g2, thickness_mm}, first layer lit; a phase"
+                " function may be "
+                "table: {angles_rad, values} instead of beta, g1, g2."
+            )
         ),
     ] = None,
     ior: Annotated[
@@ -55,7 +58,10 @@ def simulate_slab_command(
     ring_edges: Annotated[
         str,
         typer.Option(
-            help="Also the scattered light that leaves between these radii about the point of entry, and beyond the last, mm, as 0.1,0.5."
+            help=(
+                "Also the scattered light that leaves between these radii about the point of entry, and beyond the"
+                " last, mm, as 0.1,0.5."
+            )
         ),
     ] = "",
     rel_error: Annotated[float, typer.Option(min=1e-5, max=1, help="Relative standard error to reach.")] = 1e-3,
@@ -74,12 +80,14 @@ def simulate_slab_command(
     stack = _read_layers(layers, {"alpha": alpha, "sigma": sigma, "width": width}, g)
     cosines, edges_mm = _numbers("--exit-cosines", exit_cosines), _numbers("--ring-edges", ring_edges)
     result = simulate_slab(
-        stack, ior=ior, boundary=boundary.value, source=source.value, mu_incident=mu_incident, exit_cosines=cosines, ring_edges_mm=edges_mm,
-        rel_error=rel_error, gradient=gradient, seed=seed, max_seconds=max_seconds, numbered=layers is not None,
+        stack, ior=ior, boundary=boundary.value, source=source.value, mu_incident=mu_incident, exit_cosines=cosines,
+        ring_edges_mm=edges_mm, rel_error=rel_error, gradient=gradient, seed=seed, max_seconds=max_seconds,
+        numbered=layers is not None,
     )  # fmt: skip
     if not result.complete:
         print(
-            "The time ran out before every standard error was reached; the ones printed are true, give --max-seconds for smaller ones.",
+            "The time ran out before every standard error was reached; the ones printed are true, give --max-seconds"
+            " for smaller ones.",
             file=sys.stderr,
         )
     figures = result.as_json()
@@ -117,7 +125,8 @@ def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> t
             layers = json.loads(text)
         except json.JSONDecodeError as problem:
             raise SettingsError(
-                f'Option --layers is not JSON ({problem}); give a list such as \'[{{"sigma": 2, "alpha": 0.9, "thickness_mm": 1}}]\'.'
+                f'Option --layers is not JSON ({problem}); give a list such as \'[{{"sigma": 2, "alpha": 0.9,'
+                ' "thickness_mm": 1}]\'.'
             ) from problem
     try:
         return tuple(TypeAdapter(list[Layer]).validate_python(layers))
@@ -141,6 +150,7 @@ def _table(figures: dict[str, Any], cosines: tuple[float, ...], edges_mm: tuple[
         if faces := figures[name]:
             lines += [
                 f"{f'{side} {name} {place}':<24} {value:.5e} +- {error:.1e}"
-                for side in ("R", "T") for place, value, error in zip(places, faces[side], faces[f"{side}_se"], strict=True)
+                for side in ("R", "T")
+                for place, value, error in zip(places, faces[side], faces[f"{side}_se"], strict=True)
             ]  # fmt: skip
     return "\n".join(lines)

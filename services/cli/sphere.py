@@ -50,7 +50,8 @@ def _line(fitted: Fitted) -> str:
     fit = fitted.fit
     quantities = [("σa", fit.sigma_a), ("σs′", fit.sigma_s_reduced)] + ([("g", fit.g)] if fit.sigma_t else [])
     told = [
-        f"{label} {one.value:.4f} ± {one.se:.4f}{' per mm' if one.unit == '1/mm' else ''}{'' if one.determined else ' (not determined)'}"
+        f"{label} {one.value:.4f} ±"
+        f" {one.se:.4f}{' per mm' if one.unit == '1/mm' else ''}{'' if one.determined else ' (not determined)'}"
         for label, one in quantities
     ]
     return f"{fit.name}: {', '.join(told)}{'' if fit.converged else ', which does not give the readings'}"

@@ -53,7 +53,8 @@ def build_token_app(default_url: Callable[[], str]) -> typer.Typer:
             issued = tokens.create(name, [Scope(one) for one in scope], expires_days, audited, group)
         if group is None and set(scope) == {Scope.READ}:
             print(
-                f"dentine: Token {name} may only read and is in no group, so it sees no jobs; to see a group's, make it with --group.",
+                f"dentine: Token {name} may only read and is in no group, so it sees no jobs; to see a group's, make it"
+                " with --group.",
                 file=sys.stderr,
             )
         print(issued.model_dump_json() if as_json else issued.token.get_secret_value())

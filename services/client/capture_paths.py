@@ -1,4 +1,6 @@
-"""Which files a capture may hold, by their paths alone: the client asks before it reads a file, the server before it believes a manifest."""
+"""Which files a capture may hold, by their paths alone: the client asks before it reads a file, the server before it
+believes a manifest.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ TEXTS = frozenset({".csv", ".json", ".jsonl", ".toml"})
 IMAGES = frozenset({".npy", ".png", ".tif", ".tiff", ".exr"})
 MESHES = frozenset({".ply", ".obj", ".stl"})
 DESCRIPTIONS = frozenset({"capture.json", "manifest.json", "raw.toml", "slab.json"})
-"""One of these makes a folder a capture: linear images, what the capture stage published, raw photographs, or a material's cell."""
+"""One of these makes a folder a capture: linear images, what the capture stage published, raw photographs, or a
+material's cell."""
 
 _CHUNK = re.compile(r"(.*/)?[^/]+\.zarr/(.*/)?c(/\d+)+")
 
@@ -73,7 +76,10 @@ def path_fault(path: str) -> str | None:
     if len(path.encode()) > MAX_PATH_BYTES:
         return f"has a path of {len(path.encode())} bytes and {MAX_PATH_BYTES} are allowed; shorten it"
     if PurePosixPath(path).suffix.lower() not in TEXTS | IMAGES | MESHES and not _CHUNK.fullmatch(path):
-        return f"is no file of a capture; it holds {', '.join(sorted(TEXTS | IMAGES | MESHES))} and chunks of .zarr arrays, and archives are not unpacked"
+        return (
+            f"is no file of a capture; it holds {', '.join(sorted(TEXTS | IMAGES | MESHES))} and chunks of .zarr"
+            " arrays, and archives are not unpacked"
+        )
     return None
 
 

@@ -1,4 +1,7 @@
-"""Typed clients of the REST API: one that blocks, as the command line uses it, and one for asyncio. What they say is in ``requests``."""
+"""Typed clients of the REST API: one that blocks, as the command line uses it, and one for asyncio.
+
+What they say is in ``requests``.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +80,9 @@ class Client:
     def upload(
         self, folder: Path, progress: Callable[[UploadProgress], None] | None = None, subject: str | None = None
     ) -> UploadResult:
-        """Upload a folder capture and commit it. Files that the server knows are not sent; a broken upload resumes, also in a new process.
+        """Upload a folder capture and commit it.
+
+        Files that the server knows are not sent; a broken upload resumes, also in a new process.
 
         Args:
             progress: called as files are hashed and sent.

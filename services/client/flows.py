@@ -1,7 +1,9 @@
-"""What a client and a server say to each other, without a connection: whoever has one performs the steps and hands back what came of them.
+"""What a client and a server say to each other, without a connection: whoever has one performs the steps and hands back
+what came of them.
 
-A flow is a generator. It yields an ``Ask``, a ``Pause`` or some ``Work``, is sent the answer or has the error thrown into it, and returns the result. So the
-blocking and the asynchronous client share every request, retry and error, and differ only in how a step is taken.
+A flow is a generator. It yields an ``Ask``, a ``Pause`` or some ``Work``, is sent the answer or has the error thrown
+into it, and returns the result. So the blocking and the asynchronous client share every request, retry and error, and
+differ only in how a step is taken.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ Flow = Generator[Ask | Pause | Work, Any, R]
 
 
 def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
-    """The JSON that a request is answered with. One that changes nothing is made once more if its connection breaks, as servers close idle ones.
+    """The JSON that a request is answered with.
+
+    One that changes nothing is made once more if its connection breaks, as servers close idle ones.
 
     Raises:
         PlatformError: no server answers. DentineError: the one that the answer tells of.

@@ -119,7 +119,10 @@ def describe(remaining: dict[str, Any] | None) -> str:
         return ""
     if remaining["low_s"] is None or remaining["high_s"] is None:
         return f"no time range: {remaining['reason']}"
-    return f"ends in {range_text(remaining['low_s'], remaining['high_s'])} (80 % range from {remaining['past_jobs']} past jobs)"
+    return (
+        f"ends in {range_text(remaining['low_s'], remaining['high_s'])} (80 % range from {remaining['past_jobs']} past"
+        " jobs)"
+    )
 
 
 def range_text(low_s: float, high_s: float) -> str:

@@ -71,7 +71,8 @@ def parse_checksum(header: str) -> Checksum:
         raise UploadError("Upload-Checksum is not Base64; encode the digest so.") from problem
     if len(digest) != DIGEST_BYTES[algorithm]:
         raise UploadError(
-            f"Upload-Checksum has {len(digest)} bytes and a {algorithm} has {DIGEST_BYTES[algorithm]}; send the whole digest."
+            f"Upload-Checksum has {len(digest)} bytes and a {algorithm} has {DIGEST_BYTES[algorithm]}; send the whole"
+            " digest."
         )
     return Checksum(algorithm, digest)
 

@@ -1,4 +1,7 @@
-"""Sends a folder to a server, file by file and chunk by chunk. All state is the server's, so any later process goes on where this one ends."""
+"""Sends a folder to a server, file by file and chunk by chunk.
+
+All state is the server's, so any later process goes on where this one ends.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,8 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 CHUNK_BYTES = 4 * 2**20
 MIN_CHUNK_BYTES = 2**18
-"""A chunk is recorded whole or not at all; one that failed is halved down to this, so that a bad connection still gets on."""
+"""A chunk is recorded whole or not at all; one that failed is halved down to this, so that a bad connection still gets
+on."""
 PATIENCE_S = 300.0
 """How long a chunk is tried again while the server does not answer."""
 VERIFYING_S = 900.0
@@ -78,11 +82,13 @@ class Uploader:
         """Upload a folder and commit it.
 
         Raises:
-            CaptureInputError: the folder is no capture, or a file changes meanwhile. UploadError: what the server refuses. PlatformError: no server answers.
+            CaptureInputError: the folder is no capture, or a file changes meanwhile. UploadError: what the server
+                refuses. PlatformError: no server answers.
         """
         if subject is not None and re.fullmatch(SUBJECT, subject) is None:
             raise UploadError(
-                f"Subject {subject!r} is no label; use up to 64 letters, digits, dots, dashes and underscores, and no name."
+                f"Subject {subject!r} is no label; use up to 64 letters, digits, dots, dashes and underscores, and no"
+                " name."
             )
         files, left_out = yield Work(lambda: _scan(folder))
         yield Work(lambda: _require_no_metadata(folder, files))

@@ -21,7 +21,9 @@ class DomeStatus(Record):
         description="whether the relay of the LED supply is closed; it is while a driver feeds the watchdog"
     )
     stopped: bool = Field(
-        description="whether ALL OFF holds: no light goes on until somebody starts a capture, a preflight or a light anew"
+        description=(
+            "whether ALL OFF holds: no light goes on until somebody starts a capture, a preflight or a light anew"
+        )
     )
     faults: tuple[str, ...]
     lit: tuple[int, ...] = Field(description="indices of the lights that emit now")

@@ -1,4 +1,7 @@
-"""Cameras, lights and meshes as records. Lengths are millimetres, camera axes follow OpenCV (x right, y down, z forward)."""
+"""Cameras, lights and meshes as records.
+
+Lengths are millimetres, camera axes follow OpenCV (x right, y down, z forward).
+"""
 
 from __future__ import annotations
 
@@ -113,14 +116,16 @@ class Mesh:
         """
         if not np.isfinite(self.vertices_mm).all():
             raise MeshError(
-                f"Mesh {name} has {np.count_nonzero(~np.isfinite(self.vertices_mm))} non-finite coordinates; repair and export it again."
+                f"Mesh {name} has {np.count_nonzero(~np.isfinite(self.vertices_mm))} non-finite coordinates; repair and"
+                " export it again."
             )
         if len(self.faces) == 0:
             raise MeshError(f"Mesh {name} has no faces; export it again with its triangles.")
         extent = float(np.ptp(self.vertices_mm, axis=0).max())
         if not extent_mm[0] <= extent <= extent_mm[1]:
             raise MeshError(
-                f"Mesh {name} is {extent:.4g} units across, outside {extent_mm[0]:g} to {extent_mm[1]:g} mm; vertices must be in millimetres, so rescale it."
+                f"Mesh {name} is {extent:.4g} units across, outside {extent_mm[0]:g} to {extent_mm[1]:g} mm; vertices"
+                " must be in millimetres, so rescale it."
             )
 
     def shell_count(self) -> int:
@@ -142,7 +147,8 @@ class Mesh:
         """
         if (shells := self.shell_count()) > 1:
             raise MeshError(
-                f"Mesh {name} holds {shells} separate shells; join them into one surface, or remove all but the tooth's."
+                f"Mesh {name} holds {shells} separate shells; join them into one surface, or remove all but the"
+                " tooth's."
             )
 
     def require_solid(self, name: str, extent_mm: tuple[float, float] = (2.0, 100.0)) -> None:

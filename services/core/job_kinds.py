@@ -1,8 +1,9 @@
 """The kinds of job: what each goes through, who does it, and which options are its own.
 
-A kind is one entry of ``JOB_KINDS`` and the module that its doors name; its options are fields of ``JobSpec``. An installed
-package adds a kind by an entry point of the group ``dentine.job_kinds`` that leads to a ``JobKind``. Every process reads the
-entry points for itself, so a worker knows the kind where that package is installed, and names the ones it knows where not.
+A kind is one entry of ``JOB_KINDS`` and the module that its doors name; its options are fields of ``JobSpec``. An
+installed package adds a kind by an entry point of the group ``dentine.job_kinds`` that leads to a ``JobKind``. Every
+process reads the entry points for itself, so a worker knows the kind where that package is installed, and names the
+ones it knows where not.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@
 
     JOB/masks/<camera>@<light>.png     names percent-encoded; light 'all' for every light of the camera
 
-A grey PNG of the camera's size; a pixel that is not 0 is not used. Where the jaws moved between frames it is meant where they were in the first one.
+A grey PNG of the camera's size; a pixel that is not 0 is not used. Where the jaws moved between frames it is meant
+where they were in the first one.
 """
 
 from __future__ import annotations
@@ -50,7 +51,9 @@ def digest_of(masks: Mapping[tuple[str, str], bytes]) -> str:
 
 
 def is_stale(root: Path) -> bool:
-    """Whether the job's published preparation was made with other masks than there are now; not where it does not say, as it is damaged."""
+    """Whether the job's published preparation was made with other masks than there are now; not where it does not say,
+    as it is damaged.
+    """
     if not is_published(root, "prepared"):
         return False
     try:

@@ -1,7 +1,7 @@
 """Which worker may do what, and how those that do the same are shared: Dask resources and priorities by name.
 
-A resource here is a mark of what a worker can do, not an amount that is used up: a task that has given its thread back, such as
-the driver of a fit, keeps what it holds. Only the dome is one, so that its worker runs one capture at a time.
+A resource here is a mark of what a worker can do, not an amount that is used up: a task that has given its thread back,
+such as the driver of a fit, keeps what it holds. Only the dome is one, so that its worker runs one capture at a time.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ def _no_stand_in(value: Any) -> Any:
 
 
 Number = Annotated[float, Strict()]
-"""Neither a text nor true or false for a number, so that no light burns at full level because somebody wrote "level": true."""
+"""Neither a text nor true or false for a number, so that no light burns at full level because somebody wrote "level":
+true."""
 Whole = Annotated[int, BeforeValidator(_no_stand_in)]
 """The same, but 2.0 is whole too."""
 JobName = Annotated[
@@ -106,9 +107,11 @@ class SimulatedCameraSpec(Record):
 SIMULATED_DOME = "simulated"
 """In place of a dome's address: one that is started for the capture, on loopback, and lights nobody."""
 MAX_ON_TIME_S = 60.0
-"""Longest time that a light may be on at once: the controller's strobe counts 65.5 s in its 16 bits, and 2 s of them are its margin."""
+"""Longest time that a light may be on at once: the controller's strobe counts 65.5 s in its 16 bits, and 2 s of them
+are its margin."""
 DEMO_MOUTH = Path("demo")
-"""Stands for a rig's mouth that a job makes itself: a virtual incisor, rendered by its first stage, so that a demonstration needs no file anywhere."""
+"""Stands for a rig's mouth that a job makes itself: a virtual incisor, rendered by its first stage, so that a
+demonstration needs no file anywhere."""
 
 
 class RigSpec(Record):
@@ -120,8 +123,10 @@ class RigSpec(Record):
     )
     cameras: Literal["simulated", "playback"] = "simulated"
     mouth: Path = Field(
-        description="folder capture: the rig's calibration and meshes; for simulated cameras also the images they see. "
-        "'demo' has a virtual incisor rendered first"
+        description=(
+            "folder capture: the rig's calibration and meshes; for simulated cameras also the images they see. "
+            "'demo' has a virtual incisor rendered first"
+        )
     )
     level: Unit = Field(default=0.5, description="LED level, fraction of full scale")
     exposure_s: Positive = Field(default=0.05, description="exposure time")
@@ -177,7 +182,10 @@ class JobSpec(Record):
         default=None,
         ge=11,
         le=85,
-        description="of kind tooth: the tooth to fit, by its FDI number, where the capture has several; the others are in the way",
+        description=(
+            "of kind tooth: the tooth to fit, by its FDI number, where the capture has several; the others are in"
+            " the way"
+        ),
     )
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
@@ -192,7 +200,9 @@ class JobSpec(Record):
     )
     instrument: Literal["on", "off"] = Field(
         default="on",
-        description="of a tooth or jaw: fit the instrument's errors too (gain, lights, flare), within the calibration's ±",
+        description=(
+            "of a tooth or jaw: fit the instrument's errors too (gain, lights, flare), within the calibration's ±"
+        ),
     )
     loss: Loss = Field(
         default="l2", description="what is minimised; robust gives less weight to outliers such as shadow borders"
@@ -223,14 +233,18 @@ class JobSpec(Record):
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
     shadows: bool = Field(
         default=False,
-        description="leave out pixels that a camera's other lights show to lie in the shadow of lips, retractor or a hand",
+        description=(
+            "leave out pixels that a camera's other lights show to lie in the shadow of lips, retractor or a hand"
+        ),
     )
     memory_gib: Number = Field(
         default=2.0,
         ge=0.5,
         le=1024,
-        description="most memory, GiB, that a worker takes to prepare a raw folder's images: "
-        "its photographs are worked on in strips as high as that allows",
+        description=(
+            "most memory, GiB, that a worker takes to prepare a raw folder's images: "
+            "its photographs are worked on in strips as high as that allows"
+        ),
     )
     pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit means over squares of n x n pixels")
     samples_per_pixel: Whole = Field(
@@ -242,8 +256,10 @@ class JobSpec(Record):
         default=0.004,
         ge=0.0001,
         le=0.1,
-        description="a fit has converged when what noise leaves open of its parameters changes the images by no more, "
-        "as a fraction; a smaller one goes on to smaller ±, as far as max_samples_per_pixel allows",
+        description=(
+            "a fit has converged when what noise leaves open of its parameters changes the images by no more, "
+            "as a fraction; a smaller one goes on to smaller ±, as far as max_samples_per_pixel allows"
+        ),
     )
     search_candidates: Whole = Field(default=50_000, ge=100, description="table-search points per channel")
     advise: bool = Field(default=True, description="say at the end which further light or view would help most")
@@ -311,7 +327,8 @@ class JobSpec(Record):
             part, _, leaf = name.partition(".")
             if part not in {"enamel", "dentin"} or leaf not in HELD_RANGES:
                 raise ValueError(
-                    f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of enamel and dentin, such as enamel.sigma"
+                    f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of enamel and dentin, such as"
+                    " enamel.sigma"
                 )
             low, high = HELD_RANGES[leaf]
             if not low < value < high:

@@ -18,9 +18,11 @@ class Estimate(Record):
     determined: bool = Field(description="whether the data fixes this number")
     se_parts: dict[str, float] = Field(
         default={},
-        description="what the standard error is made of, largest first; the squares add up to its square. photographs: "
-        "their noise; rendering: that of renders; gain, light_gain, flare, teeth, dome: the calibration's; prior: that of media and "
-        "shapes; mean_cosine: one that is held; unfinished: the step that was left",
+        description=(
+            "what the standard error is made of, largest first; the squares add up to its square. photographs: their"
+            " noise; rendering: that of renders; gain, light_gain, flare, teeth, dome: the calibration's; prior: that"
+            " of media and shapes; mean_cosine: one that is held; unfinished: the step that was left"
+        ),
     )
 
 
@@ -85,7 +87,9 @@ class FitReport(Record):
     )
     instrument: dict[str, dict[str, Estimate]] = Field(
         default={},
-        description="per channel: the instrument's errors by name, as the images tell them; empty where it counts as perfect",
+        description=(
+            "per channel: the instrument's errors by name, as the images tell them; empty where it counts as perfect"
+        ),
     )
     instrument_prior: dict[str, dict[str, float]] = Field(
         default={}, description="per channel: one standard error of each by the calibration, before the fit"
@@ -96,7 +100,9 @@ class FitReport(Record):
     )
     instrument_faults: dict[str, tuple[str, ...]] = Field(
         default={},
-        description="per channel: the instrument's errors, by name, that the images put down to a fault of the calibration",
+        description=(
+            "per channel: the instrument's errors, by name, that the images put down to a fault of the calibration"
+        ),
     )
     instrument_told: tuple[str, ...] = Field(
         default=(),
@@ -106,7 +112,10 @@ class FitReport(Record):
     notes: tuple[str, ...] = Field(default=(), description="what the preparation had to say of the capture")
     next_capture: str = Field(
         default="",
-        description="in plain words, which further light, view or measurement of the instrument would help most; empty where none was looked for",
+        description=(
+            "in plain words, which further light, view or measurement of the instrument would help most; empty where"
+            " none was looked for"
+        ),
     )
     seconds: float = Field(description="from the first attempt's start to the end, pauses between attempts included")
 

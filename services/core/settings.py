@@ -70,7 +70,9 @@ class ConnectionLimits(Record):
 
 
 class DomeSettings(Record):
-    """The dome that a server works by hand, and how far any of its jobs may go with a dome: a job may ask for less, never for more."""
+    """The dome that a server works by hand, and how far any of its jobs may go with a dome: a job may ask for less,
+    never for more.
+    """
 
     address: str | None = Field(
         default=None,
@@ -78,7 +80,10 @@ class DomeSettings(Record):
     )
     job_addresses: str = Field(
         default="",
-        description="host:port of further domes that jobs may capture with, separated by commas; the server's own and 'simulated' always may",
+        description=(
+            "host:port of further domes that jobs may capture with, separated by commas; the server's own and"
+            " 'simulated' always may"
+        ),
     )
     watchdog_s: float = Field(
         default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long"
@@ -145,8 +150,10 @@ class ServerSettings(Record):
     )
     job_roots: str = Field(
         default="",
-        description="absolute folders on the server below which jobs may name captures, mouths and calibrations, separated by commas;"
-        " default: none where callers need tokens, any on an open server",
+        description=(
+            "absolute folders on the server below which jobs may name captures, mouths and calibrations, separated by"
+            " commas; default: none where callers need tokens, any on an open server"
+        ),
     )
     names: str = Field(
         default="", description="further host names that clients use for this server, separated by commas"
@@ -208,7 +215,8 @@ def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> 
                 node = node.setdefault(part, {})
                 if not isinstance(node, dict):
                     raise SettingsError(
-                        f"Setting {variable} needs a group of which another variable sets the whole; remove one of the two."
+                        f"Setting {variable} needs a group of which another variable sets the whole; remove one of the"
+                        " two."
                     )
             if isinstance(node.get(leaf), dict):
                 raise SettingsError(

@@ -14,9 +14,9 @@
       .<stage>.lock          held while the lease is compared and written, and while the stage is published
       .<stage>.<attempt>/    being written; never read by others
 
-A stage is written into its own hidden folder and published by one rename, with ``manifest.json`` inside that lists every
-file's size and SHA-256 and the stage's record. A reader sees all of a stage or none of it, and a missing shard, which zarr
-would read as zeros, is an error here.
+A stage is written into its own hidden folder and published by one rename, with ``manifest.json`` inside that lists
+every file's size and SHA-256 and the stage's record. A reader sees all of a stage or none of it, and a missing shard,
+which zarr would read as zeros, is an error here.
 """
 
 from __future__ import annotations
@@ -120,7 +120,9 @@ class StageWriter:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Hold the stage's lock, so that no other attempt starts or publishes it in between; the system drops it however this process ends."""
+        """Hold the stage's lock, so that no other attempt starts or publishes it in between; the system drops it
+        however this process ends.
+        """
         with (self.root / f".{self.stage}.lock").open("w") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX)
             yield
@@ -130,7 +132,8 @@ class StageWriter:
         newest = int(self._lease.read_text()) if self._lease.exists() else 0
         if newest > self.attempt or (not starting and newest != self.attempt):
             raise FencedError(
-                f"Attempt {self.attempt} of stage {self.stage} was overtaken by attempt {newest}; its writes are refused."
+                f"Attempt {self.attempt} of stage {self.stage} was overtaken by attempt {newest}; its writes are"
+                " refused."
             )
 
     def publish(self, record: Record, known: Mapping[str, tuple[int, str]] = NOTHING_KNOWN) -> Path:
@@ -237,7 +240,10 @@ def _require_intact(folder: Path, stage: str, files: dict[str, Any]) -> None:
         if not path.is_file():
             raise CorruptStoreError(f"{path} is missing from published stage {stage}; {_remedy(stage)}.")
         if path.stat().st_size != expected["bytes"]:
-            what = f"{path} of published stage {stage} has {path.stat().st_size} bytes instead of {expected['bytes']} (truncated?)"
+            what = (
+                f"{path} of published stage {stage} has {path.stat().st_size} bytes instead of {expected['bytes']}"
+                " (truncated?)"
+            )
             raise CorruptStoreError(f"{what}; {_remedy(stage)}.")
         if _sha256(path) != expected["sha256"]:
             raise CorruptStoreError(

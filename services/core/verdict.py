@@ -1,8 +1,9 @@
 """How well a fit went: the one judgement that the report, the page, the API and the command line show.
 
 Whether a job *succeeded* says that its stages ran to their end; whether its fit *converged* says whether to believe the
-numbers. The first is a stored state of the job's life, the second is derived here from the fit's report and is no state:
-a job is retried, deleted and told of by its life alone, and the states that version 0.1 has stored keep their meaning.
+numbers. The first is a stored state of the job's life, the second is derived here from the fit's report and is no
+state: a job is retried, deleted and told of by its life alone, and the states that version 0.1 has stored keep their
+meaning.
 """
 
 from __future__ import annotations
@@ -50,7 +51,9 @@ def verdict_of(report: FitReport) -> Verdict:
 
 
 def mean_figure(errors: Mapping[str, float], ses: Mapping[str, float]) -> Figure:
-    """The mean of some channels' errors; channels are rendered with paths of their own, so their noise is independent."""
+    """The mean of some channels' errors; channels are rendered with paths of their own, so their noise is
+    independent.
+    """
     count = max(len(errors), 1)
     is_known = bool(errors) and errors.keys() <= ses.keys()
     se = math.sqrt(sum(ses[channel] ** 2 for channel in errors)) / count if is_known else None

@@ -50,14 +50,15 @@ def check() -> None:
 def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitReport:
     """Fit every channel and publish ``fit/``: report, history, task trace, pictures.
 
-    Inside a Dask task the passes spread over the cluster and this task holds no slot; elsewhere they run in this process. Each step is on disk before the
-    next begins; a new attempt continues after the last one.
+    Inside a Dask task the passes spread over the cluster and this task holds no slot; elsewhere they run in this
+    process. Each step is on disk before the next begins; a new attempt continues after the last one.
 
     Args:
         engine: who renders, as ``module:class``.
 
     Raises:
-        CaptureInputError, SettingsError, StoreError: what was prepared cannot be fitted as asked. JobCancelledError: between two steps.
+        CaptureInputError, SettingsError, StoreError: what was prepared cannot be fitted as asked. JobCancelledError:
+            between two steps.
     """
     from services.fit.execution.attempt import Attempt
     from services.fit.jaw.driver import JawDriver
@@ -206,7 +207,10 @@ def _with_dentin(tooth: Tooth, dentin: DentinShape | None, shape: tuple[float, .
 
 
 def describe_options(spec: JobSpec) -> str:
-    """The options with which a fit was made, where they are not at their defaults. Paths lead nowhere for whoever reads a report."""
+    """The options with which a fit was made, where they are not at their defaults.
+
+    Paths lead nowhere for whoever reads a report.
+    """
     named = spec.changed_options - {"kind", "capture", "rig", "calibration", "seed", "workers", "priority"}
     values = spec.model_dump(mode="json", include=set(named))
     rows = [f"{name} = {value if isinstance(value, str) else json.dumps(value)}" for name, value in values.items()]

@@ -1,4 +1,6 @@
-"""The mouth of the demonstration: a virtual incisor, rendered once in a process of its own and kept for the jobs after."""
+"""The mouth of the demonstration: a virtual incisor, rendered once in a process of its own and kept for the jobs
+after.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from services.core.errors import CrashError
 from services.core.store import write_atomic
 
 OPTIONS: Mapping[str, str] = MappingProxyType({"pixel-mm": "0.5", "cameras": "3", "lights": "8", "samples": "8192"})
-"""Of ``dentine phantom``. With so many samples the images' own noise is 3 %, which is what the held-out error comes to; a quarter of them gives 6 %."""
+"""Of ``dentine phantom``. With so many samples the images' own noise is 3 %, which is what the held-out error comes to;
+a quarter of them gives 6 %."""
 NAME = "incisor-" + "-".join(f"{value}-{name}" for name, value in OPTIONS.items())
 """Folder of this mouth among those that are kept: another one where the options change."""
 WATCH_S = 0.25
@@ -44,7 +47,8 @@ def make_demo_mouth(folder: Path, kept_in: Path | None, look: Callable[[float], 
 
 
 def _render(folder: Path, look: Callable[[float], None]) -> None:
-    # As a process: a kernel may hold the interpreter for seconds, in which the worker must answer its scheduler; and it can be ended in mid-kernel.
+    # As a process: a kernel may hold the interpreter for seconds, in which the worker must answer its scheduler; and it
+    # can be ended in mid-kernel.
     options = [part for name, value in OPTIONS.items() for part in (f"--{name}", value)]
     command = [sys.executable, "-m", "services", "phantom", "--out", str(folder), *options]
     words = folder.with_name(f"{folder.name}.words")

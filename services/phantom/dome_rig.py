@@ -1,4 +1,6 @@
-"""A dome in front of the mouth: cameras near its rim, point lights over the hemisphere and a little behind the tooth's edge."""
+"""A dome in front of the mouth: cameras near its rim, point lights over the hemisphere and a little behind the tooth's
+edge.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,8 @@ from services.core.geometry import Camera, Light, Mesh
 
 RADIUS_MM = 1000.0
 WIDEST_LIGHT_DEG = 108.0
-"""Angle from the front of the last light: it grazes and reaches the tooth from behind its edge, which is what tells enamel's thickness."""
+"""Angle from the front of the last light: it grazes and reaches the tooth from behind its edge, which is what tells
+enamel's thickness."""
 INTENSITY = 1.0e6
 """Radiant intensity that gives unit irradiance at the dome's radius."""
 LED_WHITE = {"red": 1.0, "green": 1.0, "blue": 0.9}

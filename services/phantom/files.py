@@ -38,7 +38,8 @@ def require_rig(
     """
     if min(cameras, lights) < 1 or samples < 16 or not pixel_mm > 0:
         raise InputError(
-            "A phantom needs at least one camera, one light, 16 samples and a positive pixel size; raise the one that is too small."
+            "A phantom needs at least one camera, one light, 16 samples and a positive pixel size; raise the one that"
+            " is too small."
         )
     if channels not in CHANNELS:
         raise InputError(f"A phantom has 1 or 3 channels, not {channels}; choose one of these.")
@@ -49,7 +50,9 @@ def require_rig(
 
 
 def held_out_lights(lights: int, held_out: int | None) -> frozenset[int]:
-    """Which lights are kept from the fit: every fourth, or so many at even distances, neither the first nor the last where there is a choice."""
+    """Which lights are kept from the fit: every fourth, or so many at even distances, neither the first nor the last
+    where there is a choice.
+    """
     if held_out is None:
         return frozenset(range(HELD_OUT_EVERY - 1, lights, HELD_OUT_EVERY))
     return frozenset(int((k + 0.5) * lights / held_out) for k in range(held_out))

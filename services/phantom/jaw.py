@@ -137,7 +137,8 @@ def write_jaw_phantom(
     renderer: Renderer = "engine",
     lips: bool = False,
 ) -> None:
-    """Write a folder capture (``capture.json``, images with variance, ``teeth/``, ``gums.ply``, ``cavity.ply``) and ``truth.json`` with its optics.
+    """Write a folder capture (``capture.json``, images with variance, ``teeth/``, ``gums.ply``, ``cavity.ply``) and
+    ``truth.json`` with its optics.
 
     Args:
         subject: whose sizes, stances and optics are drawn; None for the average.
@@ -148,10 +149,12 @@ def write_jaw_phantom(
         seed: of the rendering and of the lights' brightness.
         samples: paths per pixel.
         renderer: the project's engine, or stock Mitsuba for boundary ``matched`` and teeth that do not overlap.
-        lips: put lips and a retractor before the teeth, which throw shadows; their surface, which a capture does not know, is in ``truth_lips.ply``.
+        lips: put lips and a retractor before the teeth, which throw shadows; their surface, which a capture does not
+            know, is in ``truth_lips.ply``.
 
     Raises:
-        InputError: impossible combination of options. CaptureInputError: the scan cannot be read. MeshError: a surface cannot bound a medium.
+        InputError: impossible combination of options. CaptureInputError: the scan cannot be read. MeshError: a surface
+            cannot bound a medium.
     """
     require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
     jaw, names = jaw_surfaces(subject, scan), CHANNELS[channels]

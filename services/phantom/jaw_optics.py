@@ -1,4 +1,6 @@
-"""Known optics of a phantom jaw: each tooth's own media about the phantom tooth's, its gums, and the colour of the mouth's wall."""
+"""Known optics of a phantom jaw: each tooth's own media about the phantom tooth's, its gums, and the colour of the
+mouth's wall.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +17,20 @@ GUMS_IOR = 1.33
 GUMS_MEAN_COSINE = 0.8
 """Generic soft tissue's is nearer to 0.9; images fix reduced scattering, and fewer scatters are cheaper."""
 GUMS_PER_MM = {"red": (1.39, 0.05), "green": (1.71, 1.2), "blue": (1.99, 0.6)}
-"""Reduced scattering and absorption of gums at 635, 540 and 480 nm: generic soft tissue (Jacques 2013) and a guess at its blood."""
+"""Reduced scattering and absorption of gums at 635, 540 and 480 nm: generic soft tissue (Jacques 2013) and a guess at
+its blood."""
 
 SIGMA_SPREAD, ABSORPTION_SPREAD, COSINE_SPREAD = 0.15, 0.30, 0.02
-"""Half widths of uniform draws about the phantom tooth: relative, relative, absolute. Reduced scattering stays within the literature's spread."""
+"""Half widths of uniform draws about the phantom tooth: relative, relative, absolute. Reduced scattering stays within
+the literature's spread."""
 REFLECTANCE_SPREAD = 0.2
 _GUMS, _CAVITY = 1, 2
 """Streams of random numbers beside the teeth's, which are their FDI numbers."""
 
 
 def jaw_mouth(fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
-    """Media of a subject's teeth, gums and wall in one channel; what differs between subjects is drawn alike for all channels.
+    """Media of a subject's teeth, gums and wall in one channel; what differs between subjects is drawn alike for all
+    channels.
 
     Args:
         subject: None for the same average in every tooth.

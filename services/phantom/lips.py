@@ -24,7 +24,9 @@ _AROUND, _ALONG = 16, 96
 
 
 def lips_and_retractor(teeth: Sequence[Mesh]) -> Mesh:
-    """One surface (V, 3), mm: the ring of both lips and the two bows of a retractor, in the teeth's frame (y forward, z towards the biting edge)."""
+    """One surface (V, 3), mm: the ring of both lips and the two bows of a retractor, in the teeth's frame (y forward, z
+    towards the biting edge).
+    """
     vertices = np.concatenate([tooth.vertices_mm for tooth in teeth])
     front = np.sort(vertices[:, 1])[-20:].mean()
     edge = np.quantile(vertices[vertices[:, 1] > front - 4.0, 2], 0.99)

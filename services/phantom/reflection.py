@@ -1,4 +1,6 @@
-"""Light that never enters the tooth: the enamel's glossy reflection and the gums' diffuse one, per camera and point light."""
+"""Light that never enters the tooth: the enamel's glossy reflection and the gums' diffuse one, per camera and point
+light.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ SHADOW_OFFSET_MM = 1e-3
 
 @dataclass(frozen=True)
 class Reflection:
-    """Radiance (L, H, W, C) of one camera under each light, averaged over the pixel, and what share of a pixel shows enamel."""
+    """Radiance (L, H, W, C) of one camera under each light, averaged over the pixel, and what share of a pixel shows
+    enamel.
+    """
 
     highlight: NDArray[np.float64]
     gums: NDArray[np.float64]
@@ -84,7 +88,9 @@ def ggx_reflection(
     roughness: float,
     ior: float,
 ) -> NDArray[np.float64]:
-    """Reflection BRDF D F G / (4 |n·l| |n·v|) of a rough dielectric (Walter et al. 2007), 1/sr; all directions unit and away from the surface."""
+    """Reflection BRDF D F G / (4 |n·l| |n·v|) of a rough dielectric (Walter et al. 2007), 1/sr; all directions unit and
+    away from the surface.
+    """
     half = towards_light + towards_eye
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     n_l, n_v, n_h = (np.clip((normal * d).sum(axis=-1), 1e-6, 1.0) for d in (towards_light, towards_eye, half))

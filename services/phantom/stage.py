@@ -9,7 +9,8 @@ from services.phantom.demo import DESCRIPTION, make_demo_mouth
 
 
 def run(spec: JobSpec, context: StageContext) -> FolderCapture:
-    """Publish ``phantom/``, the virtual incisor that a demonstration's simulated rig looks at; ``spec.rig.mouth`` is where such mouths are kept, if anywhere.
+    """Publish ``phantom/``, the virtual incisor that a demonstration's simulated rig looks at; ``spec.rig.mouth`` is
+    where such mouths are kept, if anywhere.
 
     Raises:
         CrashError: it could not be rendered. JobCancelledError: in mid-kernel.

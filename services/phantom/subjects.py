@@ -1,6 +1,8 @@
-"""Optics of random subjects, within the spread of the literature on enamel and dentin (Zijp 1995, Fried 1995, Zoller 2018).
+"""Optics of random subjects, within the spread of the literature on enamel and dentin (Zijp 1995, Fried 1995, Zoller
+2018).
 
-What images fix is drawn first: reduced scattering and absorption, log-uniform. How it divides into lobes is drawn apart from it.
+What images fix is drawn first: reduced scattering and absorption, log-uniform. How it divides into lobes is drawn apart
+from it.
 """
 
 from __future__ import annotations

@@ -68,18 +68,22 @@ def write_phantom(
     held_out: int | None = None,
     subject: int | None = None,
 ) -> None:
-    """Write a folder capture (``capture.json``, images with variance, ``teeth/<FDI>``) and ``truth.json`` with its optics.
+    """Write a folder capture (``capture.json``, images with variance, ``teeth/<FDI>``) and ``truth.json`` with its
+    optics.
 
     Args:
         pixel_mm: size of a pixel at the tooth.
         channels: 1 (green) or 3 (red, green, blue).
         samples: paths per pixel.
-        outer: another tooth's enamel surface, in the canonical frame (x mesial, y buccal, z occlusal) or near it; default the procedural incisor.
+        outer: another tooth's enamel surface, in the canonical frame (x mesial, y buccal, z occlusal) or near it;
+            default the procedural incisor.
         dentin: its dentin surface, given with ``outer``.
         fdi: its number, given with ``outer``; default ``FDI``.
         renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
-        highlights: add the surface's reflection of each light; also written alone to ``highlights/<camera>_<light>.npy``.
-        gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also written as ``gums.ply``.
+        highlights: add the surface's reflection of each light; also written alone to
+            ``highlights/<camera>_<light>.npy``.
+        gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also
+            written as ``gums.ply``.
         stains: paint stains on the enamel; also written as ``stains.npz``.
         held_out: how many lights are marked as held out; default every fourth.
         subject: seed of a random subject's optics; None for those of ``TRUE_TISSUE``.
@@ -108,7 +112,8 @@ def write_phantom(
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
         stacks = [
-            _render(out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples, seed + 7919 * number, painted)
+            _render(out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples,
+                    seed + 7919 * number, painted)
             for c, name in enumerate(names)
         ]  # fmt: skip
         mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))

@@ -1,4 +1,5 @@
-"""What every scheduler and worker loads (``--preload services.pipeline.close_http``): closes the HTTP port that Dask opens beside its own.
+"""What every scheduler and worker loads (``--preload services.pipeline.close_http``): closes the HTTP port that Dask
+opens beside its own.
 
 Dask has no option against it. The port asks nobody who he is, and what it tells this program's API tells better.
 """

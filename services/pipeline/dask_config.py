@@ -8,8 +8,8 @@ from typing import Any
 
 DASK_CONFIG: Mapping[str, Any] = MappingProxyType(
     {
-        # What Dask samples and remembers for its developers: the stack a hundred times a second, the loop's delay fifty times, a thousand messages and
-        # transitions with their tasks at each end of each connection.
+        # What Dask samples and remembers for its developers: the stack a hundred times a second, the loop's delay fifty
+        # times, a thousand messages and transitions with their tasks at each end of each connection.
         "distributed.worker.profile.enabled": False,
         "distributed.admin.tick.interval": "500ms",
         "distributed.admin.low-level-log-length": 50,
@@ -19,7 +19,8 @@ DASK_CONFIG: Mapping[str, Any] = MappingProxyType(
         # Its HTTP servers have nothing to say that this program does not say itself.
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
-        # A line for every health check would be nearly all that a scheduler logs; what a stranger tried is a warning and stays.
+        # A line for every health check would be nearly all that a scheduler logs; what a stranger tried is a warning
+        # and stays.
         "distributed.logging": {"distributed": "info", "distributed.comm.tcp": "warning"},
     }
 )

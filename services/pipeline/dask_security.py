@@ -1,8 +1,9 @@
 """Connections of Dask by TLS of which one that breaks takes no other with it.
 
-OpenSSL keeps a list of errors for each thread, and Python from 3.12.9 on leaves a failed system call in it (github.com/python/cpython/
-issues/148594). The next connection that has nothing to read yet is then told of a broken pipe that was another's, and Dask gives
-up its scheduler. Debian 13 has such a pair, and one peer that goes away ends all connections of its thread there.
+OpenSSL keeps a list of errors for each thread, and Python from 3.12.9 on leaves a failed system call in it
+(github.com/python/cpython/ issues/148594). The next connection that has nothing to read yet is then told of a broken
+pipe that was another's, and Dask gives up its scheduler. Debian 13 has such a pair, and one peer that goes away ends
+all connections of its thread there.
 """
 
 from __future__ import annotations
@@ -66,6 +67,8 @@ def _without_others_errors(
 
 
 def _forget_errors() -> None:
-    """Empty this thread's list, which Python does after ciphers that it does not know and nowhere by a call of its own."""
+    """Empty this thread's list, which Python does after ciphers that it does not know and nowhere by a call of its
+    own.
+    """
     with suppress(ssl.SSLError):
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).set_ciphers("UNKNOWN")

@@ -1,4 +1,6 @@
-"""How the parts of Dask prove to each other who they are: one folder of certificates, which API, scheduler and every worker have."""
+"""How the parts of Dask prove to each other who they are: one folder of certificates, which API, scheduler and every
+worker have.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Certificates:
-    """Whoever shows a certificate of the authority is let in, and nobody else; so the authority signs for this system alone. Host names are not compared."""
+    """Whoever shows a certificate of the authority is let in, and nobody else; so the authority signs for this system
+    alone. Host names are not compared.
+    """
 
     authority: Path
     certificate: Path
@@ -32,7 +36,8 @@ class Certificates:
         for path in (found.authority, found.certificate, found.key):
             if not path.is_file():
                 raise SettingsError(
-                    f"Setting DENTINE__SERVER__TLS: {path} does not exist; the folder needs ca.crt, tls.crt and tls.key."
+                    f"Setting DENTINE__SERVER__TLS: {path} does not exist; the folder needs ca.crt, tls.crt and"
+                    " tls.key."
                 )
         try:
             found.context()
@@ -47,7 +52,8 @@ class Certificates:
         """For a connection to the scheduler."""
         context = ssl.create_default_context(cafile=self.authority)
         context.check_hostname = False
-        # As Dask itself does: from Python 3.13 on the default refuses an authority without key usage, which many are made without.
+        # As Dask itself does: from Python 3.13 on the default refuses an authority without key usage, which many are
+        # made without.
         context.verify_flags &= ~ssl.VERIFY_X509_STRICT
         context.load_cert_chain(self.certificate, self.key)
         return context

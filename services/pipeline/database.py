@@ -1,8 +1,9 @@
-"""The database behind a URL: SQLite for one machine, Postgres for several; what is read inside ``writing`` stays true in both.
+"""The database behind a URL: SQLite for one machine, Postgres for several; what is read inside ``writing`` stays true
+in both.
 
-SQLite runs in WAL mode with ``BEGIN IMMEDIATE`` and a busy timeout, because its defaults lose updates in read-then-write. On Postgres the same
-transactions take one advisory lock. So there is one writer at a time, events become visible in the order of their ids, and a reader that remembers the last
-id it saw misses none.
+SQLite runs in WAL mode with ``BEGIN IMMEDIATE`` and a busy timeout, because its defaults lose updates in
+read-then-write. On Postgres the same transactions take one advisory lock. So there is one writer at a time, events
+become visible in the order of their ids, and a reader that remembers the last id it saw misses none.
 """
 
 from __future__ import annotations
@@ -32,10 +33,12 @@ MAX_ID = 2**31 - 1
 """Largest number of a row: Postgres' INTEGER, to which it takes nothing larger for comparison either."""
 
 POSTGRES_SILENCE_S = 15
-"""After so long without a sign of life, each side of a connection takes the other for gone, also in the middle of a transaction."""
+"""After so long without a sign of life, each side of a connection takes the other for gone, also in the middle of a
+transaction."""
 
 PASSWORD_FILE = "password_file"  # noqa: S105 - a name
-"""Part of a database's URL here, not of Postgres': the file that holds the password, so that none travels with the URL."""
+"""Part of a database's URL here, not of Postgres': the file that holds the password, so that none travels with the
+URL."""
 PATIENCE_S = 600.0
 """How long whoever works on a job waits for a database that went away."""
 
@@ -52,8 +55,8 @@ def open_database(url: str) -> sql.Engine:
     """Open a database; nothing is created in it.
 
     Args:
-        url: may name the file of its password, ``?password_file=PATH``, which is read for every connection, so that a password
-            that was changed needs no restart.
+        url: may name the file of its password, ``?password_file=PATH``, which is read for every connection, so that a
+            password that was changed needs no restart.
 
     Raises:
         SettingsError: not a URL of SQLite or Postgres. PlatformError: Postgres' driver is not installed.
@@ -145,8 +148,8 @@ def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
 class Query:
     """A question that is asked often: built and compiled once.
 
-    SQLite's driver is given the text, without a transaction, as one statement sees one state of the database; all that SQLAlchemy does around it takes four
-    times as long as the answer.
+    SQLite's driver is given the text, without a transaction, as one statement sees one state of the database; all that
+    SQLAlchemy does around it takes four times as long as the answer.
 
     Args:
         statement: its parameters have names.
@@ -211,7 +214,8 @@ def _turn(engine: sql.Engine) -> Iterator[None]:
 
 
 def _watchful(url: sql.URL) -> dict[str, Any]:
-    # By default a connection over a cut network hangs for a quarter of an hour, and the server keeps what its transaction has locked for two.
+    # By default a connection over a cut network hangs for a quarter of an hour, and the server keeps what its
+    # transaction has locked for two.
     third_s, silence_ms = POSTGRES_SILENCE_S // 3, 1000 * POSTGRES_SILENCE_S
     probes = {"keepalives_idle": third_s, "keepalives_interval": third_s, "keepalives_count": 2}
     theirs = {f"tcp_{name}": value for name, value in probes.items()}
@@ -222,8 +226,9 @@ def _watchful(url: sql.URL) -> dict[str, Any]:
 
 
 def _sqlite(url: sql.URL) -> sql.Engine:
-    # SQLite lets waiting writers sleep and look again, up to a tenth of a second each time; those of one process take turns before they ask it. Connections
-    # stay open, as opening one costs more than most questions. Errors end in logs, so they hide what was asked.
+    # SQLite lets waiting writers sleep and look again, up to a tenth of a second each time; those of one process take
+    # turns before they ask it. Connections stay open, as opening one costs more than most questions. Errors end in
+    # logs, so they hide what was asked.
     engine = sql.create_engine(
         url, hide_parameters=True, pool_size=MAX_CONNECTIONS, execution_options={"turn": threading.Lock()}
     )

@@ -2,8 +2,8 @@
 
 A server keeps it in its own database beside the jobs; ``dentine run`` keeps one in the job's folder.
 
-Whoever runs a job of a server holds a lease with a number. Every start of a stage names it, so that a runner that stalled and was given up cannot start a
-stage behind its successor's back.
+Whoever runs a job of a server holds a lease with a number. Every start of a stage names it, so that a runner that
+stalled and was given up cannot start a stage behind its successor's back.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ _COLUMNS = tuple(JobEvent.model_fields)
 
 
 def latest_of_stages(jobs: sql.Select[Any]) -> sql.Select[Any]:
-    """Query for the last event of each stage of certain jobs, and for the last one with which each was started; see ``begun``.
+    """Query for the last event of each stage of certain jobs, and for the last one with which each was started; see
+    ``begun``.
 
     Each is found by one look at an index, however many events there are.
 
@@ -110,7 +111,8 @@ _TIMED_DATA = Query(
     .order_by(event_table.c.id)
     .limit(PAGE)
 )
-# An overtaken attempt is refused, so the last event of a stage is of its newest attempt: one row to look at, however long the fit.
+# An overtaken attempt is refused, so the last event of a stage is of its newest attempt: one row to look at, however
+# long the fit.
 _NEWEST_ATTEMPT = (
     sql.select(event_table.c.attempt)
     .where(event_table.c.job == sql.bindparam("of"), event_table.c.stage == sql.bindparam("of_stage"))
@@ -122,7 +124,9 @@ _INSERT = event_table.insert()
 
 @cache
 def _page_of(columns: tuple[str, ...]) -> Query:
-    """Events of job ``of`` after ``after``, at most ``most``; each of the columns must be what the parameter of its name says."""
+    """Events of job ``of`` after ``after``, at most ``most``; each of the columns must be what the parameter of its
+    name says.
+    """
     query = sql.select(event_table).where(
         event_table.c.job == sql.bindparam("of"), event_table.c.id > sql.bindparam("after")
     )
@@ -134,7 +138,8 @@ class Begun(NamedTuple):
     """How far the stages of a job are."""
 
     latest: Sequence[JobEvent] = ()
-    """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has one."""
+    """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has
+    one."""
     started: JobEvent | None = None
     """With which the newest stage was started."""
 
@@ -199,7 +204,8 @@ class EventLog:
         self._engine, self.job, self._lease, self._request_id = engine, job, lease, request_id
 
     def begin_stage(self, stage: StageName, known: int = 0, machine: str | None = None) -> int:
-        """Record that the stage starts, on which class of machine, and return its attempt: one more than any before, in this table or ``known`` otherwise.
+        """Record that the stage starts, on which class of machine, and return its attempt: one more than any before, in
+        this table or ``known`` otherwise.
 
         Raises:
             FencedError: somebody else runs the job by now.
@@ -226,12 +232,15 @@ class EventLog:
             newest = self._newest_attempt(connection, event.stage)
             if newest > attempt:
                 raise FencedError(
-                    f"Attempt {attempt} of stage {event.stage} was overtaken by attempt {newest}; its events are refused."
+                    f"Attempt {attempt} of stage {event.stage} was overtaken by attempt {newest}; its events are"
+                    " refused."
                 )
             insert_event(connection, self.job, attempt, event)
 
     def read(self, after: int = 0, limit: int = PAGE, **only: str | int | None) -> list[JobEvent]:
-        """The job's events with an id above ``after``, oldest first; ``only`` names columns and what they must be, None for anything."""
+        """The job's events with an id above ``after``, oldest first; ``only`` names columns and what they must be, None
+        for anything.
+        """
         asked = {name: value for name, value in only.items() if value is not None}
         values = {f"of_{name}": value for name, value in asked.items()}
         return [

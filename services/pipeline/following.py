@@ -27,7 +27,8 @@ POLL_S = 0.25
 KEEP_S = 10.0
 """How often workers that were given up are started again."""
 GRACE_S = 5.0
-"""How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens the dome."""
+"""How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens
+the dome."""
 
 
 class Watch:
@@ -56,7 +57,9 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
     """
     from distributed import KilledWorker
 
-    key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"  # its own, as Dask answers for a key that it still knows with the old result
+    key = (  # its own, as Dask answers for a key that it still knows with the old result
+        f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"
+    )
     needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
     stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
     flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
@@ -70,7 +73,8 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
                 keep_at = time.monotonic() + KEEP_S
             if give_up_at is None and flag.exists():
                 give_up_at = time.monotonic() + GRACE_S
-            # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture before it has ended.
+            # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture
+            # before it has ended.
             is_given_up = give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture"
             if ended_as is None and is_given_up:
                 _stop_workers_of(client, key)
@@ -83,7 +87,8 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
     except KilledWorker as problem:
         watch.tell()
         raise WorkerLostError(
-            f"Every worker that took on stage {task.stage} died {problem.allowed_failures + 1} times; free some memory or set fewer workers, then run again.",
+            f"Every worker that took on stage {task.stage} died {problem.allowed_failures + 1} times; free some memory"
+            " or set fewer workers, then run again.",
             {"stage": task.stage, "deaths": problem.allowed_failures + 1},
         ) from problem
 
@@ -91,9 +96,9 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
 def _ended_as(stage: Future) -> str | None:
     """``finished`` once a task's result is here, or ``error``; None while it may still end otherwise.
 
-    Asks twice for ``POLL_S`` at most, for the end and for the result, and raises what Dask does where the scheduler was lost. A task
-    that has finished has not ended before its result is here: its worker may die with it, and then the task is lost for a while
-    and runs again.
+    Asks twice for ``POLL_S`` at most, for the end and for the result, and raises what Dask does where the scheduler was
+    lost. A task that has finished has not ended before its result is here: its worker may die with it, and then the
+    task is lost for a while and runs again.
     """
     from distributed import wait
 
@@ -108,8 +113,8 @@ def _ended_as(stage: Future) -> str | None:
 
 
 def _stop_workers_of(client: Client, stage: str) -> None:
-    # Those that hold the stage or tasks that it has made, whose keys begin with its own. Each is started again, and what
-    # another job had there runs again.
+    # Those that hold the stage or tasks that it has made, whose keys begin with its own. Each is started again, and
+    # what another job had there runs again.
     busy = [worker for worker, keys in client.processing().items() if any(str(key).startswith(stage) for key in keys)]
     with suppress(TimeoutError):
         client.restart_workers(busy, timeout=GRACE_S)

@@ -6,6 +6,8 @@ import gc
 
 
 def leave_alone_what_is_loaded() -> None:
-    """Never again walk through the modules that were imported: with Dask's that takes 0.15 s, in which nobody is answered."""
+    """Never again walk through the modules that were imported: with Dask's that takes 0.15 s, in which nobody is
+    answered.
+    """
     gc.collect()
     gc.freeze()

@@ -1,7 +1,7 @@
 """A stream for log lines whose writers never wait: one thread hands them on, in order.
 
-Whoever reads a server's standard error may stall, and a disk may hang. A line that is written by the event loop would then
-keep everybody waiting, ALL OFF among them.
+Whoever reads a server's standard error may stall, and a disk may hang. A line that is written by the event loop would
+then keep everybody waiting, ALL OFF among them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ class QueuedStream:
 
     def __init__(self, stream: TextIO, max_waiting_lines: int = MAX_WAITING_LINES) -> None:
         self._stream, self._max_waiting_lines, self._lost_lines = stream, max_waiting_lines, 0
-        # Both let the same thread in again: the garbage collector may run in the midst of a write, and what it ends may log.
+        # Both let the same thread in again: the garbage collector may run in the midst of a write, and what it ends may
+        # log.
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._counting = threading.RLock()
         # A daemon, as a stalled reader must not keep the process from ending.

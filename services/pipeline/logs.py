@@ -1,7 +1,8 @@
-"""Log lines that carry the request and the job they belong to: JSON where a program reads them, plain text in a terminal.
+"""Log lines that carry the request and the job they belong to: JSON where a program reads them, plain text in a
+terminal.
 
-Code logs through ``logging`` with ``extra``; what is bound around it is added here. Only whoever owns a process configures it: ``serve``, and each
-worker of a server's job.
+Code logs through ``logging`` with ``extra``; what is bound around it is added here. Only whoever owns a process
+configures it: ``serve``, and each worker of a server's job.
 """
 
 from __future__ import annotations
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 
 
 def configure_logs(stream: TextIO | QueuedStream) -> None:
-    """Write every log line of this process to a stream, as JSON unless it is a terminal. Other packages are heard from warnings on."""
+    """Write every log line of this process to a stream, as JSON unless it is a terminal.
+
+    Other packages are heard from warnings on.
+    """
     import structlog
 
     shared: list[Any] = [
@@ -60,7 +64,9 @@ def log_context(**values: str | int | None) -> AbstractContextManager[None]:
 
 
 def bind_request(request_id: str) -> None:
-    """Let every line logged from here on for this request carry its id; the server's task of the request ends with it."""
+    """Let every line logged from here on for this request carry its id; the server's task of the request ends with
+    it.
+    """
     from structlog.contextvars import bind_contextvars
 
     bind_contextvars(request_id=request_id)

@@ -1,4 +1,5 @@
-"""``python -m services.pipeline.scheduler_health tcp://HOST:PORT [FOLDER]``: whether a Dask scheduler answers, for a container's health check.
+"""``python -m services.pipeline.scheduler_health tcp://HOST:PORT [FOLDER]``: whether a Dask scheduler answers, for a
+container's health check.
 
 A program of its own, as it is started every few seconds: it loads a tenth of what the ``dentine`` command does.
 """
@@ -14,7 +15,9 @@ from services.pipeline.workers import require_scheduler
 
 
 def main(address: str, tls: str | None = None) -> int:
-    """Exit status 0 where the scheduler at ``address`` greets whoever shows it the certificates in the folder ``tls``."""
+    """Exit status 0 where the scheduler at ``address`` greets whoever shows it the certificates in the folder
+    ``tls``.
+    """
     try:
         require_scheduler(address, Certificates.of(Path(tls)) if tls else None)
     except DentineError as problem:

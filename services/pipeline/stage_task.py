@@ -92,5 +92,8 @@ def _telling_a_missing_package(stage: StageName) -> Iterator[None]:
         if (problem.name or "services").partition(".")[0] == "services":
             raise
         extra = _EXTRAS[stage]
-        what = f"Stage {stage} needs {problem.name}, which its workers do not have; install dentine[{extra}] where they run, then retry the job."
+        what = (
+            f"Stage {stage} needs {problem.name}, which its workers do not have; install dentine[{extra}] where they"
+            " run, then retry the job."
+        )
         raise PlatformError(what) from problem

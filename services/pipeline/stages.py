@@ -2,15 +2,18 @@
 
 ::
 
-    phantom {STAGES: 1} -> capture {DOME: 1} -> register {STAGES: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export {STAGES: 1}
+    phantom {STAGES: 1} -> capture {DOME: 1} -> register {STAGES: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export
+    {STAGES: 1}
 
-A capture only where the job names a rig, a phantom only where that is the demonstration's, a registration only where a raw folder has a
-scan and no teeth; that is looked for when the job runs, so such a stage is in the plan once it has begun.
+A capture only where the job names a rig, a phantom only where that is the demonstration's, a registration only where a
+raw folder has a scan and no teeth; that is looked for when the job runs, so such a stage is in the plan once it has
+begun.
 
-Each stage is one task, submitted once the one before has ended, so that nothing is needed of a worker that has done its part: a rig may go away
-after its capture. A stage that is published already is skipped, so the same call starts, resumes and repeats a job. A task whose worker dies is run again by
-Dask on another worker; it then counts one attempt more than any before, which fences whatever the old one may still write. The fit spreads its passes over the
-same workers and secedes from its own slot meanwhile.
+Each stage is one task, submitted once the one before has ended, so that nothing is needed of a worker that has done its
+part: a rig may go away after its capture. A stage that is published already is skipped, so the same call starts,
+resumes and repeats a job. A task whose worker dies is run again by Dask on another worker; it then counts one attempt
+more than any before, which fences whatever the old one may still write. The fit spreads its passes over the same
+workers and secedes from its own slot meanwhile.
 """
 
 from __future__ import annotations
@@ -51,7 +54,8 @@ from services.pipeline.workers import Workers
 
 JOB_FILE = "job.json"
 DAMAGE_FLAG = ".damaged"
-"""In a job's folder: a stage found another one's published files damaged, so the next run looks for what it must make anew."""
+"""In a job's folder: a stage found another one's published files damaged, so the next run looks for what it must make
+anew."""
 
 DOORS: Mapping[StageName, str] = MappingProxyType({})
 """``module:function`` of stages that are entered elsewhere than a job's kind says."""
@@ -97,7 +101,8 @@ def run_job(
         cluster: where it runs, default workers of its own.
         is_logged: workers write log lines on standard error.
         before: called before each stage but a capture; what it raises ends the run.
-        phantoms: folder in which the demonstration's mouth is kept from job to job, seen by the workers; None to make it anew for each.
+        phantoms: folder in which the demonstration's mouth is kept from job to job, seen by the workers; None to make
+            it anew for each.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
@@ -169,7 +174,9 @@ def _with_registration(spec: JobSpec, stages: tuple[StageName, ...]) -> tuple[St
 
 
 def _seen_by(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None) -> JobSpec:
-    """The options as a stage sees them: the demonstration's mouth is where such mouths are kept, and then the one made for this job."""
+    """The options as a stage sees them: the demonstration's mouth is where such mouths are kept, and then the one made
+    for this job.
+    """
     if spec.rig is None or not spec.is_demo:
         return spec
     mouth = (phantoms or spec.rig.mouth) if stage == "phantom" else root / PUBLISHED_AS["phantom"]
@@ -223,7 +230,9 @@ def _sole_owner(root: Path) -> Iterator[None]:
 
 
 def _withdraw_prepared(root: Path) -> None:
-    """Remove what was made with masks by hand that have changed since; last what says so, so that a kill in between is gone on with."""
+    """Remove what was made with masks by hand that have changed since; last what says so, so that a kill in between is
+    gone on with.
+    """
     for result in ("report.html", "parameters.json", "errors.json"):
         (root / result).unlink(missing_ok=True)
     for folder in ("asset", "fit", "prepared"):
@@ -241,7 +250,9 @@ def _remembering_damage(root: Path) -> Iterator[None]:
 
 
 def _withdraw_damaged(root: Path) -> None:
-    """Remove published stages that are not as published, so that they are run again; those after them were made of the whole ones. Never a capture."""
+    """Remove published stages that are not as published, so that they are run again; those after them were made of the
+    whole ones. Never a capture.
+    """
     for stage in ("registered", "prepared", "fit", "asset"):
         try:
             require_intact(root, stage)
@@ -261,7 +272,8 @@ def _claim_folder(root: Path, spec: JobSpec) -> None:
         changed = sorted(name for name in ours if name not in indifferent and ours[name] != theirs[name])
         if changed:
             raise InputError(
-                f"Folder {root} holds a job with other options ({', '.join(changed)}); choose another folder or remove it."
+                f"Folder {root} holds a job with other options ({', '.join(changed)}); choose another folder or"
+                " remove it."
             )
     write_record(path, spec)
 

@@ -1,7 +1,8 @@
-"""Whether a machine can do what a worker claims: imports what the stages need and renders a pixel, in a process of its own.
+"""Whether a machine can do what a worker claims: imports what the stages need and renders a pixel, in a process of its
+own.
 
-``python -m services.pipeline.worker_check STAGES DOME`` says nothing and ends with status 0, or ends with 4 after one sentence.
-What breaks an interpreter, such as a library that aborts it, so breaks no worker.
+``python -m services.pipeline.worker_check STAGES DOME`` says nothing and ends with status 0, or ends with 4 after one
+sentence. What breaks an interpreter, such as a library that aborts it, so breaks no worker.
 """
 
 from __future__ import annotations
@@ -50,7 +51,9 @@ def fault_of(claims: Iterable[str], timeout_s: float = CHECK_S) -> str:
 
 
 class OwnCheck:
-    """The check of the machine that this process runs on, begun when this is made; it holds for all workers of its own."""
+    """The check of the machine that this process runs on, begun when this is made; it holds for all workers of its
+    own.
+    """
 
     def __init__(self) -> None:
         self._fault: str | None = None

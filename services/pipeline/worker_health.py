@@ -1,7 +1,8 @@
-"""Signs of life of this machine's workers: each writes a small file every few seconds, ``dentine worker-health`` reads them.
+"""Signs of life of this machine's workers: each writes a small file every few seconds, ``dentine worker-health`` reads
+them.
 
-Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is this
-machine's worker that works. ``python -m services.pipeline.worker_health`` says the same and imports nothing large.
+Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is
+this machine's worker that works. ``python -m services.pipeline.worker_health`` says the same and imports nothing large.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ def require_healthy_workers(folder: Path | None = None) -> int:
     signs = sorted(path for path in folder.glob("*.json") if path.stat().st_mtime > since_s)
     if not signs:
         raise PlatformError(
-            f"No worker of this machine has been connected to its scheduler in the last {SILENT_S:g} s; read the worker's log."
+            f"No worker of this machine has been connected to its scheduler in the last {SILENT_S:g} s; read the"
+            " worker's log."
         )
     if faults := [fault for sign in signs if (fault := json.loads(sign.read_bytes())["fault"])]:
         raise PlatformError(faults[0])

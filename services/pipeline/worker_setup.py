@@ -1,8 +1,8 @@
 """What ``dentine worker`` loads into each of its Dask workers (``--preload services.pipeline.worker_setup``).
 
-A worker claims what it can do by Dask resources (``services.core.placement``). Before it takes tasks each claim is checked by
-a process of its own; what the machine does not bear out is withdrawn and told, in the log and to the scheduler, and no task
-that needs it is given to this worker.
+A worker claims what it can do by Dask resources (``services.core.placement``). Before it takes tasks each claim is
+checked by a process of its own; what the machine does not bear out is withdrawn and told, in the log and to the
+scheduler, and no task that needs it is given to this worker.
 """
 
 from __future__ import annotations

@@ -60,7 +60,10 @@ class Census(NamedTuple):
         """How many workers can do what, or why none can run stages or capture."""
         connected, stages = len(self.workers), self.able(STAGES)
         if captures and not self.able(DOME):
-            return f"None of the {connected} connected workers reaches a dome; start one with dentine worker --captures-only."
+            return (
+                f"None of the {connected} connected workers reaches a dome; start one with dentine worker"
+                " --captures-only."
+            )
         if stages or captures:
             rigs = self.able(DOME)
             return f"{stages} worker{'' if stages == 1 else 's'} can run stages, {rigs} can capture."
@@ -75,8 +78,9 @@ class Workers:
     """Opened at the first job and again after they broke; a context manager.
 
     Args:
-        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each. One more
-            than jobs ask for is started where one of them captures, so that no capture waits for a fit or is stopped with it.
+        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each.
+            One more than jobs ask for is started where one of them captures, so that no capture waits for a fit or is
+            stopped with it.
         certificates: what to show that scheduler; None for connections without TLS.
     """
 
@@ -134,7 +138,8 @@ class Workers:
             self._scale()
 
     def look(self) -> Census | None:
-        """Who works on what by now; None where workers of this process's own have not been started yet, as the first job does that.
+        """Who works on what by now; None where workers of this process's own have not been started yet, as the first
+        job does that.
 
         Raises:
             SchedulerLostError: the scheduler does not answer.
@@ -226,7 +231,8 @@ class Workers:
                 raise SchedulerLostError(
                     f"The scheduler {self._scheduler} does not answer; start it, the job waits."
                 ) from problem
-        # Loopback is open to every user of the machine, so workers there show certificates too: made now, kept in memory.
+        # Loopback is open to every user of the machine, so workers there show certificates too: made now, kept in
+        # memory.
         self._cluster = LocalCluster(
             n_workers=0,
             threads_per_worker=1,

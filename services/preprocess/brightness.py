@@ -15,7 +15,8 @@ from services.preprocess.projection import Footprint
 from services.preprocess.source import LightImage, View
 
 PLAUSIBLE = (1e-3, 10.0)
-"""Radiance of teeth over that of a white diffuser. Real teeth give 0.1 to 1; a unit that is wrong by 1000 moves this by 1e6."""
+"""Radiance of teeth over that of a white diffuser. Real teeth give 0.1 to 1; a unit that is wrong by 1000 moves this by
+1e6."""
 ODD_LIGHT = 30.0
 """A light this much brighter or dimmer than the others, against what its calibration says, is told."""
 NAMED = 3
@@ -102,8 +103,9 @@ class Brightness:
         )
         if white > 0 and not PLAUSIBLE[0] <= measured / white <= PLAUSIBLE[1]:
             raise CaptureInputError(
-                f"Teeth are {measured / white:.2g} times as bright as a white surface in their place would be, where real ones are 0.1 to 1 times; give "
-                "positions in mm, intensities per steradian with mm as the length unit, and images in the same radiance unit."
+                f"Teeth are {measured / white:.2g} times as bright as a white surface in their place would be, where"
+                " real ones are 0.1 to 1 times; give positions in mm, intensities per steradian with mm as the length"
+                " unit, and images in the same radiance unit."
             )
 
     def notes(self) -> tuple[str, ...]:
@@ -120,7 +122,8 @@ class Brightness:
         for light, ratio in ratios.items():
             if not 1 / ODD_LIGHT <= ratio / typical <= ODD_LIGHT:
                 notes.append(
-                    f"Teeth under light {light} are {ratio / typical:.2g} times as bright as its position and intensity let expect; check both."
+                    f"Teeth under light {light} are {ratio / typical:.2g} times as bright as its position and intensity"
+                    " let expect; check both."
                 )
         return tuple(notes)
 
@@ -128,7 +131,8 @@ class Brightness:
 def _incidence(
     footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_], step: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    # Cosine (N,) at which a light falls on the chosen pixels' surface, 0 from behind, and its distance in mm; shadows are not looked for.
+    # Cosine (N,) at which a light falls on the chosen pixels' surface, 0 from behind, and its distance in mm; shadows
+    # are not looked for.
     y, x = np.nonzero(chosen[::step, ::step])
     y, x = y * step, x * step
     towards = np.asarray(light.position_mm) - footprint.points_at(camera, y, x)

@@ -10,7 +10,8 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Record
 
 SWAPPED_FACTOR = 1.5
-"""How far red to blue must be from the other frames' before channels are taken for swapped; lights of one kind differ by 10 %."""
+"""How far red to blue must be from the other frames' before channels are taken for swapped; lights of one kind differ
+by 10 %."""
 MIN_OTHERS = 2
 """Frames that must agree before one is said to differ."""
 
@@ -37,6 +38,7 @@ def require_like_colours(colours: Sequence[FrameColour], camera: str) -> None:
         ratio, middle = own.log_red_to_blue, float(np.median(usual))
         if abs(ratio - middle) > limit and abs(-ratio - middle) < limit / 2:
             raise CaptureInputError(
-                f"Frame {own.file} ({own.label}) has {np.exp(ratio):.2g} times as much red as blue where {colours[0].file} has "
-                f"{np.exp(middle):.2g} times; its channels look exchanged, so export it like the others of camera {camera}."
+                f"Frame {own.file} ({own.label}) has {np.exp(ratio):.2g} times as much red as blue where"
+                f" {colours[0].file} has {np.exp(middle):.2g} times; its channels look exchanged, so export it like the"
+                f" others of camera {camera}."
             )

@@ -18,7 +18,8 @@ from services.preprocess.source import Image, LightImage, Motions, View
 from services.preprocess.stabilisation.seen import SeenFlow
 from services.preprocess.window import bands
 
-# Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is broken
+# Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is
+# broken
 NOT_FINITE_LIMIT = 0.5
 NAMES_SHOWN = 3
 """Lights that a note names, of those without an image."""
@@ -54,11 +55,13 @@ class FolderSource:
         for entry in self.description.images:
             if entry.camera not in cameras:
                 raise CaptureInputError(
-                    f"{origin}: image {entry.file} names camera {entry.camera}, which is not among the cameras; correct the name."
+                    f"{origin}: image {entry.file} names camera {entry.camera}, which is not among the cameras; correct"
+                    " the name."
                 )
             if entry.light not in lights:
                 raise CaptureInputError(
-                    f"{origin}: image {entry.file} names light {entry.light}, which is not among the lights; correct the name."
+                    f"{origin}: image {entry.file} names light {entry.light}, which is not among the lights; correct"
+                    " the name."
                 )
             if (entry.camera, entry.light) in self._entries:
                 raise CaptureInputError(
@@ -68,7 +71,8 @@ class FolderSource:
             for file in (entry.file, entry.variance_file):
                 if file is not None and not self._path(file).is_file():
                     raise CaptureInputError(
-                        f"Image file {root / file} (camera {entry.camera}, light {entry.light}) does not exist; put it there or remove its entry."
+                        f"Image file {root / file} (camera {entry.camera}, light {entry.light}) does not exist; put it"
+                        " there or remove its entry."
                     )
                 if file is not None:
                     self._map(entry, file, numbers[entry.camera])
@@ -128,7 +132,8 @@ class FolderSource:
             peak = max(peak, float(np.abs(values).max(initial=0)))
         if broken > max(1, NOT_FINITE_LIMIT * int(np.count_nonzero(covered))):
             raise CaptureInputError(
-                f"Image file {self.root / entry.file} (camera {entry.camera}, light {entry.light}) is not finite at {broken} tooth pixels; export it again."
+                f"Image file {self.root / entry.file} (camera {entry.camera}, light {entry.light}) is not finite at"
+                f" {broken} tooth pixels; export it again."
             )
         if variance is None:
             variance = self._assumed(radiance, peak)
@@ -165,7 +170,8 @@ class FolderSource:
         place = f"Image file {self.root / file} (camera {entry.camera}, light {entry.light})"
         if Path(file).suffix.lower() != ".npy":
             raise CaptureInputError(
-                f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float32."
+                f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as"
+                " float32."
             )
         width, height = self.description.cameras[camera].size
         return map_radiance(self._path(file), (height, width, len(self.description.channels)), place), place

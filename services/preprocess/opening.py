@@ -29,7 +29,8 @@ def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
         verify: compare a published capture's files with their checksums first.
 
     Raises:
-        CaptureInputError: it cannot be read, contradicts itself, or its calibration is beyond its limits. StoreError: a published capture is damaged.
+        CaptureInputError: it cannot be read, contradicts itself, or its calibration is beyond its limits. StoreError: a
+            published capture is damaged.
     """
     if spec.capture is not None and is_raw_folder(spec.capture):
         raw = RawSource(

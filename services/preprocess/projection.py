@@ -14,13 +14,17 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 # Candidate (triangle, sample) pairs held at once; about 200 bytes each, so 40 MB, near a processor's cache
 BATCH = 200_000
-# Least barycentric coordinate of a sample inside a triangle: an edge belongs to both of its triangles, rounding included
+# Least barycentric coordinate of a sample inside a triangle: an edge belongs to both of its triangles, rounding
+# included
 EDGE = -1e-9
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """What one camera sees of the meshes. Arrays are (height, width); ``mesh`` is the tooth's number, -1 where none is seen."""
+    """What one camera sees of the meshes.
+
+    Arrays are (height, width); ``mesh`` is the tooth's number, -1 where none is seen.
+    """
 
     mesh: NDArray[np.int16]
     depth_mm: NDArray[np.float32]
@@ -46,7 +50,8 @@ class Footprint:
 def project(camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = ()) -> Footprint:
     """Project teeth into a camera; ``occluders`` hide them.
 
-    A pixel is ``covered`` where its centre and its four corners see a tooth, so that no light from beside the teeth enters it.
+    A pixel is ``covered`` where its centre and its four corners see a tooth, so that no light from beside the teeth
+    enters it.
     """
     width, height = camera.size
     meshes = (*teeth, *occluders)
@@ -72,7 +77,9 @@ def vertex_normals(mesh: Mesh) -> FloatArray:
 def _rasterise(
     camera: Camera, meshes: Sequence[Mesh], shape: tuple[int, int], offset_px: float, *, with_normals: bool = True
 ) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.float32]]:
-    """Nearest mesh, its depth and, where asked for, its smooth normal at sample points (column + offset, row + offset)."""
+    """Nearest mesh, its depth and, where asked for, its smooth normal at sample points (column + offset, row +
+    offset).
+    """
     rows, columns = shape
     nearness = np.zeros(rows * columns)
     label = np.full(rows * columns, -1, dtype=np.int16)

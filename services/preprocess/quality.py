@@ -18,7 +18,8 @@ STOPS = 10
 """Factors of two below an image's brightest pixel that are told apart: a sensor of 12 bits resolves the tenth."""
 SHOWN_PIXELS = 200_000
 """Of an image, for medians."""
-# Blue, green, red: highlights red, saturated yellow, moved violet, not finite cyan, shadow blue, unlit grey, by hand green
+# Blue, green, red: highlights red, saturated yellow, moved violet, not finite cyan, shadow blue, unlit grey, by hand
+# green
 COLOURS = {
     MaskBit.HIGHLIGHT: (60, 60, 230),
     MaskBit.SATURATED: (60, 220, 230),
@@ -131,8 +132,9 @@ def unusable_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:
         return ()
     worst = images[int(np.argmax(counts))]
     note = (
-        f"{sum(counts)} pixels of teeth in {np.count_nonzero(counts)} images have no finite value or no positive variance and are left out, most of them "
-        f"({max(counts)}) in camera {worst.camera} under light {worst.light}; export these images again if they should count."
+        f"{sum(counts)} pixels of teeth in {np.count_nonzero(counts)} images have no finite value or no positive"
+        f" variance and are left out, most of them ({max(counts)}) in camera {worst.camera} under light {worst.light};"
+        " export these images again if they should count."
     )
     return (note,)
 

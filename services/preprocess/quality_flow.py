@@ -27,7 +27,9 @@ def camera_flow(camera: str, flow: SeenFlow) -> CameraFlow | None:
 
 
 def write_flow(folder: Path, flow: SeenFlow, numbers: CameraFlow) -> None:
-    """Write ``<camera>_before.png`` and ``<camera>_after.png``: hue is direction, pure colour is ``scale_px`` or more, white is none."""
+    """Write ``<camera>_before.png`` and ``<camera>_after.png``: hue is direction, pure colour is ``scale_px`` or more,
+    white is none.
+    """
     import cv2
 
     folder.mkdir(parents=True, exist_ok=True)

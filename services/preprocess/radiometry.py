@@ -34,8 +34,8 @@ class Radiometry:
     def radiance(self, counts: NDArray[np.uint16], frame: FrameRecord) -> tuple[Image, Image, BoolArray]:
         """Radiance at level 1 and 1 s, its variance, both (H, W, C), and where a channel is saturated (H, W).
 
-        The noise is that of the sensor model, ``(relative * signal)² + (floor * full scale)²``, with rounding to counts and the black
-        mean's own noise added.
+        The noise is that of the sensor model, ``(relative * signal)² + (floor * full scale)²``, with rounding to counts
+        and the black mean's own noise added.
         """
         m = self.manifest
         full_scale = 2**m.bits - 1

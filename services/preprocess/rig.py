@@ -67,7 +67,10 @@ class RigSource:
         tracking = sum(frame.kind == "tracking" for frame in manifest.frames)
         self.notes: tuple[str, ...] = ()
         if tracking < MIN_TRACKING:
-            note = f"Capture has {tracking} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to 0.2 px; lower rig.tracking_every."
+            note = (
+                f"Capture has {tracking} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to"
+                " 0.2 px; lower rig.tracking_every."
+            )
             self.notes = (note,)
 
     def lights_of(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
@@ -186,7 +189,8 @@ def _image(
 def _resampled(
     counts: NDArray[np.uint16], places: Image, radiometry: Radiometry, frame: FrameRecord
 ) -> tuple[tuple[Image, Image, NDArray[np.bool_]], NDArray[np.bool_]]:
-    """Radiance, variance and saturation where the pixels have gone to, and which of them mix in what lies beyond the frame.
+    """Radiance, variance and saturation where the pixels have gone to, and which of them mix in what lies beyond the
+    frame.
 
     Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right.
 

@@ -51,9 +51,11 @@ class LightImage:
     Attributes:
         radiance, variance: (H, W, C); where a value is not finite it is 0 and flagged.
         bits: (H, W), what the source knows: saturated, moved, not finite.
-        displacement: (h, w, 2), pixels, at every ``stored_step``-th pixel of the whole image; None where motion is not measured.
+        displacement: (h, w, 2), pixels, at every ``stored_step``-th pixel of the whole image; None where motion is not
+            measured.
         motion_px: median over the teeth; None where motion is not measured.
-        motion_error_px: by how much the motion may be wrong where the teeth are, as its interpolation in time tells; None where nothing tells.
+        motion_error_px: by how much the motion may be wrong where the teeth are, as its interpolation in time tells;
+            None where nothing tells.
         warped: whether the pixels were resampled.
         colour: of a frame whose order of channels may be wrong; None where nothing tells.
     """

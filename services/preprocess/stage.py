@@ -28,11 +28,14 @@ def check() -> None:
 def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     """Prepare ``spec.capture``, or the job's own published capture, and publish ``prepared``.
 
-    Images are made in blocks, on all workers that may run this stage. What an attempt that ended has left is gone on with.
+    Images are made in blocks, on all workers that may run this stage. What an attempt that ended has left is gone on
+    with.
 
     Raises:
-        CaptureInputError: a file, frame, camera or light is missing or malformed. MeshError: a surface cannot bound a medium.
-        SettingsError: an option names an unknown light or channel. StoreError: the capture store is damaged. JobCancelledError.
+        CaptureInputError: a file, frame, camera or light is missing or malformed. MeshError: a surface cannot bound a
+            medium.
+        SettingsError: an option names an unknown light or channel. StoreError: the capture store is damaged.
+            JobCancelledError.
     """
     from services.preprocess.masking.masks import HandMasks
     from services.preprocess.masking.valid import require_plausible_scale

@@ -1,4 +1,6 @@
-"""What a capture shows: teeth, and around them gums and the wall of the mouth, which a jaw's fit explains and a single tooth's does not."""
+"""What a capture shows: teeth, and around them gums and the wall of the mouth, which a jaw's fit explains and a single
+tooth's does not.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,10 @@ NOTHING = -1
 
 @dataclass(frozen=True)
 class Subject:
-    """The surfaces of a capture. Numbers in a footprint: teeth by their place, then one for gums and one for the wall, -1 for nothing."""
+    """The surfaces of a capture.
+
+    Numbers in a footprint: teeth by their place, then one for gums and one for the wall, -1 for nothing.
+    """
 
     teeth: tuple[Tooth, ...]
     gums: Mesh | None
@@ -91,13 +96,15 @@ def read_subject(root: Path, whole: bool, fdi: int | None = None) -> Subject:
         fdi: the one tooth that is to be fitted; None for all.
 
     Raises:
-        CaptureInputError: no tooth is there, or not this one, or a file cannot be read. MeshError: a surface cannot bound a medium.
+        CaptureInputError: no tooth is there, or not this one, or a file cannot be read. MeshError: a surface cannot
+            bound a medium.
     """
     teeth, gums = read_teeth(root), _optional(root / "gums.ply")
     chosen = tuple(tooth for tooth in teeth if fdi in {None, tooth.fdi})
     if not chosen:
         raise CaptureInputError(
-            f"Option 'fdi' names tooth {fdi}, but the capture has {', '.join(str(tooth.fdi) for tooth in teeth)}; name one of these."
+            f"Option 'fdi' names tooth {fdi}, but the capture has {', '.join(str(tooth.fdi) for tooth in teeth)}; name"
+            " one of these."
         )
     cavity = _optional(root / "cavity.ply") if whole else None
     if whole and gums is not None:

@@ -69,7 +69,9 @@ class Window:
 
 
 def window_of(camera: Camera, meshes: Sequence[Mesh]) -> Window:
-    """The smallest window that holds the meshes' images and a margin; the whole image where they reach behind the camera or beside it."""
+    """The smallest window that holds the meshes' images and a margin; the whole image where they reach behind the
+    camera or beside it.
+    """
     width, height = camera.size
     whole = Window(0, height, 0, width)
     projected = [camera.project(mesh.vertices_mm) for mesh in meshes]

@@ -45,8 +45,8 @@ def test_light_rooms_load_nothing_heavy(room: str) -> None:
 
 def test_an_application_starts_without_the_stages(tmp_path: Path) -> None:
     loaded = modules_after(
-        "from pathlib import Path\nfrom services.api.app import create_app\nfrom services.core.settings import ServerSettings\n"
-        f"create_app(ServerSettings(data=Path({str(tmp_path)!r})))"
+        "from pathlib import Path\nfrom services.api.app import create_app\nfrom services.core.settings import"
+        f" ServerSettings\ncreate_app(ServerSettings(data=Path({str(tmp_path)!r})))"
     )
     assert not [name for name in loaded if name.startswith(SERVICES) or name.split(".")[0] in HEAVY]
 

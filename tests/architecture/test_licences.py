@@ -1,4 +1,6 @@
-"""What the program is made of may be given on: every dependency, of Python and of the page, names a licence that allows it."""
+"""What the program is made of may be given on: every dependency, of Python and of the page, names a licence that allows
+it.
+"""
 
 from __future__ import annotations
 

@@ -85,7 +85,9 @@ def test_no_folder_is_so_full_that_a_file_cannot_be_found() -> None:
 
 
 def test_every_name_that_is_imported_is_there() -> None:
-    """Benchmarks and fault matrices are imported by no other test, so that a name that has moved would be missed in them alone."""
+    """Benchmarks and fault matrices are imported by no other test, so that a name that has moved would be missed in
+    them alone.
+    """
     defined: dict[str, set[str]] = {}
     asked: list[tuple[Path, str, str]] = []
     for path in sources("services", "tests", "dentine"):
@@ -103,7 +105,9 @@ def test_every_name_that_is_imported_is_there() -> None:
 
 
 def names_bound_in(tree: ast.Module) -> set[str]:
-    """What a module itself defines, assigns or imports; one with ``__getattr__`` may offer what its ``__all__`` lists besides."""
+    """What a module itself defines, assigns or imports; one with ``__getattr__`` may offer what its ``__all__`` lists
+    besides.
+    """
     bound: set[str] = set()
     nodes = list[ast.AST](tree.body)
     while nodes:

@@ -1,4 +1,6 @@
-"""Each part of the service finds all that its code imports among the packages that it is installed with; ``tests/pipeline/test_roles.py`` installs them."""
+"""Each part of the service finds all that its code imports among the packages that it is installed with;
+``tests/pipeline/test_roles.py`` installs them.
+"""
 
 from __future__ import annotations
 

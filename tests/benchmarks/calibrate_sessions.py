@@ -1,11 +1,12 @@
-"""Whole calibration sessions with drawn errors: how far off cameras, lights, intensities and colours come out, and whether they know it.
+"""Whole calibration sessions with drawn errors: how far off cameras, lights, intensities and colours come out, and
+whether they know it.
 
-``python -m tests.benchmarks.calibrate_sessions --draws 12 --json FILE`` takes about ten seconds of processor time a draw and goes on
-where a file already holds draws; ``--width 5184`` draws cameras of 20 megapixels in place of 2.
+``python -m tests.benchmarks.calibrate_sessions --draws 12 --json FILE`` takes about ten seconds of processor time a
+draw and goes on where a file already holds draws; ``--width 5184`` draws cameras of 20 megapixels in place of 2.
 
 Boards are drawn by projection with normal errors of 0.1 px, spheres by their formulae (outlines
-0.1 px and shifted alike by up to 0.2 px, highlights 0.05 px, white pixels 1 % shot noise), and every chart patch is off by 0.3 %.
-Each step gets what the step before found, never the truth.
+0.1 px and shifted alike by up to 0.2 px, highlights 0.05 px, white pixels 1 % shot noise), and every chart patch is off
+by 0.3 %. Each step gets what the step before found, never the truth.
 """
 
 from __future__ import annotations
@@ -41,8 +42,9 @@ MIRROR_MM, WHITE_MM = 28.0, 20.0
 MIRROR_PLACES_MM = np.array(
     [*([x, y, z] for x in (-62.0, 62.0) for y in (-38.0, 38.0) for z in (-50.0, 50.0)), [0, 0, 75], [0, 0, -80]]
 )
-"""Of the mirror sphere's centres about the point at which the cameras look: the corners of a box, one place nearer and one farther.
-What decides is how far apart they are, and how many; they are as far apart as the images hold spheres of this radius."""
+"""Of the mirror sphere's centres about the point at which the cameras look: the corners of a box, one place nearer and
+one farther. What decides is how far apart they are, and how many; they are as far apart as the images hold spheres of
+this radius."""
 WHITE_PLACES_MM = np.array([[-32.0, -20, -20], [32, 20, -10], [0, 0, 30]])
 REFLECTANCE = np.array([0.92, 0.9, 0.88])
 SHOT, PATCH_ERROR = 0.01, 0.003
@@ -239,7 +241,9 @@ def _colour(random: np.random.Generator) -> float:
 
 
 def _seen_at_the_teeth(true: tuple[Eye, ...], found: tuple[Eye, ...], teeth: Floats) -> tuple[float, float]:
-    """By how much teeth of 10 mm would seem moved (mm) and turned (deg), if the found cameras were taken for the true ones."""
+    """By how much teeth of 10 mm would seem moved (mm) and turned (deg), if the found cameras were taken for the true
+    ones.
+    """
     points = np.array([[x, y, z] for x in (-5.0, 5) for y in (-5.0, 5) for z in (-5.0, 5)])
     drawn = [eye.project(points + teeth) for eye in true]
 

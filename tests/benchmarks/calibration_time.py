@@ -2,9 +2,10 @@
 
 python -m tests.benchmarks.calibration_time --width 648 --cameras 3 --boards 30 --lights 54 --json time.json
 
-The virtual laboratory photographs boards, one mirror and one white sphere under every light, and a chart; ``dentine calibrate``'s own steps are
-timed as they run, each without those within it. What one photograph takes grows with its pixels and what fits take does not, so two sizes of image
-tell a third, and a session of many large images need not be written. Seconds are of this process's processor time.
+The virtual laboratory photographs boards, one mirror and one white sphere under every light, and a chart;
+``dentine calibrate``'s own steps are timed as they run, each without those within it. What one photograph takes grows
+with its pixels and what fits take does not, so two sizes of image tell a third, and a session of many large images need
+not be written. Seconds are of this process's processor time.
 """
 
 from __future__ import annotations

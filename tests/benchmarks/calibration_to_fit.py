@@ -1,15 +1,18 @@
-"""From calibration to fit: a tooth rendered by stock Mitsuba, photographed by an instrument whose calibration is that of one drawn session, as JSON.
+"""From calibration to fit: a tooth rendered by stock Mitsuba, photographed by an instrument whose calibration is that
+of one drawn session, as JSON.
 
 python -m tests.benchmarks.calibration_to_fit --sessions 4 --json calibration_to_fit.json
 
-The stored central incisor's own three cameras and eight lights are calibrated by a virtual session (as in ``calibrate_sessions``: boards of
-0.1 px, a mirror sphere in ten places, a white one in three). The fit gets what the session found: its cameras, lights, intensities and radiance per
-count, and its record's covariance. A session that measures neither flare nor where the scan lies, nor the white sphere's reflectance to better than
-1 %, leaves those to the defaults that a fit assumes, and they are drawn from these. All is told in the frame of the session's first board, so mesh,
-lights and cameras of ``capture.json`` move and no image is rendered again. Session 0 is a perfect calibration with a record that says so.
+The stored central incisor's own three cameras and eight lights are calibrated by a virtual session (as in
+``calibrate_sessions``: boards of 0.1 px, a mirror sphere in ten places, a white one in three). The fit gets what the
+session found: its cameras, lights, intensities and radiance per count, and its record's covariance. A session that
+measures neither flare nor where the scan lies, nor the white sphere's reflectance to better than 1 %, leaves those to
+the defaults that a fit assumes, and they are drawn from these. All is told in the frame of the session's first board,
+so mesh, lights and cameras of ``capture.json`` move and no image is rendered again. Session 0 is a perfect calibration
+with a record that says so.
 
-Fits run in this process, on one thread; some minutes of processor time each. ``rows`` has the value's distance from the truth over its ±, and
-the ± over that of the perfect calibration.
+Fits run in this process, on one thread; some minutes of processor time each. ``rows`` has the value's distance from the
+truth over its ±, and the ± over that of the perfect calibration.
 """
 
 from __future__ import annotations
@@ -247,7 +250,9 @@ def _off(truth: Truth, drawn: Drawn) -> dict[str, float]:
 
 
 def rows(fits: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Distance from the truth over its ±, ± in percent, and over that of the perfect calibration, where that was fitted."""
+    """Distance from the truth over its ±, ± in percent, and over that of the perfect calibration, where that was
+    fitted.
+    """
     truth = read(SUBJECT)
     media = {part: truth.medium(part) for part in ("enamel", "dentin")}
     true = {f"{part}.sigma_s_reduced": one["sigma_s_reduced"] for part, one in media.items()}
@@ -291,7 +296,8 @@ def main() -> None:
     if drawn:
         z, ratio = (max(abs(one[key]) for one in drawn) for key in ("z", "se_over_perfect"))
         print(
-            f"largest |z| {z} of {len(drawn)} (at most {MAX_Z}); largest ± over perfect {ratio} (at most {MAX_SE_RATIO})"
+            f"largest |z| {z} of {len(drawn)} (at most {MAX_Z}); largest ± over perfect {ratio} (at most"
+            f" {MAX_SE_RATIO})"
         )
 
 

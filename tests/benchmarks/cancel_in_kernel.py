@@ -1,9 +1,11 @@
-"""How long a cancel in the middle of a kernel takes to free the worker, and that the worker is the same process afterwards.
+"""How long a cancel in the middle of a kernel takes to free the worker, and that the worker is the same process
+afterwards.
 
 python -m tests.benchmarks.cancel_in_kernel --times 10
 
-A job of a live server renders with the real engine an image that would take hours. It is cancelled over REST while the kernel runs, and the next job runs on
-the same worker. Seconds are those from the request to the state CANCELLED, which is told once the rendering process is dead and its worker free.
+A job of a live server renders with the real engine an image that would take hours. It is cancelled over REST while the
+kernel runs, and the next job runs on the same worker. Seconds are those from the request to the state CANCELLED, which
+is told once the rendering process is dead and its worker free.
 """
 
 from __future__ import annotations

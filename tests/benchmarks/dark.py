@@ -3,21 +3,23 @@
 python -m tests.benchmarks.dark --json dark.json --times 300
 python -m tests.benchmarks.dark --json dark.json --times 300 --under upload half-open
 
-A real capture lights a simulated dome over Modbus while an observer reads the registers of what is emitted, again and again, over a
-connection of its own. Each time is from just before the request or the signal was sent to the answer of the first reading that saw no
-light, with none lit after it. Exposures last 2 s and are struck in their first 0.8 s, so that whoever waits for the end of one takes
-1.2 s at least. Strikes are added to those in the file, which a killed run has kept. A hundred of one way take about ten minutes.
+A real capture lights a simulated dome over Modbus while an observer reads the registers of what is emitted, again and
+again, over a connection of its own. Each time is from just before the request or the signal was sent to the answer of
+the first reading that saw no light, with none lit after it. Exposures last 2 s and are struck in their first 0.8 s, so
+that whoever waits for the end of one takes 1.2 s at least. Strikes are added to those in the file, which a killed run
+has kept. A hundred of one way take about ten minutes.
 
-==========  ==================================================================================================================
+==========  =======================================================================================
 cancel      POST /v1/jobs/<id>/cancel
 all-off     POST /v1/dome/off, for the dome of the server
 page        ALL OFF in the dome's page, beside eight pages that follow the job in the same browser
 signal      SIGTERM to ``dentine capture``
 serve       SIGTERM to ``dentine serve``, with an event stream open
-==========  ==================================================================================================================
+==========  =======================================================================================
 
-Loads of the server, each from a process of its own (``dark_loads``): ``upload`` sends captures all the time, ``half-open`` holds 1,500 connections
-that have not finished their first line's headers. The way ``signal`` has no server.
+Loads of the server, each from a process of its own (``dark_loads``): ``upload`` sends captures all the time,
+``half-open`` holds 1,500 connections that have not finished their first line's headers. The way ``signal`` has no
+server.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ from tests.support.mouth import write_mouth
 LIGHTS, TABS = 6, 8
 EXPOSURE_S = 2.0
 STEADY_S = 0.3
-"""Lit for so long without a break, it is an exposure and none of the preflight's glimpses, on all but a very busy machine."""
+"""Lit for so long without a break, it is an exposure and none of the preflight's glimpses, on all but a very busy
+machine."""
 STRIKE_WITHIN_S = 0.5
 PATIENCE_S = 120.0
 QUIET_S = 0.3

@@ -1,4 +1,5 @@
-"""Loads of a server, as processes of their own: ``python -m tests.benchmarks.dark_loads upload http://127.0.0.1:8000``; they end by SIGTERM.
+"""Loads of a server, as processes of their own: ``python -m tests.benchmarks.dark_loads upload http://127.0.0.1:8000``;
+they end by SIGTERM.
 
 A load prints one line once it is under way.
 """

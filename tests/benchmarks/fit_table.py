@@ -1,10 +1,13 @@
-"""The rows of "what a fit must reach" for single teeth, on captures rendered by stock Mitsuba with sensor noise, as JSON.
+"""The rows of "what a fit must reach" for single teeth, on captures rendered by stock Mitsuba with sensor noise, as
+JSON.
 
 python -m tests.benchmarks.fit_table --cases homogeneous,known --json fit_table.json
-python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' --json starts.json
+python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' --json
+starts.json
 
-Reduced scattering and 1 - alpha' are relative errors of what the report says; image errors have sensor noise and the truth's Monte Carlo noise taken out,
-and are not below what the photographs' noise resolves. Fits run in this process, on one thread; ``seconds`` is its processor time.
+Reduced scattering and 1 - alpha' are relative errors of what the report says; image errors have sensor noise and the
+truth's Monte Carlo noise taken out, and are not below what the photographs' noise resolves. Fits run in this process,
+on one thread; ``seconds`` is its processor time.
 """
 
 from __future__ import annotations
@@ -165,7 +168,8 @@ def stages(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
     """What dentin leaves of the homogeneous tooth's loss, each by a fit of its own, in exact media.
 
     The photographs' noise is part of every loss, and the note says how much: no fit goes below it.
-    These truths are clean; what stains leave of it, on a stained truth, is in ``tests/pipeline/test_fit_stained_truth.py``.
+    These truths are clean; what stains leave of it, on a stained truth, is in
+    ``tests/pipeline/test_fit_stained_truth.py``.
     """
     for subject in subjects:
         losses = []
@@ -252,7 +256,9 @@ def _incisal_half(fit: Fit) -> NDArray[np.bool_]:
 
 
 def known_enamel(subject: str) -> dict[str, float]:
-    """A truth's enamel as one lobe of the same reduced scattering and absorption, similar to its two lobes to the second order; only absorption is fitted."""
+    """A truth's enamel as one lobe of the same reduced scattering and absorption, similar to its two lobes to the
+    second order; only absorption is fitted.
+    """
     enamel = read(subject).medium("enamel")
     lobes = ((enamel["beta"], enamel["g1"]), (1 - enamel["beta"], enamel["g2"]))
     first, second = (sum(share * g**n for share, g in lobes) for n in (1, 2))
@@ -299,7 +305,8 @@ def main() -> None:
             ):
                 goal = "" if figure.goal is None else f", goal {figure.goal:g}"
                 print(
-                    f"{name:12} {figure.subject:16} {figure.figure:40} {figure.value:.4f} (must {figure.must:g}{goal}): {figure.reached}; {figure.note}",
+                    f"{name:12} {figure.subject:16} {figure.figure:40} {figure.value:.4f} (must {figure.must:g}{goal}):"
+                    f" {figure.reached}; {figure.note}",
                     flush=True,
                 )
                 rows.append(asdict(figure) | {"reached": figure.reached})

@@ -2,11 +2,13 @@
 
 python -m tests.benchmarks.fuzzed_load --json fuzzed.json [--inputs 2000] [--pairs 12] [--seed 1]
 
-Nine in ten are requests generated from the API's description, right and wrong ones, by callers with every right and with none (see ``generated_requests``); the
-others are captures whose description or image was damaged, announced, sent and committed, some of them as costly as may be sent. First they are sent one by
-one and judged: no failure of the server but the documented ones, no traceback in its log, memory. Then the requests are sent again beside somebody who
-reads, in pairs of a quiet and a loaded stretch that change their order; latency counts from when a request was due. Requests that made a job run are not
-sent again, as what a job takes of the machine is the matter of ``tests.benchmarks.load``.
+Nine in ten are requests generated from the API's description, right and wrong ones, by callers with every right and
+with none (see ``generated_requests``); the others are captures whose description or image was damaged, announced, sent
+and committed, some of them as costly as may be sent. First they are sent one by one and judged: no failure of the
+server but the documented ones, no traceback in its log, memory. Then the requests are sent again beside somebody who
+reads, in pairs of a quiet and a loaded stretch that change their order; latency counts from when a request was due.
+Requests that made a job run are not sent again, as what a job takes of the machine is the matter of
+``tests.benchmarks.load``.
 """
 
 from __future__ import annotations

@@ -1,14 +1,16 @@
-"""Whether a fit's ± is true: many small fits of known teeth, how many of the 95 % intervals hold the truth, and the z-scores.
+"""Whether a fit's ± is true: many small fits of known teeth, how many of the 95 % intervals hold the truth, and the
+z-scores.
 
 python -m tests.benchmarks.honest_errors --fits 100 --json honest_errors.json
 python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --json honest_errors_drawn.json
 python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --json honest_errors_formula.json
 python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --shape --json honest_errors_shape.json
 
-Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel and dentin of some 90 pixels under
-six lights (one held out). The truth is rendered with ``--paths`` paths per pixel. With ``--truths 1`` its mean cosine is the one that fits hold; with
-more, optical parameters are drawn around the centre and mean cosines from the fit's own prior, so that what holding g costs is judged too.
-``--formula`` puts a formula in place of light transport, in which similar media are not alike either: a second per fit, and the solver's errors alone.
+Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel
+and dentin of some 90 pixels under six lights (one held out). The truth is rendered with ``--paths`` paths per pixel.
+With ``--truths 1`` its mean cosine is the one that fits hold; with more, optical parameters are drawn around the centre
+and mean cosines from the fit's own prior, so that what holding g costs is judged too. ``--formula`` puts a formula in
+place of light transport, in which similar media are not alike either: a second per fit, and the solver's errors alone.
 With ``--shape`` the dentin's blend weights are drawn and fitted too, and enamel's mean thickness is judged.
 """
 
@@ -56,7 +58,9 @@ def tissue_of(reduced: dict[str, tuple[float, float]], g: dict[str, float]) -> T
 
 
 def drawn_tissue(rng: np.random.Generator, *, with_shape: bool = False) -> Tissue:
-    """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits, blend weights where they are wanted."""
+    """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits,
+    blend weights where they are wanted.
+    """
     cosines = {"enamel": COSINE, "dentin": WEAK["dentin.g1"]}
     reduced = {part: (s * 1.3 ** rng.uniform(-1, 1), a * 1.6 ** rng.uniform(-1, 1)) for part, (s, a) in CENTRE.items()}
     tissue = tissue_of(
@@ -178,8 +182,8 @@ def main() -> None:
         parser.error("--shape needs --formula and more than one of --truths")
     prepare_device(arguments.threads)
     options: dict[str, object] = {
-        "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples, "max_steps": arguments.max_steps, "search_candidates": 2000,
-        "advise": False,
+        "samples_per_pixel": arguments.samples, "max_samples_per_pixel": arguments.max_samples,
+        "max_steps": arguments.max_steps, "search_candidates": 2000, "advise": False,
     }  # fmt: skip
     rng, rows = np.random.default_rng(2024), list[dict[str, object]]()
     held = tissue_of(CENTRE, {"enamel": 0.8, "dentin": 0.8})

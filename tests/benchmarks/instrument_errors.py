@@ -1,13 +1,17 @@
-"""What errors of the instrument do to a fit, with its errors as coordinates and without: bias of the media over their ±, as JSON.
+"""What errors of the instrument do to a fit, with its errors as coordinates and without: bias of the media over their
+±, as JSON.
 
 python -m tests.benchmarks.instrument_errors --json instrument_errors.json
 python -m tests.benchmarks.instrument_errors --errors none,gain --pixel-step 3 --json gain.json
-python -m tests.benchmarks.instrument_errors --errors none,far_gain,far_light,far_scan,exchanged --seeds 3 --instrument on --json faults.json
+python -m tests.benchmarks.instrument_errors --errors none,far_gain,far_light,far_scan,exchanged --seeds 3 --instrument
+on --json faults.json
 
-The stored central incisor as stock Mitsuba renders it, with sensor noise, is photographed by an instrument with one error: its images are scaled, or
-light is added to them, or its lights, scan or dome are said to be elsewhere, by two of the ± that are assumed, or by far more, where the fit has to name
-the fault. Bias is that of the fit with the error less that of the fit without, so that what the fit itself leaves cancels; with several seeds of the
-sensor's noise, of the same seed. Fits run in this process, on one thread; ``seconds`` is its processor time, ``samples`` the paths of its last step.
+The stored central incisor as stock Mitsuba renders it, with sensor noise, is photographed by an instrument with one
+error: its images are scaled, or light is added to them, or its lights, scan or dome are said to be elsewhere, by two of
+the ± that are assumed, or by far more, where the fit has to name the fault. Bias is that of the fit with the error less
+that of the fit without, so that what the fit itself leaves cancels; with several seeds of the sensor's noise, of the
+same seed. Fits run in this process, on one thread; ``seconds`` is its processor time, ``samples`` the paths of its last
+step.
 """
 
 from __future__ import annotations

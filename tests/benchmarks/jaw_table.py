@@ -1,12 +1,15 @@
-"""The row "jaw of 14" of what a fit must reach, tooth by tooth, on the jaw that stock Mitsuba rendered (``tests/support/jaw_truth.py``), as JSON.
+"""The row "jaw of 14" of what a fit must reach, tooth by tooth, on the jaw that stock Mitsuba rendered
+(``tests/support/jaw_truth.py``), as JSON.
 
 python -m tests.benchmarks.jaw_table --json jaw_table.json
-python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "max_steps": 6}' --workers 2 --json jaw_table.json
-python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --json jaw_table.json
+python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "max_steps": 6}' --workers 2 --json
+jaw_table.json python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --json
+jaw_table.json
 
-Every visible tooth is held to the limits of a single one with known dentin. The photographs' own noise, that of the sensor and of the renderer, is part of
-every number: a medium's figure comes with its standard error, an image's with the error that this noise alone looks like in so few pixels. Photographs by
-the project's engine have the sensor's noise alone: they tell what the fit adds, not whether the engine is right.
+Every visible tooth is held to the limits of a single one with known dentin. The photographs' own noise, that of the
+sensor and of the renderer, is part of every number: a medium's figure comes with its standard error, an image's with
+the error that this noise alone looks like in so few pixels. Photographs by the project's engine have the sensor's noise
+alone: they tell what the fit adds, not whether the engine is right.
 """
 
 from __future__ import annotations
@@ -50,11 +53,14 @@ class JawFigure(Figure):
     """One tooth's number, with what noise makes of it."""
 
     resolution: float = 0.0
-    """Of a medium one standard error of its logarithm, where errors are even; of images the error that noise of photographs and renders looks like."""
+    """Of a medium one standard error of its logarithm, where errors are even; of images the error that noise of
+    photographs and renders looks like."""
 
     @property
     def is_beyond_noise(self) -> bool:
-        """Whether it misses its limit by more than three times what noise does; squares of image errors are what noise adds to."""
+        """Whether it misses its limit by more than three times what noise does; squares of image errors are what noise
+        adds to.
+        """
         if self.figure == IMAGE:
             return self.value**2 > self.must**2 + 3 * self.resolution**2
         return self.value > self.must + 3 * self.resolution
@@ -146,7 +152,9 @@ def thickness_off_mm(folder: Path, truth: JawTruth, spec: JobSpec, report: FitRe
 
 
 def judged(prepared: PreparedTooth, mouth: Mouth, samples: int) -> Iterator[tuple[float, float]]:
-    """Held-out error of all images and then of each tooth's pixels, with the error that noise of photographs and renders looks like."""
+    """Held-out error of all images and then of each tooth's pixels, with the error that noise of photographs and
+    renders looks like.
+    """
     for views in (prepared.views, *(showing(prepared.views, k) for k in range(len(mouth.teeth)))):
         own = replace(prepared, views=views)
         held_out = own.errors(mouth, samples=samples, seed=23)[1]
@@ -178,7 +186,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for one in figures(Path(folder), truth, json.loads(arguments.options), arguments.workers):
             print(
-                f"{one.subject:4} {one.figure:24} {one.value:.3f} ± {one.resolution:.3f} (must {one.must:g}): {one.reached}; {one.note}",
+                f"{one.subject:4} {one.figure:24} {one.value:.3f} ± {one.resolution:.3f} (must {one.must:g}):"
+                f" {one.reached}; {one.note}",
                 flush=True,
             )
             rows.append(asdict(one) | {"reached": one.reached})

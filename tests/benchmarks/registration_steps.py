@@ -1,13 +1,16 @@
 """What landmarks and outlines each bring to the pose of a scan, and whether their ± are honest.
 
-python -m tests.benchmarks.registration_steps --json steps.json [--draws 12] [--places 7]     some 6 s of processor time a draw
+python -m tests.benchmarks.registration_steps --json steps.json [--draws 12] [--places 7]     some 6 s of processor time
+a draw
 
-Each draw is a phantom subject of its own before three cameras, pixels of 0.2 mm, clicks to 0.3 mm, and a scan with noise of 0.02 mm
-in a frame of its own, cut off behind a place from the midline. The photographs are drawn (``tests.support.photographed_mouth``) and
-share neither outlines nor search with the registration. Draws that the file holds already are not made again.
+Each draw is a phantom subject of its own before three cameras, pixels of 0.2 mm, clicks to 0.3 mm, and a scan with
+noise of 0.02 mm in a frame of its own, cut off behind a place from the midline. The photographs are drawn
+(``tests.support.photographed_mouth``) and share neither outlines nor search with the registration. Draws that the file
+holds already are not made again.
 
-Errors are twists about the teeth's centre from the found pose to the true one: the length of the turn in degrees and of the move in
-mm, as rms over the draws. Scores are the six components whitened by the step's own covariance, as rms over six a draw.
+Errors are twists about the teeth's centre from the found pose to the true one: the length of the turn in degrees and of
+the move in mm, as rms over the draws. Scores are the six components whitened by the step's own covariance, as rms over
+six a draw.
 """
 
 from __future__ import annotations

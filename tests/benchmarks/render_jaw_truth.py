@@ -1,4 +1,5 @@
-"""Render the jaw of ``tests/data/truths-jaw`` by stock Mitsuba, one pass of all images after another; an interrupted run goes on with the next pass.
+"""Render the jaw of ``tests/data/truths-jaw`` by stock Mitsuba, one pass of all images after another; an interrupted
+run goes on with the next pass.
 
 python -m tests.benchmarks.render_jaw_truth --work FOLDER
 python -m tests.benchmarks.render_jaw_truth --work FOLDER --passes 4     stores what four passes give

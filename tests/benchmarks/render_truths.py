@@ -1,4 +1,5 @@
-"""Render the single teeth of ``tests/data/truths`` by stock Mitsuba: jaws, places and optics of random subjects, 3 cameras and 8 lights of a dome.
+"""Render the single teeth of ``tests/data/truths`` by stock Mitsuba: jaws, places and optics of random subjects, 3
+cameras and 8 lights of a dome.
 
 python -m tests.benchmarks.render_truths
 python -m tests.benchmarks.render_truths --names homogeneous --samples 512
@@ -48,8 +49,9 @@ def render(case: Case, folder: Path, samples: int) -> Path:
         write_mesh(folder / f"{name}.ply", Mesh(tooth.frame.canonical_from_world(mesh.vertices_mm), mesh.faces))
     capture = folder / "capture"
     write_phantom(
-        capture, pixel_mm=PIXEL_MM, cameras=CAMERAS, lights=LIGHTS, samples=samples, seed=case.subject, subject=case.subject, renderer="mitsuba",
-        outer=folder / "outer.ply", dentin=folder / "dentin.ply" if case.dentin else None,
+        capture, pixel_mm=PIXEL_MM, cameras=CAMERAS, lights=LIGHTS, samples=samples, seed=case.subject,
+        subject=case.subject, renderer="mitsuba", outer=folder / "outer.ply",
+        dentin=folder / "dentin.ply" if case.dentin else None,
     )  # fmt: skip
     return capture
 

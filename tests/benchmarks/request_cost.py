@@ -1,6 +1,7 @@
-"""What a request costs the server's processor, by kind, without a network: the application is called in this process. Holds on a busy machine too.
+"""What a request costs the server's processor, by kind, without a network: the application is called in this process.
 
-python -m tests.benchmarks.request_cost --json cost.json [--requests 2000] [--tokens] [--profile KIND]
+Holds on a busy machine too. python -m tests.benchmarks.request_cost --json cost.json [--requests 2000] [--tokens]
+[--profile KIND]
 """
 
 from __future__ import annotations
@@ -89,7 +90,9 @@ def _row(peer: str, kind: str, took_s: list[tuple[float, float]]) -> Row:
 
 
 async def _cost(bare: Asked, ours: Asked) -> list[tuple[str, float, float]]:
-    """Kind of each request of ours, and processor time of this process for one of the bare route's and for it, which take turns: both meet the same machine."""
+    """Kind of each request of ours, and processor time of this process for one of the bare route's and for it, which
+    take turns: both meet the same machine.
+    """
     took_s = []
     pairs = list(zip(bare[1], ours[1], strict=True))
     for number, (read, ask) in enumerate([*pairs[:WARM], *pairs]):

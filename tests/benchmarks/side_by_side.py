@@ -2,10 +2,11 @@
 
     python -m tests.benchmarks.side_by_side --json side.json [--repeats 5] [--seconds 40]
 
-The server, a scheduler, two workers and one at the rig as processes of their own. Two fits run on the workers; their blocks hold a worker for a known time and
-use no processor, so that a busy machine does not change who gets how much. While both run, captures are submitted one after the other. A row states each fit's
-share of the worker time in which both had blocks to run, and how long captures took from their submission to their first frame, alone and beside the fits.
-Takes repeats x 4 cases x about a minute.
+The server, a scheduler, two workers and one at the rig as processes of their own. Two fits run on the workers; their
+blocks hold a worker for a known time and use no processor, so that a busy machine does not change who gets how much.
+While both run, captures are submitted one after the other. A row states each fit's share of the worker time in which
+both had blocks to run, and how long captures took from their submission to their first frame, alone and beside the
+fits. Takes repeats x 4 cases x about a minute.
 """
 
 from __future__ import annotations
@@ -133,7 +134,9 @@ def row_of(
 
 
 def capture_wait_s(client: httpx.Client, source: Path) -> float:
-    """From a capture's submission until it has begun, by the server's clock; waits for its job's capture and takes the job away."""
+    """From a capture's submission until it has begun, by the server's clock; waits for its job's capture and takes the
+    job away.
+    """
     (source / "steering").mkdir(parents=True)
     job = submit(client, {"rig": {"mouth": str(source)}})
     while not (source / "steering" / "at-capture-end").exists():

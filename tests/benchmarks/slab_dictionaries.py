@@ -1,10 +1,11 @@
-"""What each dictionary finds of the slab truths and of one dispersion of spheres, as JSON rows; about 20 core-seconds a row.
+"""What each dictionary finds of the slab truths and of one dispersion of spheres, as JSON rows; about 20 core-seconds a
+row.
 
 python -m tests.benchmarks.slab_dictionaries --seeds 2 --json dictionaries.json
 
-The truths of ``slab-truth`` are another program's. The dispersion, polystyrene of 800 nm at 533 nm from the reference table at
-sigma_t w = 2, is rendered by the forward model with other seeds, by spheres of that one size, which is none of the dictionary's.
-Rows that the file holds already are not run again.
+The truths of ``slab-truth`` are another program's. The dispersion, polystyrene of 800 nm at 533 nm from the reference
+table at sigma_t w = 2, is rendered by the forward model with other seeds, by spheres of that one size, which is none of
+the dictionary's. Rows that the file holds already are not run again.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ LIKE = "mie-500nm"
 THICKNESS = 2.0
 TRUTH_SEED, TRUTH_BATCHES, TRUTH_PATHS = 4711, 16, 60_000
 RELATIVE_INDEX = {"mie-500nm": 1.59807 / 1.33499, "mie-800nm-dispersion": 1.59807 / 1.33499}
-"""Polystyrene in water at 533 nm, from the reference table; the other truths are no spheres, and these are tried on them."""
+"""Polystyrene in water at 533 nm, from the reference table; the other truths are no spheres, and these are tried on
+them."""
 
 
 def write_dispersion(out: Path, seed: int) -> dict[str, object]:

@@ -1,11 +1,12 @@
-"""A slab's job killed at random and run again: is the answer the same to the last digit? About a minute a time on two idle cores.
+"""A slab's job killed at random and run again: is the answer the same to the last digit?
 
-python -m tests.benchmarks.slab_kill --times 20 --json slab_kill.json
+About a minute a time on two idle cores. python -m tests.benchmarks.slab_kill --times 20 --json slab_kill.json
 
-A small cell of two wavelengths (or, every other time, of one, whose blocks of paths both workers share) is fitted once undisturbed.
-Then each time a new run is struck by kill -9 after a random share of that time, all its processes at once or one worker alone, and
-where it does not end by itself it is run again until it does. Its result files are compared byte by byte with the undisturbed
-run's. A time is not counted whose run ended before the kill. The file keeps the times of an earlier run and goes on after them.
+A small cell of two wavelengths (or, every other time, of one, whose blocks of paths both workers share) is fitted once
+undisturbed. Then each time a new run is struck by kill -9 after a random share of that time, all its processes at once
+or one worker alone, and where it does not end by itself it is run again until it does. Its result files are compared
+byte by byte with the undisturbed run's. A time is not counted whose run ended before the kill. The file keeps the times
+of an earlier run and goes on after them.
 """
 
 from __future__ import annotations

@@ -38,7 +38,9 @@ def rule(tolerance: NDArray[np.float64], seconds: float) -> Callable[[Sums], flo
 def measure(
     case: SlabCase, tolerance: NDArray[np.float64], shortfall: Callable[[Sums], float], seed: int
 ) -> Iterator[dict[str, object]]:
-    """One row per value; ``reached`` is its standard error over a third of its tolerance, so 1 or less fulfils the rule."""
+    """One row per value; ``reached`` is its standard error over a third of its tolerance, so 1 or less fulfils the
+    rule.
+    """
     began = time.perf_counter()
     sums = simulate(case, shortfall, seed)
     seconds = time.perf_counter() - began
@@ -89,7 +91,8 @@ def main() -> None:
     z = np.array([row["z"] for row in rows], dtype=np.float64)
     fulfilled = sum(float(str(row["reached"])) <= 1 for row in rows)
     print(
-        f"{len(rows)} values: rms z {np.sqrt(np.mean(z**2)):.3f}, largest |z| {np.abs(z).max():.2f}, {fulfilled} at a third of their tolerance"
+        f"{len(rows)} values: rms z {np.sqrt(np.mean(z**2)):.3f}, largest |z| {np.abs(z).max():.2f}, {fulfilled} at a"
+        " third of their tolerance"
     )
 
 

@@ -2,8 +2,8 @@
 
 python -m tests.benchmarks.slab_truth --seeds 5 --json slab_truth.json
 
-Noise of 1 % (Poisson, at a pixel of its image's mean) is added to noise-free images anew for each seed, and the fit is given the same seed.
-The file keeps what an earlier run measured, and a run goes on after it.
+Noise of 1 % (Poisson, at a pixel of its image's mean) is added to noise-free images anew for each seed, and the fit is
+given the same seed. The file keeps what an earlier run measured, and a run goes on after it.
 """
 
 from __future__ import annotations

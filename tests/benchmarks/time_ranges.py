@@ -2,7 +2,8 @@
 
 python -m tests.benchmarks.time_ranges --jobs 45 --stages real --json time_ranges.json
 
-Jobs come one, two or three at a time, so that some wait for others. Each is asked for its range once it is submitted and once its fit has begun.
+Jobs come one, two or three at a time, so that some wait for others. Each is asked for its range once it is submitted
+and once its fit has begun.
 """
 
 from __future__ import annotations

@@ -17,7 +17,8 @@ ARGUMENTS = (
 
 
 PATIENCE_MS = 60_000
-"""A page may take long to show what it must show on a machine with other work; how long is not what these tests judge."""
+"""A page may take long to show what it must show on a machine with other work; how long is not what these tests
+judge."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,6 @@
-"""The dashboard in a real browser on the real API: live updates, keyboard, contrast, and nothing asked of the network."""
+"""The dashboard in a real browser on the real API: live updates, keyboard, contrast, and nothing asked of the
+network.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The dashboard while the server refuses, is late or is away: what it shows is true, and it finds its way back by itself."""
+"""The dashboard while the server refuses, is late or is away: what it shows is true, and it finds its way back by
+itself.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The first minutes of a stranger: an empty page leads to the demonstration's report, or to a rig; the form says what it takes."""
+"""The first minutes of a stranger: an empty page leads to the demonstration's report, or to a rig; the form says what
+it takes.
+"""
 
 from __future__ import annotations
 

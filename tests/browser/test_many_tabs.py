@@ -1,4 +1,6 @@
-"""Many pages of one browser, which opens six connections to a server and no more: they share one stream of events, and ALL OFF is answered."""
+"""Many pages of one browser, which opens six connections to a server and no more: they share one stream of events, and
+ALL OFF is answered.
+"""
 
 from __future__ import annotations
 
@@ -231,7 +233,8 @@ def test_an_all_off_without_an_answer_is_told_in_red_after_a_second(context: Bro
         "ALL OFF has had no answer for 1 s; it is still being sent. Press the dome's emergency stop, or cut its power."
     )
     assert trouble.evaluate("one => getComputedStyle(one).color") == dome.evaluate(
-        "() => { const one = document.createElement('i'); one.style.color = 'var(--bad)'; document.body.append(one); return getComputedStyle(one).color; }"
+        "() => { const one = document.createElement('i'); one.style.color = 'var(--bad)'; document.body.append(one);"
+        " return getComputedStyle(one).color; }"
     )
     looked_at(dome, "dome-off-unanswered")
     held[0].continue_()

@@ -1,4 +1,6 @@
-"""serve -> submit -> live loss curve -> report, with the real stages on a tooth of few pixels: nothing between page and kernel is replaced."""
+"""serve -> submit -> live loss curve -> report, with the real stages on a tooth of few pixels: nothing between page and
+kernel is replaced.
+"""
 
 from __future__ import annotations
 

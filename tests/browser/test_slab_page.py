@@ -81,7 +81,8 @@ def test_the_page_shows_wavelengths_coefficients_and_phase_functions(
         picture = page.get_by_alt_text("Phase function at 532 nm")
         picture.scroll_into_view_if_needed()
         page.wait_for_function(
-            "[...document.querySelectorAll('.phases img')].every((image) => image.complete && image.naturalWidth === 640)"
+            "[...document.querySelectorAll('.phases img')].every((image) => image.complete && image.naturalWidth ==="
+            " 640)"
         )
         expect(page.locator(".job")).not_to_contain_text("No step yet")
         expect(page.locator(".job")).not_to_contain_text("No picture yet")

@@ -1,4 +1,6 @@
-"""What the page shows of how well a fit went: the report's words and numbers, the worst first; and that a job waits, as soon as it does."""
+"""What the page shows of how well a fit went: the report's words and numbers, the worst first; and that a job waits, as
+soon as it does.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +81,10 @@ def test_the_page_leads_with_the_reports_judgement(
         expect(shown).to_contain_text(
             f"green {percent(verdict.channels['green'])}, red {percent(verdict.channels['red'])}"
         )
-        result = f"Result: held-out error green {percent(verdict.channels['green'])}, red {percent(verdict.channels['red'])}."
+        result = (
+            f"Result: held-out error green {percent(verdict.channels['green'])}, red"
+            f" {percent(verdict.channels['red'])}."
+        )
         expect(page.locator(".chart figcaption")).to_contain_text(result)
         expect(page.locator(".comparison .scale")).to_contain_text("−25 % of white")
         expect(page.locator(".comparison .scale")).to_contain_text("+25 % of white")

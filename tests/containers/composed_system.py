@@ -1,7 +1,8 @@
 """The composed system in real containers, as the tests start, disturb and ask it.
 
-Which engine runs it is the environment's choice: ``DENTINE_COMPOSE`` is the compose command (``docker compose`` by default, or ``podman-compose``),
-``DENTINE_ENGINE`` the engine's (``docker`` by default), and ``DOCKER_HOST`` where it listens.
+Which engine runs it is the environment's choice: ``DENTINE_COMPOSE`` is the compose command (``docker compose`` by
+default, or ``podman-compose``), ``DENTINE_ENGINE`` the engine's (``docker`` by default), and ``DOCKER_HOST`` where it
+listens.
 """
 
 from __future__ import annotations

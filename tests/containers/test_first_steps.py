@@ -1,4 +1,6 @@
-"""From the setup link in the log to the demonstration's report, in a real browser and a system that was just started, and what that system weighs."""
+"""From the setup link in the log to the demonstration's report, in a real browser and a system that was just started,
+and what that system weighs.
+"""
 
 from __future__ import annotations
 

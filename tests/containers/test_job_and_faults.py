@@ -45,7 +45,9 @@ def submit(system: ComposedSystem, token: str, capture: str) -> str:
 
 
 def result_of(system: ComposedSystem, token: str, job: str) -> dict[str, Any]:
-    """What a job found, without the time that it took; asserts that it succeeded and that one attempt published each stage."""
+    """What a job found, without the time that it took; asserts that it succeeded and that one attempt published each
+    stage.
+    """
     with system.client(token) as client:
         detail = follow(client, job)
         assert detail["state"] == "SUCCEEDED", detail["failure"]
@@ -87,7 +89,9 @@ def kill(service: str) -> Callable[[ComposedSystem, StoreDisk], None]:
 
 
 def cut_worker(system: ComposedSystem, _disk: StoreDisk) -> None:
-    """Every packet to and from the worker is lost for a minute, also where it starts again meanwhile; its addresses stay."""
+    """Every packet to and from the worker is lost for a minute, also where it starts again meanwhile; its addresses
+    stay.
+    """
     rules = (["INPUT", "!", "-i", "lo", "-j", "DROP"], ["OUTPUT", "!", "-o", "lo", "-j", "DROP"])
     cut, end = 0, time.monotonic() + CUT_S
     while time.monotonic() < end:

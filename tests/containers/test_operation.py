@@ -1,4 +1,6 @@
-"""What whoever runs the system does with it: back up and restore, change passwords and certificates, upgrade, add a machine."""
+"""What whoever runs the system does with it: back up and restore, change passwords and certificates, upgrade, add a
+machine.
+"""
 
 from __future__ import annotations
 
@@ -122,7 +124,9 @@ def test_certificates_are_renewed(system: ComposedSystem, token: str, mouth: Pat
 
 @contextmanager
 def further_machine(system: ComposedSystem, folder: Path) -> Iterator[None]:
-    """Another project of the engine with one worker, as another host would run it on the same network as the scheduler."""
+    """Another project of the engine with one worker, as another host would run it on the same network as the
+    scheduler.
+    """
     secrets = folder / "secrets"
     for name in ("tls", "database"):
         volume = system.engine(

@@ -1,4 +1,6 @@
-"""Who is not of the system is let into nothing: another container on each of its networks, and another user of the host."""
+"""Who is not of the system is let into nothing: another container on each of its networks, and another user of the
+host.
+"""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 python -m tests.contracts.attack_list --json attacks.json
 
-The table goes into the JSON file and into the page beside the API's documentation. An attack has held off when all its cases passed; one that a machine cannot
-try, such as another user without being the superuser, says so.
+The table goes into the JSON file and into the page beside the API's documentation. An attack has held off when all its
+cases passed; one that a machine cannot try, such as another user without being the superuser, says so.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ MARK = re.compile(
 """A mark, the decorators below it, each on one line or on several, and the test's name."""
 TITLE = """# Attacks that are tried
 
-`make attacks` runs these tests and writes this page; what each of them does stands in its source below `tests/`. `make contracts` sends ten thousand generated
-requests besides, `python -m tests.benchmarks.fuzzed_load` 2,000 while others read, and `make faults` kills every part at every point of a job.
-An attack is held off when the server refuses it in the words of its description, does and stores nothing of it, and goes on serving others.
+`make attacks` runs these tests and writes this page; what each of them does stands in its source below `tests/`.
+`make contracts` sends ten thousand generated requests besides, `python -m tests.benchmarks.fuzzed_load` 2,000 while
+others read, and `make faults` kills every part at every point of a job. An attack is held off when the server refuses
+it in the words of its description, does and stores nothing of it, and goes on serving others.
 """
 
 
@@ -124,7 +125,8 @@ def main() -> None:
     for attack in broken:
         print(f"{attack.kind}: {attack.what}: {attack.outcome} ({attack.test})")
     print(
-        f"{len(attacks)} attacks in {sum(attack.outcomes.total() for attack in attacks)} cases, {len(attacks) - len(broken)} held off."
+        f"{len(attacks)} attacks in {sum(attack.outcomes.total() for attack in attacks)} cases,"
+        f" {len(attacks) - len(broken)} held off."
     )
     raise SystemExit(bool(broken) or status != 0)
 

@@ -1,4 +1,5 @@
-"""What generated requests can name so that they get past the lookup: ids that exist, and headers and bodies that fit together.
+"""What generated requests can name so that they get past the lookup: ids that exist, and headers and bodies that fit
+together.
 
 The description says of an id only that it is text, so a generated one is never anybody's.
 """

@@ -2,10 +2,12 @@
 
 python -m tests.contracts.generated_requests --cases 10000 --seed 1 --json cases.json
 
-The description that the server itself gives is read; a part of the cases goes along the borders of what it allows, the others are drawn from it, half of
-them against it. They come with a token of every scope, with one that may only read, with a wrong one, or without any. An answer is good when its status,
-content type, headers and body are described, when what the description forbids is refused, when a refusal is a problem document with a known code, and when it
-is no failure of the server. The server has a simulated dome. In the end the server must be ready, run a further job, and have kept what was there before.
+The description that the server itself gives is read; a part of the cases goes along the borders of what it allows, the
+others are drawn from it, half of them against it. They come with a token of every scope, with one that may only read,
+with a wrong one, or without any. An answer is good when its status, content type, headers and body are described, when
+what the description forbids is refused, when a refusal is a problem document with a known code, and when it is no
+failure of the server. The server has a simulated dome. In the end the server must be ready, run a further job, and have
+kept what was there before.
 """
 
 from __future__ import annotations
@@ -361,7 +363,8 @@ def main() -> None:
     ]:
         print(f"\nNever answered 2xx: {', '.join(unanswered)}.")
     print(
-        f"\n{outcome.cases} cases in {outcome.seconds:.0f} s, jobs {outcome.jobs}, {len(outcome.faults)} kinds of fault."
+        f"\n{outcome.cases} cases in {outcome.seconds:.0f} s, jobs {outcome.jobs}, {len(outcome.faults)} kinds of"
+        " fault."
     )
     raise SystemExit(bool(outcome.faults))
 

@@ -1,4 +1,7 @@
-"""Whatever a capture, a job file or an array holds: it is taken, or refused in one sentence that is of the error tree. Nothing else is ever raised."""
+"""Whatever a capture, a job file or an array holds: it is taken, or refused in one sentence that is of the error tree.
+
+Nothing else is ever raised.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Who may what: every route × every scope × whose thing it names. What is somebody else's is answered like what is not there."""
+"""Who may what: every route × every scope × whose thing it names.
+
+What is somebody else's is answered like what is not there.
+"""
 
 from __future__ import annotations
 

@@ -2,9 +2,10 @@
 
 python -m tests.faults.kill_matrix --json matrix.json
 
-A job of toy stages runs through the real API, database, scheduler and workers, each on a host of its own. It is held at one point, one fault strikes, the
-job is let go on, and what an orchestrator restarts is started again. A cell is good when the job succeeded, every stage was published once and by an attempt
-that the events tell of, what is published is whole, the dome is dark, the events tell of it in order, and there is one job for every submission. In the end all
+A job of toy stages runs through the real API, database, scheduler and workers, each on a host of its own. It is held at
+one point, one fault strikes, the job is let go on, and what an orchestrator restarts is started again. A cell is good
+when the job succeeded, every stage was published once and by an attempt that the events tell of, what is published is
+whole, the dome is dark, the events tell of it in order, and there is one job for every submission. In the end all
 stores are looked at once more, as an attempt that was given up may write late.
 """
 
@@ -152,7 +153,8 @@ def main() -> None:
         for cell in run_cells(system, cells):
             done.append(cell)
             print(
-                f"{cell.fault:21} {cell.stage:8} {cell.point:7} {cell.state:10} {cell.seconds:6.1f} s  {'; '.join(cell.faults) or 'good'}",
+                f"{cell.fault:21} {cell.stage:8} {cell.point:7} {cell.state:10} {cell.seconds:6.1f} s "
+                f" {'; '.join(cell.faults) or 'good'}",
                 flush=True,
             )
             arguments.json.write_text(json.dumps([asdict(one) for one in done], indent=1) + "\n")

@@ -1,4 +1,6 @@
-"""What can go wrong while a job is held at one point of one stage. Each fault is a context: struck when it is entered; when the job has been let go on it is
+"""What can go wrong while a job is held at one point of one stage.
+
+Each fault is a context: struck when it is entered; when the job has been let go on it is
 looked at from outside while it lasts, and mended in the end."""
 
 from __future__ import annotations
@@ -100,7 +102,8 @@ def killed(part: str, held: Held) -> Iterator[None]:
 
 @contextmanager
 def worker_cut_off(held: Held) -> Iterator[None]:
-    """The stage's host is cut from the scheduler, until another one has begun the same stage and both go on: the lost one still has database and store.
+    """The stage's host is cut from the scheduler, until another one has begun the same stage and both go on: the lost
+    one still has database and store.
 
     Nobody else can take over a capture, which goes on alone.
     """
@@ -174,7 +177,9 @@ def clock_ahead(held: Held) -> Iterator[None]:
 
 @contextmanager
 def clock_back(held: Held) -> Iterator[None]:
-    """The API is killed, and is started again with a clock that stepped back by an hour: the lease it left ends far ahead."""
+    """The API is killed, and is started again with a clock that stepped back by an hour: the lease it left ends far
+    ahead.
+    """
     held.system.kill("api")
     held.system.step_clock(-CLOCK_STEP_S)
     held.system.start()

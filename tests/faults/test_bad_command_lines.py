@@ -152,7 +152,8 @@ def test_a_server_on_a_full_disk_says_so(problem: Exception, tmp_path: Path, mon
 def test_a_stored_array_of_any_shape_is_a_sentence(lengths: str, tmp_path: Path) -> None:
     path = tmp_path / "zarr.json"
     path.write_text(
-        f'{{"node_type": "array", "data_type": "uint16", "chunk_grid": {{"configuration": {{"chunk_shape": {lengths}}}}}}}'
+        '{"node_type": "array", "data_type": "uint16", "chunk_grid": {"configuration": {"chunk_shape":'
+        f" {lengths}}}}}}}"
     )
     told = content_fault(path, "capture.zarr/zarr.json", UploadLimits(), frozenset())
     assert told is None or told.endswith(".")
@@ -201,9 +202,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "register": ("--calibration", "--out", "--max-misfit-mm"),
 }
 WORDS = (
-    "", ".", "/", "/dev/null", "/dev/full", "no/such/thing", "JOB.toml", "TEXT.toml", "mouth", "x" * 300, "ä ö", "-1", "0",
-    "1e400", "nan", "inf", "-inf", "99999999999999999999",
-    "[]", "[[[[", '{"a": 1}', "%s", "--", "http://127.0.0.1:1", "http://[", "tcp://127.0.0.1:1", "red", "11", "99", "0.5", "1,2,x", "[{\"sigma\": 1e308}]",
+    "", ".", "/", "/dev/null", "/dev/full", "no/such/thing", "JOB.toml", "TEXT.toml", "mouth", "x" * 300, "ä ö", "-1",
+    "0", "1e400", "nan", "inf", "-inf", "99999999999999999999",
+    "[]", "[[[[", '{"a": 1}', "%s", "--", "http://127.0.0.1:1", "http://[", "tcp://127.0.0.1:1", "red", "11", "99",
+    "0.5", "1,2,x", "[{\"sigma\": 1e308}]",
 )  # fmt: skip
 
 

@@ -1,4 +1,6 @@
-"""kill -9 of a capturing process: dark within the watchdog period, acknowledged frames safe, the next attempt goes on."""
+"""kill -9 of a capturing process: dark within the watchdog period, acknowledged frames safe, the next attempt goes
+on.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +78,8 @@ def test_killed_in_mid_exposure(tmp_path: Path) -> None:
             process.wait()
             killed_s = time.monotonic()
 
-        # No request that starts a watchdog period after the death may see light; the watchdog, not the strobe, made it dark.
+        # No request that starts a watchdog period after the death may see light; the watchdog, not the strobe, made it
+        # dark.
         seen_lit = 0
         while (asked_s := time.monotonic()) < killed_s + WATCHDOG_S:
             seen_lit += int(observer.outputs().any())

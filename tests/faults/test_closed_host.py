@@ -1,4 +1,6 @@
-"""The host is closed: workers on loopback run nothing for other users of the machine, files are the service's own, and nobody takes all connections."""
+"""The host is closed: workers on loopback run nothing for other users of the machine, files are the service's own, and
+nobody takes all connections.
+"""
 
 from __future__ import annotations
 

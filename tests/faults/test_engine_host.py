@@ -1,4 +1,6 @@
-"""A rendering process that grows, crashes or hangs: each is told apart, with evidence, and whoever waits for it stays alive."""
+"""A rendering process that grows, crashes or hangs: each is told apart, with evidence, and whoever waits for it stays
+alive.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,8 @@ def test_a_process_that_outgrows_its_share_is_ended_with_evidence(recipe: Stored
         host.call("grow", recipe, 8 * MIB)
     evidence = failure.value.evidence
     assert evidence["memory_limit_bytes"] == 600 * MIB
-    # It was looked at every quarter of a second and grows by at most 8 MiB in ten milliseconds: half as much again is never reached.
+    # It was looked at every quarter of a second and grows by at most 8 MiB in ten milliseconds: half as much again is
+    # never reached.
     assert 600 * MIB < int(evidence["peak_memory_bytes"] or 0) < 900 * MIB
     assert host.pid is None
     assert host.call("answer", recipe, 3) == 3

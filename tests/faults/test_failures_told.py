@@ -1,4 +1,6 @@
-"""Ways to fail, a cancel and a want of disk, through the API of a live server: each is told as what it was, with what was measured and what to do next."""
+"""Ways to fail, a cancel and a want of disk, through the API of a live server: each is told as what it was, with what
+was measured and what to do next.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,9 @@ def test_bad_input(client: httpx.Client, tmp_path: Path) -> None:
 
 
 def held_after_preparation(client: httpx.Client, tmp_path: Path) -> tuple[Path, str]:
-    """A job whose preparation is published and whose fit waits until ``hold-prepare-end`` is gone from the folder that is returned with its id."""
+    """A job whose preparation is published and whose fit waits until ``hold-prepare-end`` is gone from the folder that
+    is returned with its id.
+    """
     steering = tmp_path / "steering"
     steering.mkdir()
     (steering / "hold-prepare-end").touch()
@@ -163,7 +167,10 @@ def test_tasks_cancelled_by_nobody_here_hold_the_job_back_instead_of_starting_it
             assert len(attempts) <= 1
         assert (told["state"], told["waits_for"]) == (
             "QUEUED",
-            "Waits for workers: The workers dropped the job's tasks, which nobody had asked for here; it goes on by itself.",
+            (
+                "Waits for workers: The workers dropped the job's tasks, which nobody had asked for here; it goes on by"
+                " itself."
+            ),
         )
         assert len(attempts) == 1
 

@@ -1,4 +1,6 @@
-"""The fit on a Dask cluster: both kinds of pass at once on two workers, and the same answer after a worker or a renderer is killed."""
+"""The fit on a Dask cluster: both kinds of pass at once on two workers, and the same answer after a worker or a
+renderer is killed.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ def client() -> Iterator[Client]:
 
 def spec_for(root: Path) -> JobSpec:
     return JobSpec(
-        capture=root, boundary="matched", dentin="known", samples_per_pixel=64, max_samples_per_pixel=128, max_steps=4, search_candidates=500
+        capture=root, boundary="matched", dentin="known", samples_per_pixel=64, max_samples_per_pixel=128, max_steps=4,
+        search_candidates=500
     )  # fmt: skip
 
 
@@ -220,7 +223,8 @@ def fit_jaw_once(root: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path) -> None:
-    # Two teeth, one of them hidden. The driver's worker dies while teeth are looked at alone, and its successor in the joint fit.
+    # Two teeth, one of them hidden. The driver's worker dies while teeth are looked at alone, and its successor in the
+    # joint fit.
     answers = []
     for name, kills in (("undisturbed", ()), ("killed", (3, 8))):
         root = tmp_path / name

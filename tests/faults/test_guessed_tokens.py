@@ -1,4 +1,6 @@
-"""Guesses, ten thousand where tests may be slow, pass not once, leave few rows, and do not keep a valid token out, though it comes from the same address."""
+"""Guesses, ten thousand where tests may be slow, pass not once, leave few rows, and do not keep a valid token out,
+though it comes from the same address.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Jobs run side by side: a fit keeps no other job and no capture waiting, a cancel leaves the others alone, and whoever waits is told why."""
+"""Jobs run side by side: a fit keeps no other job and no capture waiting, a cancel leaves the others alone, and whoever
+waits is told why.
+"""
 
 from __future__ import annotations
 

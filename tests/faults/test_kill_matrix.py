@@ -1,4 +1,6 @@
-"""Eight cells of the fault matrix: every part killed once, two in the capture, and what needs no host or disk of its own; ``make faults`` runs all of them."""
+"""Eight cells of the fault matrix: every part killed once, two in the capture, and what needs no host or disk of its
+own; ``make faults`` runs all of them.
+"""
 
 from __future__ import annotations
 

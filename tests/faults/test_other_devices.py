@@ -27,7 +27,8 @@ class Device(socketserver.ThreadingTCPServer):
     """Speaks Modbus TCP; keeps (function, address) of what it is asked.
 
     Args:
-        identities: its answers for the identity, the last one for good; None for no answer, 0 for the exception "illegal address".
+        identities: its answers for the identity, the last one for good; None for no answer, 0 for the exception
+            "illegal address".
     """
 
     allow_reuse_address = daemon_threads = True

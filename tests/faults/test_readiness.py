@@ -1,4 +1,6 @@
-"""Readiness and metrics tell the truth while database, scheduler, store or disk are broken, and again once they are mended."""
+"""Readiness and metrics tell the truth while database, scheduler, store or disk are broken, and again once they are
+mended.
+"""
 
 from __future__ import annotations
 
@@ -134,7 +136,10 @@ def test_a_disk_that_takes_no_byte_is_told(
     with monkeypatch.context() as failing:
         failing.setattr(readiness_module.os, "fsync", full)
         assert bad_checks(client) == {
-            "store": "The jobs' folder cannot be written (No space left on device); check its rights, its mount and the disk."
+            "store": (
+                "The jobs' folder cannot be written (No space left on device); check its rights, its mount and the"
+                " disk."
+            )
         }
     assert bad_checks(client) == {}
     assert list((tmp_path / "jobs").iterdir()) == []

@@ -1,4 +1,6 @@
-"""kill -9 and orderly stops of the server in mid-job: the job and its history survive, and the next server ends the job."""
+"""kill -9 and orderly stops of the server in mid-job: the job and its history survive, and the next server ends the
+job.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""kill -9 of the server in mid-request, of the client in mid-file, and deaths in the middle of a commit and of a deletion."""
+"""kill -9 of the server in mid-request, of the client in mid-file, and deaths in the middle of a commit and of a
+deletion.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def upload_in_new_process(folder: Path, server: str) -> dict[str, object]:
 def send_until_killed(
     server: httpx.Client, process: subprocess.Popen[str], upload: str, offset: int, content: bytes
 ) -> None:
-    """Send some bytes of a request that never ends, then kill the server once it has read them all but the last ones."""
+    """Send some bytes of a request that never ends, then kill the server once it has read them all but the last
+    ones.
+    """
     is_sent = threading.Event()
 
     def body() -> Iterator[bytes]:

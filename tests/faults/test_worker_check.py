@@ -1,4 +1,6 @@
-"""A worker that cannot run what it claims to takes no such task and does not count, and says why: in its log, to the server and to its container."""
+"""A worker that cannot run what it claims to takes no such task and does not count, and says why: in its log, to the
+server and to its container.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``python -m tests.load.bare_server DATABASE``: FastAPI with one route that reads one row of SQLite; prints its address."""
+"""``python -m tests.load.bare_server DATABASE``: FastAPI with one route that reads one row of SQLite; prints its
+address.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """A day of a laboratory, as fast as the server takes it, and its memory meanwhile.
 
-Assumed, per quarter of an hour: 600 requests of the mix (57,600 a day: three dashboards and a watching script, one request every 1.5 s), a scrape of the
-metrics every 15 s, one small capture uploaded, one job run and followed to its end, the job of two hours ago deleted, eight event streams opened and left.
+Assumed, per quarter of an hour: 600 requests of the mix (57,600 a day: three dashboards and a watching script, one
+request every 1.5 s), a scrape of the metrics every 15 s, one small capture uploaded, one job run and followed to its
+end, the job of two hours ago deleted, eight event streams opened and left.
 """
 
 from __future__ import annotations
@@ -49,7 +50,10 @@ def measure(work: Path, quarters: int, seed: int) -> Iterator[Row]:
 
 
 def growth(curve: Sequence[Row]) -> Row:
-    """Least squares after the warm-up. Neighbouring points are alike, so the interval comes from resampling whole blocks of residuals."""
+    """Least squares after the warm-up.
+
+    Neighbouring points are alike, so the interval comes from resampling whole blocks of residuals.
+    """
     judged = curve[int(WARM_UP * len(curve)) :]
     days, size = (
         np.array([row["hours"] / 24 for row in judged]),

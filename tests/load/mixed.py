@@ -78,7 +78,9 @@ class _Clocks:
         return cls(time.perf_counter(), server_s, busy_s - server_s - own.user - own.system)
 
     def until(self, later: _Clocks, requests: int) -> Row:
-        """Of the server by request, and how many cores others kept busy: where those are about as many as there are, latencies say little."""
+        """Of the server by request, and how many cores others kept busy: where those are about as many as there are,
+        latencies say little.
+        """
         wall_s, server_s = later.wall_s - self.wall_s, later.server_s - self.server_s
         return {
             "cpu_s_per_request": round(server_s / requests, 6),
@@ -147,7 +149,9 @@ def _p99(rounds: Sequence[Sequence[Answer]]) -> float:
 
 
 def _summary(answers: Mapping[str, list[list[Answer]]], cpu_s_per_request: Mapping[str, float]) -> Iterator[Row]:
-    """p99 over all rounds, its ratio to the bare route's, and that ratio's spread: over rounds, and by resampling them together; and the processor's time."""
+    """p99 over all rounds, its ratio to the bare route's, and that ratio's spread: over rounds, and by resampling them
+    together; and the processor's time.
+    """
     rng = np.random.default_rng(1)
     bare = answers[BARE]
     draws = rng.integers(0, len(bare), (RESAMPLES, len(bare)))

@@ -47,7 +47,9 @@ def session(served: Served, connections: int = 256) -> aiohttp.ClientSession:
 
 
 def run(work: Coroutine[Any, Any, T]) -> T:
-    """Run with ``select``, whose timeouts are finer than the millisecond of ``epoll``: a request is sent when it is due."""
+    """Run with ``select``, whose timeouts are finer than the millisecond of ``epoll``: a request is sent when it is
+    due.
+    """
     with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(selectors.SelectSelector())) as runner:
         return runner.run(work)
 
@@ -65,7 +67,9 @@ async def offer(
     plan: Sequence[tuple[float, Ask]],
     follow_up: Callable[[Answer], tuple[float, Ask] | None] = lambda _: None,
 ) -> list[Answer]:
-    """Send the plan, times in seconds from now and in order, and what ``follow_up`` makes of each answer, so many seconds later."""
+    """Send the plan, times in seconds from now and in order, and what ``follow_up`` makes of each answer, so many
+    seconds later.
+    """
     answers: list[Answer] = []
     loop = asyncio.get_running_loop()
     async with session(served) as http, asyncio.TaskGroup() as sending:

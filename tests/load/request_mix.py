@@ -29,7 +29,9 @@ class Ask:
 
 
 class RequestMix:
-    """Draws requests over a library; what is new in it is named by ``prefix``, so that no two mixes submit the same job."""
+    """Draws requests over a library; what is new in it is named by ``prefix``, so that no two mixes submit the same
+    job.
+    """
 
     def __init__(self, library: Library, rng: random.Random, prefix: str) -> None:
         self._library, self._rng, self._prefix, self._submitted = library, rng, prefix, 0

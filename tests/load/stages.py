@@ -1,6 +1,7 @@
 """Toy stages whose fit goes on at a pace.
 
-With solver = adam it waits for ``go`` in the job's folder and then takes ``adam_steps`` steps, ``adam_rate`` seconds apart.
+With solver = adam it waits for ``go`` in the job's folder and then takes ``adam_steps`` steps, ``adam_rate`` seconds
+apart.
 """
 
 from __future__ import annotations

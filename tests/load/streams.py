@@ -1,4 +1,6 @@
-"""Many event streams on one running job: whether each gets every event in order, how long after its commit, and what that costs the server."""
+"""Many event streams on one running job: whether each gets every event in order, how long after its commit, and what
+that costs the server.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Many jobs submitted at once, each of them twice: whether all are accounted for, each was run once, and they ran in their order."""
+"""Many jobs submitted at once, each of them twice: whether all are accounted for, each was run once, and they ran in
+their order.
+"""
 
 from __future__ import annotations
 

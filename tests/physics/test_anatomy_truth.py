@@ -38,7 +38,8 @@ def test_the_scanned_incisors_images_come_out_again() -> None:
             noise = variance[part].sum() + stored_variance[part].sum()
             if stored[part].sum() > 0.02 * stored.sum():
                 scores.append((mean[part] - stored[part]).sum() / np.sqrt(noise))
-    # About 15 values: |z| <= 4.5 fails one correct run in 10,000; a camera half a pixel off or a wrong medium gives |z| of 10 and more.
+    # About 15 values: |z| <= 4.5 fails one correct run in 10,000; a camera half a pixel off or a wrong medium gives |z|
+    # of 10 and more.
     assert len(scores) >= 12
     assert np.abs(scores).max() <= 4.5
     assert np.sqrt(np.mean(np.square(scores))) < 1.7

@@ -9,7 +9,9 @@ from tests.benchmarks.calibrate_sessions import one_session, summary
 
 @pytest.mark.slow
 def test_sessions_keep_their_limits_and_know_their_errors() -> None:
-    """Four sessions: 168 scores of cameras, 144 of lights and of intensities, so their rms has a standard error of 0.06."""
+    """Four sessions: 168 scores of cameras, 144 of lights and of intensities, so their rms has a standard error of
+    0.06.
+    """
     told = summary([one_session(seed) for seed in range(4)])
     assert told["rms_shift_mm"] < 0.05
     assert told["rms_turn_deg"] < 0.02

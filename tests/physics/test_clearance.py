@@ -36,5 +36,6 @@ def test_bounds_hold_and_tell_something_as_surfaces_move() -> None:
         bound = np.asarray(grid(mi.Point3f(*points.T.astype(np.float32)), mi.Bool(True)))
         true = np.min([SurfaceDistance(mesh).closest(points)[1] for mesh in (outer, *inner)], axis=0)
         assert (bound <= true + ROUNDING_MM).all()
-        # A cell's half diagonal twice, the spacing of samples and the slack of a small move: a third of a millimetre at cells of 0.1.
+        # A cell's half diagonal twice, the spacing of samples and the slack of a small move: a third of a millimetre at
+        # cells of 0.1.
         assert np.mean(true - bound) < 0.35

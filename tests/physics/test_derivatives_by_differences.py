@@ -1,8 +1,8 @@
 """Every derivative against central differences with common random numbers, on a small tooth.
 
-Each is compared on the scalar that shows it best: the image projected on the derivative's own picture, taken from another
-seed. Two steps tell the differences' bias apart: it grows as the square of the step, so (4 fd(h/2) - fd(h)) / 3 is free of
-it to fourth order.
+Each is compared on the scalar that shows it best: the image projected on the derivative's own picture, taken from
+another seed. Two steps tell the differences' bias apart: it grows as the square of the step, so (4 fd(h/2) - fd(h)) / 3
+is free of it to fourth order.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ GRADUAL = Group(
     2048,
     lambda boundary: replace(recipe(boundary), border_width_mm=1.2),
 )
-"""Albedo and phase function differ far more than extinction, so that what they change near the border rules the derivative to its shape."""
+"""Albedo and phase function differ far more than extinction, so that what they change near the border rules the
+derivative to its shape."""
 IN_A_MOUTH = Group(
     MOUTH,
     {

@@ -1,4 +1,6 @@
-"""What the engine and the slab cannot take is refused before any kernel runs, with a sentence that names parameter and value."""
+"""What the engine and the slab cannot take is refused before any kernel runs, with a sentence that names parameter and
+value.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,9 @@ TISSUE = Tissue(Medium(2, 0.9, 0.9, 0.6, -0.2), Medium(4, 0.8), (0.5, 0.4))
 
 FORBIDDEN = [
     ("sigma", 0.0, "0"), ("sigma", -3.0, "-3"), ("sigma", math.inf, "inf"), ("sigma", math.nan, "nan"),
-    ("sigma", 1e39, "1e+39"), ("sigma", 1e-50, "1e-50"), ("g1", 0.999999999, "0.999999999"), ("g2", -0.999999999, "-0.999999999"),
-    ("alpha", -0.1, "-0.1"), ("alpha", 1.001, "1.001"), ("alpha", math.nan, "nan"),
-    ("beta", -0.2, "-0.2"), ("beta", 1.5, "1.5"),
+    ("sigma", 1e39, "1e+39"), ("sigma", 1e-50, "1e-50"), ("g1", 0.999999999, "0.999999999"),
+    ("g2", -0.999999999, "-0.999999999"), ("alpha", -0.1, "-0.1"), ("alpha", 1.001, "1.001"),
+    ("alpha", math.nan, "nan"), ("beta", -0.2, "-0.2"), ("beta", 1.5, "1.5"),
     ("g1", 1.0, "1"), ("g1", -1.0, "-1"), ("g2", 1.7, "1.7"), ("g2", -math.inf, "-inf"),
 ]  # fmt: skip
 
@@ -218,10 +220,14 @@ def test_a_libllvm_that_would_crash_is_refused(version: tuple[int, int, int], pa
     ],
 )
 def test_an_unusable_libllvm_ends_with_a_sentence(tmp_path: Path, before: str, sentence: str) -> None:
-    # The whole way, in a process that cannot load the library, an empty file where it is looked for, and in one that is told it is old.
+    # The whole way, in a process that cannot load the library, an empty file where it is looked for, and in one that is
+    # told it is old.
     library = tmp_path / "libLLVM.so"
     library.touch()
-    script = f"{before}; from services.fit.transport.engine import Engine; from tests.support.small_tooth import recipe; Engine(recipe())"
+    script = (
+        f"{before}; from services.fit.transport.engine import Engine; from tests.support.small_tooth import recipe;"
+        " Engine(recipe())"
+    )
     root = Path(__file__).resolve().parents[2]
     ended = subprocess.run(
         [sys.executable, "-c", script],

@@ -1,4 +1,6 @@
-"""What a view does not need is not rendered: lights it does not list come out as zero, and the rest as if those had never been there."""
+"""What a view does not need is not rendered: lights it does not list come out as zero, and the rest as if those had
+never been there.
+"""
 
 from __future__ import annotations
 

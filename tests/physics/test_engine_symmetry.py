@@ -28,8 +28,8 @@ def uniform_room(count: int) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize(("boundary", "first_surface"), [("matched", 0.0), ("thin", ((1.631 - 1) / (1.631 + 1)) ** 2)])
 def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surface: float) -> None:
-    # Radiance 1 from everywhere is 1 everywhere. The camera sees the centre of a ball so deep that no light comes straight
-    # through (optical depth 16); of a thin boundary the first reflection is left out, as highlights are.
+    # Radiance 1 from everywhere is 1 everywhere. The camera sees the centre of a ball so deep that no light comes
+    # straight through (optical depth 16); of a thin boundary the first reflection is left out, as highlights are.
     lights = uniform_room(200)
     core = sphere(1.2)
     dentin = DentinShape.known(core)

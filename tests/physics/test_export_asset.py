@@ -55,7 +55,8 @@ class Rig:
 
     def write(self, folder: Path, boundary: Boundary, stains: ToothStains | None = None) -> tuple[str, ...]:
         return write_asset(
-            folder, report_of(TISSUE), (self.tooth,), self.cameras, self.lights, channels=CHANNELS, boundary=boundary, ior=1.631, stains=stains
+            folder, report_of(TISSUE), (self.tooth,), self.cameras, self.lights, channels=CHANNELS, boundary=boundary,
+            ior=1.631, stains=stains
         )  # fmt: skip
 
     def engine_image(

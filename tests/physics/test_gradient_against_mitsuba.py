@@ -1,6 +1,7 @@
 """The gradient of an L2 loss to both media against stock ``prbvolpath`` backward, on a small tooth under two lights.
 
-The two share no code. Honest ones fail one run in 1000 (t-tests with the fewest degrees of freedom there can be, Bonferroni), and seeds are fixed.
+The two share no code. Honest ones fail one run in 1000 (t-tests with the fewest degrees of freedom there can be,
+Bonferroni), and seeds are fixed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ OTHER = Tissue(Medium(1.0, 0.6, 0.4, 0.8, -0.3), Medium(1.0, 0.5, g1=-0.2))
 """Far away, so that no component is near 0."""
 REPEATS, SAMPLES = 16, 128
 LARGEST_ERROR = 0.15
-"""Standard error of the difference, as a fraction of the component: 13 % for sigma of dentin, 2 to 6 % for all others, where errors of a third are seen."""
+"""Standard error of the difference, as a fraction of the component: 13 % for sigma of dentin, 2 to 6 % for all others,
+where errors of a third are seen."""
 FALSE_ALARM = 1e-3
 
 

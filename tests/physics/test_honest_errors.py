@@ -1,8 +1,10 @@
-"""Standard errors are honest: 95 % intervals by Student's t hold the truth 95 times in a hundred, and an error asked for is the error there is.
+"""Standard errors are honest: 95 % intervals by Student's t hold the truth 95 times in a hundred, and an error asked
+for is the error there is.
 
-The lights of a pixel, and the derivatives of its images, come from the same walks. So every interval here is from a walk of its own: one
-value per seed and pixel, light and parameter drawn beforehand. Pixels lie inside the tooth's outline: where a pixel is mostly beside the
-tooth, few of its paths count, and a mean of so few is not normally distributed yet whatever its standard error.
+The lights of a pixel, and the derivatives of its images, come from the same walks. So every interval here is from a
+walk of its own: one value per seed and pixel, light and parameter drawn beforehand. Pixels lie inside the tooth's
+outline: where a pixel is mostly beside the tooth, few of its paths count, and a mean of so few is not normally
+distributed yet whatever its standard error.
 """
 
 from __future__ import annotations
@@ -23,9 +25,11 @@ TISSUE = Tissue(Medium(2, 0.95, 0.8, 0.6, -0.3), Medium(3, 0.8, 0.7, 0.6, -0.3),
 NAMES = ("enamel.sigma", "dentin.alpha", "enamel.g1", "dentin.beta", "shape.0")
 VIEW = whole_view(camera_at((0.2, 1, 0.1), size=6, span_mm=4.0))
 SEEDS, SAMPLES, TRUTH_SAMPLES = 56, 1024, 64 * 1024
-"""The truth's own error must be small: it is counted by the few batches' wide quantile, so intervals that hold much of it hold the truth too often."""
+"""The truth's own error must be small: it is counted by the few batches' wide quantile, so intervals that hold much of
+it hold the truth too often."""
 LEVEL, LOWEST, HIGHEST = 0.95, 0.93, 0.97
-"""Of 2016 independent intervals an honest 95 % holds 93 to 97 % but for once in 20,000 times: the binomial's standard deviation is 0.49 %."""
+"""Of 2016 independent intervals an honest 95 % holds 93 to 97 % but for once in 20,000 times: the binomial's standard
+deviation is 0.49 %."""
 
 Array = NDArray[np.float64]
 
@@ -103,7 +107,8 @@ def test_an_error_asked_for_is_the_error_there_is(engine: Engine) -> None:
     truth = engine.images(TISSUE, VIEW, samples=TRUTH_SAMPLES, seed=9200)
     runs = [engine.images(TISSUE, VIEW, rel_error=asked, seed=9201 + seed) for seed in range(12)]
     assert all(run.complete and run.rel_error <= asked and run.samples > 64 for run in runs)
-    # Twelve images of 36 independent pixels know their mean square error to 7 % if a pixel's lights are one, and to 3 % if not: four of the former.
+    # Twelve images of 36 independent pixels know their mean square error to 7 % if a pixel's lights are one, and to 3 %
+    # if not: four of the former.
     squares = [np.sum((run.mean - truth.mean) ** 2) for run in runs]
     reached = (np.mean(squares) - truth.variance.sum()) / np.sum(truth.mean**2)
     assert 0.72 <= reached / np.mean([run.rel_error**2 for run in runs]) <= 1.28

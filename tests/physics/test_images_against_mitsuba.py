@@ -60,7 +60,8 @@ def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
     [pytest.param(1024, 4, 250, id="blocks"), pytest.param(8192, 2, 800, id="small-blocks", marks=pytest.mark.slow)],
 )
 def test_the_scanned_incisor_looks_as_in_mitsuba(samples: int, block: int, least: int) -> None:
-    # Pixels of few paths are skewed, the truth's 5,120 among them, which no t-distribution corrects; sums over blocks of them are not.
+    # Pixels of few paths are skewed, the truth's 5,120 among them, which no t-distribution corrects; sums over blocks
+    # of them are not.
     root = shared_path("data/tooth-ur1-truth")
     capture, tooth = read_record(root / "capture.json", FolderCapture), read_teeth(root)[0]
     truth = json.loads((root / "truth.json").read_text())

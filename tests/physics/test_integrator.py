@@ -1,7 +1,7 @@
 """The integrator plug-in against stock Mitsuba and the project's own engine.
 
-Images are compared in blocks of pixels by the rule of ``test_images_against_mitsuba``; an honest integrator fails one run of
-such a comparison in 500. Seeds are fixed.
+Images are compared in blocks of pixels by the rule of ``test_images_against_mitsuba``; an honest integrator fails one
+run of such a comparison in 500. Seeds are fixed.
 """
 
 from __future__ import annotations
@@ -92,7 +92,9 @@ def properties(*tissues: Tissue, **others: Any) -> SceneDict:
 
 
 def scene_dict(folder: Path, **shapes: SceneDict) -> SceneDict:
-    """The tooth in stock media under a point light, with other shapes: stock integrators and ours render the same scene."""
+    """The tooth in stock media under a point light, with other shapes: stock integrators and ours render the same
+    scene.
+    """
     return (
         nested_scene({"11": (folder / "outer.ply", folder / "dentin.ply")}, TISSUE, (CAMERA,), LIGHTS_MM[0], INTENSITY)
         | shapes
@@ -208,8 +210,9 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(tooth: Path) -> None:
 
 
 def test_a_thin_face_gives_back_what_it_keeps_out(tooth: Path) -> None:
-    # With its mirror image the white tooth vanishes again but for what a single bounce between facets loses, here far under 0.5 %; without, it is darker.
-    # In sparse media much light is turned back inside and leaves without another scattering.
+    # With its mirror image the white tooth vanishes again but for what a single bounce between facets loses, here far
+    # under 0.5 %; without, it is darker. In sparse media much light is turned back inside and leaves without another
+    # scattering.
     sparse = Tissue(Medium(0.2, 1.0, g1=0.3), Medium(0.4, 1.0))
     scene = load_scene(scene_dict(tooth, light={"type": "constant"}))
     brightness = []

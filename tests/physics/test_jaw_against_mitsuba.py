@@ -1,4 +1,5 @@
-"""The phantom jaw by the engine, which lets solids overlap, and by stock Mitsuba on surfaces cut along each other, pixel by pixel.
+"""The phantom jaw by the engine, which lets solids overlap, and by stock Mitsuba on surfaces cut along each other,
+pixel by pixel.
 
 The rule is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
 """
@@ -23,7 +24,8 @@ from tests.support.shared_data import shared_path
 SUBJECT = 1
 FRONT = (11, 12, 21)
 BLOCK_PX = 4
-"""Of so few paths a single pixel's batches are skewed, differently by the two renderers, which moves its z; sums over blocks are not."""
+"""Of so few paths a single pixel's batches are skewed, differently by the two renderers, which moves its z; sums over
+blocks are not."""
 
 
 def scores(jaw: JawSurfaces, folder: Path, *, pixel_mm: float, samples: int, block: int) -> np.ndarray:

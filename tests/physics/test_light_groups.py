@@ -1,4 +1,6 @@
-"""A connection looks up one light of every group: each light as often as its brightness asks for, for any number of lights."""
+"""A connection looks up one light of every group: each light as often as its brightness asks for, for any number of
+lights.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ def test_a_light_is_chosen_as_often_as_it_is_bright(lights: int) -> None:
     towards = positions - POINT_MM
     squared = np.sum(towards**2, axis=1)
     brightness = lobe(towards @ AHEAD / np.sqrt(squared)) * intensities / squared
-    # Draws at equal steps fall into an interval of (0, 1) as often as its width says, give or take one; the rest is single precision.
+    # Draws at equal steps fall into an interval of (0, 1) as often as its width says, give or take one; the rest is
+    # single precision.
     counts = np.array([np.bincount(row, minlength=lights) for row in found.reshape(groups.count, DRAWS)])
     of = counts.argmax(axis=0)
     of[counts.sum(axis=0) == 0] = -1

@@ -1,4 +1,6 @@
-"""A system library that the renderer's wheels need and the machine lacks is told as one sentence, wherever the renderer is entered."""
+"""A system library that the renderer's wheels need and the machine lacks is told as one sentence, wherever the renderer
+is entered.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ ENTRIES = {
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with Dr.Jit as installed, but for the name of a library that it asks the system for: no system has that one."""
+    """A folder with Dr.Jit as installed, but for the name of a library that it asks the system for: no system has that
+    one.
+    """
     spec = importlib.util.find_spec("drjit")
     assert spec is not None
     assert spec.submodule_search_locations is not None

@@ -1,4 +1,5 @@
-"""A gradual border between enamel and dentin: images against stock Mitsuba, which takes albedo and lobe weight from volumes, and derivatives to the shape.
+"""A gradual border between enamel and dentin: images against stock Mitsuba, which takes albedo and lobe weight from
+volumes, and derivatives to the shape.
 
 The rule for images is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
 """
@@ -124,7 +125,8 @@ def test_the_distance_moves_as_the_surface_does() -> None:
     here = border_at(0.5)
     (speed, _), q = (np.array(values) for values in here.motion(x, mi.Bool(True))), distance(here)
     dr.sync_thread()
-    # Interpolated on a grid of 0.15 mm both are a few hundredths off at a point, and on average much less; the surface itself has edges.
+    # Interpolated on a grid of 0.15 mm both are a few hundredths off at a point, and on average much less; the surface
+    # itself has edges.
     band = (np.abs(q) > 0.1) & (np.abs(q) < 0.4)
     assert band.sum() > 1000
     gap = (moved - speed)[band]
@@ -148,7 +150,8 @@ def test_no_part_of_a_mouth_with_gradual_borders_has_a_table() -> None:
 
 @pytest.mark.parametrize("whole", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_mixture_changes_where_the_border_moves(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Albedos far apart and extinctions near: nearly all of the derivative of the images' sum is what the mixture's albedo does, and without it the test fails.
+    # Albedos far apart and extinctions near: nearly all of the derivative of the images' sum is what the mixture's
+    # albedo does, and without it the test fails.
     if not whole:
         monkeypatch.setattr(Scores, "mixed_albedo_motion", lambda *_: mi_zero())
     tissue = Tissue(Medium(1.5, 0.6, 0.9, 0.7, -0.3), Medium(1.2, 0.95, 0.3, 0.5, -0.2), (0.5, 0.4))

@@ -1,4 +1,5 @@
-"""Several teeth, gums and the wall of the mouth: images against stock Mitsuba's ``prbvolpath``, pixel by pixel, and derivatives against differences.
+"""Several teeth, gums and the wall of the mouth: images against stock Mitsuba's ``prbvolpath``, pixel by pixel, and
+derivatives against differences.
 
 The rule for images is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
 """

@@ -16,7 +16,8 @@ from tests.support.z_scores import LARGEST_Z
 G = np.array(
     [0.0, 1e-7, -1e-6, 1e-3, -0.05, 0.3, -0.3, 0.5, -0.7, 0.9, -0.95, 0.99, -0.999, 0.9999, -0.9999], dtype=np.float32
 )
-"""Mean cosines. In single precision 1 - |g| is exact for |g| >= 0.5, so the corner loses nothing that its input still has."""
+"""Mean cosines. In single precision 1 - |g| is exact for |g| >= 0.5, so the corner loses nothing that its input still
+has."""
 ROUNDING = 6e-8
 """Half a unit in the last place of single precision."""
 
@@ -101,7 +102,8 @@ def test_sampled_deviations_invert_the_distribution() -> None:
     s = 2 * v - 1
     series = (s + a * (s**2 + 3) / 2 + a**2 * s + a**3 * (s**2 - 1) / 2) / (1 + a * s) ** 2
     truth = 1 - np.where(a < 0.3, series, textbook)
-    # Relative where the lobe is narrow, since m is what the density takes; the reference itself has 1e-13 left of 1 - cos.
+    # Relative where the lobe is narrow, since m is what the density takes; the reference itself has 1e-13 left of 1 -
+    # cos.
     assert (np.abs(ours - truth) <= 20 * ROUNDING * truth + 1e-13).all()
 
 

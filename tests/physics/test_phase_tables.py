@@ -1,4 +1,6 @@
-"""Tabulated phase functions: values and sampling in single precision, slabs and a tooth against truths that know no table of ours."""
+"""Tabulated phase functions: values and sampling in single precision, slabs and a tooth against truths that know no
+table of ours.
+"""
 
 from __future__ import annotations
 
@@ -146,7 +148,8 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
 
     # What the table calls empty is hit only by rounding of a direction at its rim.
     assert np.count_nonzero(value == 0) <= 1e-4 * SAMPLES
-    # Through its distribution function the angle is uniform. The finest peak is as narrow as directions are round, so its cells are wide.
+    # Through its distribution function the angle is uniform. The finest peak is as narrow as directions are round, so
+    # its cells are wide.
     cells = 4 if "thousandth" in name else CELLS
     uniform = cumulative(table, angle)
     counts = np.bincount(np.minimum((uniform * cells).astype(int), cells - 1), minlength=cells)
@@ -158,8 +161,8 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
 
 
 def test_tabulated_lobes_reproduce_slab_totals() -> None:
-    # Two walks that draw from phase functions of distance d differ in at most d of their scatterings; of (1 - R - T) alpha / (1 - alpha) on
-    # average. The tables are so fine that this is below a tenth of a standard error.
+    # Two walks that draw from phase functions of distance d differ in at most d of their scatterings; of (1 - R - T)
+    # alpha / (1 - alpha) on average. The tables are so fine that this is below a tenth of a standard error.
     rows = (
         "a=0.9 g=0.75 tau=2 n=1 ",
         "a=0.8 g=-0.9 tau=2 n=1 ",

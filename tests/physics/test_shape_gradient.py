@@ -1,7 +1,9 @@
-"""The shape gradient by light and importance on the border, against central differences of the images with common random numbers.
+"""The shape gradient by light and importance on the border, against central differences of the images with common
+random numbers.
 
-Tolerance: the series ends and light is averaged over patches of the border. On these scenes, thin enamel, lights nearly behind the camera and media that are
-clear, or scatter forwards, that was measured to move the derivative by 1 % and by 10 to 15 % (``services/fit/README.md``): the bias each case allows.
+Tolerance: the series ends and light is averaged over patches of the border. On these scenes, thin enamel, lights nearly
+behind the camera and media that are clear, or scatter forwards, that was measured to move the derivative by 1 % and by
+10 to 15 % (``services/fit/README.md``): the bias each case allows.
 """
 
 from __future__ import annotations
@@ -71,7 +73,8 @@ def test_its_errors_are_honest() -> None:
     runs = [engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=64, photons=512) for seed in range(64)]
     claimed = np.mean([run.variance for run in runs], axis=0)
     found = np.var([run.gradient for run in runs], axis=0, ddof=1)
-    # The variance of 64 values is chi-square with 63 degrees of freedom; 0.6 to 1.6 holds it but once in 1e4, and the claim's own noise beside it.
+    # The variance of 64 values is chi-square with 63 degrees of freedom; 0.6 to 1.6 holds it but once in 1e4, and the
+    # claim's own noise beside it.
     assert ((found / claimed > 0.55) & (found / claimed < 1.7)).all()
 
 

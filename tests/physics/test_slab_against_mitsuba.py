@@ -1,8 +1,8 @@
 """Index-matched cells against stock Mitsuba.
 
-Stock Mitsuba has no narrow beam that a path from a camera can be connected to, but a directional light. A cell that is wide
-against its light's way lets both be compared: the radiance under irradiance 1 across the beam is the sum over pixels of the
-beam's image times their area times the cosine of the beam, as shifting the beam shifts the image.
+Stock Mitsuba has no narrow beam that a path from a camera can be connected to, but a directional light. A cell that is
+wide against its light's way lets both be compared: the radiance under irradiance 1 across the beam is the sum over
+pixels of the beam's image times their area times the cosine of the beam, as shifting the beam shifts the image.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ def direction(side: str, angle_deg: float, *, arriving: bool) -> np.ndarray:
 
 
 def by_mitsuba(sigma_s: float, g: float, sigma_a: float) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance (lights, cameras) under irradiance 1 across the beam, unscattered light left out, and standard errors."""
+    """Radiance (lights, cameras) under irradiance 1 across the beam, unscattered light left out, and standard
+    errors.
+    """
     prepare_device()
     import mitsuba as mi
 

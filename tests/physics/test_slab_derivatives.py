@@ -1,9 +1,10 @@
-"""Slab derivatives against ``slab_derivatives.csv``, and the moving border against cases whose derivative is exactly zero.
+"""Slab derivatives against ``slab_derivatives.csv``, and the moving border against cases whose derivative is exactly
+zero.
 
-The rule asks for a standard error of a third of 1 % (of the value, or of 1e-3 of the largest derivative of the same case and
-source). Some values of the table cost minutes at that error and the border's ``c`` by its own two terms days, as it is the
-small difference of two much larger terms. So the rule is applied in full to the cases that reach it, and to
-the border in the form of the zero test; all 320 values are tested for bias at the error that seconds reach.
+The rule asks for a standard error of a third of 1 % (of the value, or of 1e-3 of the largest derivative of the same
+case and source). Some values of the table cost minutes at that error and the border's ``c`` by its own two terms days,
+as it is the small difference of two much larger terms. So the rule is applied in full to the cases that reach it, and
+to the border in the form of the zero test; all 320 values are tested for bias at the error that seconds reach.
 ``tests/benchmarks/slab_table.py`` writes the error of every value.
 """
 
@@ -20,7 +21,8 @@ from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
 ZERO_TOLERANCE = 0.02
 """Of the one-sided border term."""
 AT_TOLERANCE = 70
-"""Of the table's 320 values, at least this many reach the full rule's standard error in the short runs (74 were counted)."""
+"""Of the table's 320 values, at least this many reach the full rule's standard error in the short runs (74 were
+counted)."""
 
 
 def to_one_percent(case: SlabCase, seed: int) -> NDArray[np.float64]:
@@ -58,7 +60,8 @@ def test_all_derivatives_are_unbiased_at_the_error_reached() -> None:
 
 
 def test_extinction_scores_give_the_borders_derivative_too() -> None:
-    # R and T depend on sigma_i d_i alone, so dR/dc = (sigma1/d1) dR/dsigma1 - (sigma2/d2) dR/dsigma2, with a fraction of the noise.
+    # R and T depend on sigma_i d_i alone, so dR/dc = (sigma1/d1) dR/dsigma1 - (sigma2/d2) dR/dsigma2, with a fraction
+    # of the noise.
     cases, scores = named(derivative_cases(), "S10", "S14", "S16"), []
     for number, case in enumerate(cases):
         sums = simulate(case, passes(1), seed=700 + number)

@@ -38,7 +38,9 @@ def test_weights_have_the_derivatives_of_their_mixtures() -> None:
 
 
 def test_algorithm_1_as_printed_is_biased_and_independent_streams_are_not() -> None:
-    """At the truth the gradient is zero; the printed product of an image with its own derivative has their covariance instead."""
+    """At the truth the gradient is zero; the printed product of an image with its own derivative has their covariance
+    instead.
+    """
     rig = small_rig(pixels={"x_mm": [-4.0, 4.0], "y_mm": [-4.0, 4.0], "columns": 4, "rows": 4})
     material = henyey_greenstein(1.0, 0.5, 0.1)
     truth = render(rig, material, seed=1, step=0, batches=1, paths=400_000, scores=False).mean

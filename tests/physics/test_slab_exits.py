@@ -1,8 +1,9 @@
-"""Where, and in which directions, light leaves a slab, against van de Hulst's tables, Chandrasekhar's H function and rings of a pencil beam.
+"""Where, and in which directions, light leaves a slab, against van de Hulst's tables, Chandrasekhar's H function and
+rings of a pencil beam.
 
-The rule is that of ``tests.support.z_scores``. Totals have a tolerance of 1e-3 (rings 5e-4, the half space of albedo 0.5 1e-4) in every
-run and of 1e-4 in the slow ones. Radiances have one of 0.3 % of their value: their standard error of 0.1 % is then at least ten times
-what rounding leaves of the printed digits.
+The rule is that of ``tests.support.z_scores``. Totals have a tolerance of 1e-3 (rings 5e-4, the half space of albedo
+0.5 1e-4) in every run and of 1e-4 in the slow ones. Radiances have one of 0.3 % of their value: their standard error of
+0.1 % is then at least ten times what rounding leaves of the printed digits.
 """
 
 from __future__ import annotations
@@ -60,7 +61,9 @@ def test_a_pencil_beam_leaves_within_its_rings_to_four_digits() -> None:
 
 
 def scattered_totals(layer: Layer, ior: float, boundary: str, R: float, T: float) -> NDArray[np.float64]:
-    """Known totals (R, T) at normal incidence less the light that leaves without scattering, which faces turn back any number of times."""
+    """Known totals (R, T) at normal incidence less the light that leaves without scattering, which faces turn back any
+    number of times.
+    """
     depth, mirrored = layer.sigma * layer.thickness_mm, 0.0 if boundary == "matched" else ((ior - 1) / (ior + 1)) ** 2
     through = (1 - mirrored) ** 2 * math.exp(-depth) / (1 - mirrored**2 * math.exp(-2 * depth))
     return np.array([R - mirrored - mirrored * math.exp(-depth) * through, T - through])
@@ -82,8 +85,8 @@ def hemisphere(result: SlabResult, weights: NDArray[np.float64]) -> tuple[NDArra
     ],
 )
 def test_radiance_adds_up_to_the_reference_totals(layer: Layer, boundary: str, ior: float, R: float, T: float) -> None:
-    # Refraction, its solid angles and faces that reflect have no table by direction. Totals are rows of the slab tables;
-    # 16 Gauss nodes integrate these smooth radiances to 1e-5.
+    # Refraction, its solid angles and faces that reflect have no table by direction. Totals are rows of the slab
+    # tables; 16 Gauss nodes integrate these smooth radiances to 1e-5.
     nodes, weights = np.polynomial.legendre.leggauss(16)
     cosines = 0.5 * (nodes + 1)
     result = simulate_slab((layer,), boundary=boundary, ior=ior, exit_cosines=tuple(cosines), rel_error=4e-3, seed=851)  # type: ignore[arg-type]

@@ -55,7 +55,8 @@ def test_totals_of_the_deepest_white_slabs_agree(source: str) -> None:
 @pytest.mark.parametrize(("boundary", "ior"), [("matched", 1.0), ("thin", 1.631), ("smooth", 1.5)])
 @pytest.mark.parametrize("source", SOURCES)
 def test_white_slabs_return_all_light(boundary: str, ior: float, source: str) -> None:
-    # |R + T - 1| < 1e-3. R and T of a white slab are nearly perfectly anticorrelated, so 2e-4 each leaves their sum far below that.
+    # |R + T - 1| < 1e-3. R and T of a white slab are nearly perfectly anticorrelated, so 2e-4 each leaves their sum far
+    # below that.
     layers = (
         Layer(sigma=3, alpha=1, g1=0.6, thickness_mm=0.5),
         Layer(sigma=6, alpha=1, beta=0.8, g1=0.7, g2=-0.2, thickness_mm=0.5),

@@ -1,4 +1,6 @@
-"""The slab's own walk: energy, totals of the table, scores against differences, single scattering against the walk's shape."""
+"""The slab's own walk: energy, totals of the table, scores against differences, single scattering against the walk's
+shape.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,8 @@ def totals(
 
 @pytest.mark.parametrize(("index", "glass"), [(1.0, None), (1.33, None), (1.33, 1.52)])
 def test_white_cells_return_all_light(index: float, glass: float | None) -> None:
-    # |R + T - 1| < 1e-3 at albedo 1 and sigma_t w = 10. Paths end outside alone, so the sum has only the draw of cosines as noise.
+    # |R + T - 1| < 1e-3 at albedo 1 and sigma_t w = 10. Paths end outside alone, so the sum has only the draw of
+    # cosines as noise.
     got, _ = totals(henyey_greenstein(10.0, 0.8, 0.0), index, blocks=4, paths=5000, glass=glass)
     assert abs(got.sum() - 1) < 1e-3
 
@@ -74,7 +77,8 @@ def test_totals_agree_with_adding_doubling() -> None:
 
 
 def test_a_beam_that_is_never_scattered_twice_agrees_with_quadrature_by_hand() -> None:
-    # Isotropic scattering, matched, normal beam, camera behind at 0 degrees: the image's sum is T p sigma_s w exp(-sigma_t w).
+    # Isotropic scattering, matched, normal beam, camera behind at 0 degrees: the image's sum is T p sigma_s w
+    # exp(-sigma_t w).
     rig = small_rig(
         cell={"width_mm": 1.0, "index": None, "boundary": "matched"},
         lights=NORMAL_LIGHT,
@@ -150,9 +154,9 @@ def test_glass_of_no_thickness_and_the_samples_index_changes_nothing() -> None:
 def test_scores_agree_with_differences(thickness: float) -> None:
     """12 atoms and 12 random directions: differences with common random numbers against scores from other paths.
 
-    The functional is the sum of images over their own means, so that all pixels count alike. Changes are made in f itself,
-    in which an image is nearly linear: +-0.4 of f at one knot, or of random sign at all. Absorption is changed by a tenth of
-    that, as the longest ways are tens of millimetres.
+    The functional is the sum of images over their own means, so that all pixels count alike. Changes are made in f
+    itself, in which an image is nearly linear: +-0.4 of f at one knot, or of random sign at all. Absorption is changed
+    by a tenth of that, as the longest ways are tens of millimetres.
     """
     rig = small_rig(pixels={"x_mm": [-4.0, 4.0], "y_mm": [-4.0, 4.0], "columns": 4, "rows": 4})
     material = henyey_greenstein(thickness, 0.6, 0.05)

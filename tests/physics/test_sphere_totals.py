@@ -17,8 +17,8 @@ from tests.support.slab_tables import total_cases
 GLASS = Cell(width_mm=1, index=1.34, glass=Glass(index=1.5, thickness_mm=1))
 SPHERE = Sphere(diameter_mm=203.2, sample_port_mm=25.4, third_port_mm=12.7, detector_port_mm=1, wall_reflectance=0.96)
 FIRST_BOUNCE = 1 - 0.000978
-"""What is not the entrance port. IAD 3.16 counts the first bounce behind the baffle, this times the wall's reflectance, for
-the sample and not for the standard; its figures are compared with ours times both."""
+"""What is not the entrance port. IAD 3.16 counts the first bounce behind the baffle, this times the wall's reflectance,
+for the sample and not for the standard; its figures are compared with ours times both."""
 
 TABLE = [
     (0.9, 0.75, 2.0, 1.0, (0.09739464, 0.66095770, 0.19109023, 0.50181606)),
@@ -29,8 +29,8 @@ TABLE = [
     (0.5, 0.9, 1.0, 1.4, (0.03895326, 0.54506757, 0.09199007, 0.43747217)),
     (0.99, 0.8, 5.0, 1.631, (0.32853474, 0.46492220, 0.38193355, 0.41305722)),
 ]
-"""Albedo, g, optical thickness, index; R and T for a beam and for diffuse light: adding-doubling with 256 to 512 nodes. The
-first row is van de Hulst's, the fifth Giovanelli's."""
+"""Albedo, g, optical thickness, index; R and T for a beam and for diffuse light: adding-doubling with 256 to 512 nodes.
+The first row is van de Hulst's, the fifth Giovanelli's."""
 
 
 def four(totals: Totals) -> tuple[float, float, float, float]:

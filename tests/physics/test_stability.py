@@ -51,7 +51,8 @@ def test_the_walk_holds_in_every_corner(corners: Corners) -> None:
     rows = walk_rows(corners, most_steps=STEPS)
     assert [row.region for row in rows] == [*REGIONS, WHITE]
     assert sum(row.non_finite for row in rows) == 0
-    # Energy never grows, and none is lost in white sets: of 13 values an honest run has one beyond 4.5 standard errors in 10,000.
+    # Energy never grows, and none is lost in white sets: of 13 values an honest run has one beyond 4.5 standard errors
+    # in 10,000.
     for row in rows:
         assert row.gain is not None
         assert row.gain_error is not None
@@ -108,15 +109,17 @@ def test_slab_tables_as_lanes_of_one_kernel() -> None:
     # Light meets a first layer without forced collisions, so that one is made too thin to matter.
     film = 1e-6 * np.minimum(thickness, 1)
     sets = Corners(
-        region=np.zeros(len(alpha), dtype=np.int64), sigma=both(np.ones_like(alpha)), absorbed=both(1 - alpha), beta=both(np.ones_like(alpha)),
-        g1=both(g), g2=both(0 * g), width_mm=np.stack([film, thickness]), boundary=np.where(smooth == 1, SMOOTH, MATCHED), ior=ior, diffuse=diffuse == 1,
+        region=np.zeros(len(alpha), dtype=np.int64), sigma=both(np.ones_like(alpha)), absorbed=both(1 - alpha),
+        beta=both(np.ones_like(alpha)), g1=both(g), g2=both(0 * g), width_mm=np.stack([film, thickness]),
+        boundary=np.where(smooth == 1, SMOOTH, MATCHED), ior=ior, diffuse=diffuse == 1,
     )  # fmt: skip
     totals = trace(sets, paths=8, most_steps=1 << 20, seed=6, gradient=False).totals.reshape(len(cases), copies, 3)
     assert totals[:, :, 2].max() == 0
     mean, error = totals[:, :, :2].mean(axis=1), totals[:, :, :2].std(axis=1, ddof=1) / np.sqrt(copies)
     mean[:, 0] += [specular_share(case.ior, case.source) for case in cases]
     truth = np.concatenate([case.values for case in cases])
-    # Transmittances near 1 are sure to a rounding; one of 1e-4 through a deep slab is a path in ten thousand, seen or not.
+    # Transmittances near 1 are sure to a rounding; one of 1e-4 through a deep slab is a path in ten thousand, seen or
+    # not.
     error = np.maximum(error, 1e-6)
     resolved = (truth > 1e-3) | np.array([[slab.thickness_mm < 1] for slab in slabs])
     assert resolved.sum() == 64
@@ -145,8 +148,9 @@ def test_sets_out_of_range_are_refused(corners: Corners, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Walk, "run", lambda *_: pytest.fail("a kernel ran"))
     wrong = {
-        "sigma": (0.0, -1e4, 1e39, np.nan, np.inf), "alpha": (-1e-7, 1 + 1e-6, np.nan), "beta": (-1e-7, 1 + 1e-6, np.nan),
-        "g1": (1.0, -1.0, 1 - 1e-9, 1.0001, np.nan), "g2": (1.0, 1e-9 - 1, -np.inf), "thickness_mm": (0.0, -1e-3, np.nan),
+        "sigma": (0.0, -1e4, 1e39, np.nan, np.inf), "alpha": (-1e-7, 1 + 1e-6, np.nan),
+        "beta": (-1e-7, 1 + 1e-6, np.nan), "g1": (1.0, -1.0, 1 - 1e-9, 1.0001, np.nan), "g2": (1.0, 1e-9 - 1, -np.inf),
+        "thickness_mm": (0.0, -1e-3, np.nan),
     }  # fmt: skip
     media, rng = corners.media(), np.random.default_rng(7)
     for number in rng.integers(0, SETS, 200):
@@ -212,7 +216,8 @@ def test_dentin_has_room_inside_enamel() -> None:
 
 
 def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Coincident surfaces hide one another, and a lane outside believed to be inside scattered in endless enamel: 100 times too bright.
+    # Coincident surfaces hide one another, and a lane outside believed to be inside scattered in endless enamel: 100
+    # times too bright.
     monkeypatch.setattr("services.fit.transport.scene.mesh_geometry.require_nested", lambda *_: None)
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
     known = DentinShape.known(outer)

@@ -1,4 +1,5 @@
-"""Stains: images against stock Mitsuba, where a stain is a mask over black, and the derivative to texels against central differences.
+"""Stains: images against stock Mitsuba, where a stain is a mask over black, and the derivative to texels against
+central differences.
 
 The rule for images is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
 """
@@ -106,7 +107,8 @@ def test_texels_derivatives_are_those_of_the_images(boundary: Boundary) -> None:
             image = engine.images(replace(TISSUE, stain=Stain(moved)), view, samples=640, seed=200 + seed).mean
             return float((image * cotangent).sum())
 
-        # A path crosses two faces, so images are quadratic in a texel, near enough, and central differences without bias.
+        # A path crosses two faces, so images are quadratic in a texel, near enough, and central differences without
+        # bias.
         differences = np.array([(projected(0.2, seed) - projected(-0.2, seed)) / 0.4 for seed in range(SEEDS)])
         gap = (gradients[:, row, column] - differences) / gradients[:, row, column].mean()
         error = gap.std(ddof=1) / np.sqrt(SEEDS)
@@ -143,7 +145,8 @@ def test_an_image_dims_with_the_square_of_a_common_stain() -> None:
         engine.images(replace(TISSUE, stain=given), view, samples=1024, seed=3)
         for given in (Stain(np.ones((2, 3))), Stain(np.full((2, 3), 0.6)))
     )
-    # Pixels are independent, the lights of one are not; four standard errors of the two as if they had nothing in common.
+    # Pixels are independent, the lights of one are not; four standard errors of the two as if they had nothing in
+    # common.
     spread = np.sqrt(
         sum(scale**2 * (np.sqrt(image.variance).sum(axis=0) ** 2).sum() for scale, image in ((0.36, clean), (1, dim)))
     )

@@ -1,4 +1,6 @@
-"""The peer of the fit's race goes downhill: stock gradients in our unbounded domain lead from a start that is far off towards the truth."""
+"""The peer of the fit's race goes downhill: stock gradients in our unbounded domain lead from a start that is far off
+towards the truth.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from services.phantom.tooth import write_phantom
 
 @pytest.mark.slow
 def test_stock_fit_goes_downhill(tmp_path: Path) -> None:
-    # Rates are so large that twelve rounds at half the photographs' error left are many times the noise of their gradients.
+    # Rates are so large that twelve rounds at half the photographs' error left are many times the noise of their
+    # gradients.
     write_phantom(tmp_path / "capture", pixel_mm=1.0, cameras=1, lights=4, samples=256, subject=2)
     options = {"capture": tmp_path / "capture", "boundary": "matched", "dentin": "known"}
     case = prepared_tooth(tmp_path / "job", JobSpec.model_validate(options))

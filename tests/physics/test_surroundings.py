@@ -31,7 +31,8 @@ def test_a_white_tooth_is_lit_from_the_roots_by_the_top_of_an_environment() -> N
     centre = slice(3, 5)
     roots, crown = image[5:7, centre].mean(), image[1:3, centre].mean()
     assert roots > crown + 0.3
-    # What a white tooth sends out under half a sky of 2 and one turned over adds to 2: 4 standard errors of some 6 % of a pixel, sixteen of them.
+    # What a white tooth sends out under half a sky of 2 and one turned over adds to 2: 4 standard errors of some 6 % of
+    # a pixel, sixteen of them.
     turned = seen_under(environment_light(sky[::-1].copy(), 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)  # type: ignore[arg-type]
     middle = (image + turned)[2:6, 2:6]
     assert middle.mean() == pytest.approx(2.0, abs=4 * middle.std() / 4)

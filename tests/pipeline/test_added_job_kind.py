@@ -1,4 +1,6 @@
-"""A package from outside adds a kind of job, which runs on workers that were spawned and learn of it by its entry point."""
+"""A package from outside adds a kind of job, which runs on workers that were spawned and learn of it by its entry
+point.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,10 @@ def job_file(folder: Path, kind: str = "weight", extra: str = "") -> Path:
 
 
 def test_an_added_kind_is_known_beside_the_others(tmp_path: Path, environment: dict[str, str]) -> None:
-    code = f"from services.core.settings import read_job; from pathlib import Path; print(read_job(Path({str(job_file(tmp_path))!r})).kind)"
+    code = (
+        "from services.core.settings import read_job; from pathlib import Path;"
+        f" print(read_job(Path({str(job_file(tmp_path))!r})).kind)"
+    )
     answer = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "weight"
 

@@ -1,4 +1,6 @@
-"""ALL OFF and cancels are answered while everything else of the server hangs, and the loop that serves everybody goes on meanwhile."""
+"""ALL OFF and cancels are answered while everything else of the server hangs, and the loop that serves everybody goes
+on meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ BODY_BYTES = 2**20
 TURNS, LOOP_PATIENCE_S = 10, 10.0
 """So many turns must the loop make while something else works, which gives up after this time."""
 POOLS = (1, 1, min(32, (os.cpu_count() or 1) + 4), 40)
-"""Threads that read the database, open files, do what coroutines wait for (asyncio's default), and call plain handlers (FastAPI's)."""
+"""Threads that read the database, open files, do what coroutines wait for (asyncio's default), and call plain handlers
+(FastAPI's)."""
 TUS = "Tus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\nContent-Type: application/offset+octet-stream\r\n"
 
 
@@ -73,7 +76,9 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def occupy(address: str, job: str) -> ExitStack:
-    """Send so many requests of each kind that takes threads: those that read jobs and files, send and commit captures, or delete jobs."""
+    """Send so many requests of each kind that takes threads: those that read jobs and files, send and commit captures,
+    or delete jobs.
+    """
     host, port = address.removeprefix("http://").split(":")
     kinds = [
         f"GET /v1/jobs HTTP/1.1\r\nHost: {host}\r\n\r\n",

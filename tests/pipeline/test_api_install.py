@@ -1,4 +1,6 @@
-"""``dentine[api]`` alone is a server: installed into an empty environment, it starts, answers, and says the truth of a job that its workers run elsewhere."""
+"""``dentine[api]`` alone is a server: installed into an empty environment, it starts, answers, and says the truth of a
+job that its workers run elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,10 @@ def served(environment: Path, data: Path, **settings: str) -> Iterator[httpx.Cli
 
 
 def test_what_renders_captures_and_speaks_to_domes_is_absent(environment: Path) -> None:
-    code = f"import importlib.util, json; print(json.dumps([name for name in {ABSENT!r} if importlib.util.find_spec(name)]))"
+    code = (
+        f"import importlib.util, json; print(json.dumps([name for name in {ABSENT!r} if"
+        " importlib.util.find_spec(name)]))"
+    )
     answer = subprocess.run(
         [str(environment / "bin/python"), "-I", "-c", code], check=True, capture_output=True, text=True
     )
@@ -63,7 +68,10 @@ def test_the_server_answers_and_shows_its_page(environment: Path, tmp_path: Path
         while "being found out" in (ready := client.get("/v1/health/ready")).text:
             time.sleep(0.2)
         bad = [check for check in ready.json()["checks"] if not check["ok"]]
-        sentence = "This machine cannot run stages: The package cv2 is not installed; install dentine[preprocess] on this machine."
+        sentence = (
+            "This machine cannot run stages: The package cv2 is not installed; install dentine[preprocess] on this"
+            " machine."
+        )
         assert (ready.status_code, bad) == (503, [{"name": "workers", "ok": False, "sentence": sentence}])
         assert "<title>dentine</title>" in client.get("/").text
         assert client.get("/app.js").status_code == (200 if is_dashboard_built() else 404)

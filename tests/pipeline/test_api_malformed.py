@@ -1,4 +1,6 @@
-"""Malformed requests of which each once was a failure of the server, or was answered with something else than a problem document."""
+"""Malformed requests of which each once was a failure of the server, or was answered with something else than a problem
+document.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What uploads say of themselves is read in processes of bounded memory and time: no file of anybody takes the server's."""
+"""What uploads say of themselves is read in processes of bounded memory and time: no file of anybody takes the
+server's.
+"""
 
 from __future__ import annotations
 

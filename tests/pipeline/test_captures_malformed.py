@@ -1,4 +1,6 @@
-"""Whatever a client sends to the routes of captures and uploads, the answer is a problem document of the 4xx family and nothing is opened."""
+"""Whatever a client sends to the routes of captures and uploads, the answer is a problem document of the 4xx family and
+nothing is opened.
+"""
 
 from __future__ import annotations
 

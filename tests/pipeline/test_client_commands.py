@@ -1,4 +1,6 @@
-"""The commands that speak to a server: list, name, download, delete; one sentence where they cannot; and nothing but the base install."""
+"""The commands that speak to a server: list, name, download, delete; one sentence where they cannot; and nothing but
+the base install.
+"""
 
 from __future__ import annotations
 

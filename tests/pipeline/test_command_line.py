@@ -145,14 +145,12 @@ def test_submit_watch_and_retry_through_a_server(tmp_path: Path, job_file: Path)
 def test_ctrl_c_during_a_capture_leaves_the_dome_dark(tmp_path: Path) -> None:
     """The whole process group gets the signal, as from a terminal."""
     code = (
-        "import sys; from pathlib import Path; from services.cli.run import cancelling_on_signals;"
-        "from services.pipeline.stages import run_job; from services.core.errors import JobCancelledError;"
-        "from services.core.records import JobSpec, RigSpec; from tests.support.toy_stages import DOORS\n"
-        "if __name__ == '__main__':\n"
-        "    root = Path(sys.argv[1])\n"
-        "    with cancelling_on_signals(root):\n"
-        "        try: run_job(JobSpec(rig=RigSpec(mouth=Path('/')), workers=1), root, lambda event: print(event.kind, flush=True), doors=DOORS)\n"
-        "        except JobCancelledError as problem: sys.exit(problem.exit_status)\n"
+        "import sys; from pathlib import Path; from services.cli.run import cancelling_on_signals;from"
+        " services.pipeline.stages import run_job; from services.core.errors import JobCancelledError;from"
+        " services.core.records import JobSpec, RigSpec; from tests.support.toy_stages import DOORS\nif __name__ =="
+        " '__main__':\n    root = Path(sys.argv[1])\n    with cancelling_on_signals(root):\n        try:"
+        " run_job(JobSpec(rig=RigSpec(mouth=Path('/')), workers=1), root, lambda event: print(event.kind, flush=True),"
+        " doors=DOORS)\n        except JobCancelledError as problem: sys.exit(problem.exit_status)\n"
     )
     script = tmp_path / "interrupted.py"
     script.write_text(code)

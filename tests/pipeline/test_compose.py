@@ -1,4 +1,7 @@
-"""The compose file: valid, and what it starts works together. Its own commands and environments run as processes on loopback, and a small job through them."""
+"""The compose file: valid, and what it starts works together.
+
+Its own commands and environments run as processes on loopback, and a small job through them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""TLS between API, scheduler and workers by one setting: who shows a certificate of the authority is let in, and nobody else."""
+"""TLS between API, scheduler and workers by one setting: who shows a certificate of the authority is let in, and nobody
+else.
+"""
 
 from __future__ import annotations
 

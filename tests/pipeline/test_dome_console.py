@@ -1,4 +1,6 @@
-"""The dome by hand where something is in its way: no connection left for ALL OFF, and a rig that asks for more than the server allows."""
+"""The dome by hand where something is in its way: no connection left for ALL OFF, and a rig that asks for more than the
+server allows.
+"""
 
 from __future__ import annotations
 
@@ -138,8 +140,8 @@ def test_a_preflight_may_not_ask_for_more_than_the_server_allows(
 def test_preflights_add_up_to_the_limit_with_light_by_hand(
     address: Address, observer: DomeObserver, rig: Callable[..., RigSpec]
 ) -> None:
-    # The last light is on for 0.3 s and a glimpse of 5 ms in each preflight, the others for the glimpse. A preflight and the capture after it are within
-    # the limit, which a second preflight passes.
+    # The last light is on for 0.3 s and a glimpse of 5 ms in each preflight, the others for the glimpse. A preflight
+    # and the capture after it are within the limit, which a second preflight passes.
     wanted = rig(level=1.0, exposure_s=0.3, tracking_every=0)
     with console(address, light_exposure_limit_s=0.607) as answer:
         assert answer(do="preflight", rig=wanted).code is None

@@ -1,4 +1,6 @@
-"""A figure from nothing: capture and fit by the command line, renders beside photographs, a caption with their errors; then again from what is kept."""
+"""A figure from nothing: capture and fit by the command line, renders beside photographs, a caption with their errors;
+then again from what is kept.
+"""
 
 from __future__ import annotations
 

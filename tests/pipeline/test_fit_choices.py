@@ -20,9 +20,10 @@ QUANTITIES = [(part, leaf) for part in ("enamel", "dentin") for leaf in ("sigma_
 
 def fit(root: Path, *, attempt: int = 1, listen: Any = None, **options: Any) -> FitReport:
     values: dict[str, Any] = {
-        "capture": root, "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 1024, "max_steps": 8,
-        "search_candidates": 500,
-        # This engine's renders are so noisy that they drown what the instrument's errors leave to tell; test_fit_instrument.py fits those.
+        "capture": root, "boundary": "matched", "dentin": "known", "samples_per_pixel": 64,
+        "max_samples_per_pixel": 1024, "max_steps": 8, "search_candidates": 500,
+        # This engine's renders are so noisy that they drown what the instrument's errors leave to tell;
+        # test_fit_instrument.py fits those.
         "instrument": "off",
     }  # fmt: skip
     return run(JobSpec(**(values | options)), LocalContext(root, attempt, listen), engine=FAKE)
@@ -81,13 +82,15 @@ def test_every_loss_finds_the_truth_where_the_model_holds(loss: str, tmp_path: P
 
 
 def test_images_outvote_the_literature(tmp_path: Path) -> None:
-    # Dentin's true albedo lies 2.5 widths from the table's centre. A fifth is far below the widths of densities, factors of 5.7 and 3.4.
+    # Dentin's true albedo lies 2.5 widths from the table's centre. A fifth is far below the widths of densities,
+    # factors of 5.7 and 3.4.
     write_prepared(tmp_path)
     require_truth(fit(tmp_path, prior="literature"), largest=0.2)
 
 
 def test_a_robust_loss_forgives_shadows(tmp_path: Path) -> None:
-    # A fifth of all measurements in shadow moves L2 by 15 to 23 %; what is left of the robust fit's 2 % is Monte Carlo noise.
+    # A fifth of all measurements in shadow moves L2 by 15 to 23 %; what is left of the robust fit's 2 % is Monte Carlo
+    # noise.
     errors = {}
     for loss in ("l2", "robust"):
         write_prepared(tmp_path / loss, shadowed=0.2)
@@ -123,7 +126,8 @@ def test_adam_finds_the_truth_and_resumes(tmp_path: Path) -> None:
     options = {"solver": "adam", "adam_steps": 80}
     write_prepared(tmp_path / "whole")
     report = fit(tmp_path / "whole", **options)
-    # A constant rate of 0.05 leaves densities wandering by 3 % a step, several times that where enamel and dentin trade places.
+    # A constant rate of 0.05 leaves densities wandering by 3 % a step, several times that where enamel and dentin trade
+    # places.
     assert off(report) < 0.15
     assert report.held_out_error["green"] < 0.02
     # Its standard errors are those of normal equations at the end.

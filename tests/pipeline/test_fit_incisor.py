@@ -59,7 +59,8 @@ def run_both_stages(spec: JobSpec, root: Path) -> None:
 
 @pytest.mark.slow
 def test_quarter_of_the_pixels_on_two_workers(tmp_path: Path) -> None:
-    # Every second pixel in x and y, few samples: the goals of the full fit (20 %, 5 %) plus three of the fit's own standard errors, Monte Carlo included.
+    # Every second pixel in x and y, few samples: the goals of the full fit (20 %, 5 %) plus three of the fit's own
+    # standard errors, Monte Carlo included.
     spec = spec_for(tmp_path, seed=3, pixel_step=2, max_samples_per_pixel=256, max_steps=4, search_candidates=5000)
     with (
         dask.config.set({"distributed.worker.daemon": False}),

@@ -22,7 +22,8 @@ from tests.support.prepared import TRUTH, write_prepared
 
 ENGINE = "tests.support.fake_engine:QuietFakeEngine"
 OPTIONS: dict[str, Any] = {
-    "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_steps": 15, "search_candidates": 2000, "advise": False,
+    "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_steps": 15, "search_candidates": 2000,
+    "advise": False,
 }  # fmt: skip
 TRUE = {
     f"{part}.{leaf}": value

@@ -1,4 +1,6 @@
-"""A jaw's fit through the service's door: all teeth with gums and wall, one that fails, one that is hidden, and what is written of them."""
+"""A jaw's fit through the service's door: all teeth with gums and wall, one that fails, one that is hidden, and what is
+written of them.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +90,8 @@ def test_hidden_and_failed_teeth_are_held_near_the_others_and_marked(
             others = [
                 np.log(report.teeth[other].parameters["green"][f"{part}.sigma_s_reduced"].value) for other in FITTED
             ]
-            # No fitted pixel of the formula depends on them: their prior alone speaks, the median of two front teeth as the last stage found them.
+            # No fitted pixel of the formula depends on them: their prior alone speaks, the median of two front teeth as
+            # the last stage found them.
             assert np.log(found.value) == pytest.approx(np.mean(others), abs=TIED_SD["sigma"])
             assert not found.determined
             assert found.se == pytest.approx(TIED_SD["sigma"] * found.value, rel=0.01)
@@ -167,14 +170,16 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
 
 def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
     truth: tuple[float, ...] = (1.0, 0.0, 1.0)
-    # This engine's renders are so noisy that they drown what the instrument's errors leave to tell of a shape; test_jaw_instrument.py fits those.
+    # This engine's renders are so noisy that they drown what the instrument's errors leave to tell of a shape;
+    # test_jaw_instrument.py fits those.
     options: dict[str, Any] = {"dentin": "fit", "max_steps": 5, "search_candidates": 400, "instrument": "off"}
     write_prepared_jaw(tmp_path, FAKE, (11, 12, 21), hidden=(21,), shape=truth, noise=0.003, samples=20_000)
     report = fit(tmp_path, **options)
     for fdi in ("11", "12"):
         tooth = report.teeth[fdi]
         for k, (found, true) in enumerate(zip(tooth.shape, truth, strict=True)):
-            # Sixty pixels leave a weight open by 0.2 to 0.5, half of which the weak prior takes off; nearer to the truth than where it started is asked.
+            # Sixty pixels leave a weight open by 0.2 to 0.5, half of which the weak prior takes off; nearer to the
+            # truth than where it started is asked.
             assert abs(found - true) < 0.75 * abs(SHAPE[0] - true), (fdi, tooth.shape)
             estimate = tooth.parameters["green"][f"shape.{k}"]
             assert estimate.value == found
@@ -195,11 +200,13 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
-    # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed, with 1 % of sensor noise.
+    # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed,
+    # with 1 % of sensor noise.
     write_prepared_jaw(tmp_path, ENGINE, (11, 12), dentin=False)
     # These photographs' instrument is perfect, and the limits below are on what noise alone leaves.
     spec = jaw_spec(
-        tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=4, search_candidates=1600, instrument="off"
+        tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=4, search_candidates=1600,
+        instrument="off"
     )  # fmt: skip
     report = run(spec, LocalContext(tmp_path))
     found = {

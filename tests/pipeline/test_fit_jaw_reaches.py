@@ -1,4 +1,6 @@
-"""What a jaw's fit reaches on fourteen teeth rendered by stock Mitsuba: limits are those of ``tests/benchmarks/jaw_table.py``, which prints them."""
+"""What a jaw's fit reaches on fourteen teeth rendered by stock Mitsuba: limits are those of
+``tests/benchmarks/jaw_table.py``, which prints them.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,15 @@ def test_jaw_of_fourteen(tmp_path: Path) -> None:
     options = {"samples_per_pixel": 32, "max_samples_per_pixel": 512, "instrument": "off"}
     found = list(figures(tmp_path, read_jaw_truth(), options))
     assert len(found) == 1 + 3 * 14
-    # Limits are on what the fit adds to the photographs' own noise: three standard errors, beyond which one of 43 honest numbers on its limit falls in 17 runs.
+    # Limits are on what the fit adds to the photographs' own noise: three standard errors, beyond which one of 43
+    # honest numbers on its limit falls in 17 runs.
     missed = [
         f"{one.subject}, {one.figure}: {one.value:.3f} ± {one.resolution:.3f} > {one.must:g}"
         for one in found
         if one.is_beyond_noise
     ]
     assert not missed
-    # Noise excuses little where it can: of all images together, and of enamel's scattering. Dentin's absorption is known to 3 to 16 % from these photographs.
+    # Noise excuses little where it can: of all images together, and of enamel's scattering. Dentin's absorption is
+    # known to 3 to 16 % from these photographs.
     assert found[0].resolution < IMAGE_MUST
     assert median(one.resolution for one in found if one.figure.startswith("enamel")) < ENAMEL_MUST

@@ -1,4 +1,6 @@
-"""What a fit must reach on single teeth that stock Mitsuba rendered: the limits are those of ``tests/benchmarks/fit_table.py``, which prints the figures."""
+"""What a fit must reach on single teeth that stock Mitsuba rendered: the limits are those of
+``tests/benchmarks/fit_table.py``, which prints the figures.
+"""
 
 from __future__ import annotations
 

@@ -23,8 +23,10 @@ from tests.support.prepared import FAKE, TRUTH, write_prepared
 
 def spec_for(root: Path, **options: Any) -> JobSpec:
     defaults: dict[str, Any] = {
-        "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 1024, "max_steps": 15, "search_candidates": 2000,
-        # This engine's renders are so noisy that they drown what the instrument's errors leave to tell; test_fit_instrument.py fits those.
+        "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 1024,
+        "max_steps": 15, "search_candidates": 2000,
+        # This engine's renders are so noisy that they drown what the instrument's errors leave to tell;
+        # test_fit_instrument.py fits those.
         "instrument": "off",
     }  # fmt: skip
     return JobSpec(capture=root, **(defaults | options))
@@ -55,7 +57,8 @@ def test_finds_the_reduced_quantities_within_their_errors(finished: tuple[Path, 
             estimate = table[f"{part}.{leaf}"]
             assert estimate.determined
             assert estimate.se is not None
-            # One fit at one seed: 4.5 of its own standard errors, and the errors themselves are small enough to mean something.
+            # One fit at one seed: 4.5 of its own standard errors, and the errors themselves are small enough to mean
+            # something.
             assert abs(estimate.value - getattr(medium, leaf)) < 4.5 * estimate.se, (part, leaf, estimate)
             assert estimate.se < 0.1 * estimate.value
     assert report.held_out_error["green"] < 0.02
@@ -77,7 +80,8 @@ def test_says_what_is_known_what_goes_together_and_what_would_help(
 
 @pytest.mark.slow
 def test_standard_errors_are_those_seen_over_noise(tmp_path: Path) -> None:
-    # z of 4 quantities over 6 captures and seeds: the mean square of 24 values lies in 0.2 to 2.6 for all but 1e-3 of cases even if the 4 move together.
+    # z of 4 quantities over 6 captures and seeds: the mean square of 24 values lies in 0.2 to 2.6 for all but 1e-3 of
+    # cases even if the 4 move together.
     z = []
     for seed in range(6):
         root = tmp_path / str(seed)
@@ -106,7 +110,8 @@ def test_events_show_a_falling_loss_and_previews(finished: tuple[Path, FitReport
 
 
 def test_photographs_that_no_medium_explains_do_not_count_as_converged(tmp_path: Path) -> None:
-    # Alternate photographs differ by a factor 1.5: the best common scale leaves 0.2 of the images, above the 0.15 that still counts as explained.
+    # Alternate photographs differ by a factor 1.5: the best common scale leaves 0.2 of the images, above the 0.15 that
+    # still counts as explained.
     write_prepared(tmp_path, uneven=0.5)
     report = fit(tmp_path)
     assert max(report.fit_error["green"], report.held_out_error["green"]) > 0.15

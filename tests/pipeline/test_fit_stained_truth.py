@@ -1,4 +1,6 @@
-"""A stained incisor by stock Mitsuba, fitted end to end: every stage of teeth 2018 Fig. 9 lowers the loss, and the texture holds on lights it never saw."""
+"""A stained incisor by stock Mitsuba, fitted end to end: every stage of teeth 2018 Fig. 9 lowers the loss, and the
+texture holds on lights it never saw.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +31,11 @@ PIXEL_MM, SEED = 0.8, 4
 MIN_GAIN = 0.2
 """Of the loss, by each stage."""
 JUDGE_SAMPLES = 2048
-"""Held-out errors of 13 and 6 % come with 0.4 and 0.9 of Monte Carlo error; those of the fit's own steps, of at most 512 paths, with 3 to 9."""
+"""Held-out errors of 13 and 6 % come with 0.4 and 0.9 of Monte Carlo error; those of the fit's own steps, of at most
+512 paths, with 3 to 9."""
 CERTAINTY = 3.0
-"""Standard errors by which the texture must help on held-out images: a false alarm in 700, had it no effect beyond the least that is asked."""
+"""Standard errors by which the texture must help on held-out images: a false alarm in 700, had it no effect beyond the
+least that is asked."""
 
 
 @pytest.mark.slow

@@ -44,7 +44,8 @@ def spec_for(root: Path, **options: Any) -> JobSpec:
     values: dict[str, Any] = {
         "capture": root, "boundary": "matched", "dentin": "known", "stains": True,
         "samples_per_pixel": 64, "max_samples_per_pixel": 256, "max_steps": 6, "search_candidates": 500,
-        # A gain of the instrument is much like a stain that is the same everywhere; what media cannot explain is to be the stains' here.
+        # A gain of the instrument is much like a stain that is the same everywhere; what media cannot explain is to be
+        # the stains' here.
         "instrument": "off",
     }  # fmt: skip
     return JobSpec(**(values | options))
@@ -68,7 +69,8 @@ def test_the_texture_explains_what_media_cannot(stained: tuple[Path, FitReport, 
     # The fake engine's noise at 256 paths, 6 % of a pixel, leaves the texture about 2 %.
     assert report.held_out_error["green"] < 0.03
 
-    # What pixels see of the texture, up to the common factor that the media may carry: half the surface is clean, so correlation needs both kinds right.
+    # What pixels see of the texture, up to the common factor that the media may carry: half the surface is clean, so
+    # correlation needs both kinds right.
     found = kept_stains(root / "fit")
     truth, layout = stained_truth(root)
     assert found is not None

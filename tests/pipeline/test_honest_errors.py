@@ -1,4 +1,6 @@
-"""The ± of whole fits is true: 95 % intervals hold the truth, from sensor noise to a mean cosine that was held at another value."""
+"""The ± of whole fits is true: 95 % intervals hold the truth, from sensor noise to a mean cosine that was held at
+another value.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A jaw's fit by a formula of photographs that are all brighter: one gain for all its teeth, and what each ± is made of."""
+"""A jaw's fit by a formula of photographs that are all brighter: one gain for all its teeth, and what each ± is made
+of.
+"""
 
 from __future__ import annotations
 

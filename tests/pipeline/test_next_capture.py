@@ -16,7 +16,8 @@ from services.fit.execution.engine_host import InProcessHost
 from services.fit.execution.executors import LocalExecutor
 from services.fit.execution.passes import Passes, StackProblem
 from services.fit.execution.seeds import Seeds
-from services.fit.solve.covariance import Uncertainty, estimates, uncertainty
+from services.fit.solve.covariance import Uncertainty, uncertainty
+from services.fit.solve.estimates import estimates
 from services.fit.solve.information import Addition, covariance_with
 from services.fit.tooth.schedule import media_domain
 from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
@@ -54,7 +55,8 @@ def problem_of(folder: Path, recipe: SceneRecipe) -> StackProblem:
 
 
 def known_of(problem: StackProblem) -> Uncertainty:
-    # At the truth, where nothing is left of the step to the minimum but what noise makes of it; that is no part of a prediction.
+    # At the truth, where nothing is left of the step to the minimum but what noise makes of it; that is no part of a
+    # prediction.
     x = DOMAIN.x_of(TRUTH)
     known = uncertainty(DOMAIN, x, problem.linearise(x, samples=SAMPLES, step=0))
     assert known.sandwich is not None
@@ -123,7 +125,8 @@ def test_new_images_have_the_errors_that_are_known_and_one_of_their_own(tmp_path
     blocks = (write_block(tmp_path, replace(block, instrument=known)),)
     problem = replace(problem, passes=replace(problem.passes, blocks=blocks))
     lights, *views = probes_of(problem, tmp_path)[1]
-    # A new light under the fit's camera has that camera's flare, and a gain of its own; a new camera the old lights' gains, and a flare.
+    # A new light under the fit's camera has that camera's flare, and a gain of its own; a new camera the old lights'
+    # gains, and a flare.
     acting = read_block(lights.block).instrument
     assert acting is not None
     assert (acting.flare, acting.lights[:2], lights.own_error) == (known.flare, ("light_gain.a", ""), "light_gain")

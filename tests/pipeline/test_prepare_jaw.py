@@ -1,4 +1,6 @@
-"""A virtual jaw from the command that writes it to the prepared store: every pixel's surface and mask is what a ray tracer sees."""
+"""A virtual jaw from the command that writes it to the prepared store: every pixel's surface and mask is what a ray
+tracer sees.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,8 @@ def test_everything_but_the_background_is_valid_for_a_jaw(capture: Path, scene: 
         outside = valid & MaskBit.OUTSIDE > 0
         assert all(np.count_nonzero(one != ~np.all(met, axis=0)) <= 2 for one in outside)
         assert (arrays["surface"][k, height:] == -1).all()
-        # Of what is left only pixels without light, whose variance is 0, are not used: a matched surface reflects nothing.
+        # Of what is left only pixels without light, whose variance is 0, are not used: a matched surface reflects
+        # nothing.
         assert set(np.unique(valid[~outside]).tolist()) <= {0, int(MaskBit.NOT_FINITE)}
         dark = arrays["variance"][k, :, :height, :width, 0] == 0
         assert np.array_equal(valid & MaskBit.NOT_FINITE > 0, dark)

@@ -1,4 +1,6 @@
-"""Preparation of a captured rig whose motion and highlights are known: frames of a moving, glossy tooth by stock Mitsuba."""
+"""Preparation of a captured rig whose motion and highlights are known: frames of a moving, glossy tooth by stock
+Mitsuba.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +88,9 @@ def moved(
 def test_residual_motion(
     moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]
 ) -> None:
-    """At most 0.2 px in the median after stabilisation (acceptance), of a motion of several pixels that includes a nod and a turn."""
+    """At most 0.2 px in the median after stabilisation (acceptance), of a motion of several pixels that includes a nod
+    and a turn.
+    """
     root, rendered, manifest, _ = moved
     folder, _ = open_stage(root, "prepared", PreparedManifest)
     motion = zarr.open_array(folder / "prepared.zarr" / "motion", mode="r")
@@ -108,7 +112,9 @@ def test_residual_motion(
 def test_highlight_energy(
     moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]
 ) -> None:
-    """At least 90 % of the reflected light masked (acceptance; the goal is 95 %), and at most 3 % of the pixels that reflect less than the noise of 1 %."""
+    """At least 90 % of the reflected light masked (acceptance; the goal is 95 %), and at most 3 % of the pixels that
+    reflect less than the noise of 1 %.
+    """
     root, rendered, _, _ = moved
     folder, _ = open_stage(root, "prepared", PreparedManifest)
     valid = zarr.open_array(folder / "prepared.zarr" / "valid", mode="r")
@@ -133,8 +139,9 @@ def test_highlight_energy(
 def test_still_capture_keeps_radiance_and_variance(renders: Mapping[str, Any], tmp_path: Path) -> None:
     """Without motion a pixel is the rendered radiance plus the sensor's noise and nothing else.
 
-    About 300,000 z-scores against the true variance: mean and mean square within 5 standard errors (1e-6 false alarms each), clipping and
-    rounding included in the variance; black frames are shared within a camera, which correlates the images of one pixel and triples the error.
+    About 300,000 z-scores against the true variance: mean and mean square within 5 standard errors (1e-6 false alarms
+    each), clipping and rounding included in the variance; black frames are shared within a camera, which correlates the
+    images of one pixel and triples the error.
     """
     frozen = {**renders, "total": renders["total"].copy()}
     first = {light: number for number, (light, _) in enumerate(FRAMES) if light >= 0}
@@ -184,7 +191,8 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
         (root / "prepared" / "quality" / f"{image.camera}_{image.light}.png").stat().st_size > 1000
         for image in report.images
     )
-    # Flow knows nothing of the scan: it sees the motion, and little but its own errors of some 0.2 px once it is taken out
+    # Flow knows nothing of the scan: it sees the motion, and little but its own errors of some 0.2 px once it is taken
+    # out
     assert [flow.camera for flow in report.flows] == [camera.name for camera in rendered.cameras]
     for flow in report.flows:
         assert flow.before_px[0] > 2

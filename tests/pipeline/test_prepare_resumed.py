@@ -1,4 +1,6 @@
-"""A preparation that is cut off anywhere and gone on with leaves the very store that an undisturbed one leaves, here and on workers."""
+"""A preparation that is cut off anywhere and gone on with leaves the very store that an undisturbed one leaves, here
+and on workers.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +89,9 @@ def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
 def test_killed_at_any_write(
     undisturbed: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Killed after a few writes, and the next attempt likewise, until one ends; finding one camera's view takes seven of them."""
+    """Killed after a few writes, and the next attempt likewise, until one ends; finding one camera's view takes seven
+    of them.
+    """
     capture, expected = undisturbed
     attempts = 0
     for attempt in range(1, 20):

@@ -39,8 +39,9 @@ def twist_to_truth(record: Registration, mouth: RawMouth) -> np.ndarray:
 
 
 def require_near(record: Registration, mouth: RawMouth) -> None:
-    # Six front teeth beside others that the scan does not have: the design's target of 0.05 mm. Few teeth leave the tilt open by more
-    # than its 0.1 degrees, which the record has to say: all six parts within 22.5, what one draw in a thousand exceeds (chi squared).
+    # Six front teeth beside others that the scan does not have: the design's target of 0.05 mm. Few teeth leave the
+    # tilt open by more than its 0.1 degrees, which the record has to say: all six parts within 22.5, what one draw in a
+    # thousand exceeds (chi squared).
     twist = twist_to_truth(record, mouth)
     assert np.linalg.norm(twist[3:]) < 0.05
     assert twist @ np.linalg.solve(record.uncertainty.matrix, twist) < 22.5

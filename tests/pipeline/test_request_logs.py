@@ -1,4 +1,6 @@
-"""One id from an HTTP answer to the worker that runs the job, in lines that a program can read and that hold no secret."""
+"""One id from an HTTP answer to the worker that runs the job, in lines that a program can read and that hold no
+secret.
+"""
 
 from __future__ import annotations
 

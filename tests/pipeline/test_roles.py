@@ -1,6 +1,8 @@
-"""Every part of the service, each in a virtual environment with its own extras alone, and a small job through all of them: ``make roles``.
+"""Every part of the service, each in a virtual environment with its own extras alone, and a small job through all of
+them: ``make roles``.
 
-The job lights the simulated dome from the rig's worker, uploads from a client without the server's packages, and fits on a worker without them.
+The job lights the simulated dome from the rig's worker, uploads from a client without the server's packages, and fits
+on a worker without them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Known secrets are driven through success and failure; afterwards they are nowhere in what the server wrote or said."""
+"""Known secrets are driven through success and failure; afterwards they are nowhere in what the server wrote or
+said.
+"""
 
 from __future__ import annotations
 

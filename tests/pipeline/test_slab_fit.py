@@ -24,7 +24,9 @@ NOISE = 0.01
 
 @pytest.fixture(scope="module")
 def small_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cell of sigma_s 1.2, g 0.6, sigma_a 0.05 per mm seen by two lights and two cameras, one image held out, 1 % noise."""
+    """A cell of sigma_s 1.2, g 0.6, sigma_a 0.05 per mm seen by two lights and two cameras, one image held out, 1 %
+    noise.
+    """
     root = tmp_path_factory.mktemp("slab")
     told = description()
     told["images"][0]["held_out"] = True
@@ -145,8 +147,8 @@ def test_angles_that_no_camera_sees_are_flagged(tmp_path: Path) -> None:
         truth = noisy_truth("hg-paper-angles", tmp_path, seed)
         (fit,) = fit_slab(tmp_path, SlabOptions(seed=seed))
         errors.append(errors_of(fit, truth)["sigma_s"])
-        # Cameras and beams differ by 7.5 degrees in the medium at least; beyond 20 degrees all is seen. The seventh and eighth
-        # knot are next to that and may be determined by it.
+        # Cameras and beams differ by 7.5 degrees in the medium at least; beyond 20 degrees all is seen. The seventh and
+        # eighth knot are next to that and may be determined by it.
         flagged = np.array(fit.phase.theta_deg)[~np.array(fit.phase.determined)]
         assert (flagged < 6).sum() >= 6
         assert not ((flagged > 20) & (flagged < 90)).any()

@@ -69,7 +69,9 @@ def write_cell(root: Path, *wavelengths_nm: float) -> Path:
 
 
 def require_truths(root: Path, *wavelengths_nm: float) -> None:
-    """Coefficients within 4.5 of their standard errors: 1 value in 100,000 is not, and errors are themselves known to some per cent."""
+    """Coefficients within 4.5 of their standard errors: 1 value in 100,000 is not, and errors are themselves known to
+    some per cent.
+    """
     told = json.loads((root / "parameters.json").read_text())
     assert set(told) == {f"{nm:g}" for nm in wavelengths_nm}
     for nm in wavelengths_nm:

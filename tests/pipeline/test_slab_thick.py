@@ -18,7 +18,8 @@ from services.fit.slab.solve.uncertainty import slopes, uncertainty_of
 THICKNESS = 6.0
 """sigma_t w, at a width of 1 mm."""
 NOISE = 0.03
-"""Three times a measurement's, so that 1.6 million paths a light are as good as exact: their variance is a tenth of it."""
+"""Three times a measurement's, so that 1.6 million paths a light are as good as exact: their variance is a tenth of
+it."""
 
 
 def small_spheres() -> Material:

@@ -1,4 +1,6 @@
-"""The client and the command line upload a folder, whatever happens to the connection, and send nothing that the server has."""
+"""The client and the command line upload a folder, whatever happens to the connection, and send nothing that the server
+has.
+"""
 
 from __future__ import annotations
 

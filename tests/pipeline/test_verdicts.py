@@ -1,4 +1,6 @@
-"""A job whose fit did not converge succeeded and is told as what it is: by the API, in lists, and by the exit status of every command that awaits one."""
+"""A job whose fit did not converge succeeded and is told as what it is: by the API, in lists, and by the exit status of
+every command that awaits one.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,8 @@ from tests.support.live_server import serving
 def verdict(*, converged: bool) -> Verdict:
     errors = {"green": 0.04 if converged else 0.336}
     report = FitReport(
-        converged=converged, advice="" if converged else "Check the mesh.", parameters={}, fit_error=errors, held_out_error=errors,
-        held_out_error_se={"green": 0.012}, steps=9, seconds=1.0,
+        converged=converged, advice="" if converged else "Check the mesh.", parameters={}, fit_error=errors,
+        held_out_error=errors, held_out_error_se={"green": 0.012}, steps=9, seconds=1.0,
     )  # fmt: skip
     return verdict_of(report)
 
@@ -36,7 +38,9 @@ GOOD, BAD = verdict(converged=True), verdict(converged=False)
 
 
 def run(spec: JobSpec, _folder: Path, events: EventAddress) -> None:
-    """In place of stages: seed 1 converges, 2 does not, 3 is of a version that did not judge, 4 of one that judged otherwise."""
+    """In place of stages: seed 1 converges, 2 does not, 3 is of a version that did not judge, 4 of one that judged
+    otherwise.
+    """
     good, bad = ({VERDICT: one.model_dump(mode="json")} for one in (GOOD, BAD))
     data: dict[str, Any] = {1: good, 2: bad, 3: {}, 4: {VERDICT: {"is_good": True}}}[spec.seed]
     with events.open() as log:

@@ -25,7 +25,8 @@ from tests.support.uploading import write_capture
 
 @pytest.fixture
 def cluster() -> Iterator[LocalCluster]:
-    # The worker lives in the tests' own process, which may hold more than the limit that is told: so it is not acted upon.
+    # The worker lives in the tests' own process, which may hold more than the limit that is told: so it is not acted
+    # upon.
     unlimited = dict.fromkeys(
         (f"distributed.worker.memory.{act}" for act in ("target", "spill", "pause", "terminate")), False
     )

@@ -101,7 +101,9 @@ def told_of(
 
 
 def array_session(seed: int) -> ArraySession:
-    """A good session: 3 cameras, 8 places of a board, 6 lights on a mirror sphere in 4 places, white spheres in 2, a chart."""
+    """A good session: 3 cameras, 8 places of a board, 6 lights on a mirror sphere in 4 places, white spheres in 2, a
+    chart.
+    """
     random = np.random.default_rng(seed)
     rig = true_rig(random, 8)
     eyes = tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))

@@ -1,4 +1,6 @@
-"""A fit of blocks that last as long as its source says, spread over the workers as a real one's, and told in a file; the other stages are toys."""
+"""A fit of blocks that last as long as its source says, spread over the workers as a real one's, and told in a file;
+the other stages are toys.
+"""
 
 from __future__ import annotations
 

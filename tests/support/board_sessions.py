@@ -40,7 +40,9 @@ def looking(position_mm: NDArray[np.float64], target_mm: NDArray[np.float64]) ->
 
 
 def true_rig(random: np.random.Generator, n_places: int = 12, size: tuple[int, int] = SIZE) -> Rig:
-    """Three cameras, 450 mm away from boards that lie tilted about the place of the teeth; all sizes of image show as much."""
+    """Three cameras, 450 mm away from boards that lie tilted about the place of the teeth; all sizes of image show as
+    much.
+    """
     scale = size[0] / SIZE[0]
     lenses, cameras = [], []
     for azimuth in np.deg2rad([-35.0, 0.0, 35.0]):
@@ -103,7 +105,9 @@ def photographed(rig: Rig, noise_px: float, random: np.random.Generator) -> list
 
 
 def table_views(path: Path) -> list[View]:
-    """Views of a table of ChArUco corners with metres and OpenCV's pixels; views of fewer than four corners are left out."""
+    """Views of a table of ChArUco corners with metres and OpenCV's pixels; views of fewer than four corners are left
+    out.
+    """
     rows = defaultdict(list)
     with path.open() as stream:
         for row in csv.DictReader(stream):

@@ -10,7 +10,9 @@ import pytest
 
 
 def certificates(folder: Path) -> Path:
-    """A folder with a new authority's ``ca.crt``, and ``tls.crt`` and ``tls.key`` that it signed; skips without openssl."""
+    """A folder with a new authority's ``ca.crt``, and ``tls.crt`` and ``tls.key`` that it signed; skips without
+    openssl.
+    """
     openssl = shutil.which("openssl")
     if openssl is None:
         pytest.skip("openssl is not installed")

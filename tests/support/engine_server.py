@@ -1,4 +1,6 @@
-"""``python -m tests.support.engine_server SETTINGS``: the real server with a fit that calls an engine, its worker's memory limited to a known figure."""
+"""``python -m tests.support.engine_server SETTINGS``: the real server with a fit that calls an engine, its worker's
+memory limited to a known figure.
+"""
 
 from __future__ import annotations
 

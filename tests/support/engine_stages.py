@@ -1,4 +1,6 @@
-"""A fit that makes one call to an engine on the worker's rendering process, or none, as a file in the capture says; it publishes what a toy fit does."""
+"""A fit that makes one call to an engine on the worker's rendering process, or none, as a file in the capture says; it
+publishes what a toy fit does.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
         "crash": ("die", int(signal.SIGSEGV)),
         "render": ("render", str(spec.capture / "started")),
     }.get(call, ("answer", 1))
-    prefix = f"{context.root.name}-{context.attempt}"  # as every fit has its own: Dask answers for a key that it still knows with the old result
+    prefix = (  # as every fit has its own: Dask answers for a key that it still knows with the old result
+        f"{context.root.name}-{context.attempt}"
+    )
     with executor(context.root / CANCEL_FLAG, REAL if call == "render" else BROKEN, prefix) as run_on:
         run_on.gather([run_on.submit(call, ask, write_recipe(context.root, recipe()), method, *arguments)])
     return toy_stages.fit(spec, context)

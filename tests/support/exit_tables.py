@@ -1,4 +1,6 @@
-"""The reference tables of light that leaves a slab by direction and place, and of the half space, as layers and values."""
+"""The reference tables of light that leaves a slab by direction and place, and of the half space, as layers and
+values.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ UNKNOWN = math.nan
 
 @dataclass(frozen=True)
 class ExitCase:
-    """One simulation's worth of reference. Rows are those of ``Sums``, columns R and T; NaN where a table has no value."""
+    """One simulation's worth of reference.
+
+    Rows are those of ``Sums``, columns R and T; NaN where a table has no value.
+    """
 
     name: str
     layer: Layer
@@ -67,7 +72,9 @@ def angular_cases(relative_tolerance: float) -> list[ExitCase]:
 
 
 def half_space_cases(tolerance: float, relative_tolerance: float, *albedos: str) -> list[ExitCase]:
-    """``hfunction.csv``: albedos of the isotropic half space, and H(1) by the radiance a H(1)^2 / (8 pi) straight back from normal incidence."""
+    """``hfunction.csv``: albedos of the isotropic half space, and H(1) by the radiance a H(1)^2 / (8 pi) straight back
+    from normal incidence.
+    """
     cases = []
     for row in rows_of("hfunction.csv"):
         if row["a"] not in albedos:
@@ -86,7 +93,9 @@ def half_space_cases(tolerance: float, relative_tolerance: float, *albedos: str)
 
 
 def ring_case(tolerance: float) -> ExitCase:
-    """``pencil_beam_rings.csv``: sigma 5, albedo 0.99, g 0.8, 1 mm between smooth faces of index 1.33; totals by adding-doubling beside it."""
+    """``pencil_beam_rings.csv``: sigma 5, albedo 0.99, g 0.8, 1 mm between smooth faces of index 1.33; totals by
+    adding-doubling beside it.
+    """
     rows = rows_of("pencil_beam_rings.csv")
     values = np.array([[0.300137, 0.554013], *([float(row["R_scattered"]), float(row["T_scattered"])] for row in rows)])
     errors = np.array([[0.0, 0.0], *([float(row["se_R"]), float(row["se_T"])] for row in rows)])

@@ -1,11 +1,14 @@
 """An engine without light transport: a smooth formula with seeded noise, for tests of everything around the engine.
 
-The image of a pixel with enamel of thickness d under a light at angle c has a near part from enamel and a deep part from dentin::
+The image of a pixel with enamel of thickness d under a light at angle c has a near part from enamel and a deep part
+from dentin::
 
-    I = c (1 - T) a_e^1.5 + T c^(1/2) a_d^1.5 (1 - exp(-s_d c^2)) + 0.05,   T = exp(-s_e d),   s = reduced scattering, a = reduced albedo
+    I = c (1 - T) a_e^1.5 + T c^(1/2) a_d^1.5 (1 - exp(-s_d c^2)) + 0.05,   T = exp(-s_e d),   s = reduced scattering, a
+    = reduced albedo
 
-so reduced quantities are fixed by the images and nothing else is. A stain multiplies by a_t at the texel a pixel looks at, and by its mean over all texels of
-the tooth, for the way in. Noise is Gaussian, relative, falls with the samples and depends on seed and pixel alone.
+so reduced quantities are fixed by the images and nothing else is. A stain multiplies by a_t at the texel a pixel looks
+at, and by its mean over all texels of the tooth, for the way in. Noise is Gaussian, relative, falls with the samples
+and depends on seed and pixel alone.
 """
 
 # ruff: noqa: ARG002 - signatures are those of what is replaced
@@ -34,7 +37,8 @@ class FakeEngine:
     """Same methods as the real engine."""
 
     directness = 0.0
-    """By how much the mean cosine adds to what enamel seems to scatter: media of equal reduced quantities then differ."""
+    """By how much the mean cosine adds to what enamel seems to scatter: media of equal reduced quantities then
+    differ."""
     path_noise = NOISE
     shared_noise = 0.0
     """Part of the noise's variance that all lights of a pixel share, as those of one walk do."""
@@ -80,7 +84,8 @@ class FakeEngine:
         return StainGradient((gradient,), (np.zeros_like(gradient),), samples)
 
     def _texels(self, view: View, stain: Stain) -> tuple[NDArray[np.int64], Array]:
-        # The middle of a face chosen by the pixel: neighbouring pixels look at faces far apart, which no smoothness explains away.
+        # The middle of a face chosen by the pixel: neighbouring pixels look at faces far apart, which no smoothness
+        # explains away.
         uv = self.recipe.teeth[0].stain_uv
         assert uv is not None
         x, y = view.pixels.T
@@ -165,13 +170,17 @@ class DirectFakeEngine(FakeEngine):
 
 
 class QuietFakeEngine(FakeEngine):
-    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that counts."""
+    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that
+    counts.
+    """
 
     path_noise = 0.1 * NOISE
 
 
 class Slowly(FakeEngine):
-    """Takes long enough per pass that two workers overlap and a kill lands in mid-fit; the numbers are those of the engine it is mixed with."""
+    """Takes long enough per pass that two workers overlap and a kill lands in mid-fit; the numbers are those of the
+    engine it is mixed with.
+    """
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
         time.sleep(0.01)

@@ -1,4 +1,6 @@
-"""The fake engine for a whole mouth: every pixel shows the tooth or the gums at its middle, and the wall brightens all of them."""
+"""The fake engine for a whole mouth: every pixel shows the tooth or the gums at its middle, and the wall brightens all
+of them.
+"""
 
 from __future__ import annotations
 
@@ -54,6 +56,8 @@ class SlowFakeMouthEngine(Slowly, FakeMouthEngine):
 
 
 class QuietFakeMouthEngine(FakeMouthEngine):
-    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that counts."""
+    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that
+    counts.
+    """
 
     path_noise = 0.1 * NOISE

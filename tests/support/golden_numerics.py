@@ -1,7 +1,8 @@
-"""The numbers that the fit's parts gave for fixed seeds when their numerics were last raised; ``python -m tests.support.golden_numerics`` stores them anew.
+"""The numbers that the fit's parts gave for fixed seeds when their numerics were last raised;
+``python -m tests.support.golden_numerics`` stores them anew.
 
-Images and derivatives of the real engine on a small tooth with stains, and every result that a short fit records on the fake engine, which
-shows solvers and schedules.
+Images and derivatives of the real engine on a small tooth with stains, and every result that a short fit records on the
+fake engine, which shows solvers and schedules.
 """
 
 from __future__ import annotations

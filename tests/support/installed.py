@@ -1,4 +1,6 @@
-"""This project as a user installs it: a wheel, and virtual environments that hold it with some extras and nothing else."""
+"""This project as a user installs it: a wheel, and virtual environments that hold it with some extras and nothing
+else.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ NOT_COPIED = shutil.ignore_patterns("__pycache__", "node_modules")
 
 
 def build_wheel(folder: Path, added: Mapping[str, str] = MappingProxyType({})) -> Path:
-    """Build the wheel from a copy of this tree, with the dashboard's bundle where it has been built; ``added`` gives the text of further files."""
+    """Build the wheel from a copy of this tree, with the dashboard's bundle where it has been built; ``added`` gives
+    the text of further files.
+    """
     tree = folder / "tree"
     tree.mkdir(parents=True)
     for name in TREE:

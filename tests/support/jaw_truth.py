@@ -1,7 +1,7 @@
 """A jaw with known optics as stock Mitsuba renders it; ``tests/benchmarks/render_jaw_truth.py`` made the images.
 
-Its surfaces are those of the phantom jaw of one subject, which are built again; numbers stored with the images tell whether they are still the same.
-Sensor noise is added when the capture is written.
+Its surfaces are those of the phantom jaw of one subject, which are built again; numbers stored with the images tell
+whether they are still the same. Sensor noise is added when the capture is written.
 """
 
 from __future__ import annotations
@@ -82,7 +82,9 @@ def read_jaw_truth(stored: Path = STORED) -> JawTruth:
 
 
 def by_engine(truth: JawTruth, samples: int) -> JawTruth:
-    """The same jaw as the project's own engine renders it, where the question is what a fit makes of photographs with less noise than stock Mitsuba affords."""
+    """The same jaw as the project's own engine renders it, where the question is what a fit makes of photographs with
+    less noise than stock Mitsuba affords.
+    """
     from services.fit.transport.engine import Engine
     from services.phantom.render import render_engine
 
@@ -95,8 +97,9 @@ def by_engine(truth: JawTruth, samples: int) -> JawTruth:
 def write_jaw_capture(folder: Path, truth: JawTruth, seed: int, *, dentin: bool = True) -> None:
     """Write the truth as a folder capture with sensor noise.
 
-    A pixel's variance file holds the sensor's variance and the renderer's, the latter as its neighbours have it: where few bright paths are missed,
-    value and spread both come out low, and weights by a pixel's own spread would pull a fit down.
+    A pixel's variance file holds the sensor's variance and the renderer's, the latter as its neighbours have it: where
+    few bright paths are missed, value and spread both come out low, and weights by a pixel's own spread would pull a
+    fit down.
 
     Args:
         dentin: give its surfaces.

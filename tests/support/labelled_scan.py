@@ -87,8 +87,10 @@ def write_vtp(
     offsets = array("offsets", "Int64", 3 * np.arange(1, len(mesh.faces) + 1, dtype=np.int64))
     compressor = ' compressor="vtkZLibDataCompressor"' if compressed else ""
     head = (
-        f'<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1" byte_order="{byte_order}" header_type="{header_type}"{compressor}><PolyData>'
-        f'<Piece NumberOfPoints="{len(mesh.vertices_mm)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="{len(mesh.faces)}">'
+        f'<?xml version="1.0"?>\n<VTKFile type="PolyData" version="0.1" byte_order="{byte_order}"'
+        f' header_type="{header_type}"{compressor}><PolyData>'
+        f'<Piece NumberOfPoints="{len(mesh.vertices_mm)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0"'
+        f' NumberOfPolys="{len(mesh.faces)}">'
         f"<CellData>{cells}</CellData><Points>{points}</Points><Polys>{connectivity}{offsets}</Polys></Piece></PolyData>"
     )
     appended = b""

@@ -49,7 +49,9 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
 def toy_server(
     data: Path, log: IO[str] | None = None, stages: str = "tests.support.toy_stages", **settings: Any
 ) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
-    """The server with a module's stages as a process of its own, ended by SIGTERM unless the block ended it; ``log`` takes its standard error."""
+    """The server with a module's stages as a process of its own, ended by SIGTERM unless the block ended it; ``log``
+    takes its standard error.
+    """
     chosen = json.dumps({"data": str(data), "port": 0} | settings)
     with running_server([sys.executable, "-m", "tests.support.toy_server", chosen, stages], log) as running:
         yield running

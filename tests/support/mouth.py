@@ -20,7 +20,9 @@ def write_mouth(
     sizes: tuple[tuple[int, int], ...] = ((24, 18), (20, 16)),
     channels: tuple[str, ...] = ("red", "green", "blue"),
 ) -> FolderCapture:
-    """Write ``capture.json``, smooth images of distinct brightness per light and channel, and one round tooth, FDI 11."""
+    """Write ``capture.json``, smooth images of distinct brightness per light and channel, and one round tooth, FDI
+    11.
+    """
     cameras = tuple(
         Camera(
             name=f"c{i}",

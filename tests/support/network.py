@@ -57,7 +57,9 @@ class Network:
         )  # not ip netns exec, which takes a view of the disks along
 
     def cut(self, one: str, other: str) -> None:
-        """Let nothing through between two hosts, without a word to either: what they send goes to a hardware address that nobody has."""
+        """Let nothing through between two hosts, without a word to either: what they send goes to a hardware address
+        that nobody has.
+        """
         self._misdirect(one, other)
         self._misdirect(other, one)
 

@@ -1,7 +1,8 @@
-"""Five photographs of one patient with reference meshes of the same teeth: what is read of them, and clicks made by hand.
+"""Five photographs of one patient with reference meshes of the same teeth: what is read of them, and clicks made by
+hand.
 
-Focal lengths and principal points are those that the data's authors fitted, for images 800 pixels wide. Clicks were made by
-looking at the photographs and at shaded meshes; labels of tooth edges and fitted poses were not used for them.
+Focal lengths and principal points are those that the data's authors fitted, for images 800 pixels wide. Clicks were
+made by looking at the photographs and at shaded meshes; labels of tooth edges and fitted poses were not used for them.
 """
 
 from __future__ import annotations

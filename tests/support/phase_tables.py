@@ -26,9 +26,11 @@ def over_equal_cosines(values: NDArray[np.float64]) -> PhaseTable:
 
 
 def henyey_greenstein(g: float, spacing: float) -> tuple[PhaseTable, float]:
-    """A lobe at nodes whose distances x = (1 - |g|)^2 / 2|g| + 1 - cos grow by ``spacing``, and how far its values may be off, relatively.
+    """A lobe at nodes whose distances x = (1 - |g|)^2 / 2|g| + 1 - cos grow by ``spacing``, and how far its values may
+    be off, relatively.
 
-    p ~ x^-1.5 is convex, so a chord lies above it, by at most p'' dx^2 / 8 = 15/32 (dx / x)^2 p; normalising takes at most as much away.
+    p ~ x^-1.5 is convex, so a chord lies above it, by at most p'' dx^2 / 8 = 15/32 (dx / x)^2 p; normalising takes at
+    most as much away.
     """
     a = abs(g)
     nearest = (1 - a) ** 2 / (2 * a)

@@ -1,7 +1,8 @@
-"""A phantom jaw in front of three cameras, drawn with plain shading, and clicks on its landmarks: what registration is given.
+"""A phantom jaw in front of three cameras, drawn with plain shading, and clicks on its landmarks: what registration is
+given.
 
-The drawing shares the z-buffer with the registration but neither its outlines nor its search. Teeth are off-white with a dark
-line where they meet, gums are red, lips of another red hide a part, and every pixel carries noise.
+The drawing shares the z-buffer with the registration but neither its outlines nor its search. Teeth are off-white with
+a dark line where they meet, gums are red, lips of another red hide a part, and every pixel carries noise.
 """
 
 from __future__ import annotations

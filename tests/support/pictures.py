@@ -1,8 +1,9 @@
 """Judging renders of one scene by two renderers, pixel by pixel.
 
-z-scores come from 16 batches a side, mapped through Student's t with Welch's degrees of freedom. The count beyond 3 stays
-below its 99.9 % binomial quantile, |mean z| below 4 standard errors, and the rms within 0.9 to 1.1 (of few pixels: within what
-chi-square leaves with probability 1e-3). The lights of a pixel share its walks, so what counts as independent is a pixel.
+z-scores come from 16 batches a side, mapped through Student's t with Welch's degrees of freedom. The count beyond 3
+stays below its 99.9 % binomial quantile, |mean z| below 4 standard errors, and the rms within 0.9 to 1.1 (of few
+pixels: within what chi-square leaves with probability 1e-3). The lights of a pixel share its walks, so what counts as
+independent is a pixel.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ BATCHES = 16
 def pixel_scores(
     means: list[NDArray[np.float64]], variances: list[NDArray[np.float64]], block: int = 1
 ) -> NDArray[np.float64]:
-    """z of two sides' images (lights, H, W), summed over blocks of pixels, NaN where unlit; variances are of means over BATCHES."""
+    """z of two sides' images (lights, H, W), summed over blocks of pixels, NaN where unlit; variances are of means over
+    BATCHES.
+    """
     means = [sum_blocks(mean, block) for mean in means]
     squares = [sum_blocks(variance**2, block) for variance in variances]
     total = sum_blocks(variances[0] + variances[1], block)

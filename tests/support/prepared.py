@@ -102,8 +102,8 @@ def write_prepared(
     for part, radius in (("outer", 4.0), ("dentin", 3.0)):
         write_mesh(writer.folder / "teeth" / "11" / f"{part}.ply", sphere(radius))
     manifest = PreparedManifest(
-        channels=channels, cameras=cameras, lights=all_lights, held_out=held_out, fdi=(11,), dentin_known=(11,), median_motion_px=None, notes=notes,
-        valid_fraction=0.9,
+        channels=channels, cameras=cameras, lights=all_lights, held_out=held_out, fdi=(11,), dentin_known=(11,),
+        median_motion_px=None, notes=notes, valid_fraction=0.9,
     )  # fmt: skip
     writer.publish(manifest)
     return manifest

@@ -20,7 +20,9 @@ def counts(seed: int, channels: int = 3) -> NDArray[np.uint16]:
 
 
 def write_raw_folder(root: Path) -> Tree:
-    """Two cameras, two lights, a black frame and a lit one of each camera and light, a board, spheres, a chart and a scan."""
+    """Two cameras, two lights, a black frame and a lit one of each camera and light, a board, spheres, a chart and a
+    scan.
+    """
     cameras = [{"name": name, "size": list(SIZE), "bits": BITS} for name in ("left", "right")]
     lights = [
         {"name": name, "address": k, "position_mm": [500.0 * k, 0.0, -300.0]} for k, name in enumerate(("L1", "L2"))

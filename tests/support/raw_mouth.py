@@ -1,4 +1,6 @@
-"""A raw folder as a laboratory has it: tracking frames of a phantom mouth, a scan in a frame of its own, clicked landmarks."""
+"""A raw folder as a laboratory has it: tracking frames of a phantom mouth, a scan in a frame of its own, clicked
+landmarks.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ def write_raw_mouth(
 ) -> RawMouth:
     """Three cameras; the scan is of the teeth up to a place from the midline.
 
-    Without labels it is an STL file, and each tooth that is not clicked in photographs has a landmark in the scan alone.
+    Without labels it is an STL file, and each tooth that is not clicked in photographs has a landmark in the scan
+    alone.
     """
     jaw = build_jaw(subject)
     mouth = photographed_mouth(subject, seed, 0.2, jaw)

@@ -1,4 +1,6 @@
-"""A camera that turns known radiance into counts: shot noise, read noise, black, rounding, mosaic, vignetting, a bent response."""
+"""A camera that turns known radiance into counts: shot noise, read noise, black, rounding, mosaic, vignetting, a bent
+response.
+"""
 
 from __future__ import annotations
 

@@ -13,7 +13,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 @dataclass
 class Receiver:
-    """What was received, and what to answer: ``answers`` one after the other, then 204; 0 hangs until ``let_go`` is set."""
+    """What was received, and what to answer: ``answers`` one after the other, then 204; 0 hangs until ``let_go`` is
+    set.
+    """
 
     url: str = ""
     answers: list[int] = field(default_factory=list)

@@ -1,4 +1,6 @@
-"""A small tooth as a prepared stage: rendered once with many paths, then photographed as often as asked, each time with fresh sensor noise."""
+"""A small tooth as a prepared stage: rendered once with many paths, then photographed as often as asked, each time with
+fresh sensor noise.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A published capture made from rendered frames, without the capture service: counts, noise and frame table as the records specify."""
+"""A published capture made from rendered frames, without the capture service: counts, noise and frame table as the
+records specify.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ LEVEL, EXPOSURE_S = 0.5, 0.05
 
 @dataclass(frozen=True)
 class Rendered:
-    """Frames of a moving tooth: ``frames`` is (light index or -1 for all on, time); radiance (camera, frame, y, x, channel)."""
+    """Frames of a moving tooth: ``frames`` is (light index or -1 for all on, time); radiance (camera, frame, y, x,
+    channel).
+    """
 
     frames: tuple[tuple[int, float], ...]
     radiance: NDArray[np.float32]
@@ -39,7 +43,9 @@ def write_capture(
     floor: float = 0.002,
     peak: float | None = None,
 ) -> CaptureManifest:
-    """Publish ``root/capture``; radiance ``peak`` (default: the brightest under one light) sits at 0.7 of the range above black."""
+    """Publish ``root/capture``; radiance ``peak`` (default: the brightest under one light) sits at 0.7 of the range
+    above black.
+    """
     rng = np.random.default_rng(seed)
     full_scale, count_of = 2**bits - 1, len(rendered.lights)
     brightest = max(float(rendered.radiance[:, k].max()) for k, (light, _) in enumerate(rendered.frames) if light >= 0)

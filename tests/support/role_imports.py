@@ -20,7 +20,8 @@ from types import ModuleType
 from tests.support.roles import ROLES, distributions, normal
 
 REGISTRY = "services.cli.app:build_app"
-"""Names every command, and calls none: what it imports is executed, but what those modules import when they are called is not theirs."""
+"""Names every command, and calls none: what it imports is executed, but what those modules import when they are called
+is not theirs."""
 
 
 class Refusal(importlib.abc.MetaPathFinder):

@@ -63,7 +63,9 @@ ROLES: Mapping[str, Role] = {
 
 
 def distributions(extras: Iterable[str]) -> set[str]:
-    """Normal names of all that ``pip install dentine[extras]`` brings: this tree's own requirements, and theirs as they are installed here."""
+    """Normal names of all that ``pip install dentine[extras]`` brings: this tree's own requirements, and theirs as they
+    are installed here.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     optional: dict[str, list[str]] = project["optional-dependencies"]
     found: set[tuple[str, str]] = set()

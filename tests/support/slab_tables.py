@@ -16,7 +16,8 @@ SOURCES = ("normal", "diffuse")
 BOUNDARIES = {"none": "matched", "thin": "thin", "smooth": "smooth"}
 """The tables' names, and the project's."""
 COSTLY_DEPTH = 50
-"""Finite white slabs beyond this depth scatter hundreds of times per path: up to a minute each, and at the wider tolerance only."""
+"""Finite white slabs beyond this depth scatter hundreds of times per path: up to a minute each, and at the wider
+tolerance only."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,12 @@ def simulate(case: SlabCase, shortfall: Callable[[Sums], float], seed: int, *, b
     """Trace until ``shortfall`` is at most 1; with derivatives where the case has any.
 
     Args:
-        border_terms_only: take the derivative to the border's depth from the two border terms, as a tooth does, not from
-            the extinction scores to which it is equal in a slab.
+        border_terms_only: take the derivative to the border's depth from the two border terms, as a tooth does, not
+            from the extinction scores to which it is equal in a slab.
     """
     names, sums = accumulate(
-        case.layers, shortfall, ior=case.ior, boundary=case.boundary, source=case.source, gradient=bool(case.names), seed=seed,
-        border_terms_only=border_terms_only,
+        case.layers, shortfall, ior=case.ior, boundary=case.boundary, source=case.source, gradient=bool(case.names),
+        seed=seed, border_terms_only=border_terms_only,
     )  # fmt: skip
     assert names[-len(case.names) :] == case.names
     return sums
@@ -106,7 +107,9 @@ def derivative_cases() -> list[SlabCase]:
 
 
 def zero_cases() -> list[SlabCase]:
-    """``boundary_zero_test.csv``, lit uniformly, with the border at the table's middle depth; dR/dc, the last value, is exactly zero."""
+    """``boundary_zero_test.csv``, lit uniformly, with the border at the table's middle depth; dR/dc, the last value, is
+    exactly zero.
+    """
     cases = []
     for row in rows_of("boundary_zero_test.csv"):
         border, depth = float(row["c2_mm"]), float(row["depth_mm_T_below_1e-6"])

@@ -1,4 +1,6 @@
-"""A small jaw as a prepared stage: round teeth in a row whose roots sit in gums, and a wall behind; photographs by the engine or by a formula."""
+"""A small jaw as a prepared stage: round teeth in a row whose roots sit in gums, and a wall behind; photographs by the
+engine or by a formula.
+"""
 
 from __future__ import annotations
 
@@ -140,8 +142,9 @@ def write_prepared_jaw(
         write_mesh(writer.folder / f"{part}.ply", mesh)
     lights = tuple(Light(name=f"l{k}", position_mm=place, intensity=(1e6,)) for k, place in enumerate(LIGHTS_MM))
     manifest = PreparedManifest(
-        channels=("green",), cameras=cameras(), lights=lights, held_out=tuple((f"c{c}", f"l{HELD_OUT_LIGHT}") for c in range(2)), fdi=fdi,
-        dentin_known=fdi if dentin else (), median_motion_px=None, valid_fraction=0.9,
+        channels=("green",), cameras=cameras(), lights=lights,
+        held_out=tuple((f"c{c}", f"l{HELD_OUT_LIGHT}") for c in range(2)), fdi=fdi, dentin_known=fdi if dentin else (),
+        median_motion_px=None, valid_fraction=0.9,
     )  # fmt: skip
     writer.publish(manifest)
 
@@ -149,7 +152,7 @@ def write_prepared_jaw(
 def jaw_spec(root: Path, **options: Any) -> JobSpec:
     """A short fit of it."""
     defaults: dict[str, Any] = {
-        "kind": "jaw", "boundary": "matched", "dentin": "known", "samples_per_pixel": 32, "max_samples_per_pixel": 256, "max_steps": 8,
-        "search_candidates": 2000,
+        "kind": "jaw", "boundary": "matched", "dentin": "known", "samples_per_pixel": 32, "max_samples_per_pixel": 256,
+        "max_steps": 8, "search_candidates": 2000,
     }  # fmt: skip
     return JobSpec(capture=root, **(defaults | options))

@@ -1,7 +1,9 @@
-"""A small mouth: a tooth with dentin whose root sits in gums, a tooth without that hangs free beside it, and a wall behind both.
+"""A small mouth: a tooth with dentin whose root sits in gums, a tooth without that hangs free beside it, and a wall
+behind both.
 
-The first tooth is a solid of revolution with a ring of vertices in the plane where the gums' flat top cuts it. So the same media can be bounded by surfaces
-that do not overlap, which is what stock Mitsuba needs: the parts of the tooth above and below that plane, and a top with a hole.
+The first tooth is a solid of revolution with a ring of vertices in the plane where the gums' flat top cuts it. So the
+same media can be bounded by surfaces that do not overlap, which is what stock Mitsuba needs: the parts of the tooth
+above and below that plane, and a top with a hole.
 """
 
 from __future__ import annotations
@@ -69,7 +71,9 @@ FREE = revolved((1.6, 2.2), FREE_MM)
 
 
 def gums(hole_radius_mm: float = 0.0) -> Mesh:
-    """A cylinder with its top in the plane z = 0; with a hole, only its surface outside the tooth, which then is open."""
+    """A cylinder with its top in the plane z = 0; with a hole, only its surface outside the tooth, which then is
+    open.
+    """
     turn = 2 * np.pi * np.arange(AROUND) / AROUND
     ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
     top, low = GUMS_RADIUS_MM * ring, GUMS_RADIUS_MM * ring - [0, 0, GUMS_DEPTH_MM + 1.0]

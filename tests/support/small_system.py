@@ -1,6 +1,7 @@
 """Database, scheduler, workers and API as processes of their own, each of which a test can kill and start again.
 
-As the superuser each may be a host of its own on a network that can be cut, and the store a disk of its own that can be full.
+As the superuser each may be a host of its own on a network that can be cut, and the store a disk of its own that can be
+full.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""A small tooth that renders in milliseconds: an ellipsoid of enamel around dentin with two shape modes, five lights, one camera."""
+"""A small tooth that renders in milliseconds: an ellipsoid of enamel around dentin with two shape modes, five lights,
+one camera.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``python -m tests.support.stepped_clock FILE MODULE ARGUMENTS``: a program whose clock goes ahead by as many seconds as a file says, or behind."""
+"""``python -m tests.support.stepped_clock FILE MODULE ARGUMENTS``: a program whose clock goes ahead by as many seconds
+as a file says, or behind.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Images of an index-matched cell by stock Mitsuba: truths for the slab's fit that share no code with its kernel.
 
-Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black plate
-whose opacity is one minus the beam's profile is one: ``volpath`` multiplies what a plate lets through into every connection.
+Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black
+plate whose opacity is one minus the beam's profile is one: ``volpath`` multiplies what a plate lets through into every
+connection.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ RENDERS = 8
 
 
 def matched_folder() -> SlabFolder:
-    """The benchmarks' cell with a matched boundary, under a beam of 1 mm: as broad as stock Mitsuba can light well, as a connection
-    from outside of it brings nothing.
+    """The benchmarks' cell with a matched boundary, under a beam of 1 mm: as broad as stock Mitsuba can light well, as
+    a connection from outside of it brings nothing.
     """
     return near_beam_folder(
         cell={"width_mm": 1.0, "index": None, "boundary": "matched"},

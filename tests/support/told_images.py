@@ -11,7 +11,10 @@ import pytest
 
 Image = pytest.importorskip("PIL.Image", reason="Pillow comes with the extra fit")
 PngInfo = pytest.importorskip("PIL.PngImagePlugin").PngInfo
-XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description exif:GPSLatitude="52,31.2N" aux:SerialNumber="0123456"/></x:xmpmeta>'
+XMP = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description exif:GPSLatitude="52,31.2N"'
+    ' aux:SerialNumber="0123456"/></x:xmpmeta>'
+)
 CAMERA, GPS, BODY_SERIAL, MAKE = 0x8769, 0x8825, 0xA431, 0x010F
 
 

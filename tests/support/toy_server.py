@@ -1,4 +1,5 @@
-"""``python -m tests.support.toy_server SETTINGS [MODULE]``: the real server with toy stages, or those of another module, so that a test can kill it.
+"""``python -m tests.support.toy_server SETTINGS [MODULE]``: the real server with toy stages, or those of another
+module, so that a test can kill it.
 
 Leases are short, as tests wait for them.
 """

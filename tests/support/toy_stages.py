@@ -1,7 +1,8 @@
 """Stages that publish tiny results, for tests of what surrounds stages.
 
-What they do is steered by files in the job's folder, or in ``steering`` below the folder that the job names, where there is one: it is there before the job
-and may be written whatever happens to the store. What they did is told in the same place.
+What they do is steered by files in the job's folder, or in ``steering`` below the folder that the job names, where
+there is one: it is there before the job and may be written whatever happens to the store. What they did is told in the
+same place.
 """
 
 from __future__ import annotations
@@ -82,7 +83,9 @@ def prepare(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 
 def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Checks the preparation, reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill`` each; ``deaf-fit`` ignores a cancel."""
+    """Checks the preparation, reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill``
+    each; ``deaf-fit`` ignores a cancel.
+    """
     _reach(spec, context, "fit", "start")
     require_intact(context.root, "prepared")
     for step in range(10):

@@ -1,6 +1,8 @@
-"""Captures of single teeth with known optics, rendered by stock Mitsuba; ``tests/benchmarks/render_truths.py`` made them.
+"""Captures of single teeth with known optics, rendered by stock Mitsuba; ``tests/benchmarks/render_truths.py`` made
+them.
 
-A file holds one tooth: meshes, rig, optics, and per camera the images (L, H, W) with the standard error of each pixel. Sensor noise is added when read.
+A file holds one tooth: meshes, rig, optics, and per camera the images (L, H, W) with the standard error of each pixel.
+Sensor noise is added when read.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from services.core.geometry import Mesh, teeth_folder
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "truths"
 SIDE_LIGHTS = ("l2", "l4", "l6")
-"""To hold out: 54, 75 and 94 degrees from the front, the last one grazing from the side; five lights between them remain."""
+"""To hold out: 54, 75 and 94 degrees from the front, the last one grazing from the side; five lights between them
+remain."""
 
 
 @dataclass(frozen=True)

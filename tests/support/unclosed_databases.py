@@ -1,6 +1,7 @@
 """SQLite connections that nobody closed are told on every Python as 3.13 tells them, with the test that opened them.
 
-Before 3.13 the interpreter closes them silently when they are collected, so that a leak would be found only by those who have a newer one.
+Before 3.13 the interpreter closes them silently when they are collected, so that a leak would be found only by those
+who have a newer one.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Judging Monte Carlo results: z-scores against a truth, with stated false-alarm rates.
 
-The rule of every table: standard error at most a third of the tolerance, then |z| <= 4.5 for each value (one false alarm in
-150,000 values) and an rms z between 0.8 and 1.25. Of few values an honest rms strays further; then the bounds are those
-that chi-square leaves with probability 1e-3.
+The rule of every table: standard error at most a third of the tolerance, then |z| <= 4.5 for each value (one false
+alarm in 150,000 values) and an rms z between 0.8 and 1.25. Of few values an honest rms strays further; then the bounds
+are those that chi-square leaves with probability 1e-3.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ RMS_FALSE_ALARM = 1e-3
 
 
 def rms_bounds(independent: int, rule: tuple[float, float] = (0.8, 1.25)) -> tuple[float, float]:
-    """The rule's bounds on the rms of z-scores, widened where ``independent`` is too small for them; fewer count as the wider case."""
+    """The rule's bounds on the rms of z-scores, widened where ``independent`` is too small for them; fewer count as the
+    wider case.
+    """
     tails = stats.chi2.ppf([RMS_FALSE_ALARM / 2, 1 - RMS_FALSE_ALARM / 2], independent) / independent
     return min(rule[0], math.sqrt(tails[0])), max(rule[1], math.sqrt(tails[1]))
 

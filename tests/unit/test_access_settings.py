@@ -26,7 +26,9 @@ def test_an_open_server_on_the_network_does_not_start(
     for start in (create_app, serve):
         with pytest.raises(
             SettingsError,
-            match=f"Host {host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens",
+            match=(
+                f"Host {host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens"
+            ),
         ):
             start(settings)
     assert not (tmp_path / "data").exists()

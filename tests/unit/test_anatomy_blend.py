@@ -124,7 +124,8 @@ def test_weights_make_enamel_thicken_with_the_root_of_height() -> None:
 
 @pytest.mark.parametrize("fdi", [11, 13, 14, 16])
 def test_some_weights_are_near_the_dentin_of_other_makers(fdi: int) -> None:
-    # The phantom's dentin does not come from this family. Bound: the 0.15 mm that a fit is to reach on average on this half of the crown.
+    # The phantom's dentin does not come from this family. Bound: the 0.15 mm that a fit is to reach on average on this
+    # half of the crown.
     tooth = build_jaw(1).tooth(fdi)
     shape = dentin_blend_shape(tooth.outer, tooth.frame, crown=upper_tooth(fdi % 10))
     height = tooth.outer.vertices_mm @ tooth.frame.axes[2]

@@ -59,7 +59,8 @@ def test_the_scanned_incisor_is_seen_by_its_landmarks() -> None:
 def test_a_bare_crown_points_to_its_edge() -> None:
     crown = read_mesh(shared_path("data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI=11.obj"))
     frame = estimate_frame(crown, np.array([[0.0, 0.0, 1000.0]]))
-    # These teeth look to larger z, and the edges of the upper ones hang towards smaller y; a crown's own axis leans up to 15 degrees to the side.
+    # These teeth look to larger z, and the edges of the upper ones hang towards smaller y; a crown's own axis leans up
+    # to 15 degrees to the side.
     assert frame.rotation[2] @ [0.0, -1.0, 0.0] > np.cos(np.radians(15))
 
 

@@ -54,7 +54,8 @@ def test_dimensions_are_wheelers_averages(incisor: Incisor) -> None:
 
 
 def test_labial_enamel_follows_the_thickness_model(incisor: Incisor) -> None:
-    # Shortest distance is at most the thickness along the normal; the wall's curvature makes up to 0.05 mm of difference.
+    # Shortest distance is at most the thickness along the normal; the wall's curvature makes up to 0.05 mm of
+    # difference.
     distance = SurfaceDistance(incisor.dentin).closest(incisor.outer.vertices_mm)[1]
     height = incisor.outer.vertices_mm[:, 2] - cervix_height_mm()
     labial = (

@@ -1,4 +1,6 @@
-"""The phantom jaw: closed, nested, of the dimensions in the table, side by side without overlap, rooted in gums, and accepted by the engine."""
+"""The phantom jaw: closed, nested, of the dimensions in the table, side by side without overlap, rooted in gums, and
+accepted by the engine.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ def heights_mm(tooth: JawTooth, mesh: Mesh) -> NDArray[np.float64]:
 
 
 def depth_mm(surface: SurfaceDistance, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance below a closed smooth surface, negative outside; the side is the nearest face's, as no faces meet at sharp angles."""
+    """Distance below a closed smooth surface, negative outside; the side is the nearest face's, as no faces meet at
+    sharp angles.
+    """
     nearest, distance, face = surface.closest(points_mm)
     a, b, c = (surface.mesh.vertices_mm[surface.mesh.faces[face, k]] for k in range(3))
     outside = np.einsum("ij,ij->i", points_mm - nearest, np.cross(b - a, c - a)) > 0
@@ -96,13 +100,15 @@ def test_meshes_are_fine_even_and_smooth(average: Jaw) -> None:
         for mesh in (tooth.outer, tooth.dentin):
             assert len(mesh.faces) <= 6000
             surface = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-            # A rounding of a quarter turn in three rows turns 30 degrees a row, and the crown's slope adds to that on a cusp's flank.
+            # A rounding of a quarter turn in three rows turns 30 degrees a row, and the crown's slope adds to that on a
+            # cusp's flank.
             assert np.degrees(surface.face_adjacency_angles).max() < 50
             assert 0.3 <= np.median(surface.edges_unique_length) <= 0.5
 
 
 def test_dentin_lies_inside_enamel(subject: Jaw) -> None:
-    # The root's cover is 0.08 mm along the normal; faces of 0.4 mm over its rounding of 0.8 mm cut in by 0.4² / (8 x 0.8) = 0.025 mm.
+    # The root's cover is 0.08 mm along the normal; faces of 0.4 mm over its rounding of 0.8 mm cut in by 0.4² / (8 x
+    # 0.8) = 0.025 mm.
     for tooth in subject.teeth:
         require_nested(tooth.outer, tooth.dentin, 0.05)
 
@@ -121,7 +127,8 @@ def test_enamel_is_thicker_towards_the_tip(average: Jaw) -> None:
 
 
 def test_enamel_of_the_central_incisor_follows_the_labial_model(average: Jaw) -> None:
-    # 0.35 + 0.75 z / 10.5; shortest distance is at most the thickness along the normal, and walls' curvature makes up to 0.05 mm of difference.
+    # 0.35 + 0.75 z / 10.5; shortest distance is at most the thickness along the normal, and walls' curvature makes up
+    # to 0.05 mm of difference.
     tooth = average.tooth(11)
     height, canonical = heights_mm(tooth, tooth.outer), tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
     labial = (np.abs(canonical[:, 0]) < 0.8) & (canonical[:, 1] > 0) & (height > 0.5) & (height < 8.5)
@@ -132,7 +139,8 @@ def test_enamel_of_the_central_incisor_follows_the_labial_model(average: Jaw) ->
 
 @pytest.mark.parametrize("fdi", FDI)
 def test_crowns_have_the_dimensions_of_the_table(average: Jaw, fdi: int) -> None:
-    # Widest diameters and length are met; the narrowing towards the tongue, set at the widest place, changes the sections at the cervix by up to 1.5 %.
+    # Widest diameters and length are met; the narrowing towards the tongue, set at the widest place, changes the
+    # sections at the cervix by up to 1.5 %.
     tooth, d = average.tooth(fdi), upper_tooth(fdi % 10)
     canonical = tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
     crown = canonical[canonical[:, 2] >= tooth.cervix_mm]
@@ -171,8 +179,9 @@ def test_the_table_is_the_references() -> None:
 
 
 def test_neighbours_all_but_touch_and_never_overlap(subject: Jaw) -> None:
-    # Teeth are moved until a vertex is within 0.005 mm of the gap; from the other tooth's vertices the distance differs by what faces of 0.45 mm cut off
-    # crowns that bend with 3 mm or more, 0.45² / (8 x 3) = 0.008 mm; sizes vary by 5 %.
+    # Teeth are moved until a vertex is within 0.005 mm of the gap; from the other tooth's vertices the distance differs
+    # by what faces of 0.45 mm cut off crowns that bend with 3 mm or more, 0.45² / (8 x 3) = 0.008 mm; sizes vary by 5
+    # %.
     surfaces = [SurfaceDistance(tooth.outer) for tooth in subject.teeth]
     for (one, one_surface), (other, other_surface) in pairwise(zip(subject.teeth, surfaces, strict=True)):
         for still, near in ((one_surface, other), (other_surface, one)):
@@ -186,7 +195,8 @@ def test_the_average_is_symmetric(average: Jaw) -> None:
         right, left = average.tooth(10 + place), average.tooth(20 + place)
         np.testing.assert_array_equal(left.outer.vertices_mm, mirror * right.outer.vertices_mm)
         np.testing.assert_array_equal(left.dentin.vertices_mm, mirror * right.dentin.vertices_mm)
-    # The gums' vertices are not paired, their surface is: a mirrored vertex is off it by what its faces cut off bends of 0.6 mm radius at most.
+    # The gums' vertices are not paired, their surface is: a mirrored vertex is off it by what its faces cut off bends
+    # of 0.6 mm radius at most.
     points = mirror * average.gums.vertices_mm[::7]
     assert SurfaceDistance(average.gums).closest(points)[1].max() < 0.6**2 / (8 * 0.6)
 

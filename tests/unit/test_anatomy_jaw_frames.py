@@ -25,7 +25,8 @@ SHIFT_MM = np.array([40.0, -7.0, 300.0])
 ALL = (*range(11, 18), *range(21, 28))
 FRONT_CAMERA_MM = np.array([[0.0, 400.0, 60.0]])
 LEAN_DEG = 20.0
-"""Of a real tooth's axis off the arch's normal, but for last molars and upper front teeth, which lean up to 30 degrees."""
+"""Of a real tooth's axis off the arch's normal, but for last molars and upper front teeth, which lean up to 30
+degrees."""
 
 
 def angles_deg(found: Axes, true: Axes) -> Axes:
@@ -54,8 +55,8 @@ def phantom_errors_deg(jaw: Jaw, numbers: tuple[int, ...], seed: int) -> Axes:
     return errors_deg(frames, [jaw.tooth(number).frame.axes for number in numbers], turn)
 
 
-# Phantom teeth are sized and turned averages, so that what is left is the sampling's: 1 degree of the occlusal axis and 5 of the others were measured over
-# 3 subjects and 9 choices of teeth, 5 at a canine, which is almost round.
+# Phantom teeth are sized and turned averages, so that what is left is the sampling's: 1 degree of the occlusal axis and
+# 5 of the others were measured over 3 subjects and 9 choices of teeth, 5 at a canine, which is almost round.
 PHANTOM_BOUNDS_DEG = np.array([8.0, 8.0, 3.0])
 
 
@@ -115,7 +116,8 @@ def real_axes(numbers: list[int], meshes: list[Mesh]) -> list[Axes]:
     for number, middle in zip(numbers, middles, strict=True):
         up = np.array([0.0, -1.0 if number < 30 else 1.0, 0.0])
         own = [k for k, other in enumerate(numbers) if (other < 30) == (number < 30)]
-        # The arch as a parabola z(x) is steep at the sides; a circle's centre in its depth serves all places to about 15 degrees.
+        # The arch as a parabola z(x) is steep at the sides; a circle's centre in its depth serves all places to about
+        # 15 degrees.
         outward = middle - np.array([0.0, middle[1], middles[own, 2].min()])
         buccal = outward - (outward @ up) * up
         buccal /= np.linalg.norm(buccal)

@@ -46,7 +46,8 @@ def test_every_tooth_of_every_subject_has_its_own_media() -> None:
     mouths = [jaw_mouth(FDI, "green", subject) for subject in SUBJECTS]
     media = [medium for mouth in mouths for tissue in mouth.teeth for medium in (tissue.enamel, tissue.dentin)]
     assert len(set(media)) == 2 * len(FDI) * len(SUBJECTS)
-    # ../shared/reference/tooth_optics.csv, reduced scattering near 540 nm: 0.24 to 2.1 per mm in enamel, 0.245 to 3.77 in dentin.
+    # ../shared/reference/tooth_optics.csv, reduced scattering near 540 nm: 0.24 to 2.1 per mm in enamel, 0.245 to 3.77
+    # in dentin.
     for mouth in mouths:
         for tissue in mouth.teeth:
             assert 0.24 < tissue.enamel.sigma_s_reduced < 2.11

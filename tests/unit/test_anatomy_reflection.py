@@ -55,7 +55,8 @@ def test_pixels_off_the_tooth_reflect_nothing_and_shadow_side_is_dark() -> None:
     assert not seen.highlight[:, ~seen.enamel_pixels].any()
     assert (seen.enamel_share == 1).all()
     assert not seen.gums.any()
-    # The last light stands behind the tooth's plane: its mirror direction never meets the frontal camera except at the rim.
+    # The last light stands behind the tooth's plane: its mirror direction never meets the frontal camera except at the
+    # rim.
     assert seen.highlight[-1].sum() < 0.5 * seen.highlight[0].sum()
 
 

@@ -52,7 +52,8 @@ def in_arch(jaw: ScannedJaw, points_mm: NDArray[np.float64]) -> NDArray[np.float
 
 
 def require_tidy(mesh: Mesh, name: str, extent_mm: tuple[float, float] = (2.0, 100.0)) -> None:
-    # Single precision holds 4e-6 mm at 40 mm from the origin; a triangle thinner than that has no normal for a ray tracer.
+    # Single precision holds 4e-6 mm at 40 mm from the origin; a triangle thinner than that has no normal for a ray
+    # tracer.
     mesh.require_solid(name, extent_mm)
     corners = mesh.vertices_mm[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
@@ -72,7 +73,8 @@ def test_bumps_become_solids_in_gums(pair: ScannedJaw) -> None:
     assert [tooth.fdi for tooth in pair.teeth] == [11, 21]
     for tooth in pair.teeth:
         require_tidy(tooth.outer, f"tooth {tooth.fdi}")
-        # From the bump's top to the root's end, below where the label begins, which triangles and smoothing know to about a triangle.
+        # From the bump's top to the root's end, below where the label begins, which triangles and smoothing know to
+        # about a triangle.
         height = np.ptp(tooth.outer.vertices_mm[:, 2])
         assert height == pytest.approx(CROWN_MM - NECK_MM + STUB_MM, abs=1.5 * PITCH_MM)
     require_tidy(pair.gums, "gums", (2.0, 200.0))
@@ -91,8 +93,9 @@ def test_crowns_and_gingiva_are_the_scan_away_from_their_border(pair: ScannedJaw
 
 
 def test_axes_follow_the_arch(pair: ScannedJaw) -> None:
-    # The bumps stand straight on the plate, 11 on the side where x, the patient's left, is negative. The plate's diagonals run one way, so labels are not
-    # quite symmetric: of a crown 7 mm wide a triangle's third at one side, a hundredth of a millimetre in its middle.
+    # The bumps stand straight on the plate, 11 on the side where x, the patient's left, is negative. The plate's
+    # diagonals run one way, so labels are not quite symmetric: of a crown 7 mm wide a triangle's third at one side, a
+    # hundredth of a millimetre in its middle.
     np.testing.assert_allclose(pair.arch_from_scan[:3, :3], np.eye(3), atol=2e-3)
     for frame, tooth in zip(pair.frames, pair.teeth, strict=True):
         np.testing.assert_allclose(frame.axes, np.eye(3), atol=0.02)
@@ -222,7 +225,8 @@ def test_a_real_arch_becomes_solids(arch: LabelledScan, jaw: ScannedJaw) -> None
     for tooth in jaw.teeth:
         require_tidy(tooth.outer, f"tooth {tooth.fdi}")
     require_tidy(jaw.gums, "gums", (2.0, 200.0))
-    # The crowns' areas as the data's description gives them, to its digits; root and contacts' walls add half to one and a half times as much.
+    # The crowns' areas as the data's description gives them, to its digits; root and contacts' walls add half to one
+    # and a half times as much.
     for tooth in jaw.teeth:
         crown = areas_mm2(Mesh(arch.mesh.vertices_mm, arch.mesh.faces[arch.fdi == tooth.fdi])).sum()
         assert 158.5 <= crown <= 272.5
@@ -292,8 +296,8 @@ def test_real_frames_follow_the_arch(jaw: ScannedJaw) -> None:
 
 
 def test_matched_frames_agree_with_the_cervical_lines(jaw: ScannedJaw) -> None:
-    # Two ways that share no data but the arch's order: crowns' shapes, and the line where they leave the gums. Neither knows a tooth to better than some
-    # degrees; 7 of the occlusal axis and 7 of the buccal one were measured.
+    # Two ways that share no data but the arch's order: crowns' shapes, and the line where they leave the gums. Neither
+    # knows a tooth to better than some degrees; 7 of the occlusal axis and 7 of the buccal one were measured.
     chosen = [k for k, tooth in enumerate(jaw.teeth) if tooth.fdi in (14, 15, 16, 17)]
     matched = jaw_frames([jaw.teeth[k] for k in chosen], np.zeros((1, 3)))
     for frame, k in zip(matched, chosen, strict=True):
@@ -312,8 +316,8 @@ def test_real_teeth_show_their_outside(jaw: ScannedJaw) -> None:
         seen += np.count_nonzero(hits.hit)
         inverted += np.count_nonzero(hits.hit & (hits.normals @ direction > 0))
     assert seen > 50_000
-    # Where the borders of two touching teeth cross over, a root's wall may begin folded: 7 rays were measured, and several times as many without
-    # the strips at contacts.
+    # Where the borders of two touching teeth cross over, a root's wall may begin folded: 7 rays were measured, and
+    # several times as many without the strips at contacts.
     assert inverted < 20
 
 

@@ -1,4 +1,6 @@
-"""Solids that overlap become surfaces that do not: nothing is lost, nothing is double, and cut edges are shared bit by bit."""
+"""Solids that overlap become surfaces that do not: nothing is lost, nothing is double, and cut edges are shared bit by
+bit.
+"""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ def looked_up(mesh: Mesh, layout: StainLayout, count: int = 20_000) -> tuple[np.
 def test_every_place_reads_texels_of_its_own(mesh: Mesh, layout: StainLayout) -> None:
     places, texels, shares = looked_up(mesh, layout)
     assert (texels[shares > 1e-3] >= 0).all()
-    # A texel colours what lies within about its own edge; one shared by two charts would have its middle between them, far from both.
+    # A texel colours what lies within about its own edge; one shared by two charts would have its middle between them,
+    # far from both.
     distance = np.linalg.norm(places[:, None] - layout.points_mm[texels], axis=2)
     assert distance[(texels >= 0) & (shares > 0.05)].max() < 2.5 * TEXEL
 

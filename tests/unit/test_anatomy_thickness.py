@@ -57,7 +57,8 @@ def test_the_image_of_the_scanned_tooth_has_its_pixels() -> None:
 
 
 def test_errors_of_weights_become_errors_of_thickness() -> None:
-    # A ball of dentin that shrinks: thickness is 0.5 + 0.4 c, so its error is 0.4 that of c, at every point and of the mean.
+    # A ball of dentin that shrinks: thickness is 0.5 + 0.4 c, so its error is 0.4 that of c, at every point and of the
+    # mean.
     ball = sphere(3.5)
     shape = DentinShape(ball, -0.4 * sphere(1.0).vertices_mm[None])
     found = uncertain_thickness(sphere(4.0).vertices_mm, shape, np.array([0.3]), np.array([[0.05**2]]))
@@ -68,7 +69,8 @@ def test_errors_of_weights_become_errors_of_thickness() -> None:
 
 
 def test_errors_against_many_drawn_shapes() -> None:
-    # Two modes, correlated weights: 400 draws know a standard deviation to 3.5 %; 4 of these, and the second order of a spread of 0.05.
+    # Two modes, correlated weights: 400 draws know a standard deviation to 3.5 %; 4 of these, and the second order of a
+    # spread of 0.05.
     shape, points = dentin_shape(), ellipsoid(SEMI_AXES_MM).vertices_mm[::40]
     weights, covariance = np.array([0.5, 0.4]), np.array([[0.0025, -0.001], [-0.001, 0.002]])
     found = uncertain_thickness(points, shape, weights, covariance)

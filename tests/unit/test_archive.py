@@ -1,4 +1,6 @@
-"""The streamed zip is a correct zip: checked by the reader of the standard library, by ``unzip``, past zip64's limit, and for memory."""
+"""The streamed zip is a correct zip: checked by the reader of the standard library, by ``unzip``, past zip64's limit,
+and for memory.
+"""
 
 from __future__ import annotations
 

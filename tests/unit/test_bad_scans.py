@@ -1,4 +1,6 @@
-"""Scans and landmarks that cannot be used end in a sentence that names what is wrong and what to do, each in its own words."""
+"""Scans and landmarks that cannot be used end in a sentence that names what is wrong and what to do, each in its own
+words.
+"""
 
 from __future__ import annotations
 

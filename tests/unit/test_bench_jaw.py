@@ -1,4 +1,6 @@
-"""The jaw's benchmark: parameters become the mouth they name, errors are relative to the truth, rows are kept as they come."""
+"""The jaw's benchmark: parameters become the mouth they name, errors are relative to the truth, rows are kept as they
+come.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Pictures of benchmarks: every point is in its panel, the peer's ratio beside its name, and a missing drawing library costs only the picture."""
+"""Pictures of benchmarks: every point is in its panel, the peer's ratio beside its name, and a missing drawing library
+costs only the picture.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,8 @@ def test_lights_and_pixels_have_panels_of_their_own(tmp_path: Path) -> None:
         benchmark: str, lights: int, pixels: int, seconds: float, cost: float | None, peer: str = "dentine"
     ) -> dict[str, Any]:
         return LightsRow(
-            benchmark=benchmark, peer=peer, seconds=seconds, error=0.1, lights=lights, pixels=pixels, samples=8, seconds_per_path=0.1, relative_cost=cost
+            benchmark=benchmark, peer=peer, seconds=seconds, error=0.1, lights=lights, pixels=pixels, samples=8,
+            seconds_per_path=0.1, relative_cost=cost
         ).model_dump()  # fmt: skip
 
     rows = [row("transport-lights", lights, 10, lights**0.5, lights**0.5) for lights in (1, 4, 9)]

@@ -1,4 +1,6 @@
-"""The race of tooth fits: ratios are of times to one error, bounds are marked as such, and rows are kept as they come."""
+"""The race of tooth fits: ratios are of times to one error, bounds are marked as such, and rows are kept as they
+come.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from services.fit.optics.parameters import Medium, Tissue
 
 def row(peer: str, seconds: float, error: float, rate: float | None = None) -> ToothRow:
     return ToothRow(
-        benchmark="tooth", peer=peer, seconds=seconds, error=error, error_se=0.001, fitted_error=error, stage="", parameters={}, rate=rate
+        benchmark="tooth", peer=peer, seconds=seconds, error=error, error_se=0.001, fitted_error=error, stage="",
+        parameters={}, rate=rate
     )  # fmt: skip
 
 

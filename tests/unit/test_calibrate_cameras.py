@@ -161,7 +161,9 @@ def test_boards_in_photographs_are_found_and_calibrate_a_camera() -> None:
 
 @pytest.mark.slow
 def test_held_out_boards_are_drawn_at_least_as_well_as_by_opencv() -> None:
-    """Over both cameras and four ways to split 13 boards; single splits differ by up to 3 % either way, and one by 27 %."""
+    """Over both cameras and four ways to split 13 boards; single splits differ by up to 3 % either way, and one by 27
+    %.
+    """
     import cv2
 
     if not STEREO_BOARDS.is_dir():
@@ -230,7 +232,9 @@ def test_a_camera_that_shares_no_board_is_named() -> None:
 
 
 def test_lens_and_uncertainty_of_projection_are_those_of_mrcal() -> None:
-    """mrcal's own answer to the same corners, made by ``projection_uncertainty(what="covariance")`` of its Debian package 2.2."""
+    """mrcal's own answer to the same corners, made by ``projection_uncertainty(what="covariance")`` of its Debian
+    package 2.2.
+    """
     table = json.loads((Path(__file__).parents[1] / "data" / "mrcal_chessboard.json").read_text())
     corners = corners_on_board(CHESSBOARD)
     seen = np.array(table["corners_px"]) + 0.5

@@ -57,7 +57,8 @@ def test_boards_are_advised_for_a_camera_whatever_its_name(cameras: CamerasStep)
     told = judge(folder("red"), replace(cameras, fit=shaken), lights(), INTENSITY, None, None)
     assert [one.what for one in told.broken] == [f"scatter of corners, camera {name}" for name in NAMES]
     assert told.advice.startswith("Photograph boards again: scatter of corners, camera")
-    # Corners scatter by 0.1 px in each coordinate, so their rms is 15 × 0.141 = 2.1 px, and 2.1² asks for five times as many.
+    # Corners scatter by 0.1 px in each coordinate, so their rms is 15 × 0.141 = 2.1 px, and 2.1² asks for five times as
+    # many.
     assert "; 5 times as many photographs would meet it" in told.advice
 
 

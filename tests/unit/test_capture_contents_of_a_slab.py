@@ -1,4 +1,6 @@
-"""A slab's folder among the captures that a server takes: what its description declares is looked at before it is accepted."""
+"""A slab's folder among the captures that a server takes: what its description declares is looked at before it is
+accepted.
+"""
 
 from __future__ import annotations
 

@@ -39,8 +39,9 @@ def test_resampling_a_known_function_matches_it() -> None:
     flow = SubjectMotion(1.7, reference=0, last=10, seed=3).flow_px(7, 1, 40, 50)
     sampled = resample(scene(x, y).astype(np.float32), flow)
     inside = np.s_[3:-3, 3:-3]
-    # Exact for quadratics, so per axis the error is at most a sixth of the largest third derivative times sum_j |w_j||x_j - t|^3,
-    # which is at most 0.5625 (at t = 1/2); along y it passes the x weights, whose absolute sum is at most 1.25.
+    # Exact for quadratics, so per axis the error is at most a sixth of the largest third derivative times sum_j
+    # |w_j||x_j - t|^3, which is at most 0.5625 (at t = 1/2); along y it passes the x weights, whose absolute sum is at
+    # most 1.25.
     bound = 0.5625 / 6 * ((2 * np.pi / 20) ** 3 + 1.25 * (2 * np.pi / 25) ** 3)
     moved = scene(x + flow[..., 0], y + flow[..., 1])
     assert np.abs(sampled - moved)[inside].max() < bound

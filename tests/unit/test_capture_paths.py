@@ -1,4 +1,6 @@
-"""Which paths a capture may have: what is accepted can be laid out below a folder without surprise, on any file system."""
+"""Which paths a capture may have: what is accepted can be laid out below a folder without surprise, on any file
+system.
+"""
 
 from __future__ import annotations
 

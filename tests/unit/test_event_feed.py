@@ -47,7 +47,10 @@ def work(repository: Repository, lease: Lease) -> None:
 
 @contextmanager
 def working(repository: Repository, *leases: Lease) -> Iterator[None]:
-    """Jobs that work meanwhile. All have ended when it ends, as one still writing would keep a connection open past the repository's close."""
+    """Jobs that work meanwhile.
+
+    All have ended when it ends, as one still writing would keep a connection open past the repository's close.
+    """
     with ThreadPoolExecutor(len(leases)) as threads:
         ends = [threads.submit(work, repository, lease) for lease in leases]
         yield

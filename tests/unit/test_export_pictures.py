@@ -66,7 +66,8 @@ def test_residual_colours_have_a_sign_and_a_neutral_zero() -> None:
 
 
 def test_both_arms_differ_for_missing_cones() -> None:
-    # Red-blind and green-blind observers confuse what differs in red minus green only: the arms differ in blue minus yellow.
+    # Red-blind and green-blind observers confuse what differs in red minus green only: the arms differ in blue minus
+    # yellow.
     ends = colour_map(np.array([0.1, 0.9]), DIVERGING).astype(float)
     yellowness = ends[:, :2].mean(axis=1) - ends[:, 2]
     assert yellowness[1] - yellowness[0] > 150

@@ -1,4 +1,6 @@
-"""Figures: panels lie where they should, captures of a case hold what it says, and what cannot be drawn is refused in a sentence."""
+"""Figures: panels lie where they should, captures of a case hold what it says, and what cannot be drawn is refused in a
+sentence.
+"""
 
 from __future__ import annotations
 

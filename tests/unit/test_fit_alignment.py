@@ -55,8 +55,8 @@ def compare(
     }
     for name, values in arrays.items():
         stored = create_array(
-            root / "prepared.zarr", name, (1, 1, *values.shape), (1, 1, *values.shape), "uint16" if name == "valid" else "float32",
-            ("camera", "light", "y", "x", "channel")[: 2 + values.ndim],
+            root / "prepared.zarr", name, (1, 1, *values.shape), (1, 1, *values.shape),
+            "uint16" if name == "valid" else "float32", ("camera", "light", "y", "x", "channel")[: 2 + values.ndim],
         )  # fmt: skip
         stored[0, 0] = values
     manifest = PreparedManifest(

@@ -1,4 +1,6 @@
-"""A block asks for the lights under which it has something to compare, and for no other; scenes keep what they are stored with."""
+"""A block asks for the lights under which it has something to compare, and for no other; scenes keep what they are
+stored with.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Cells in which losses are compared: squares of the coarse grid, alike at every resolution, never across parts, never too few."""
+"""Cells in which losses are compared: squares of the coarse grid, alike at every resolution, never across parts, never
+too few.
+"""
 
 from __future__ import annotations
 

@@ -33,7 +33,8 @@ KINDS = tuple(BOUNDS)
 def test_round_trip_and_derivative_over_the_whole_range(kind: str, fraction: float) -> None:
     low, high = BOUNDS[kind]
     x = low + fraction * (high - low)
-    # alpha is stored as itself: 1 - alpha has 1e-16 of absolute rounding, so kappa has 1e-16 / (10^-kappa ln 10), 4.4e-10 at kappa = 7.
+    # alpha is stored as itself: 1 - alpha has 1e-16 of absolute rounding, so kappa has 1e-16 / (10^-kappa ln 10),
+    # 4.4e-10 at kappa = 7.
     assert math.isclose(to_dual(kind, to_natural(kind, x)), x, rel_tol=1e-9, abs_tol=1e-9)
     step = 1e-6
     numeric = (to_natural(kind, x + step) - to_natural(kind, x - step)) / (2 * step)

@@ -43,7 +43,8 @@ def test_thickness_has_an_error_only_where_the_dentin_was_fitted() -> None:
     )
     assert spread is not None
     assert spread.mean.se is not None
-    # Independent weights of 0.1 move the mean by some hundredths of a millimetre, and each point's by at least as much in the root mean square.
+    # Independent weights of 0.1 move the mean by some hundredths of a millimetre, and each point's by at least as much
+    # in the root mean square.
     assert 0.005 < spread.mean.se < 0.1
     assert spread.errors_mm is not None
     assert np.sqrt(np.nanmean(spread.errors_mm**2)) >= spread.mean.se

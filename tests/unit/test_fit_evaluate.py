@@ -27,7 +27,8 @@ def test_error_is_unbiased_by_either_noise(truth_error: float) -> None:
 
 
 def test_lights_of_a_pixel_err_together() -> None:
-    # Twelve lights whose noise is one and the same. The variance over 2000 draws is known to 3 %, its heavy tails to three times that.
+    # Twelve lights whose noise is one and the same. The variance over 2000 draws is known to 3 %, its heavy tails to
+    # three times that.
     rng, reference = np.random.default_rng(3), np.full((12, 60), 1.0)
     draws = []
     for _ in range(2000):

@@ -12,7 +12,9 @@ LIGHTS = tuple(f"l{k}" for k in range(6))
 
 
 def scene(seed: int, off: float = 0.05) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Renders (6, 80) of a round body under lights 15 degrees apart, and photographs that differ from them by a smooth misfit and noise."""
+    """Renders (6, 80) of a round body under lights 15 degrees apart, and photographs that differ from them by a smooth
+    misfit and noise.
+    """
     random = np.random.default_rng(seed)
     place = np.linspace(-1.2, 1.2, 80)
     render = np.array([0.1 + np.maximum(np.cos(place - np.deg2rad(15 * (k - 2.5))), 0.0) for k in range(6)])

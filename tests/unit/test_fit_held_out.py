@@ -6,15 +6,15 @@ import numpy as np
 
 from services.core.geometry import Light
 from services.core.records import JobSpec, PreparedManifest
-from services.fit.inputs.observations import held_out_images
+from services.fit.inputs.held_out import held_out_images
 from tests.support.prepared import camera
 
 
 def manifest() -> PreparedManifest:
     lights = tuple(Light(name=f"l{k}", position_mm=(float(k), 500.0, 300.0), intensity=(1e6,)) for k in range(5))
     return PreparedManifest(
-        channels=("green",), cameras=(camera("c0"), camera("c1"), camera("c2")), lights=lights, held_out=(("c0", "l1"),),
-        fdi=(11,), dentin_known=(), median_motion_px=None, valid_fraction=0.9,
+        channels=("green",), cameras=(camera("c0"), camera("c1"), camera("c2")), lights=lights,
+        held_out=(("c0", "l1"),), fdi=(11,), dentin_known=(), median_motion_px=None, valid_fraction=0.9,
     )  # fmt: skip
 
 

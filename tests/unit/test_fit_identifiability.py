@@ -30,9 +30,10 @@ def correlated(value: float, first: int = 0, second: int = 1) -> Correlation:
 
 def test_known_and_unknown_are_told_with_unit_and_error() -> None:
     text = told({"green": table()}, {"green": correlated(0.3)})
-    assert text == (
-        "This capture tells enamel scattering (0.900 ± 0.050 per mm), dentin scattering (2.40 ± 0.12 per mm) and dentin absorption "
-        "(0.0300 ± 0.0040 per mm), but not enamel absorption (anything up to 0.05 per mm fits)."
+    assert (
+        text
+        == "This capture tells enamel scattering (0.900 ± 0.050 per mm), dentin scattering (2.40 ± 0.12 per mm) and"
+        " dentin absorption (0.0300 ± 0.0040 per mm), but not enamel absorption (anything up to 0.05 per mm fits)."
     )
 
 

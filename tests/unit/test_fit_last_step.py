@@ -54,13 +54,15 @@ def taken(problem: Any, part_count: int, **model: float) -> float:
 
 
 def test_many_teeth_are_wrong_independently() -> None:
-    # By hand: of one tooth the promise is -1000 ± 500, with the comparison 100 ± 359 that makes -274 ± 292; of fourteen -1000 ± 134, together -866 ± 125.
+    # By hand: of one tooth the promise is -1000 ± 500, with the comparison 100 ± 359 that makes -274 ± 292; of fourteen
+    # -1000 ± 134, together -866 ± 125.
     assert taken(FakeProblem(100.0), part_count=1) == 0
     assert taken(FakeProblem(100.0), part_count=14) == pytest.approx(1)
 
 
 def test_a_step_that_is_contradicted_is_tried_at_the_parabolas_least() -> None:
-    # 1300 is 3.4 of its standard errors. With slope -2000 and 300 at the whole the parabola is least at 2000 / 4600, -435 ± 156 for -681 ± 91 promised.
+    # 1300 is 3.4 of its standard errors. With slope -2000 and 300 at the whole the parabola is least at 2000 / 4600,
+    # -435 ± 156 for -681 ± 91 promised.
     problem = FakeProblem(300.0)
     assert taken(problem, part_count=14) == pytest.approx(2000 / 4600)
     assert len(problem.asked) == CLOSING_TRIALS

@@ -23,7 +23,9 @@ CAMERA = Camera(
 
 
 def test_a_square_is_where_its_middle_was() -> None:
-    """Rays through a reduced pixel's centre and through its square's centre are the same; centres are at half-integers."""
+    """Rays through a reduced pixel's centre and through its square's centre are the same; centres are at
+    half-integers.
+    """
     small = reduced_camera(CAMERA, 3)
     assert small.size == (7, 5)
     _, coarse = small.rays(np.array([0.5, 4.5]), np.array([0.5, 2.5]))

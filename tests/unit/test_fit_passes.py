@@ -1,4 +1,6 @@
-"""How a stage's images are differentiated: which columns are scores and which differences, over what reach, at what share of the paths."""
+"""How a stage's images are differentiated: which columns are scores and which differences, over what reach, at what
+share of the paths.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def problem(
 
 @dataclass
 class Linear:
-    """An engine whose one image is linear in the logarithm of both reduced scatterings, in absorption and in the enamel's mean cosine."""
+    """An engine whose one image is linear in the logarithm of both reduced scatterings, in absorption and in the
+    enamel's mean cosine.
+    """
 
     asked: list[tuple[str, int]] = field(default_factory=list)
 
@@ -83,7 +87,8 @@ def slope(x: np.ndarray, k: int, engine: Linear) -> float:
 
 
 def test_a_wide_difference_is_the_derivative_where_images_are_linear() -> None:
-    # In ln sigma at constant albedo absorption is exponential, so a difference over +-0.7 overstates its small part, 5 sigma_a, by sinh(0.7) / 0.7 = 1.084.
+    # In ln sigma at constant albedo absorption is exponential, so a difference over +-0.7 overstates its small part, 5
+    # sigma_a, by sinh(0.7) / 0.7 = 1.084.
     engine, x = Linear(), DOMAIN.x_of(TISSUE)
     _, similar, how = problem().jacobian_media(x)
     found, true = rendered(how, similar, engine), [slope(x, k, engine) for k in range(len(x))]

@@ -134,7 +134,9 @@ def test_a_folder_without_photographs(tmp_path: Path) -> None:
 
 
 def test_tracking_frames_in_one_block_are_told(tmp_path: Path) -> None:
-    """Names do not tell that these were taken between the lights, so motion would be interpolated to where there is none."""
+    """Names do not tell that these were taken between the lights, so motion would be interpolated to where there is
+    none.
+    """
     for name in ("black", "L1", "L2", "L3", "all0", "all1", "all2", "all3"):
         np.save(tmp_path / f"left_{name}_10ms.npy", counts(1, 1))
     told = import_folder(tmp_path, None, "RGGB", None).missing

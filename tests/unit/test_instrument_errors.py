@@ -1,4 +1,6 @@
-"""The instrument's errors as coordinates: what a calibration states of them, their columns, and the covariance that they leave to the tissue."""
+"""The instrument's errors as coordinates: what a calibration states of them, their columns, and the covariance that
+they leave to the tissue.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,10 @@ from services.fit.instrument.moves import by_scene, move_covariance, rigid, writ
 from services.fit.instrument.sentences import assumed_names, instrument_sentences
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.solve.covariance import _prior_parts, estimates, instrument_estimates, uncertainty
+from services.fit.solve.covariance import _prior_parts, uncertainty
 from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
 from services.fit.solve.elimination import eliminate
+from services.fit.solve.estimates import estimates, instrument_estimates
 from services.fit.solve.normal_equations import normal_equations
 from services.fit.solve.recombination import Fault
 from services.fit.transport.scene.recipe import View, single_tooth
@@ -63,7 +66,8 @@ def test_columns_are_the_derivatives_of_what_the_instrument_takes() -> None:
 
 
 def test_a_gain_is_not_pulled_by_noise_of_photographs_or_renders() -> None:
-    # The slope to a gain at the truth, over many draws of both noises, in its own standard errors: each alone would pull it by sqrt(M) of the photographs'.
+    # The slope to a gain at the truth, over many draws of both noises, in its own standard errors: each alone would
+    # pull it by sqrt(M) of the photographs'.
     random, image, found = np.random.default_rng(2), np.full(400, 0.7), []
     for _ in range(200):
         photograph = image + 0.01 * random.standard_normal(400)
@@ -163,7 +167,8 @@ def test_exact_derivatives_have_the_noise_of_any_that_agree() -> None:
 
 
 def test_what_noise_squares_to_in_the_elimination_is_known() -> None:
-    # The mean of two derivatives of unit noise has half its variance, so sum_kl S^-1_kl Cov(A_ak, A_al) is half of sum_kl S^-1_kl sum_i w^2 b_k b_l.
+    # The mean of two derivatives of unit noise has half its variance, so sum_kl S^-1_kl Cov(A_ak, A_al) is half of
+    # sum_kl S^-1_kl sum_i w^2 b_k b_l.
     found = []
     for seed in range(100):
         one = equations(np.random.default_rng([6, seed]), noise=1.0)

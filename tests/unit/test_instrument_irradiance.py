@@ -28,10 +28,11 @@ NAMES += tuple(f"light.{light.name}.{axis}" for light in LIGHTS for axis in "xyz
 
 
 def calibrated(rng: np.random.Generator, off_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """One calibration by a white sphere where the teeth are: errors of NAMES (10,), and relative ones of photographs over renders (3,).
+    """One calibration by a white sphere where the teeth are: errors of NAMES (10,), and relative ones of photographs
+    over renders (3,).
 
-    Lights are taken to be beside where they are, most along the line of sight; what the sphere shows is kept by intensities
-    and by the radiance per count, whose gauge is that the mean intensity is 1.
+    Lights are taken to be beside where they are, most along the line of sight; what the sphere shows is kept by
+    intensities and by the radiance per count, whose gauge is that the mean intensity is 1.
     """
     away = PLACES_MM / np.linalg.norm(PLACES_MM, axis=1, keepdims=True)
     # All lights err alike in part, as where the spheres stood is one thing for all of them.
@@ -58,7 +59,8 @@ def test_gains_are_those_of_photographs_over_renders(off_mm: float) -> None:
     stated, photographs = drawn(off_mm)
     found = at_the_teeth(stated, LIGHTS, CHANNELS, TEETH_MM)
     assert found is not None
-    # What all lights share is the gain's, not a light's; here, by no derivative but whole calibrations, it is the sphere's own scatter.
+    # What all lights share is the gain's, not a light's; here, by no derivative but whole calibrations, it is the
+    # sphere's own scatter.
     apart = photographs - photographs @ (INTENSITY / INTENSITY.sum())[:, None]
     expected = np.cov(apart.T) + DRIFT**2 * np.eye(3)
     # Squares of 1.5 % of a distance are left out, and 8,000 draws tell a variance to 1.6 %.

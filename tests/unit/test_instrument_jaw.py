@@ -15,8 +15,9 @@ from services.fit.instrument.columns import columns, photographed
 from services.fit.instrument.errors import errors_of
 from services.fit.instrument.sentences import instrument_sentences
 from services.fit.optics.domain import Coordinate, Domain
-from services.fit.solve.covariance import Uncertainty, instrument_estimates, uncertainty
+from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.elimination import eliminate
+from services.fit.solve.estimates import instrument_estimates
 from services.fit.solve.normal_equations import NormalEquations, normal_equations
 from services.fit.transport.scene.recipe import View
 from tests.support.prepared import camera

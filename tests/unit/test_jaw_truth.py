@@ -1,4 +1,6 @@
-"""The stored jaw's file format and the capture written from it, with images made up here; ``render_jaw_truth`` makes the real ones."""
+"""The stored jaw's file format and the capture written from it, with images made up here; ``render_jaw_truth`` makes
+the real ones.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,8 @@ def test_the_capture_has_the_sensors_noise(truth: JawTruth, tmp_path: Path) -> N
         sensor = np.sqrt((NOISE_RELATIVE * mean) ** 2 + (NOISE_FLOOR * mean.max()) ** 2)
         scores.append((np.load(tmp_path / entry.file)[..., 0] - mean) / sensor)
     z = np.stack(scores)
-    # 7,560 values: |mean| beyond 4 / sqrt(7560), or a standard deviation off by 4 / sqrt(2 x 7560), fails one run in 8,000.
+    # 7,560 values: |mean| beyond 4 / sqrt(7560), or a standard deviation off by 4 / sqrt(2 x 7560), fails one run in
+    # 8,000.
     assert z.size == 7560
     assert abs(z.mean()) < 4 / np.sqrt(z.size)
     assert abs(z.std() - 1) < 4 / np.sqrt(2 * z.size)

@@ -39,7 +39,9 @@ def random_pose(seed: int) -> np.ndarray:
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
-    """A laboratory whose registration is off by 0.05 mm and whose lights are said to be 1 % too bright in one channel."""
+    """A laboratory whose registration is off by 0.05 mm and whose lights are said to be 1 % too bright in one
+    channel.
+    """
     mouth = tmp_path / "mouth"
     mouth.mkdir()
     write_raw_folder(mouth)

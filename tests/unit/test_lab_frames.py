@@ -124,7 +124,8 @@ def test_the_measured_tooth_has_a_whole_root_that_holds_its_dentin(mouth: LabMou
 
 
 def test_a_scans_root_is_as_wide_below_the_gums_as_the_one_it_does_not_see(mouth: LabMouth) -> None:
-    # Light comes down it to the crown: a root that narrowed evenly was 10 % too narrow 2 mm below the gums' crest, at -2.4 mm.
+    # Light comes down it to the crown: a root that narrowed evenly was 10 % too narrow 2 mm below the gums' crest, at
+    # -2.4 mm.
     jaw = jaw_from_scan(mouth.scan, "whole")
     world_from_arch = mouth.world_from_scan @ np.linalg.inv(jaw.arch_from_scan)
     made = next(tooth.outer for tooth in jaw.teeth if tooth.fdi == FITTED)

@@ -1,4 +1,6 @@
-"""Priors of the fit: the literature's table is the reference's, its centres are what a fit of it would report, and the schedule takes what the job asks."""
+"""Priors of the fit: the literature's table is the reference's, its centres are what a fit of it would report, and the
+schedule takes what the job asks.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ def test_the_table_is_the_references() -> None:
 
 @pytest.mark.parametrize("part", ["enamel", "dentin"])
 def test_the_literatures_centre_is_its_geometric_mean(part: str) -> None:
-    # sigma at the held mean cosine is sigma_s' / (1 - g) + sigma_a; the prior's centre is the mean of its logarithm over sources.
+    # sigma at the held mean cosine is sigma_s' / (1 - g) + sigma_a; the prior's centre is the mean of its logarithm
+    # over sources.
     rows = [row for row in LITERATURE_TABLE if row.tissue == part]
     given = [row.sigma_a for row in rows if row.sigma_a is not None]
     usual = math.exp(sum(map(math.log, given)) / len(given))
@@ -57,7 +60,8 @@ def test_a_fits_coordinates_carry_the_chosen_prior() -> None:
     table = literature()
     for k, name in enumerate(("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")):
         assert (means[k], precision[k]) == pytest.approx((table[name][0], table[name][1] ** -2))
-    # Weak: sigma is free, and what both media share keeps the prior that is theirs both; of the literature's two there is none.
+    # Weak: sigma is free, and what both media share keeps the prior that is theirs both; of the literature's two there
+    # is none.
     assert list(media_domain(("enamel",), ("sigma", "alpha")).prior[1]) == [0.0, WEAK["enamel.alpha"][1] ** -2]
     assert list(shared_domain().prior[1]) == [0.0, 1.0]
     assert list(shared_domain(literature()).prior[1]) == [0.0, 0.0]

@@ -27,7 +27,9 @@ def lips(teeth: list[Mesh]) -> Mesh:
 
 
 def test_they_are_solids_that_face_outwards(lips: Mesh) -> None:
-    """A ring of round section has the volume 2 π² R r² of its middle line's length; half of it bounds any mistake of side."""
+    """A ring of round section has the volume 2 π² R r² of its middle line's length; half of it bounds any mistake of
+    side.
+    """
     edges = lips.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
     count = len(lips.vertices_mm)
     _, part = connected_components(coo_matrix((np.ones(edges.shape[1]), tuple(edges)), shape=(count, count)))

@@ -54,7 +54,8 @@ def test_pictures_show_direction_and_how_much_is_left(seen: SeenFlow, tmp_path: 
     assert after is not None
     assert before.shape == (HEIGHT, WIDTH, 3)
     assert not before[~seen.teeth].any()
-    # To the right and a little up: red, with more blue than green in it; afterwards white, to the last tenth in the median
+    # To the right and a little up: red, with more blue than green in it; afterwards white, to the last tenth in the
+    # median
     blue, green, red = np.median(before[seen.teeth], axis=0)
     assert red == 255
     assert blue > green

@@ -41,8 +41,8 @@ def angles() -> np.ndarray:
 @pytest.mark.parametrize("roughness", [0.1, 0.15, 0.2])
 @pytest.mark.parametrize("learned_from", [0.0, 0.02])
 def test_half_angle_is_where_the_lobe_falls_below_what_is_tolerated(roughness: float, learned_from: float) -> None:
-    """To a degree of the profile and half a step of the roughness, 5.5 % of the angle: ± 2 degrees at 13 to 28, also where the diffuse
-    colour was learned from pixels that reflect a fiftieth of their light."""
+    """To a degree of the profile and half a step of the roughness, 5.5 % of the angle: ± 2 degrees at 13 to 28, also
+    where the diffuse colour was learned from pixels that reflect a fiftieth of their light."""
     angle = angles()
     lobe = 0.8 * ggx(angle, roughness)
     fine = np.arange(0, 90, 0.01)
@@ -60,7 +60,9 @@ def test_a_broad_lobe_is_cut_at_the_widest() -> None:
 
 @pytest.mark.parametrize("wrong_shading", [0.0, 0.05, -0.1])
 def test_errors_of_the_shading_are_no_lobe(wrong_shading: float) -> None:
-    """Flat light that a quadratic misjudges at the mirror direction by less than a reflection brings, and far more where it turns away."""
+    """Flat light that a quadratic misjudges at the mirror direction by less than a reflection brings, and far more
+    where it turns away.
+    """
     angle = angles()
     error = wrong_shading * np.cos(np.radians(3 * angle)) + np.maximum(angle - 42, 0) * 0.1
     assert half_angle_deg(error, np.ones(PIXELS), angle) == 0

@@ -77,7 +77,9 @@ def test_surface_points_project_back_to_their_pixels() -> None:
 
 @pytest.mark.parametrize(("camera", "hit", "whole"), [(0, 395, 367), (1, 406, 380), (2, 403, 370)])
 def test_incisor_pixels(camera: int, hit: int, whole: int) -> None:
-    """Counts are those of trimesh's ray tracer on the same pixel centres and corners; the images are stock Mitsuba's own witness."""
+    """Counts are those of trimesh's ray tracer on the same pixel centres and corners; the images are stock Mitsuba's
+    own witness.
+    """
     folder = shared_path("data/tooth-ur1-truth")
     description = read_record(folder / "capture.json", FolderCapture)
     view = project(description.cameras[camera], [read_teeth(folder)[0].outer])

@@ -50,8 +50,9 @@ def expose(truth: np.ndarray, frame: FrameRecord, rng: np.random.Generator) -> n
 def test_radiance_and_variance_describe_the_draw() -> None:
     """z-scores of 40,000 pixels: mean and mean square within 5 standard errors, 1e-6 false alarms each.
 
-    Dividing by a variance that is itself estimated from the noisy value shifts mean z by -0.01 and mean z² by 3·0.01² at most, so z is
-    formed with the true variance and the estimated one is compared to it: their ratio spreads by 2·0.01.
+    Dividing by a variance that is itself estimated from the noisy value shifts mean z by -0.01 and mean z² by 3·0.01²
+    at most, so z is formed with the true variance and the estimated one is compared to it: their ratio spreads by
+    2·0.01.
     """
     rng = np.random.default_rng(2)
     truth = np.linspace(5, 250, 40_000).reshape(200, 200, 1)

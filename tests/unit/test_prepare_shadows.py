@@ -25,7 +25,8 @@ def test_a_known_ball_shades_what_lies_behind_it(view: Footprint) -> None:
         place, centre = tuple(light.tolist()), before_ball(light, 9.0)
         reached = reached_by(points, view.normal, place, [ball(BALL_MM), ball(radius, centre)])
         facing = view.covered & (expected_irradiance(points, view.normal, place, None) > 0.1e-6)
-        # An edge may lie a pixel of the light's view (0.25 mm) beside the formula's; inner and outer balls allow for that and the mesh's sagitta
+        # An edge may lie a pixel of the light's view (0.25 mm) beside the formula's; inner and outer balls allow for
+        # that and the mesh's sagitta
         surely, never = (behind_ball(points, light, centre, radius + margin) for margin in (-0.5, 0.5))
         assert (facing & surely).sum() > 50
         assert not reached[facing & surely].any()
@@ -34,7 +35,9 @@ def test_a_known_ball_shades_what_lies_behind_it(view: Footprint) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_shadows_of_an_unknown_ball_are_found_and_lit_pixels_are_left(view: Footprint, seed: int) -> None:
-    """A matt ball of uneven albedo: 90 % of the shadow found at 3 % of false ones are what a capture asks for, without light that spreads inside."""
+    """A matt ball of uneven albedo: 90 % of the shadow found at 3 % of false ones are what a capture asks for, without
+    light that spreads inside.
+    """
     rng = np.random.default_rng(seed)
     points = view.points_mm(CAMERA, slice(None)).astype(np.float64)
     places = lights_mm(12)

@@ -34,7 +34,9 @@ def view_of(seen: Footprint) -> View:
 
 
 def warped_photograph(path: Path, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A photograph, the same moved by up to 6 px under other light with sensor noise on both, and the true displacement."""
+    """A photograph, the same moved by up to 6 px under other light with sensor noise on both, and the true
+    displacement.
+    """
     photograph = (cv2.imread(str(path)).astype(np.float32) / 255) ** 2.2
     linear = photograph.mean(axis=-1)
     height, width = linear.shape
@@ -78,7 +80,9 @@ def test_known_warp_of_an_intraoral_photograph_under_changed_light(view: int) ->
 
 
 def test_parallax_of_a_real_stereo_pair() -> None:
-    """With the true relief given, displacement follows it; a median of 0.42 px is what dense flow (DIS medium) reaches on this pair."""
+    """With the true relief given, displacement follows it; a median of 0.42 px is what dense flow (DIS medium) reaches
+    on this pair.
+    """
     folder = shared_path("data/flow-pairs")
     left, right = (
         (cv2.imread(str(folder / f"motorcycle_{side}.png")).astype(np.float32).mean(axis=-1) / 255) ** 2.2

@@ -21,7 +21,8 @@ def test_the_order_of_the_table_does_not_matter(order: object, monkeypatch: pyte
     assert len(KINDS) > 50
     monkeypatch.setattr(problems, "_STATUS", dict(order(list(_STATUS.items()))))  # type: ignore[operator]
     for kind in KINDS:
-        # The tree has no kind with two parents, so the nearest one above is the first listed one on the way to the root.
+        # The tree has no kind with two parents, so the nearest one above is the first listed one on the way to the
+        # root.
         above = kind
         while above not in _STATUS:
             (above,) = above.__bases__

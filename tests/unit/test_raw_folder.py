@@ -38,7 +38,10 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "unknown key of a frame": (
         lambda t: t["frame"][1].update(exposure=0.1),
-        r"frame 2 \(left_L1\.npy\): unknown key 'exposure'; known keys are board, camera, chart, corners_px, exposure_s",
+        (
+            r"frame 2 \(left_L1\.npy\): unknown key 'exposure'; known keys are board, camera, chart, corners_px,"
+            r" exposure_s"
+        ),
     ),
     "unknown key of a pixel": (
         lambda t: t["landmark"][0]["pixels"][0].update(z=1),

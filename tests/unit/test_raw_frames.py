@@ -31,7 +31,9 @@ def write_exr(path: Path, values: Any) -> None:
 
 
 def write_dng(path: Path, values: Any, pattern: tuple[int, ...] = (0, 1, 1, 2)) -> None:
-    """A DNG by a writer that has nothing to do with the reader: Adobe's tags (DNG 1.4, chapter 4) in a TIFF by tifffile."""
+    """A DNG by a writer that has nothing to do with the reader: Adobe's tags (DNG 1.4, chapter 4) in a TIFF by
+    tifffile.
+    """
     one, zero = (1, 1), (0, 1)
     identity = (*one, *zero, *zero, *zero, *one, *zero, *zero, *zero, *one)
     tags = (

@@ -34,7 +34,9 @@ def signal(
 def test_photon_transfer_finds_gain_and_read_noise_to_two_per_cent(
     read: float, per_electron: float, gain: float
 ) -> None:
-    """100,000 pixels a pair leave 0.45 % of a variance open, and four pairs half of that, so 2 % is nine standard errors."""
+    """100,000 pixels a pair leave 0.45 % of a variance open, and four pairs half of that, so 2 % is nine standard
+    errors.
+    """
     sensor = Sensor(read_counts=read, counts_per_electron=per_electron)
     dark = [signal(sensor, k, 0 * RAMP, gain=gain) for k in range(5)]
     found_read = read_noise(dark, gain)
@@ -68,8 +70,8 @@ def exposure(sensor: Sensor, radiance: np.ndarray, exposure_s: float, seed: int)
 def test_merged_exposures_are_unbiased_and_as_uncertain_as_they_say() -> None:
     """100,000 pixels from near read noise to beyond full scale of the longest exposure.
 
-    In each of 20 levels of 5,000 pixels the mean lies within 5 of its standard errors of the truth (1e-5 false alarms in all), and
-    the scatter within 5 standard errors, 10 %, of the mean variance that is told.
+    In each of 20 levels of 5,000 pixels the mean lies within 5 of its standard errors of the truth (1e-5 false alarms
+    in all), and the scatter within 5 standard errors, 10 %, of the mean variance that is told.
     """
     sensor, radiance = Sensor(), np.broadcast_to(np.geomspace(2, 12_000, SHAPE[1])[None, :, None], SHAPE)
     exposures = [exposure(sensor, radiance, seconds, k) for k, seconds in enumerate((0.2, 1.0, 5.0))]
@@ -124,7 +126,9 @@ def test_demosaicing_keeps_what_is_linear_in_place(mosaic: str) -> None:
 
 
 def test_sums_over_a_demosaiced_image_have_the_error_that_they_say() -> None:
-    """400 draws of noise: the variance of a sum over 40 x 40 pixels is known to 7 %, so a ratio within 0.75 to 1.3 is 4 standard errors."""
+    """400 draws of noise: the variance of a sum over 40 x 40 pixels is known to 7 %, so a ratio within 0.75 to 1.3 is 4
+    standard errors.
+    """
     rng, variance = np.random.default_rng(4), np.full((60, 60), 9.0, dtype=np.float32)
     told = demosaic_variance(variance, "GRBG")[10:50, 10:50].sum(axis=(0, 1))
     sums = [

@@ -1,4 +1,6 @@
-"""Where a scan stands in the rig: derivatives, landmarks with wrong clicks, outlines of known shapes, a phantom and a patient."""
+"""Where a scan stands in the rig: derivatives, landmarks with wrong clicks, outlines of known shapes, a phantom and a
+patient.
+"""
 
 from __future__ import annotations
 

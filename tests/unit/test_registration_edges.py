@@ -1,4 +1,6 @@
-"""Edges told by their light: unbiased beside the dark and gums, under a lens' blur and a shade; and the pose that hangs on it."""
+"""Edges told by their light: unbiased beside the dark and gums, under a lens' blur and a shade; and the pose that hangs
+on it.
+"""
 
 from __future__ import annotations
 
@@ -96,7 +98,8 @@ def test_plain_colours_do_not_turn_six_front_teeth(subject: int) -> None:
     start = pose_from_landmarks({camera.name: camera for camera in cameras}, clicks, centre)
     found = pose_from_outlines(views, teeth, [mouth.gums], start, centre, 8.0)
     twist = found.pose.twist_to(here, found.pose.apply(centre[None])[0])
-    # A fifth of the lean, and the design's 0.05 mm; within the stated covariance but for one draw in a thousand (chi squared of 6).
+    # A fifth of the lean, and the design's 0.05 mm; within the stated covariance but for one draw in a thousand (chi
+    # squared of 6).
     assert np.degrees(np.linalg.norm(twist[:3])) < 0.12
     assert np.linalg.norm(twist[3:]) < 0.05
     assert twist @ np.linalg.solve(found.covariance, twist) < 22.5

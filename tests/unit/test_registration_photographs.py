@@ -62,7 +62,8 @@ def test_a_click_is_where_its_photograph_shows_it(
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]] + 0.5
     weight = np.where(image > 0.02 * image.max(), image, 0)
     seen = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
-    # The colours of a mosaic lie up to half a pixel beside each other, which its mean halves; a pixel cut off at 2 % adds hundredths.
+    # The colours of a mosaic lie up to half a pixel beside each other, which its mean halves; a pixel cut off at 2 %
+    # adds hundredths.
     np.testing.assert_allclose(click.pixel, seen, atol=0.1)
     (one,) = (camera for camera in calibration.cameras)
     assert views["c0"].camera.K[0][0] == pytest.approx(one.K[0][0] * image.shape[1] / SIZE[0])

@@ -122,7 +122,8 @@ def test_a_lease_from_before_the_clock_stepped_back_is_not_waited_for(repository
 
 
 def test_a_server_that_stopped_working_on_a_job_loses_it_like_any_other(repository: Repository, clock: Clock) -> None:
-    # What it holds is told by the lease it works under now, not by its name: a runner that broke off must not keep its job for ever.
+    # What it holds is told by the lease it works under now, not by its name: a runner that broke off must not keep its
+    # job for ever.
     broken, current = (repository.lease(repository.create(SPEC, None).job.id, "a", 60) for _ in range(2))
     clock.now_s += 70
     assert repository.lose_expired([current]) == [broken.job.id]

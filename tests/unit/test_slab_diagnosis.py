@@ -1,4 +1,6 @@
-"""What is said of a cell's images before a fit: each fault is told with its number and remedy, and good images say nothing."""
+"""What is said of a cell's images before a fit: each fault is told with its number and remedy, and good images say
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,10 @@ def test_pixels_that_lie_beside_the_beam_are_told() -> None:
             20.0,
             0.0,
             (
-                "The sample is too thick: σt·w is about 20, and images tell a phase function from 0.1 to 10; dilute it 10-fold",
+                (
+                    "The sample is too thick: σt·w is about 20, and images tell a phase function from 0.1 to 10; dilute"
+                    " it 10-fold"
+                ),
             ),
         ),
         (0.1, 0.9, ("The sample absorbs too much: about 90 % ",)),

@@ -1,4 +1,6 @@
-"""Dictionaries of a slab's fit: their phase functions, derivatives by their weights, what they give back, and what is refused."""
+"""Dictionaries of a slab's fit: their phase functions, derivatives by their weights, what they give back, and what is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -230,7 +232,8 @@ ANGLES = np.linspace(0, 180, 5)
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda _: None, "holds no dictionary.csv or dictionary.npy, which dictionary = table is read from; put one there."),
+        (lambda _: None,
+        "holds no dictionary.csv or dictionary.npy, which dictionary = table is read from; put one there."),
         (written(""), "the first line must name the columns, the first of them angle_deg."),
         (written("theta,a\n0,1\n180,1\n"), "the first line must name the columns, the first of them angle_deg."),
         (written("angle_deg\n0\n180\n"), "has 0 atoms; give 1 to 200, each a column after the angles."),
@@ -241,7 +244,8 @@ ANGLES = np.linspace(0, 180, 5)
         (written("angle_deg,a\n0,1\n"), "angles must rise from 0 to 180 degrees in the first column."),
         (written("angle_deg,a\n0,1\n90,1\n80,1\n180,1\n"), "angles must rise from 0 to 180 degrees"),
         (written("angle_deg,a\n1,1\n180,1\n"), "angles must rise from 0 to 180 degrees"),
-        (written("angle_deg,a\n0,1\n90,-1\n180,1\n"), "atom a is negative at 90 degrees; a phase function is never below"),
+        (written("angle_deg,a\n0,1\n90,-1\n180,1\n"),
+        "atom a is negative at 90 degrees; a phase function is never below"),
         (written("angle_deg,a,b\n0,1,0\n180,1,0\n"), "atom b scatters nowhere; remove its column."),
         (written("angle_deg,\xe9\n0,1\n180,1\n"), "cannot be read ("),
         (saved(np.ones(5)), "holds float64 (5,) instead of floats (angles, 1 + atoms); save it as such."),

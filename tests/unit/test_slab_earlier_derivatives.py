@@ -104,7 +104,8 @@ def test_earlier_derivatives_lower_the_noise_of_the_gradient() -> None:
     with_them, without = (
         np.std([one.gradient[:SEEN] for one in drawn(anew=True, kept=kept)], axis=0) for kept in (True, False)
     )
-    # Noise of J is nine times its square and falls by KEPT / COUNT + 1 = 6; the images' own noise meets the signal as before.
+    # Noise of J is nine times its square and falls by KEPT / COUNT + 1 = 6; the images' own noise meets the signal as
+    # before.
     assert (with_them < 0.6 * without).all()
 
 
@@ -143,7 +144,8 @@ def test_residuals_of_renders_before_join_without_bias_and_with_less_noise() -> 
     true = np.einsum("ipu,ip->u", SIGNAL, RESIDUAL)
     joined, single = (np.stack([one.gradient[:SEEN] for one in each]) for each in (found, alone))
     assert np.abs((joined.mean(axis=0) - true) / (joined.std(axis=0) / np.sqrt(FEW_DRAWS))).max() < 4
-    # Twice the batches halve the variance, or more where products of two noises matter; three of 25 draws are known to 20 %.
+    # Twice the batches halve the variance, or more where products of two noises matter; three of 25 draws are known to
+    # 20 %.
     assert joined.var(axis=0).sum() < 0.75 * single.var(axis=0).sum()
 
 

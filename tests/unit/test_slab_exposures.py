@@ -1,4 +1,6 @@
-"""Stacks of exposures in a slab's folder, by a camera whose numbers are known: what is read of them, and what is refused."""
+"""Stacks of exposures in a slab's folder, by a camera whose numbers are known: what is read of them, and what is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ EXPOSURE = {"exposure_s": 1.0, "bits": 12}
 
 
 def radiance() -> np.ndarray:
-    """From 2 to 20,000 counts per s above black, so that the longest exposure is full near the middle and the shortest dark beside it."""
+    """From 2 to 20,000 counts per s above black, so that the longest exposure is full near the middle and the shortest
+    dark beside it.
+    """
     x, y = np.meshgrid(*2 * [np.linspace(-4, 4, EDGE)])
     return np.asarray(2 + 20_000 * np.exp(-2 * np.hypot(x, y)))
 
@@ -67,7 +71,8 @@ def test_exposures_become_one_image_with_the_noise_that_it_has(tmp_path: Path) -
     # 4,608 values: the rms of as many normal ones is 1 within 0.011, and the measured noise model is known to 2 %.
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=0.05)
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
-    # The brightest pixels are seen by the shortest exposure alone, the dark ones by the longest better than by it: 64 times the light.
+    # The brightest pixels are seen by the shortest exposure alone, the dark ones by the longest better than by it: 64
+    # times the light.
     dark = true * POWER < 5
     alone = np.sqrt((2.0**2 + 0.5 * true * POWER * TIMES_S[0]) / 2) / TIMES_S[0] / POWER
     assert (np.sqrt(measured.variances[0])[dark] < 0.05 * alone[dark]).all()
@@ -150,7 +155,10 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "unknown wavelength": (lambda d: d["exposures"][0].update(wavelength_nm=700), "wavelength_nm 700"),
     "a missing frame": (lambda d: d["exposures"][-1].update(file="gone.npy"), "gone.npy does not exist"),
     "fewer bits": (lambda d: d["exposures"][2].update(bits=8), "more than the 8 bits"),
-    "black as a light": (lambda d: d["exposures"][2].update(file="f0_black_1.npy") or d["exposures"].remove(blacks(d)[1]), "no brighter than"),
+    "black as a light": (
+        lambda d: d["exposures"][2].update(file="f0_black_1.npy") or d["exposures"].remove(blacks(d)[1]),
+        "no brighter than",
+    ),
     "another size": (lambda d: d["pixels"].update(columns=EDGE // 2), "export it at the camera's size"),
 }  # fmt: skip
 

@@ -18,8 +18,8 @@ REACH = Knots().reach(henyey_greenstein(5.0, 0.5, 0.0))
 WEAK = BROAD[:, 0] / np.linalg.norm(BROAD[:, 0])
 """sigma_s at a constant shape: the direction that holds the only signal here."""
 SPREAD = 0.02
-"""Standard deviation of a matrix's entries. Eigenvalues of such noise reach 2 SPREAD sqrt(UNKNOWNS) = 0.57 (Wigner's semicircle),
-those of ten directions 0.13."""
+"""Standard deviation of a matrix's entries. Eigenvalues of such noise reach 2 SPREAD sqrt(UNKNOWNS) = 0.57 (Wigner's
+semicircle), those of ten directions 0.13."""
 SIGNAL = 0.3
 PRIOR = 0.01 * np.eye(UNKNOWNS)
 GRADIENT_NOISE = 0.01 * np.eye(UNKNOWNS)

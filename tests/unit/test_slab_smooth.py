@@ -28,7 +28,8 @@ def batches(relative: np.ndarray, single: np.ndarray) -> Batches:
 
 def test_what_varies_slowly_stays_and_single_scattering_too() -> None:
     rng = np.random.default_rng(1)
-    # The relative derivative of diffuse light by its rate of fall is the distance; a slanted beam adds what is odd in x.
+    # The relative derivative of diffuse light by its rate of fall is the distance; a slanted beam adds what is odd in
+    # x.
     slow = rng.standard_normal(UNKNOWNS) * DISTANCE[:, None] + rng.standard_normal(UNKNOWNS) * X_MM[:, None]
     given = batches(slow[None], rng.standard_normal((GRID.pixels, UNKNOWNS)))
     smooth = smoother_of(GRID, 1.0, IMAGE[None], VARIANCE[None]).of(given)

@@ -1,4 +1,6 @@
-"""Where a slab's fit stands, kept in a file: read again to the last digit, and not at all where it is torn or of another fit."""
+"""Where a slab's fit stands, kept in a file: read again to the last digit, and not at all where it is torn or of
+another fit.
+"""
 
 from __future__ import annotations
 

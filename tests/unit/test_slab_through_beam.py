@@ -1,4 +1,6 @@
-"""The index of refraction from the through-beam: back from shifts that Snell's law gives, and refused where they belong to none."""
+"""The index of refraction from the through-beam: back from shifts that Snell's law gives, and refused where they belong
+to none.
+"""
 
 from __future__ import annotations
 

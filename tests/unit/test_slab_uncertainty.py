@@ -14,7 +14,8 @@ from services.fit.slab.solve.uncertainty import uncertainty_of
 
 MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)
 CURVATURE = 1e4
-"""Of every unknown, so strong that no prior matters: an unknown's variance is that of its gradient over the square of this."""
+"""Of every unknown, so strong that no prior matters: an unknown's variance is that of its gradient over the square of
+this."""
 
 
 def solution(short: np.ndarray, rendering: float) -> Solution:
@@ -50,7 +51,8 @@ def test_a_way_that_is_left_counts_as_error() -> None:
 
 
 def test_a_way_that_noise_explains_does_not() -> None:
-    # Each unknown off by one of its own standard errors, as noise leaves it: 200 of them, so the square of their length is known to 10 %.
+    # Each unknown off by one of its own standard errors, as noise leaves it: 200 of them, so the square of their length
+    # is known to 10 %.
     short = np.random.default_rng(1).standard_normal(UNKNOWNS) * 1e-2
     short[-1] = 0.0
     still = standard_error(solution(np.zeros(UNKNOWNS), 0.0))

@@ -1,4 +1,6 @@
-"""Weights of a slab's images: what cameras of one light share of the paths' noise is known, and tells nothing thrice."""
+"""Weights of a slab's images: what cameras of one light share of the paths' noise is known, and tells nothing
+thrice.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ GROUPS = (np.array([0, 2]), np.array([1, 3]))
 
 
 def noise(seed: int) -> list[np.ndarray]:
-    # Covariances (pixels, 2, 2) of two lights, each of three paths that both cameras see alike and a little that they do not.
+    # Covariances (pixels, 2, 2) of two lights, each of three paths that both cameras see alike and a little that they
+    # do not.
     rng = np.random.default_rng(seed)
     alike = rng.uniform(1, 2, (2, 6, 1, 1))
     return [one * np.array([[1.0, 0.9], [0.9, 1.0]]) for one in alike]
@@ -60,8 +63,8 @@ def test_independent_weights_are_inverse_variances() -> None:
 
 
 def test_the_covariance_of_batches_is_that_of_their_mean() -> None:
-    # 4,000 batches of noise that two cameras share by half. A corner's mean counts pixels by 4, 2, 2 and 1 ninths, as 3.2 equal ones:
-    # a variance of 13,000 draws is known to 1.2 %, and 5 % is four times that.
+    # 4,000 batches of noise that two cameras share by half. A corner's mean counts pixels by 4, 2, 2 and 1 ninths, as
+    # 3.2 equal ones: a variance of 13,000 draws is known to 1.2 %, and 5 % is four times that.
     rng = np.random.default_rng(8)
     shared = rng.standard_normal((4000, 1, 6))
     images = np.sqrt(0.5) * (shared + rng.standard_normal((4000, 2, 6)))

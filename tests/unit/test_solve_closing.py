@@ -22,7 +22,9 @@ SENSOR, IMAGE, SLOPE = 0.05, 0.05, 0.15
 
 
 class Linear:
-    """Images J x with the instruments ``similar`` in place of J, and noise of which the lights of a pixel share half."""
+    """Images J x with the instruments ``similar`` in place of J, and noise of which the lights of a pixel share
+    half.
+    """
 
     def __init__(self, seed: int, held: bool = False) -> None:
         rng = np.random.default_rng(1)
@@ -91,7 +93,8 @@ def rms(*, measured: bool, held: bool) -> np.ndarray:
 
 @pytest.mark.parametrize("held", [False, True])
 def test_stated_errors_are_those_seen_over_noise(held: bool) -> None:
-    # The rule of tables, an rms of 0.8 to 1.25; an honest one of 200 strays beyond in fewer than one of a thousand cases.
+    # The rule of tables, an rms of 0.8 to 1.25; an honest one of 200 strays beyond in fewer than one of a thousand
+    # cases.
     low, high = rms_bounds(ROUNDS)
     found = rms(measured=True, held=held)
     assert (found > low).all(), found
@@ -99,7 +102,8 @@ def test_stated_errors_are_those_seen_over_noise(held: bool) -> None:
 
 
 def model_and_loss(seed: int) -> tuple[ClosingModel, np.ndarray, Callable[[np.ndarray], float]]:
-    # Images are linear and instruments their own derivatives, so what a model says of x can be held against the loss itself.
+    # Images are linear and instruments their own derivatives, so what a model says of x can be held against the loss
+    # itself.
     problem = Linear(seed)
     problem.similar = problem.exact
     photo, x = problem.photograph(0.0), problem.truth + 0.05
@@ -116,7 +120,8 @@ def assert_standard(z: list[float]) -> None:
 
 
 def test_a_step_s_promise_is_what_the_loss_falls_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Derivatives are quiet: what their noise does to the curvature is the judge's allowance and not in the stated error.
+    # Derivatives are quiet: what their noise does to the curvature is the judge's allowance and not in the stated
+    # error.
     monkeypatch.setattr("tests.unit.test_solve_closing.SLOPE", 0.01)
     z = []
     for seed in range(ROUNDS):
@@ -143,7 +148,8 @@ def test_without_the_measurement_they_are_not() -> None:
 
 
 def test_the_stated_noise_of_a_response_is_what_is_seen() -> None:
-    # Rendered rows and a borrowed one, mixed by T. Variances of 2000 draws, each known to 3 %, and stated by the draws themselves: 20 % is six times that.
+    # Rendered rows and a borrowed one, mixed by T. Variances of 2000 draws, each known to 3 %, and stated by the draws
+    # themselves: 20 % is six times that.
     borrowed, transform = np.array([False, False, True]), np.array([[1.0, 0.0, 0.3], [0.0, 0.8, -0.2], [0.1, 0.0, 1.2]])
     draws = []
     for seed in range(2000):
@@ -185,7 +191,8 @@ def test_a_response_beyond_noise_is_taken_as_it_is() -> None:
 
 
 def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
-    # Twelve teeth of two coordinates, each of which responds with others of its own; noise of 0.1 and of 0.03 between teeth.
+    # Twelve teeth of two coordinates, each of which responds with others of its own; noise of 0.1 and of 0.03 between
+    # teeth.
     rng = np.random.default_rng(5)
     domain = Domain(tuple(Coordinate((f"{k}.enamel.{leaf}",)) for k in range(12) for leaf in ("sigma", "alpha")))
     own = domain.relation == 0
@@ -197,7 +204,8 @@ def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
         response(sums, np.zeros((24, 24)), relation).excess
         for relation in (domain.relation, np.zeros_like(domain.relation))
     )
-    # Shrinking by 0.3^2 / (0.3^2 + 0.1^2) leaves an rms error of 0.095; one scatter for all entries shrinks the teeth's own by more than half.
+    # Shrinking by 0.3^2 / (0.3^2 + 0.1^2) leaves an rms error of 0.095; one scatter for all entries shrinks the teeth's
+    # own by more than half.
     assert np.sqrt(np.mean((told - excess)[own] ** 2)) < 0.12
     assert np.sqrt(np.mean((alike - excess)[own] ** 2)) > 0.15
     assert np.abs(told[~own]).max() < 0.03

@@ -90,8 +90,9 @@ def test_thousand_ill_conditioned_or_indefinite_systems_never_worsen() -> None:
 
 
 def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
-    # A flat problem: every accepted step is a false alarm. At z = 3 each of at most 3 comparisons a step passes with 1.35e-3; 500 systems x 5 steps x 3
-    # comparisons give at most 10 on average, and more than 22 with probability 1e-3 (Poisson).
+    # A flat problem: every accepted step is a false alarm. At z = 3 each of at most 3 comparisons a step passes with
+    # 1.35e-3; 500 systems x 5 steps x 3 comparisons give at most 10 on average, and more than 22 with probability 1e-3
+    # (Poisson).
     accepted = 0
     for case in range(500):
         problem = Quadratic(
@@ -109,10 +110,11 @@ def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
 
 
 def test_thousand_noisy_systems_take_worse_steps_no_more_often_than_stated() -> None:
-    # A third each ill-conditioned, indefinite and nothing but noise, the comparison itself noisy. A step that is taken while truly worse is a false alarm
-    # at z = 3: 1.35e-3 of all comparisons at most. The count of these is Poisson; beyond its mean by four standard deviations, plus one, is one in 10,000.
-    # The last step, onto the minimum of all that is known, is refused only when surely worse, so it may lose up to what the comparison cannot see: with
-    # 3 standard errors to refuse and one in 150,000 to be missed, 7.5 of them.
+    # A third each ill-conditioned, indefinite and nothing but noise, the comparison itself noisy. A step that is taken
+    # while truly worse is a false alarm at z = 3: 1.35e-3 of all comparisons at most. The count of these is Poisson;
+    # beyond its mean by four standard deviations, plus one, is one in 10,000. The last step, onto the minimum of all
+    # that is known, is refused only when surely worse, so it may lose up to what the comparison cannot see: with 3
+    # standard errors to refuse and one in 150,000 to be missed, 7.5 of them.
     rng, worse, compared = np.random.default_rng(5), 0, 0
     for case in range(1000):
         problem, domain, x = _random_problem(rng)
@@ -205,7 +207,8 @@ def test_state_survives_the_journal_exactly() -> None:
 
 
 def test_a_stage_that_goes_on_with_the_same_measurements_forgets_nothing() -> None:
-    # Noise is all that is left at the start, so that nothing moves; variances of pooled gradients add like those of 256 and 512 paths in one.
+    # Noise is all that is left at the start, so that nothing moves; variances of pooled gradients add like those of 256
+    # and 512 paths in one.
     problem, domain = Quadratic(np.eye(2), np.array([1.0, 2.0]), gradient_noise=1.0, loss_noise=100.0), _domain(2)
     solver = GaussNewton(domain, Options(max_samples=512))
     first = solver.step(problem, solver.init(problem.best, 256))
@@ -244,7 +247,8 @@ class Overpromising(Quadratic):
 
 
 def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> None:
-    # The promise, 408 x 0.07^2 = 2, is for a fifth of a unit of length, so that the model's own error is 0.2; the comparison sees nothing, 0.4 +- 1.
+    # The promise, 408 x 0.07^2 = 2, is for a fifth of a unit of length, so that the model's own error is 0.2; the
+    # comparison sees nothing, 0.4 +- 1.
     problem = Overpromising(np.diag([816.0, 816.0]), np.array([0.07, 0.0]), seen=1.0)
     domain = Domain((Coordinate(("enamel.g1",)), Coordinate(("dentin.g1",))))
     start = np.zeros(2)
@@ -259,8 +263,8 @@ def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> N
 
 
 def test_the_last_step_goes_where_both_witnesses_together_point() -> None:
-    # The promise is 2 again, uncertain by 0.53 of it. A comparison of 0.4 +- 10 knows nothing and leaves it standing by 1.9 standard errors: too few for a
-    # step on the way, enough for the last. One of 0.4 +- 0.1 knows better.
+    # The promise is 2 again, uncertain by 0.53 of it. A comparison of 0.4 +- 10 knows nothing and leaves it standing by
+    # 1.9 standard errors: too few for a step on the way, enough for the last. One of 0.4 +- 0.1 knows better.
     domain = Domain((Coordinate(("enamel.g1",)), Coordinate(("dentin.g1",))))
     solver, start = GaussNewton(domain, Options(max_samples=64, slope_error=0.5)), np.zeros(2)
     ends = []

@@ -61,7 +61,8 @@ def test_l1_finds_the_median(loss: Loss) -> None:
 
 
 def test_robust_loss_ignores_a_shadow() -> None:
-    # A fifth of the values lies 20 standard deviations off: the mean moves by 4, Cauchy's place by less than 3 standard errors of the rest's mean.
+    # A fifth of the values lies 20 standard deviations off: the mean moves by 4, Cauchy's place by less than 3 standard
+    # errors of the rest's mean.
     rng = np.random.default_rng(4)
     values = rng.standard_normal(500)
     values[:100] -= 20.0

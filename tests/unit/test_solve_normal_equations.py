@@ -48,14 +48,16 @@ def test_sums_are_unbiased_and_their_errors_true() -> None:
         z = (sample.mean(axis=0) - exact) / (sample.std(axis=0) / np.sqrt(ROUNDS))
         assert np.abs(z).max() < 4
 
-    # Stated against seen variances: a variance of ROUNDS values has a relative error of sqrt(2 / ROUNDS) = 2.6 %, doubled for non-Gaussian products; 4 sigma.
+    # Stated against seen variances: a variance of ROUNDS values has a relative error of sqrt(2 / ROUNDS) = 2.6 %,
+    # doubled for non-Gaussian products; 4 sigma.
     tolerance = 4 * 2 * np.sqrt(2 / ROUNDS)
     for u in np.eye(3), np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]:
         seen = np.array([[direction @ h @ direction for direction in u.T] for h in hessians]).var(axis=0)
         stated = np.mean([e.eigenvalue_noise(u) ** 2 for e in many], axis=0)
         np.testing.assert_allclose(stated, seen, rtol=tolerance)
         np.testing.assert_allclose(
-            np.mean([np.diag(u.T @ e.gradient_noise @ u) for e in many], axis=0), ((gradients @ u).var(axis=0)), rtol=tolerance
+            np.mean([np.diag(u.T @ e.gradient_noise @ u) for e in many], axis=0), ((gradients @ u).var(axis=0)),
+            rtol=tolerance
         )  # fmt: skip
 
 
@@ -89,7 +91,8 @@ def test_compared_losses_are_unbiased_and_their_error_true(edge: int) -> None:
 
 
 def test_cells_take_away_noise_and_leave_what_is_smooth() -> None:
-    # 16 pixels to a cell; noise that outweighs residuals falls as their root, to a quarter. Within cells old and new differ by what every pixel has alike.
+    # 16 pixels to a cell; noise that outweighs residuals falls as their root, to a quarter. Within cells old and new
+    # differ by what every pixel has alike.
     rng, pixels = np.random.default_rng(8), 640
     cell = (np.arange(pixels) // 16).astype(np.int32)
     old, weight = 0.1 * rng.standard_normal(40)[cell], np.ones(pixels)

@@ -1,4 +1,6 @@
-"""The prior of an instrument's errors, used in full: smaller errors where a fit did not use it, true ones, and faults by name."""
+"""The prior of an instrument's errors, used in full: smaller errors where a fit did not use it, true ones, and faults
+by name.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ TISSUE, ERRORS, COUNT = 2, 3, 60
 
 @dataclass(frozen=True)
 class Crude:
-    """A linear fit by derivatives that are not the images' own, of images that a move changes too, of which it knows nothing."""
+    """A linear fit by derivatives that are not the images' own, of images that a move changes too, of which it knows
+    nothing.
+    """
 
     answer: Array
     """What it makes of measurements, (F, M)."""
@@ -47,7 +51,9 @@ class Crude:
 
 
 def crude(seed: int, misfit: float, moved: float) -> Crude:
-    """Measurements of unit noise, in which the tissue is well and the errors are about as well known as by their prior."""
+    """Measurements of unit noise, in which the tissue is well and the errors are about as well known as by their
+    prior.
+    """
     random = np.random.default_rng(seed)
     exact = np.concatenate(
         [3 * random.standard_normal((COUNT, TISSUE)), 20 * random.standard_normal((COUNT, ERRORS))], axis=1

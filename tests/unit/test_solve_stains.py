@@ -1,4 +1,6 @@
-"""Steps of a stain texture on a product model whose truth is known: they lower F, find the texture, and leave alone what nobody sees."""
+"""Steps of a stain texture on a product model whose truth is known: they lower F, find the texture, and leave alone
+what nobody sees.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ UNSEEN = slice(50, TEXELS)
 
 @dataclass
 class Toy:
-    """C_p = light_p exp(-sum_t S_pt d_t): a share 1 on the way out at one texel, another spread over its neighbourhood on the way in."""
+    """C_p = light_p exp(-sum_t S_pt d_t): a share 1 on the way out at one texel, another spread over its neighbourhood
+    on the way in.
+    """
 
     light: np.ndarray
     shares: np.ndarray
@@ -58,7 +62,8 @@ def truth(low: float = 0.0) -> np.ndarray:
 
 
 def test_ratio_steps_lower_the_loss_however_uneven_the_texture() -> None:
-    # The bound holds for any texture without noise, as long as nothing is shifted: here a third of the surface is clean and the render starts too bright.
+    # The bound holds for any texture without noise, as long as nothing is shifted: here a third of the surface is clean
+    # and the render starts too bright.
     toy, state = Toy.of(truth()), clean(TEXELS)
     for _ in range(6):
         before, state = toy.loss(state.depth), SOLVER.ratio_step(state, toy.sums(state.depth))
@@ -67,7 +72,8 @@ def test_ratio_steps_lower_the_loss_however_uneven_the_texture() -> None:
 
 
 def test_ratio_steps_find_the_pattern_when_the_render_is_too_dark() -> None:
-    # Media that took the mean of the stain: everything is brighter than the render in the clean parts. The pattern comes out, up to a common depth.
+    # Media that took the mean of the stain: everything is brighter than the render in the clean parts. The pattern
+    # comes out, up to a common depth.
     toy, state = Toy.of(truth()), clean(TEXELS)
     toy.light = toy.light * 0.6
     for _ in range(2):
@@ -77,7 +83,8 @@ def test_ratio_steps_find_the_pattern_when_the_render_is_too_dark() -> None:
 
 
 def test_exact_steps_find_the_texture() -> None:
-    # What stays after seven steps is the slowest direction, (1 - 1/4) damped to a momentum step's 0.48 each, and the prior, at most 1e-3 of the data here.
+    # What stays after seven steps is the slowest direction, (1 - 1/4) damped to a momentum step's 0.48 each, and the
+    # prior, at most 1e-3 of the data here.
     toy, state = Toy.of(truth()), clean(TEXELS)
     for step in range(20):
         state = SOLVER.exact_step(state, toy.sums(state.depth), 0)

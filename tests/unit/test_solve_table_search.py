@@ -43,7 +43,8 @@ def test_finds_the_albedo_and_scale_it_was_given() -> None:
     for alpha, scale in ((0.93, 1.0), (0.99, 1.2), (0.997, 0.9)):
         image = scale * np.einsum("k,kln->ln", bin_powers(np.array([alpha]), EDGES)[0], orders)
         found = search_node(NODE, [(orders, orders)], EDGES, [_observed(image)], 3000)
-        # 3000 albedos over two decades of 1 - alpha: neighbours are 0.15 % of 1 - alpha apart; by error alone scale must not matter.
+        # 3000 albedos over two decades of 1 - alpha: neighbours are 0.15 % of 1 - alpha apart; by error alone scale
+        # must not matter.
         closest = min(found, key=lambda c: c.error)
         assert abs(np.log((1 - closest.alpha) / (1 - alpha))) < 0.05
         assert abs(closest.scale / scale - 1) < 0.01

@@ -1,4 +1,6 @@
-"""Stored truths hold what they say: optics of their subject, closed meshes, little space; and the sensor noise that is added is that of the variance files."""
+"""Stored truths hold what they say: optics of their subject, closed meshes, little space; and the sensor noise that is
+added is that of the variance files.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ def test_optics_are_those_of_the_subject(name: str) -> None:
 
 
 def test_noise_has_the_variance_that_is_written(tmp_path: Path) -> None:
-    # The sum of squared z-scores of N pixels is chi-squared; five standard deviations of it happen by chance once in a million.
+    # The sum of squared z-scores of N pixels is chi-squared; five standard deviations of it happen by chance once in a
+    # million.
     name = names()[0]
     truth = write_capture(name, tmp_path / "capture", seed=3, tested_camera="c1")
     description = json.loads((tmp_path / "capture" / "capture.json").read_text())

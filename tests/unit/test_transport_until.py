@@ -1,4 +1,6 @@
-"""Rounds of a walk that is to reach an error: they go on where the last one ended, grow within bounds, and stop when the error is there."""
+"""Rounds of a walk that is to reach an error: they go on where the last one ended, grow within bounds, and stop when
+the error is there.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ def test_rounds_follow_on_and_grow_within_bounds() -> None:
     for last, following in zip(walk.rounds, walk.rounds[1:], strict=False):
         assert following.start == last.stop
         assert MIN_GROWTH <= following.stop / last.stop <= GROWTH
-    # An error of 5 % takes 200^2 paths; 6000 degrees of freedom know it to 2 %, and the last round leaves a margin of 5 to 25 %.
+    # An error of 5 % takes 200^2 paths; 6000 degrees of freedom know it to 2 %, and the last round leaves a margin of 5
+    # to 25 %.
     assert found.samples == 16 * walk.rounds[-1].stop
     assert 0.95 * 200**2 <= found.samples <= 1.35 * 200**2
     assert abs(found.mean.mean() - 1) <= 4.5 * 0.05 / np.sqrt(PIXELS)

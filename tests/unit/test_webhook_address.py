@@ -16,9 +16,10 @@ from services.client.errors import WebhookAddressError
 
 STRICT, PRIVATE = AddressPolicy(), AddressPolicy(allow_private=True)
 HIDDEN = (
-    "127.0.0.1", "10.1.2.3", "172.16.0.1", "192.168.1.1", "169.254.169.254", "100.64.0.1", "0.0.0.0", "224.0.0.1", "255.255.255.255", "240.0.0.1",
-    "::1", "::", "fe80::1", "fc00::1", "fec0::1", "ff02::1", "::ffff:127.0.0.1", "::ffff:169.254.169.254", "64:ff9b::7f00:1", "2002:7f00:1::", "2001:db8::1",
-    "3fff::1", "3fff:fff::1", "2001:4860::5efe:7f00:1", "2606:2800::200:5efe:a9fe:a9fe", "2606:2800::5efe:5db8:d822",
+    "127.0.0.1", "10.1.2.3", "172.16.0.1", "192.168.1.1", "169.254.169.254", "100.64.0.1", "0.0.0.0", "224.0.0.1",
+    "255.255.255.255", "240.0.0.1", "::1", "::", "fe80::1", "fc00::1", "fec0::1", "ff02::1", "::ffff:127.0.0.1",
+    "::ffff:169.254.169.254", "64:ff9b::7f00:1", "2002:7f00:1::", "2001:db8::1", "3fff::1", "3fff:fff::1",
+    "2001:4860::5efe:7f00:1", "2606:2800::200:5efe:a9fe:a9fe", "2606:2800::5efe:5db8:d822",
 )  # fmt: skip
 PUBLIC = ("93.184.216.34", "2606:2800:220:1:248:1893:25c8:1946", "::ffff:93.184.216.34", "64:ff9b::5db8:d822")
 
@@ -95,8 +96,10 @@ def test_no_setting_opens_what_is_no_host(address: str) -> None:
 
 @pytest.mark.parametrize(
     "url",
-    ["", "/hook", "example.org/hook", "ftp://example.org/", "file:///etc/passwd", "https://", "https:///hook", "https://u:p@example.org/", "https://a@example.org",
-     "https://example.org/#part", "https://exa mple.org/", "https://example.org:99999/", "https://example.org/\n", "https://[::1", "http://example.org/"],
+    ["", "/hook", "example.org/hook", "ftp://example.org/", "file:///etc/passwd", "https://", "https:///hook",
+    "https://u:p@example.org/", "https://a@example.org",
+     "https://example.org/#part", "https://exa mple.org/", "https://example.org:99999/", "https://example.org/\n",
+     "https://[::1", "http://example.org/"],
 )  # fmt: skip
 @pytest.mark.attack("webhooks", "another scheme, a login or a malformed address")
 def test_what_is_no_secure_web_address_is_refused(url: str) -> None:

@@ -1,6 +1,8 @@
-"""Where an average crown lies in the mesh of a tooth: closest points iterated from many turns at once (Besl and McKay 1992), with normals.
+"""Where an average crown lies in the mesh of a tooth: closest points iterated from many turns at once (Besl and McKay
+1992), with normals.
 
-Only the average's crown is looked for, so that it does not matter how much root the mesh has. Its size is free within limits.
+Only the average's crown is looked for, so that it does not matter how much root the mesh has. Its size is free within
+limits.
 """
 
 from __future__ import annotations
@@ -18,15 +20,19 @@ from services.core.geometry import Mesh
 Array = NDArray[np.float64]
 
 NORMAL_MM = 2.0
-"""What a difference of one radian between normals counts as: it keeps a crown's walls apart, which are some millimetres from each other."""
+"""What a difference of one radian between normals counts as: it keeps a crown's walls apart, which are some millimetres
+from each other."""
 FARTHEST_MM = 3.0
-"""A point that is farther than this from the other surface counts as this far: it is of something that the other does not have."""
+"""A point that is farther than this from the other surface counts as this far: it is of something that the other does
+not have."""
 SOFT_MM = 1.0
 """Distance at which a point has half its weight in the next step."""
 SCALES = (0.8, 1.25)
-"""Of a tooth's size to the average's: real teeth differ by 10 to 20 %; an upper average stands for the smaller lower incisors too."""
+"""Of a tooth's size to the average's: real teeth differ by 10 to 20 %; an upper average stands for the smaller lower
+incisors too."""
 NECK = 0.12
-"""Share of the crown's length above its neck in which the mesh is not compared: its cervical line, or where it was cut and closed, is elsewhere."""
+"""Share of the crown's length above its neck in which the mesh is not compared: its cervical line, or where it was cut
+and closed, is elsewhere."""
 MESH_POINTS, CROWN_POINTS = 3000, 2500
 """Of the mesh and of the average, in which closest points are looked for: 0.3 mm apart."""
 REVERSE_STEP = 4
@@ -81,7 +87,8 @@ class CrownMatch:
         crown = average.outer.faces[
             average.outer.vertices_mm[average.outer.faces].mean(axis=1)[:, 2] > average.cervix_mm
         ]
-        # x is mesial on the patient's right above and on the left below; on the other sides the average is a mirror image.
+        # x is mesial on the patient's right above and on the left below; on the other sides the average is a mirror
+        # image.
         self._mirror = np.array([-float(side_of_front(fdi)), 1.0, 1.0])
         self._crown = Mesh(average.outer.vertices_mm, crown)
         self._middle = (

@@ -1,8 +1,9 @@
-"""Teeth of a scan without labels: the operator points at each, an average crown is fitted there, and creases part the surface.
+"""Teeth of a scan without labels: the operator points at each, an average crown is fitted there, and creases part the
+surface.
 
-A fitted crown only tells what is surely its tooth and what is surely not; between the two a minimal cut follows the creases of the
-surface (Boykov and Jolly, "Interactive graph cuts", ICCV 2001). Teeth are told from each other by fronts that run from what is surely
-theirs and that creases hold up (Dijkstra's distances).
+A fitted crown only tells what is surely its tooth and what is surely not; between the two a minimal cut follows the
+creases of the surface (Boykov and Jolly, "Interactive graph cuts", ICCV 2001). Teeth are told from each other by fronts
+that run from what is surely theirs and that creases hold up (Dijkstra's distances).
 """
 
 from __future__ import annotations
@@ -37,11 +38,13 @@ FARTHEST_MM = 2.0
 NEAREST_MM = 2.0
 """Between points of two teeth: the narrowest teeth are 5 mm wide."""
 PATCH_MM, PATCH_DEPTH_MM = 8.0, 6.0
-"""Around a point, and below it, that a crown is fitted to: half a molar's width with room, and the least height of a crown."""
+"""Around a point, and below it, that a crown is fitted to: half a molar's width with room, and the least height of a
+crown."""
 CROWN_POINTS, CROWN_ROUNDS = 300, 12
 """Of a fit, which need not be closer than a millimetre."""
 SHIFTS_MM = (-2.5, 0.0, 2.5)
-"""Towards the cheek, of where fits begin: people click the cusp, a premolar's or molar's being so far beside its middle."""
+"""Towards the cheek, of where fits begin: people click the cusp, a premolar's or molar's being so far beside its
+middle."""
 CORE = 0.7
 """Share of the fitted crown's half width within which its upper half is surely the tooth's."""
 CLICKED_MM = 1.0
@@ -49,13 +52,16 @@ CLICKED_MM = 1.0
 CORE_ABOVE_MM = 2.0
 """Above the fitted crown's top, as far as the core reaches."""
 GUMS_MM = (1.0, 3.5)
-"""Away from the boxes around all fitted crowns: where the surface begins to be likelier gums than tooth, and where it surely is."""
+"""Away from the boxes around all fitted crowns: where the surface begins to be likelier gums than tooth, and where it
+surely is."""
 GUMS_PER_MM = 0.3
-"""Cost of a square millimetre that is taken for tooth just before it is surely gums, against a millimetre of border on a flat surface."""
+"""Cost of a square millimetre that is taken for tooth just before it is surely gums, against a millimetre of border on
+a flat surface."""
 FLAT = 0.2
 """Spread of the points across their line, relative to that along it, above which they span the occlusal plane."""
 SMOOTH_MM = 0.33
-"""Over which normals are averaged before the surface's bend is taken: a scan's noise is shorter, a crease at a neck as wide."""
+"""Over which normals are averaged before the surface's bend is taken: a scan's noise is shorter, a crease at a neck as
+wide."""
 MAX_ROUNDS = 30
 CREASE_PER_MM = 0.4
 """Bend inwards, radians a millimetre, at which a border costs 1/e of one on a flat surface."""
@@ -88,13 +94,13 @@ def part_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) -> 
 
     Args:
         mesh: open surface of one jaw, counter-clockwise seen from outside.
-        points_mm: by FDI number, points (N, 3) in the middle of the tooth's edge or chewing surface, or on a cusp; a tooth
-            without any is left to the gums.
+        points_mm: by FDI number, points (N, 3) in the middle of the tooth's edge or chewing surface, or on a cusp; a
+            tooth without any is left to the gums.
         what: the scan's name for messages.
 
     Raises:
-        CaptureInputError: fewer than two teeth have points, a point is not on the scan, two teeth's are at one place, they
-            point into the gums, or no crown is found about one.
+        CaptureInputError: fewer than two teeth have points, a point is not on the scan, two teeth's are at one place,
+            they point into the gums, or no crown is found about one.
     """
     teeth = tuple(sorted(points_mm))
     tops = np.array([points_mm[fdi].mean(axis=0) for fdi in teeth]).reshape(-1, 3)
@@ -113,7 +119,8 @@ def part_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) -> 
     for fdi in teeth:
         if not (labels == fdi).any():
             raise CaptureInputError(
-                f"No crown is found about the landmarks of tooth {fdi} in {what}; click the middle of its edge or chewing surface."
+                f"No crown is found about the landmarks of tooth {fdi} in {what}; click the middle of its edge or"
+                " chewing surface."
             )
     return labels
 
@@ -123,8 +130,8 @@ def _require_points(mesh: Mesh, points_mm: Mapping[int, Array], teeth: tuple[int
 
     if len(teeth) < 2:
         raise CaptureInputError(
-            f"{what[0].upper()}{what[1:]} has no labels, and landmarks name {len(teeth)} of its teeth; click one point on each tooth, "
-            "in the middle of its edge or chewing surface, or export the scan with its segmentation."
+            f"{what[0].upper()}{what[1:]} has no labels, and landmarks name {len(teeth)} of its teeth; click one point"
+            " on each tooth, in the middle of its edge or chewing surface, or export the scan with its segmentation."
         )
     for fdi in teeth:
         if not (fdi // 10 in PERMANENT_QUADRANTS and 1 <= fdi % 10 <= TEETH_A_QUADRANT):
@@ -136,15 +143,15 @@ def _require_points(mesh: Mesh, points_mm: Mapping[int, Array], teeth: tuple[int
         off_mm = float(tree.query(points_mm[fdi])[0].max())
         if off_mm > FARTHEST_MM:
             raise CaptureInputError(
-                f"A landmark of tooth {fdi} lies {off_mm:.3g} mm from {what}; give xyz_mm in the scan's own coordinates, "
-                "in mm, and see whether the scan's units are right."
+                f"A landmark of tooth {fdi} lies {off_mm:.3g} mm from {what}; give xyz_mm in the scan's own"
+                " coordinates, in mm, and see whether the scan's units are right."
             )
     for k, fdi in enumerate(teeth[:-1]):
         apart = np.linalg.norm(tops[k + 1 :] - tops[k], axis=1)
         if apart.min() < NEAREST_MM:
             raise CaptureInputError(
-                f"Landmarks of teeth {fdi} and {teeth[k + 1 + int(apart.argmin())]} are {apart.min():.2g} mm apart, which two teeth "
-                "never are; correct the one that is on the wrong tooth."
+                f"Landmarks of teeth {fdi} and {teeth[k + 1 + int(apart.argmin())]} are {apart.min():.2g} mm apart,"
+                " which two teeth never are; correct the one that is on the wrong tooth."
             )
     if (tops.mean(axis=0) - middle_mm(mesh)) @ vector_area_mm2(mesh) < 0:
         raise CaptureInputError(
@@ -184,7 +191,8 @@ def _fitted_crowns(
 
 
 def _axes(surface: Mesh, teeth: tuple[int, ...], tops: Array) -> Array:
-    # Canonical axes (T, 3, 3): z across the plane of the points, or of the scan's rim where they lie in a line; x along the arch.
+    # Canonical axes (T, 3, 3): z across the plane of the points, or of the scan's rim where they lie in a line; x along
+    # the arch.
     opening = vector_area_mm2(surface)
     _, spread, principal = np.linalg.svd(tops - tops.mean(axis=0), full_matrices=False)
     plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
@@ -213,7 +221,8 @@ def _bends(surface: Mesh, middles: Array) -> _Bends:
     away = middles[other] - middles[one]
     apart = np.maximum(np.linalg.norm(away, axis=1), NEAREST_FACES_MM)
 
-    # Means over a face and its neighbours, again and again, spread over the root of the rounds times the faces' distance.
+    # Means over a face and its neighbours, again and again, spread over the root of the rounds times the faces'
+    # distance.
     rounds = int(np.clip(round((SMOOTH_MM / float(np.median(apart))) ** 2), 1, MAX_ROUNDS))
     a, b, c = (surface.vertices_mm[surface.faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a) / np.maximum(2 * area, np.finfo(float).tiny)[:, None]

@@ -13,7 +13,10 @@ TINY_MM2 = 1e-30
 
 
 def neighbours(faces: Faces) -> NDArray[np.int64]:
-    """Face (F, 3) across each edge, which runs from corner k to corner k + 1; -1 at a boundary. Each edge has at most two faces."""
+    """Face (F, 3) across each edge, which runs from corner k to corner k + 1; -1 at a boundary.
+
+    Each edge has at most two faces.
+    """
     count = int(faces.max()) + 1
     start, end = faces.astype(np.int64).reshape(-1), np.roll(faces, -1, axis=1).astype(np.int64).reshape(-1)
     key, twin = start * count + end, end * count + start
@@ -51,7 +54,9 @@ def middle_mm(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:
-    """Faces (F,) of the largest piece without edges of three faces and without pieces that hang together at a vertex alone."""
+    """Faces (F,) of the largest piece without edges of three faces and without pieces that hang together at a vertex
+    alone.
+    """
     area = areas_mm2(mesh)
     kept = (area > 0) & _first_of_equals(mesh.faces)
     while True:
@@ -67,7 +72,9 @@ def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:
 
 
 def boundary_loops(faces: Faces) -> list[NDArray[np.int64]]:
-    """Vertices of each boundary loop of a manifold piece in the direction of its faces' edges, the loop of most vertices first."""
+    """Vertices of each boundary loop of a manifold piece in the direction of its faces' edges, the loop of most
+    vertices first.
+    """
     open_edge = (neighbours(faces) < 0).reshape(-1)
     following = dict(
         zip(
@@ -88,7 +95,9 @@ def boundary_loops(faces: Faces) -> list[NDArray[np.int64]]:
 
 
 def fill_holes(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
-    """Close every boundary loop but the longest by a fan about its middle; for the new faces, the old face (N,) across their outer edge."""
+    """Close every boundary loop but the longest by a fan about its middle; for the new faces, the old face (N,) across
+    their outer edge.
+    """
     across, owner = neighbours(mesh.faces), {}
     for face, corner in np.argwhere(across < 0):
         owner[int(mesh.faces[face, corner])] = int(face)
@@ -108,10 +117,11 @@ def compact(mesh: Mesh) -> Mesh:
 
 
 def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
-    """Rings (steps, N, 3) that lead from one ring of points (N, 3), left out, to another, each point the mean of its four neighbours.
+    """Rings (steps, N, 3) that lead from one ring of points (N, 3), left out, to another, each point the mean of its
+    four neighbours.
 
-    Around the ring that is a Fourier series, whose wave k falls off over the rows as a hyperbolic sine of the rate with cosh(rate) = 2 - cos(2 pi k / N):
-    what is ragged in a ring ends within a few rows.
+    Around the ring that is a Fourier series, whose wave k falls off over the rows as a hyperbolic sine of the rate with
+    cosh(rate) = 2 - cos(2 pi k / N): what is ragged in a ring ends within a few rows.
     """
     count = len(first_mm)
     rate = np.arccosh(2 - np.cos(2 * np.pi * np.arange(1, count) / count))
@@ -128,7 +138,9 @@ def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], s
 
 
 def ring_faces(rings: NDArray[np.int64], vertices_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Triangles between rings of vertices (R, N), the first a boundary loop of the faces that they continue; quads split along their shorter diagonal."""
+    """Triangles between rings of vertices (R, N), the first a boundary loop of the faces that they continue; quads
+    split along their shorter diagonal.
+    """
     a, b = rings[:-1], np.roll(rings[:-1], -1, axis=1)
     c, d = rings[1:], np.roll(rings[1:], -1, axis=1)
     falling = (
@@ -172,10 +184,13 @@ def without_specks(mesh: Mesh, labels: NDArray[np.int64], share: float = 0.05) -
 
 
 def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Mesh:
-    """Straighten the lines between labels along the surface; a vertex stays where a face about it would fold or nearly vanish."""
+    """Straighten the lines between labels along the surface; a vertex stays where a face about it would fold or nearly
+    vanish.
+    """
     from services.anatomy.distance import SurfaceDistance
 
-    # Edges between labels: each of their vertices moves towards the mean of its neighbours along them, but where a line ends at the scan's rim.
+    # Edges between labels: each of their vertices moves towards the mean of its neighbours along them, but where a line
+    # ends at the scan's rim.
     across = neighbours(mesh.faces)
     border = (across >= 0) & (labels[across] != labels[:, None])
     start, end = mesh.faces[border], np.roll(mesh.faces, -1, axis=1)[border]
@@ -242,7 +257,8 @@ def _simple_edges(faces: Faces) -> NDArray[np.bool_]:
 
 
 def _largest_fans(faces: Faces) -> NDArray[np.bool_]:
-    # Corners of one vertex are joined across the edges that end there; of several fans about a vertex, the one of most faces stays.
+    # Corners of one vertex are joined across the edges that end there; of several fans about a vertex, the one of most
+    # faces stays.
     across = neighbours(faces)
     face, k = np.nonzero(across >= 0)
     other = across[face, k]

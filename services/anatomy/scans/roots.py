@@ -1,4 +1,6 @@
-"""Roots for scanned crowns: an open crown becomes a solid by a tapering root, or a stub of one, from its cervical line."""
+"""Roots for scanned crowns: an open crown becomes a solid by a tapering root, or a stub of one, from its cervical
+line.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +31,11 @@ TAPER = 0.72
 ROUNDING_MM = 1.2
 """Height of the root's rounded end, part of ``STUB_MM``."""
 WHOLE_TAPER, MOLAR_TAPER = 0.35, 0.5
-"""The same of a root as long as those of its kind: a single root ends in a blunt point, the roots of a molar stand apart."""
+"""The same of a root as long as those of its kind: a single root ends in a blunt point, the roots of a molar stand
+apart."""
 WHOLE_NARROWING = 1.5
-"""Roots stay nearly as wide as the neck for some millimetres, and are conical further on: half way down they have 0.77 of its width."""
+"""Roots stay nearly as wide as the neck for some millimetres, and are conical further on: half way down they have 0.77
+of its width."""
 FIRST_MOLAR = 6
 ROW_MM = 0.45
 WIDEST_BRIDGE_MM = 3.5
@@ -60,7 +64,9 @@ STUB = Root()
 
 
 def whole_root(fdi: int) -> Root:
-    """The root of a tooth of average length for its kind; molars' several roots are one, as wide as they are together."""
+    """The root of a tooth of average length for its kind; molars' several roots are one, as wide as they are
+    together.
+    """
     place = fdi % 10
     taper = MOLAR_TAPER if place >= FIRST_MOLAR else WHOLE_TAPER
     return Root(root_length_mm(place, is_upper=is_upper(fdi)), taper, narrowing=WHOLE_NARROWING)
@@ -81,12 +87,14 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, root: Roo
     crown = compact(Mesh(crown.vertices_mm, crown.faces[manifold_piece(crown)]))
     if not boundary_loops(crown.faces):
         raise MeshError(
-            f"The crown of {name} has no open edge at its neck; give the scanned crown alone, or use the solid as it is."
+            f"The crown of {name} has no open edge at its neck; give the scanned crown alone, or use the solid as"
+            " it is."
         )
     crown, _ = fill_holes(_without_spikes(crown))
     if vector_area_mm2(crown) @ occlusal <= 0:
         raise MeshError(
-            f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its triangles."
+            f"The crown of {name} is open towards its cusps or inside out; check its label and the orientation of its"
+            " triangles."
         )
 
     crown = _bridge_contacts(crown, occlusal)
@@ -115,7 +123,8 @@ def _without_spikes(crown: Mesh, rounds: int = 4) -> Mesh:
 
 
 def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
-    # Where teeth touch, the scan sees neither's wall and the cervical line climbs to the contact. A strip joins the two sides of each such notch.
+    # Where teeth touch, the scan sees neither's wall and the cervical line climbs to the contact. A strip joins the two
+    # sides of each such notch.
     for apex in _notches(crown, occlusal):
         loop = boundary_loops(crown.faces)[0]
         loop = np.roll(loop, -int(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1).argmin()))

@@ -1,4 +1,6 @@
-"""An intra-oral scan: one open surface of one jaw, whose every triangle is of a tooth or of the gingiva by labels or landmarks."""
+"""An intra-oral scan: one open surface of one jaw, whose every triangle is of a tooth or of the gingiva by labels or
+landmarks.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from services.core.files.scans import SIDECARS, ScanFile, read_scan_file, read_s
 from services.core.geometry import Mesh
 
 Numbering = Literal["universal", "fdi", "either"]
-"""How labels name teeth; ``either`` takes FDI numbers where the labels can be these and name one jaw, else Universal ones."""
+"""How labels name teeth; ``either`` takes FDI numbers where the labels can be these and name one jaw, else Universal
+ones."""
 Jaw = Literal["upper", "lower"]
 
 GINGIVA = 0
@@ -32,7 +35,9 @@ EXTENT_MM = (8.0, 200.0)
 
 @dataclass(frozen=True)
 class LabelledScan:
-    """An open surface, counter-clockwise seen from outside the tissue, and the FDI number of each face (F,), 0 for gingiva."""
+    """An open surface, counter-clockwise seen from outside the tissue, and the FDI number of each face (F,), 0 for
+    gingiva.
+    """
 
     mesh: Mesh
     fdi: NDArray[np.int64]
@@ -68,7 +73,8 @@ def read_scan(
     jaw: Jaw | None = None,
     points_mm: Mapping[int, NDArray[np.float64]] | None = None,
 ) -> LabelledScan:
-    """Read a scan (.vtp, .ply, .stl or .obj) with a label for each triangle or each vertex, or with points on its teeth.
+    """Read a scan (.vtp, .ply, .stl or .obj) with a label for each triangle or each vertex, or with points on its
+    teeth.
 
     Args:
         path: of the scan.
@@ -80,7 +86,8 @@ def read_scan(
         points_mm: by FDI number, points (N, 3) on the tooth, by which a scan without labels is parted; in mm.
 
     Raises:
-        CaptureInputError: unreadable, without labels, with labels that name no tooth, without gingiva, or not of one jaw.
+        CaptureInputError: unreadable, without labels, with labels that name no tooth, without gingiva, or not of one
+            jaw.
         MeshError: of a size that no jaw has in this unit.
     """
     file = read_scan_file(path)
@@ -113,7 +120,8 @@ def _require_one_jaw(scan: LabelledScan, path: Path, jaw: Jaw | None) -> None:
         )
     if len({is_upper(number) for number in scan.teeth}) > 1:
         raise CaptureInputError(
-            f"Scan {path} has teeth of both jaws ({', '.join(map(str, scan.teeth))}); export each jaw alone, or mend the labels."
+            f"Scan {path} has teeth of both jaws ({', '.join(map(str, scan.teeth))}); export each jaw alone, or mend"
+            " the labels."
         )
     found = "upper" if is_upper(scan.teeth[0]) else "lower"
     if jaw is not None and jaw != found:
@@ -156,12 +164,14 @@ def _per_triangle(values: NDArray[np.float64], file: ScanFile, what: str) -> NDA
         one, two, three = (values[file.mesh.faces[:, k]] for k in range(3))
         return np.asarray(np.where(two == three, two, one))
     raise CaptureInputError(
-        f"{what} has labels of shape {values.shape} for {triangles} triangles and {vertices} vertices; export one a triangle."
+        f"{what} has labels of shape {values.shape} for {triangles} triangles and {vertices} vertices; export one a"
+        " triangle."
     )
 
 
 def _welded(mesh: Mesh) -> tuple[Mesh, int]:
-    # Vertices at one place are one; an STL file writes each of them some six times. Single precision is what scanners write.
+    # Vertices at one place are one; an STL file writes each of them some six times. Single precision is what scanners
+    # write.
     joined, first, index = np.unique(
         mesh.vertices_mm.astype(np.float32), axis=0, return_index=True, return_inverse=True
     )
@@ -187,7 +197,8 @@ def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) 
     if unknown:
         expected = "1 to 32" if numbering == "universal" else "11 to 48"
         raise CaptureInputError(
-            f"Scan {path} has label {unknown[0]}, which names no tooth in {numbering} numbering; give {GINGIVA} for gingiva, {expected} for teeth."
+            f"Scan {path} has label {unknown[0]}, which names no tooth in {numbering} numbering; give {GINGIVA} for"
+            f" gingiva, {expected} for teeth."
         )
     return np.array([number_of[float(label)] for label in labels], dtype=np.int64)[index.reshape(-1)]
 

@@ -1,4 +1,6 @@
-"""Gums from a scanned jaw: the gingiva's own triangles, a membrane where the teeth were, and a base that encloses the roots."""
+"""Gums from a scanned jaw: the gingiva's own triangles, a membrane where the teeth were, and a base that encloses the
+roots.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,9 @@ RIM_ROUNDS = 200
 def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.float64], deepest_mm: float) -> Mesh:
     """A watertight solid; on the gingiva it is the scan itself.
 
-    The crowns' triangles stay, but shrink to a membrane that each cervical line spans: every vertex off the gingiva moves to the mean of its neighbours.
-    The scan's rim is drawn away from the teeth to a flat base. Teeth stand in the solid and overlap it.
+    The crowns' triangles stay, but shrink to a membrane that each cervical line spans: every vertex off the gingiva
+    moves to the mean of its neighbours. The scan's rim is drawn away from the teeth to a flat base. Teeth stand in the
+    solid and overlap it.
 
     Args:
         surface: the scan, manifold, with one boundary loop.
@@ -58,7 +61,8 @@ def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.f
 
 
 def fill_outline(outline: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Delaunay triangles (N - 2, 3), counter-clockwise, of a closed outline (N, 2) whose vertices are dense for its bends and for its width.
+    """Delaunay triangles (N - 2, 3), counter-clockwise, of a closed outline (N, 2) whose vertices are dense for its
+    bends and for its width.
 
     Raises:
         MeshError: the outline crosses itself, or is not that dense.

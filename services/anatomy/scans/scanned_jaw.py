@@ -1,4 +1,6 @@
-"""A jaw of solids from a labelled scan, in arch coordinates: x along the front teeth, y to the front, z occlusal, the origin in the arch's middle."""
+"""A jaw of solids from a labelled scan, in arch coordinates: x along the front teeth, y to the front, z occlusal, the
+origin in the arch's middle.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ SMALLEST_CROWN_MM2 = 15.0
 STEEPEST_TILT_DEG = 25.0
 """Of a tooth's axis off the arch's normal: upper front teeth lean about so far to the front."""
 FLAT = 0.2
-"""Spread of the crowns across their line, relative to that along it, above which their middles span the occlusal plane."""
+"""Spread of the crowns across their line, relative to that along it, above which their middles span the occlusal
+plane."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +66,15 @@ class Repairs:
 
 @dataclass(frozen=True)
 class ScannedJaw:
-    """Solids in arch coordinates, mm. Teeth overlap the gums, which hold their roots; roots are made up, and so is the gums' base."""
+    """Solids in arch coordinates, mm.
+
+    Teeth overlap the gums, which hold their roots; roots are made up, and so is the gums' base.
+    """
 
     teeth: tuple[Tooth, ...]
     frames: tuple[ToothFrame, ...]
-    """Of each tooth: x = y × z, which is mesial in the quadrants 1 and 3 and distal in 2 and 4; y buccal, z occlusal."""
+    """Of each tooth: x = y × z, which is mesial in the quadrants 1 and 3 and distal in 2 and 4; y buccal, z
+    occlusal."""
     gums: Mesh
     arch_from_scan: NDArray[np.float64]
     """Rigid transform (4, 4)."""
@@ -82,7 +89,8 @@ def jaw_from_scan(scan: LabelledScan, roots: Literal["stub", "whole"] = "stub") 
         roots: a stub of 4 mm, all that a camera's light reaches, or as long as the average of the tooth's kind.
 
     Raises:
-        CaptureInputError: a label is in several pieces, or left and right are exchanged. MeshError: a part cannot be closed.
+        CaptureInputError: a label is in several pieces, or left and right are exchanged. MeshError: a part cannot be
+            closed.
     """
     _require_whole_teeth(scan)
     surface, labels, repairs = _clean(scan)
@@ -136,8 +144,8 @@ def _require_whole_teeth(scan: LabelledScan) -> None:
         size = np.bincount(touching_pieces(scan.mesh.faces[own]), weights=area[own])
         if size.max() < LARGEST_SHARE * size.sum():
             raise CaptureInputError(
-                f"The label of tooth {number} is in {len(size)} pieces, the largest {size.max() / size.sum():.0%} of its area; "
-                "relabel the scan so that it is one."
+                f"The label of tooth {number} is in {len(size)} pieces, the largest {size.max() / size.sum():.0%} of"
+                " its area; relabel the scan so that it is one."
             )
 
 
@@ -167,14 +175,16 @@ def _length_mm(loop_mm: NDArray[np.float64]) -> float:
 
 
 def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float64]) -> NDArray[np.float64]:
-    # The occlusal normal is that of the plane through the crowns' middles; few crowns in a line leave the turn about it to the normal of the scan's rim.
+    # The occlusal normal is that of the plane through the crowns' middles; few crowns in a line leave the turn about it
+    # to the normal of the scan's rim.
     opening = vector_area_mm2(surface)
     _, spread, principal = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)
     plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
     occlusal = principal[2] if plane else opening - (opening @ principal[0]) * principal[0]
     occlusal = _unit(occlusal * np.sign(occlusal @ opening))
 
-    # The turn about it that brings the crowns nearest to an average arch's; to a mirrored one they must not be nearer by far.
+    # The turn about it that brings the crowns nearest to an average arch's; to a mirrored one they must not be nearer
+    # by far.
     side = np.linalg.svd(occlusal[None])[2][1]
     across = np.stack([side, np.cross(occlusal, side)])
     seen = (middles - middles.mean(axis=0)) @ across.T
@@ -184,7 +194,8 @@ def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float6
     match, mirrored = np.vdot(nominal_plane, seen_plane), np.vdot(nominal_plane.conj(), seen_plane)
     if abs(mirrored) > abs(match) * (1 + 1e-3) and len(teeth) > 2 and plane:
         raise CaptureInputError(
-            "The scan's teeth run the wrong way around the arch; exchange left and right in its labels, or mirror the scan back."
+            "The scan's teeth run the wrong way around the arch; exchange left and right in its labels, or mirror the"
+            " scan back."
         )
     front = match / abs(match)
     x = front.real * across[0] + front.imag * across[1]
@@ -198,7 +209,8 @@ def _tooth_axes(
     tangents = np.gradient(middles[order], axis=0)
     upward, axes = np.array([0.0, 0.0, 1.0]), {}
     for k, tangent in zip(order, tangents, strict=True):
-        # A cervical line rises between teeth and lies deepest in front, so its normal leans about twice as far as the tooth does.
+        # A cervical line rises between teeth and lies deepest in front, so its normal leans about twice as far as the
+        # tooth does.
         occlusal = _unit(_unit(vector_area_mm2(crowns[teeth[k]])) + upward)
         tilt = np.arccos(occlusal @ upward)
         if tilt > np.radians(STEEPEST_TILT_DEG):

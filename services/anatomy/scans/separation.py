@@ -1,7 +1,9 @@
-"""Surfaces that bound the media of a mouth without overlapping, for renderers in which a surface knows its two sides and nothing else.
+"""Surfaces that bound the media of a mouth without overlapping, for renderers in which a surface knows its two sides
+and nothing else.
 
-Teeth and gums are solids that overlap: a tooth counts over gums, and of two teeth the one listed first. Here each surface is cut along the others. Two
-surfaces share their cut edge bit by bit, so that no ray slips through; at the points where three meet they do to rounding.
+Teeth and gums are solids that overlap: a tooth counts over gums, and of two teeth the one listed first. Here each
+surface is cut along the others. Two surfaces share their cut edge bit by bit, so that no ray slips through; at the
+points where three meet they do to rounding.
 """
 
 from __future__ import annotations
@@ -75,7 +77,8 @@ class _Solid:
         self.body: Any = Manifold(Mesh64(vertices, faces))
         if self.body.status() != Error.NoError:
             raise MeshError(
-                f"Mesh {name} cannot be cut where it meets others ({self.body.status().name}); repair it so that it is one closed surface."
+                f"Mesh {name} cannot be cut where it meets others ({self.body.status().name}); repair it so that it is"
+                " one closed surface."
             )
         self._number = int(self.body.to_mesh64().run_original_id[0])
         self._low, self._high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
@@ -103,5 +106,6 @@ def _require_whole_dentin(tooth: Tooth, outer: _Solid, other: Tooth) -> None:
         and not (outer.body ^ _Solid(other.dentin, f"teeth/{other.fdi}/dentin.ply").body).is_empty()
     ):
         raise MeshError(
-            f"Tooth {tooth.fdi} reaches into the dentin of tooth {other.fdi}, so no surface between them is known; move them apart."
+            f"Tooth {tooth.fdi} reaches into the dentin of tooth {other.fdi}, so no surface between them is known; move"
+            " them apart."
         )

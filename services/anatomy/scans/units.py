@@ -16,8 +16,9 @@ Unit = Literal["mm", "cm", "m", "um", "inch"]
 
 MM_PER_UNIT = MappingProxyType({"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4})
 LIKELY = (0.6, 1.6)
-"""Distance between neighbouring teeth to that of average upper ones, as a median over a jaw: lower incisors are narrower by a third,
-teeth of one person differ from the average by up to 20 %, and crowded or gapped arches by as much again."""
+"""Distance between neighbouring teeth to that of average upper ones, as a median over a jaw: lower incisors are
+narrower by a third, teeth of one person differ from the average by up to 20 %, and crowded or gapped arches by as much
+again."""
 
 
 def neighbour_ratio(teeth: tuple[int, ...], middles: NDArray[np.float64]) -> float | None:

@@ -1,6 +1,7 @@
 """The dental arch: a superellipse on which teeth stand, measured by its arc length from the midline.
 
-Jaw frame: x to the patient's left, y forward, z occlusal (an upper jaw's teeth point along +z, down), mm; the occlusal plane is z = 0, the midline x = 0.
+Jaw frame: x to the patient's left, y forward, z occlusal (an upper jaw's teeth point along +z, down), mm; the occlusal
+plane is z = 0, the midline x = 0.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 
 HALF_WIDTH_MM = 25.5
 DEPTH_MM = 47.0
-"""With the half width, gives second molars 49 mm apart at their middles, and the arc length that an average upper jaw's teeth need."""
+"""With the half width, gives second molars 49 mm apart at their middles, and the arc length that an average upper jaw's
+teeth need."""
 EXPONENT = 2.2
 """Above 2 the front is flatter than an ellipse's."""
 STRAIGHT_MM = 20.0

@@ -1,6 +1,7 @@
 """An average dental arch by FDI number: where each tooth stands and how, and how an arch of seen teeth lies to it.
 
-Arch frame: x along the front teeth, y to the front, z occlusal; x is the patient's left in an upper jaw and the right in a lower one.
+Arch frame: x along the front teeth, y to the front, z occlusal; x is the patient's left in an upper jaw and the right
+in a lower one.
 """
 
 from __future__ import annotations
@@ -22,12 +23,16 @@ def is_upper(fdi: int) -> bool:
 
 
 def side_of_front(fdi: int) -> int:
-    """Sign of x = y × z: upper teeth point down and lower ones up, so x is the patient's left in one jaw and right in the other."""
+    """Sign of x = y × z: upper teeth point down and lower ones up, so x is the patient's left in one jaw and right in
+    the other.
+    """
     return 1 if fdi // 10 % 2 == 0 else -1
 
 
 def nominal_places(teeth: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Middles (N, 3) in mm and canonical axes (N, 3, 3), rows x = y × z, y buccal and z occlusal, of an average arch's teeth."""
+    """Middles (N, 3) in mm and canonical axes (N, 3, 3), rows x = y × z, y buccal and z occlusal, of an average arch's
+    teeth.
+    """
     line = np.concatenate([NOMINAL_MM[::-1] * (-1, 1), NOMINAL_MM])
     steps = np.gradient(line, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)

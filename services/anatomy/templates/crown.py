@@ -1,8 +1,9 @@
 """Upper teeth of every kind from their dimensions: superellipse cross-sections along the axis, then cusps.
 
-Enamel and dentin are stacks of cross-sections, one inside the other. Two maps shape both alike: the cross-section narrows towards the tongue, and the
-occlusal part sinks between the cusps. A map that keeps the order of points along x and along z keeps what is inside inside.
-Frame: x mesial (of a right tooth), y buccal, z occlusal, mm, centred at the origin.
+Enamel and dentin are stacks of cross-sections, one inside the other. Two maps shape both alike: the cross-section
+narrows towards the tongue, and the occlusal part sinks between the cusps. A map that keeps the order of points along x
+and along z keeps what is inside inside. Frame: x mesial (of a right tooth), y buccal, z occlusal, mm, centred at the
+origin.
 """
 
 from __future__ import annotations
@@ -197,7 +198,8 @@ def _outer_profile(form: CrownForm, d: ToothDimensions) -> Profile:
 
 
 def _dentin_profile(form: CrownForm, crown_length_mm: float, outer: Profile, scale: float) -> Profile:
-    # Thickness is a distance along the normal; on an inclined wall the horizontal step is longer by the secant of its slope.
+    # Thickness is a distance along the normal; on an inclined wall the horizontal step is longer by the secant of its
+    # slope.
     step = 1e-3
 
     def profile(height_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -225,7 +227,8 @@ def _dentin_top_mm(form: CrownForm, crown_length_mm: float, dentin: Profile, sca
 
 
 def _stack(profile: Profile, ends_mm: tuple[float, float], rounding_mm: tuple[float, float], form: CrownForm) -> Mesh:
-    # Rows (height, inset, scale): a rounded rim, the wall, and the other rim. Either end has a flat lid; a wide one has rings of its own.
+    # Rows (height, inset, scale): a rounded rim, the wall, and the other rim. Either end has a flat lid; a wide one has
+    # rings of its own.
     rims, thin = [], []
     for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
         half_x, half_y, _ = (float(value[0]) for value in profile(np.array([end])))

@@ -1,4 +1,6 @@
-"""Average dimensions of the upper teeth, and roots of both jaws: Wheeler's averages, some recalled, all recorded in steps of 0.5 mm."""
+"""Average dimensions of the upper teeth, and roots of both jaws: Wheeler's averages, some recalled, all recorded in
+steps of 0.5 mm.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,8 @@ from typing import Literal
 from services.core.errors import CaptureInputError
 
 Status = Literal["Wheeler", "from memory"]
-"""``Wheeler``: Wheeler's table of averages (Wheeler's Dental Anatomy, Physiology and Occlusion); ``from memory``: the same table, recalled."""
+"""``Wheeler``: Wheeler's table of averages (Wheeler's Dental Anatomy, Physiology and Occlusion); ``from memory``: the
+same table, recalled."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,8 @@ UPPER_TEETH = (
 
 UPPER_ROOTS_MM = (13.0, 13.0, 17.0, 14.0, 14.0, 13.0, 12.0, 11.0)
 LOWER_ROOTS_MM = (12.5, 14.0, 16.0, 14.0, 14.5, 14.0, 13.0, 11.0)
-"""Cervical line to apex by place from the midline, recalled from Wheeler's table of averages; of molars the longest root."""
+"""Cervical line to apex by place from the midline, recalled from Wheeler's table of averages; of molars the longest
+root."""
 
 
 def root_length_mm(position: int, *, is_upper: bool) -> float:
@@ -62,6 +66,7 @@ def upper_tooth(position: int) -> ToothDimensions:
     """
     if not 1 <= position <= len(UPPER_TEETH):
         raise CaptureInputError(
-            f"No tooth stands at place {position} from the midline; FDI numbers end in 1 to {len(UPPER_TEETH)}, so renumber the tooth."
+            f"No tooth stands at place {position} from the midline; FDI numbers end in 1 to {len(UPPER_TEETH)}, so"
+            " renumber the tooth."
         )
     return UPPER_TEETH[position - 1]

@@ -14,7 +14,8 @@ from services.anatomy.templates.sections import close_rings, superellipse
 from services.core.geometry import Mesh
 
 MARGIN_MM = 0.7
-"""Height of the gums' crest above the cervical line at a tooth's middle; the margin on the tooth is lower, where the crest rounds off."""
+"""Height of the gums' crest above the cervical line at a tooth's middle; the margin on the tooth is lower, where the
+crest rounds off."""
 PAPILLA_MM = 0.8
 """Height of the crest between teeth above what the cervical lines' curvature gives."""
 BELOW_ROOT_MM = 3.5
@@ -85,7 +86,9 @@ def build_gums(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
 
 
 def build_cavity(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
-    """An open wall: the palate's vault between the gums and, behind the last teeth, a wall down past the occlusal plane."""
+    """An open wall: the palate's vault between the gums and, behind the last teeth, a wall down past the occlusal
+    plane.
+    """
     ends = (
         np.array([sockets[-1].arc_mm, -sockets[0].arc_mm])
         + np.array([sockets[-1].width_mm, sockets[0].width_mm]) / 2
@@ -111,7 +114,8 @@ def build_cavity(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
 def _outline(
     sockets: tuple[Socket, ...], stations_mm: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    # Crest, floor and half depth at arc lengths: nodes at each tooth's middle and shoulders and between neighbours, monotone in between, then rounded off.
+    # Crest, floor and half depth at arc lengths: nodes at each tooth's middle and shoulders and between neighbours,
+    # monotone in between, then rounded off.
     from scipy.interpolate import PchipInterpolator
     from scipy.ndimage import gaussian_filter1d
 

@@ -1,8 +1,8 @@
 """A procedural upper central incisor after Wheeler's averages, with the enamel-thickness model of its labial face.
 
-Superellipse cross-sections, stacked along the tooth's axis: labiolingual diameter 6.0 mm at the cervix, 7.0 mm at 2.5 mm above it and 1.5 mm at the
-incisal edge, 10.5 mm above it; mesiodistal 7.0 mm at the cervix and 8.5 mm at the widest. Labial enamel is 0.35 mm + 0.75 z / 10.5 thick.
-Frame: x mesial, y buccal, z occlusal, mm, centred at the origin.
+Superellipse cross-sections, stacked along the tooth's axis: labiolingual diameter 6.0 mm at the cervix, 7.0 mm at 2.5
+mm above it and 1.5 mm at the incisal edge, 10.5 mm above it; mesiodistal 7.0 mm at the cervix and 8.5 mm at the widest.
+Labial enamel is 0.35 mm + 0.75 z / 10.5 thick. Frame: x mesial, y buccal, z occlusal, mm, centred at the origin.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def cervix_height_mm() -> float:
 
 
 def _outer_profile(height_mm: NDArray[np.float64]) -> Profile:
-    # Half axes and the labial offset of the centre line, monotone between the measured heights so that no waist appears.
+    # Half axes and the labial offset of the centre line, monotone between the measured heights so that no waist
+    # appears.
     from scipy.interpolate import PchipInterpolator
 
     labial, diameter, width = (
@@ -86,7 +87,8 @@ def _outer_profile(height_mm: NDArray[np.float64]) -> Profile:
 
 
 def _dentin_profile(height_mm: NDArray[np.float64]) -> Profile:
-    # Thickness is a distance along the normal; on an inclined wall the horizontal step is longer by the secant of its slope.
+    # Thickness is a distance along the normal; on an inclined wall the horizontal step is longer by the secant of its
+    # slope.
     width, depth, centre = _outer_profile(height_mm)
     thickness, step = enamel_thickness_mm(height_mm), 1e-3
 
@@ -129,7 +131,8 @@ def _stack(
 
 
 def _gum_collar(columns: int) -> Mesh:
-    # A block around the root whose top rises to papillae between the teeth; inside the tooth it is hidden by the enamel.
+    # A block around the root whose top rises to papillae between the teeth; inside the tooth it is hidden by the
+    # enamel.
     def profile(height_mm: NDArray[np.float64]) -> Profile:
         return np.full_like(height_mm, 6.5), np.full_like(height_mm, 5.0), np.full_like(height_mm, 0.2)
 

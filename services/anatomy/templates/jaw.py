@@ -1,7 +1,8 @@
 """A phantom upper jaw: fourteen teeth of average dimensions along an arch, their gums, and the wall of the mouth.
 
-Jaw frame as in ``arch``: x to the patient's left, y forward, z occlusal. Each tooth's canonical frame has y buccal, z occlusal and x = y × z, which is
-mesial for the patient's right (11 to 17) and distal for the left (21 to 27), so that all transforms are rotations.
+Jaw frame as in ``arch``: x to the patient's left, y forward, z occlusal. Each tooth's canonical frame has y buccal, z
+occlusal and x = y × z, which is mesial for the patient's right (11 to 17) and distal for the left (21 to 27), so that
+all transforms are rotations.
 """
 
 from __future__ import annotations
@@ -91,7 +92,8 @@ def build_jaw(seed: int | None = None) -> Jaw:
     """Build a subject's upper jaw.
 
     Args:
-        seed: None for the average, which is symmetric; a number for a subject whose size varies by 5 %, enamel by 10 %, and whose teeth stand a little askew.
+        seed: None for the average, which is symmetric; a number for a subject whose size varies by 5 %, enamel by 10 %,
+            and whose teeth stand a little askew.
     """
     arch = Arch()
     random = None if seed is None else np.random.default_rng(seed)
@@ -124,7 +126,8 @@ def _stances(random: np.random.Generator | None) -> tuple[Stance, ...]:
 
 
 def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -> list[tuple[JawTooth, Socket]]:
-    # From the midline back, each tooth is moved along the arch until it all but touches the one before; the first, where there is none, the midline's plane.
+    # From the midline back, each tooth is moved along the arch until it all but touches the one before; the first,
+    # where there is none, the midline's plane.
     placed: list[tuple[JawTooth, Socket]] = []
     neighbour = None if first is None else SurfaceDistance(_far_half(first))
     arc_mm = 0.0
@@ -146,7 +149,8 @@ def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -
             frame = _standing(arch, arc_mm, solid, d, stance)
         else:
             raise MeshError(
-                f"Tooth {RIGHT + place} finds no place beside its neighbour along the arch; give it a smaller variation."
+                f"Tooth {RIGHT + place} finds no place beside its neighbour along the arch; give it a smaller"
+                " variation."
             )
         tooth = _stood(solid, frame, RIGHT + place)
         neighbour = SurfaceDistance(_far_half(tooth))
@@ -179,7 +183,8 @@ def _stood(solid: ToothSolid, frame: ToothFrame, fdi: int) -> JawTooth:
 
 
 def _far_half(tooth: JawTooth) -> Mesh:
-    # Of the crown, the side that the next tooth of the right meets: a right tooth's distal side, or the mesial one across the midline.
+    # Of the crown, the side that the next tooth of the right meets: a right tooth's distal side, or the mesial one
+    # across the midline.
     canonical = tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
     kept = (canonical[:, 0] < 0) & (canonical[:, 2] > tooth.cervix_mm)
     return Mesh(tooth.outer.vertices_mm, tooth.outer.faces[kept[tooth.outer.faces].all(axis=1)])

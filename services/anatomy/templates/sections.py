@@ -28,7 +28,8 @@ def superellipse(
 
 
 def close_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int) -> Mesh:
-    """Join rings (rows x columns vertices, then the first and the last pole) to a closed surface, with fans at the poles.
+    """Join rings (rows x columns vertices, then the first and the last pole) to a closed surface, with fans at the
+    poles.
 
     It faces outward where rings run counter-clockwise seen from the last pole.
     """
@@ -40,7 +41,8 @@ def close_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int) -> Me
 def cover_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int, thin: tuple[bool, bool]) -> Mesh:
     """Join rings (rows x columns vertices) to a closed surface whose first and last ring are flat.
 
-    A thin ring is bridged straight across, where a fan's long triangles would make its edge rough; others get a fan at their middle.
+    A thin ring is bridged straight across, where a fan's long triangles would make its edge rough; others get a fan at
+    their middle.
 
     Args:
         columns: even; vertices k and columns - k lie opposite each other, as ``superellipse`` puts them.

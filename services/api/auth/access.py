@@ -71,5 +71,6 @@ def refuse_open_network(settings: ServerSettings) -> None:
     """
     if settings.access == "open" and not settings.is_loopback:
         raise SettingsError(
-            f"Host {settings.host} is reachable from other machines and access is open; set DENTINE__SERVER__ACCESS=tokens, or listen on 127.0.0.1."
+            f"Host {settings.host} is reachable from other machines and access is open; set"
+            " DENTINE__SERVER__ACCESS=tokens, or listen on 127.0.0.1."
         )

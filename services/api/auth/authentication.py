@@ -1,4 +1,7 @@
-"""Who may pass to the routes, decided before a byte of the body is read. What passes, and what is refused, is audited here."""
+"""Who may pass to the routes, decided before a byte of the body is read.
+
+What passes, and what is refused, is audited here.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +108,9 @@ class AuthenticationMiddleware:
     async def _hidden(
         self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, audited: AuditedAction
     ) -> Response | None:
-        """The answer to a request that names something of others: the same as if it were not there, and before anything else of it is looked at."""
+        """The answer to a request that names something of others: the same as if it were not there, and before anything
+        else of it is looked at.
+        """
         named = None if caller.viewer.sees_all else self._ownership.named_in(route.template, ids)
         if named is None:
             return None
@@ -119,7 +124,9 @@ class AuthenticationMiddleware:
         return response_of(thing.absent(name), request.scope["path"])
 
     async def _stranger_refusal(self, request: HTTPConnection, audited: AuditedAction) -> Response | None:
-        """The answer to somebody with a setup link who may not even try it: each try counts as a request without a valid token."""
+        """The answer to somebody with a setup link who may not even try it: each try counts as a request without a
+        valid token.
+        """
         audited.who, request.scope["audited"] = "setup link", audited
         if wait_s := self._rates.count_refusal(network_of(audited.address)):
             await self._tell_of_many(audited)
@@ -133,7 +140,10 @@ class AuthenticationMiddleware:
     async def _refuse_unknown(
         self, request: HTTPConnection, problem: UnauthenticatedError, audited: AuditedAction
     ) -> Response:
-        """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it. A valid token never gets here."""
+        """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it.
+
+        A valid token never gets here.
+        """
         credential = Access.credential(request)
         audited.token = public_id(credential) if credential else None
         if wait_s := self._rates.count_refusal(network_of(audited.address)):

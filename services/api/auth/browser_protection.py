@@ -37,7 +37,8 @@ _NOT_KEPT = (b"cache-control", b"no-store")
 
 
 class BrowserProtection:
-    """Adds security headers; refuses other names for this server (DNS rebinding), and changes that another site's page asks a visitor's browser to make.
+    """Adds security headers; refuses other names for this server (DNS rebinding), and changes that another site's page
+    asks a visitor's browser to make.
 
     Args:
         names: of this server, as clients use them.
@@ -67,7 +68,10 @@ class BrowserProtection:
 
         asked, refusal = Headers(scope=scope), None
         if _name_of(asked.get("host", "")) not in self._names:
-            detail = "This server does not go by the name in the request's Host; add it to DENTINE__SERVER__NAMES, or use another."
+            detail = (
+                "This server does not go by the name in the request's Host; add it to DENTINE__SERVER__NAMES, or use"
+                " another."
+            )
             refusal = Problem.of(HTTPStatus.BAD_REQUEST, "foreign-host", detail, scope["path"])
         elif scope["method"] not in SAFE_METHODS and _is_foreign(asked):
             detail = "Another site asked for this change; use the dashboard or the API itself."
@@ -86,7 +90,10 @@ def _name_of(host: str) -> str | None:
 
 
 def _is_foreign(asked: Headers) -> bool:
-    """Whether another site's page may be behind a change. A browser says where a change comes from; one that sends a cookie must."""
+    """Whether another site's page may be behind a change.
+
+    A browser says where a change comes from; one that sends a cookie must.
+    """
     origin, site = asked.get("origin"), asked.get("sec-fetch-site")
     if origin is not None and _host_of(origin) != asked.get("host"):
         return True

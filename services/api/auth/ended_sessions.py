@@ -1,4 +1,7 @@
-"""Browser sessions that were ended before their time. A cookie that somebody has copied opens nothing once its owner has signed out."""
+"""Browser sessions that were ended before their time.
+
+A cookie that somebody has copied opens nothing once its owner has signed out.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Finds the owner of what a request's path names, so that whoever may not see it is told that it is not there, whatever the route."""
+"""Finds the owner of what a request's path names, so that whoever may not see it is told that it is not there, whatever
+the route.
+"""
 
 from __future__ import annotations
 

@@ -47,8 +47,10 @@ class Session(Record):
     is_open: bool = Field(description="whether this server asks nobody for a token")
     dark_key: str | None = Field(
         default=None,
-        description="of a browser session whose token may operate the dome: sent as 'Authorization: Bearer …' and without"
-        " the cookie, it darkens the dome and does nothing else",
+        description=(
+            "of a browser session whose token may operate the dome: sent as 'Authorization: Bearer …' and without"
+            " the cookie, it darkens the dome and does nothing else"
+        ),
     )
 
 
@@ -91,7 +93,9 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
 
     @router.post("/setup", status_code=201, tags=["access"])
     def set_up(link: Sent[SetupRequest], request: Request, response: Response) -> IssuedToken:
-        """Make the first administrator's token by the link in the server's log, which works once, and open a browser session for it."""
+        """Make the first administrator's token by the link in the server's log, which works once, and open a browser
+        session for it.
+        """
         if access.sessions is None:
             raise SetupLinkError("This server asks nobody for a token, so there is nothing to set up; open its page.")
         issued = links.redeem(link.secret.get_secret_value(), request.scope["audited"])
@@ -107,7 +111,9 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
 
     @router.post("/session", tags=["access"], dependencies=[needs("read")])
     def sign_in(request: Request, response: Response) -> Session:
-        """Open a browser session for the token in the Authorization header; the answer sets a cookie that scripts cannot read."""
+        """Open a browser session for the token in the Authorization header; the answer sets a cookie that scripts
+        cannot read.
+        """
         caller: Caller = request.scope["caller"]
         cookie = None
         if access.sessions is not None:

@@ -1,4 +1,7 @@
-"""Which scope a route needs, declared beside it: ``dependencies=[needs("read")]``. A route that declares none is closed."""
+"""Which scope a route needs, declared beside it: ``dependencies=[needs("read")]``.
+
+A route that declares none is closed.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,9 @@ class Needs(HTTPBearer):
         self.scope, self.audited, self.darkens = scope, audited, darkens
 
     async def __call__(self, request: Request) -> None:  # type: ignore[override]
-        """Check the caller that the gate has found; the gate has refused already, unless somebody built an application without it."""
+        """Check the caller that the gate has found; the gate has refused already, unless somebody built an application
+        without it.
+        """
         require(request.scope.get("caller"), self.scope)
 
 
@@ -44,7 +49,8 @@ def needs(scope: str, *, audited: bool = False, darkens: bool = False) -> params
 
     Args:
         audited: of a route that only reads; changes always are.
-        darkens: whether it darkens a dome, perhaps among other things, so that its row of the audit is written before those of others.
+        darkens: whether it darkens a dome, perhaps among other things, so that its row of the audit is written before
+            those of others.
     """
     known = Scope(scope)
     return params.Security(Needs(known, audited=audited, darkens=darkens), scopes=[known])
@@ -67,7 +73,8 @@ async def _viewer(request: Request) -> Viewer:
 
 
 Asker = Annotated[Viewer, Depends(_viewer)]
-"""Parameter of a handler whose answer depends on who asks. What a path names by ``job_id`` or ``capture`` the gate has looked after already."""
+"""Parameter of a handler whose answer depends on who asks. What a path names by ``job_id`` or ``capture`` the gate has
+looked after already."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +95,13 @@ class GuardedRoute:
         """Let a caller with the route's scope pass.
 
         Raises:
-            ScopeError: the caller lacks the scope, or has a dark key and the route does more than darken, or the route declares
-                none or several scopes.
+            ScopeError: the caller lacks the scope, or has a dark key and the route does more than darken, or the route
+                declares none or several scopes.
         """
         if self.needs is None:
             raise ScopeError(
-                f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs() beside the route."
+                f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs()"
+                " beside the route."
             )
         # A cancel darkens too, but it ends jobs without a dome as well.
         if caller.only_darkens and not (self.needs.darkens and self.needs.scope is Scope.OPERATE_DOME):

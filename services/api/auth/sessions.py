@@ -1,13 +1,14 @@
-"""Browser sessions: a signed cookie that stands for a token for some hours. The server keeps nothing but those that were ended; see ``ended_sessions``.
+"""Browser sessions: a signed cookie that stands for a token for some hours.
 
-::
+The server keeps nothing but those that were ended; see ``ended_sessions``. ::
 
     dentine_<token id>_<expiry, Unix s>_<random>.<HMAC-SHA256>     version 0.1 had no random part
 
     dark_<token id>_<expiry, Unix s>_<SHA-256 of the cookie's claim>.<HMAC-SHA256>     a session's dark key
 
-A page cannot read its cookie, and what is sent with a cookie waits for one of the browser's six connections, which long downloads
-may all hold. A dark key, which darkens the dome and does nothing else, is sent without the cookie, over a connection of its own.
+A page cannot read its cookie, and what is sent with a cookie waits for one of the browser's six connections, which long
+downloads may all hold. A dark key, which darkens the dome and does nothing else, is sent without the cookie, over a
+connection of its own.
 
 The signing key lies beside the database and not in it, so that a copy of the database opens no session.
 """

@@ -1,7 +1,7 @@
 """The first token of a server: a link in its log makes it, so that nobody needs a shell where the server runs.
 
-As long as the token table is empty, each start of a server writes one link to the log. It holds for an hour, and the first one that is used makes an
-administrator's token and ends them all. The database keeps a link's hash alone.
+As long as the token table is empty, each start of a server writes one link to the log. It holds for an hour, and the
+first one that is used makes an administrator's token and ends them all. The database keeps a link's hash alone.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class SetupLinks:
         """The administrator's token that a link stands for; no link holds after this.
 
         Raises:
-            SetupLinkError: it was used, has expired or is unknown, or there is a token by now; the message does not tell which.
+            SetupLinkError: it was used, has expired or is unknown, or there is a token by now; the message does not
+                tell which.
         """
         presented = _hash(secret)
         with writing(self._engine) as connection:
@@ -73,7 +74,8 @@ class SetupLinks:
             if not is_known or _has_token(connection):
                 what = "This setup link was used, has expired or is unknown"
                 raise SetupLinkError(
-                    f"{what}; restart the server for a new one, or, where there is a token already, ask its owner for one."
+                    f"{what}; restart the server for a new one, or, where there is a token already, ask its owner for"
+                    " one."
                 )
             connection.execute(setup_link_table.delete())
             return insert_token(connection, NAME, (Scope.ADMIN,), self._clock(), None, audited)

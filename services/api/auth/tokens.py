@@ -139,7 +139,9 @@ LOCAL = Caller("local", frozenset(Scope))
 
 
 class _Credential(NamedTuple):
-    """A token's hash, or a session's, else the id of its token: an id is public, so one must never pass for the other."""
+    """A token's hash, or a session's, else the id of its token: an id is public, so one must never pass for the
+    other.
+    """
 
     sha256: str | None
     session_of: str | None
@@ -150,7 +152,9 @@ class _Credential(NamedTuple):
 
 
 class _Trust(NamedTuple):
-    """A token that was looked up, how long to trust it, and how many were revoked at this server before the look-up began: after another one it is void."""
+    """A token that was looked up, how long to trust it, and how many were revoked at this server before the look-up
+    began: after another one it is void.
+    """
 
     token: Token
     until_ticks: float
@@ -187,10 +191,14 @@ class Tokens:
             group: owns what it makes; None: nobody but the token itself and administrators see that.
 
         Raises:
-            InputError: the name is malformed or belongs to a living token, the group's is malformed, or there is no scope.
+            InputError: the name is malformed or belongs to a living token, the group's is malformed, or there is no
+                scope.
         """
         if not re.fullmatch(NAME, name) or name == LOCAL.name or re.fullmatch(ID, name):
-            what = f"use up to 64 letters, digits, points and hyphens, not '{LOCAL.name}' and nothing that looks like an id"
+            what = (
+                f"use up to 64 letters, digits, points and hyphens, not '{LOCAL.name}' and nothing that looks like"
+                " an id"
+            )
             raise InputError(f"Token name {name!r} does not serve; {what}.")
         if group is not None and not re.fullmatch(NAME, group):
             raise InputError(
@@ -248,7 +256,9 @@ class Tokens:
         return Token(**_fields(row))
 
     def trusted(self, *, presented: str | None = None, session_of: str | None = None) -> Token | None:
-        """What ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, a moment ago; asks nobody."""
+        """What ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, a moment ago; asks
+        nobody.
+        """
         found = self._trusted.get(_Credential.of(presented, session_of))
         return (
             found.token

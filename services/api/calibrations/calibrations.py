@@ -53,7 +53,10 @@ class NamedCalibration(StoredName):
     """A calibration as it is listed."""
 
     state: CalibrationState = Field(
-        description="good, old (beyond its valid_days), beyond its limits (jobs refuse it unless they accept_calibration), or not known"
+        description=(
+            "good, old (beyond its valid_days), beyond its limits (jobs refuse it unless they accept_calibration), or"
+            " not known"
+        )
     )
 
 
@@ -82,7 +85,8 @@ class Calibrations:
         """Store a calibration under a name of whoever puts it. Putting the same again changes nothing.
 
         Raises:
-            CaptureInputError: names or channels contradict each other. CalibrationTakenError: the name means another content.
+            CaptureInputError: names or channels contradict each other. CalibrationTakenError: the name means another
+                content.
         """
         require_consistent(calibration, f"Calibration {name}")
         content = (calibration.model_dump_json(indent=1) + "\n").encode()
@@ -103,7 +107,8 @@ class Calibrations:
         known = entry if is_new else read_record(names / f"{name}.json", StoredName)
         if known.id != entry.id:
             raise CalibrationTakenError(
-                f"Calibration {name} exists with another content and is never changed; choose another name, such as one with a date."
+                f"Calibration {name} exists with another content and is never changed; choose another name, such as one"
+                " with a date."
             )
         return CalibrationCreation(self._detail(known, calibration), is_new)
 
@@ -121,7 +126,9 @@ class Calibrations:
         return self._detail(entry, read_record(self._content(entry.id), Calibration))
 
     def by_content(self, spec: JobSpec, viewer: Viewer = LOCAL_VIEWER) -> JobSpec:
-        """The job with the id of what it calls ``calibrations/<name>``, so that it means the same for ever; others as they are."""
+        """The job with the id of what it calls ``calibrations/<name>``, so that it means the same for ever; others as
+        they are.
+        """
         path = spec.calibration
         if path is None or not is_stored(path) or _ID.fullmatch(path.name):
             return spec
@@ -131,7 +138,8 @@ class Calibrations:
             raise SettingsError(f"Option 'calibration': {problem.message}") from problem
 
     def require(self, path: Path, viewer: Viewer = LOCAL_VIEWER, *, accepted: bool = True) -> None:
-        """Refuse the option of a job that names a calibration that is not here, is somebody else's, or is beyond its limits.
+        """Refuse the option of a job that names a calibration that is not here, is somebody else's, or is beyond its
+        limits.
 
         Args:
             path: ``calibrations/<id>``.

@@ -16,8 +16,8 @@ def made_by(jobs: Jobs, job_id: str) -> Calibration:
     """The record of a calibration job.
 
     Raises:
-        UnknownJobError: there is no such job. JobStateError: it makes no calibration, or has made none yet. CorruptStoreError:
-            its files are not as they were published.
+        UnknownJobError: there is no such job. JobStateError: it makes no calibration, or has made none yet.
+            CorruptStoreError: its files are not as they were published.
     """
     job = jobs.repository.get(job_id)
     if job.spec.kind != KIND:

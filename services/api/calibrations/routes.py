@@ -59,7 +59,10 @@ def build_calibrations_router(
         dependencies=[needs("submit")],
     )
     def put(name: Name, calibration: Sent[Calibration], asker: Asker) -> Response:
-        """Store a calibration under a new name: 201, or 200 where it is there already. A name never changes its content: 409."""
+        """Store a calibration under a new name: 201, or 200 where it is there already.
+
+        A name never changes its content: 409.
+        """
         return tell(calibrations.put(name, calibration, asker))
 
     @router.put(
@@ -71,7 +74,10 @@ def build_calibrations_router(
     )
     @openers.answering
     def keep(job_id: str, name: Name, asker: Asker) -> Response:
-        """Store what a calibration job made under a new name: 201, or 200 where it is there already. The job may be deleted then."""
+        """Store what a calibration job made under a new name: 201, or 200 where it is there already.
+
+        The job may be deleted then.
+        """
         return tell(calibrations.put(name, made_by(jobs, job_id), asker))
 
     @router.get("/captures/{capture}/calibration", dependencies=[needs("read")])

@@ -97,7 +97,8 @@ class Blobs:
     def adopt(self, capture: str, number: int, sha256: str) -> bool:
         """Make a received file a content if it has this SHA-256, else discard it; returns which.
 
-        It stays a partial file too, to be discarded once its content is recorded as known: a server that dies before that finds it whole.
+        It stays a partial file too, to be discarded once its content is recorded as known: a server that dies before
+        that finds it whole.
         """
         partial, final = self._partial_path(capture, number), self.path(sha256)
         with partial.open("rb") as stream:

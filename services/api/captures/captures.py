@@ -88,7 +88,8 @@ class Captures:
         """Open a capture, or find the one that this manifest or idempotency key has led its owner to already.
 
         Raises:
-            UploadError: a path that no capture may hold; TooLargeError: over a limit. CaptureStateError: the key belongs to another manifest.
+            UploadError: a path that no capture may hold; TooLargeError: over a limit. CaptureStateError: the key
+                belongs to another manifest.
             DiskFullError: too little free disk for it.
         """
         self._require_limits(manifest)
@@ -126,7 +127,8 @@ class Captures:
         """What a committed capture says of its cameras and lights.
 
         Raises:
-            UnknownCaptureError: there is no such capture. CaptureStateError: it is not committed. CaptureInputError: it says nothing.
+            UnknownCaptureError: there is no such capture. CaptureStateError: it is not committed. CaptureInputError: it
+                says nothing.
         """
         if (state := self._table.get(capture).state) is not CaptureState.COMMITTED:
             raise CaptureStateError(
@@ -140,7 +142,9 @@ class Captures:
         return CapturePage(captures=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
     def commit(self, capture: str) -> list[FileFault]:
-        """Publish the capture's folder if nothing is missing or wrong, else return what is. Committing again changes nothing.
+        """Publish the capture's folder if nothing is missing or wrong, else return what is.
+
+        Committing again changes nothing.
 
         Raises:
             ExpiredError: the capture expired. LockedError: a file is still being sent.
@@ -196,7 +200,8 @@ class Captures:
 
     @contextmanager
     def keeping(self, spec: JobSpec, viewer: Viewer = LOCAL_VIEWER) -> Iterator[None]:
-        """Keep an uploaded capture from being deleted while a job that names it, as capture or mouth, is recorded; other paths pass.
+        """Keep an uploaded capture from being deleted while a job that names it, as capture or mouth, is recorded;
+        other paths pass.
 
         Raises:
             SettingsError: no such capture that whoever submits may see, or it is not committed.
@@ -211,7 +216,10 @@ class Captures:
                 except UnknownCaptureError as problem:
                     raise SettingsError(f"Option '{option}': {problem.message}") from problem
                 if found.state is not CaptureState.COMMITTED:
-                    what = f"capture {path.name} is {found.state}; commit it first with POST /v1/captures/{path.name}/commit"
+                    what = (
+                        f"capture {path.name} is {found.state}; commit it first with POST"
+                        f" /v1/captures/{path.name}/commit"
+                    )
                     raise SettingsError(f"Option '{option}': {what}.")
             yield
 
@@ -270,11 +278,14 @@ class Captures:
         except OSError as problem:
             shutil.rmtree(draft, ignore_errors=True)
             raise DiskFullError(
-                f"Capture {capture} cannot be published ({problem.strerror}); free some disk on the server and commit again."
+                f"Capture {capture} cannot be published ({problem.strerror}); free some disk on the server and commit"
+                " again."
             ) from problem
 
     def _retire(self, capture: str) -> None:
-        """Make it expired, then remove its folder, and every content that no other capture has; repeatable at any point."""
+        """Make it expired, then remove its folder, and every content that no other capture has; repeatable at any
+        point.
+        """
         self._table.change_state(capture, CaptureState.EXPIRED)
         folder = self._data / FOLDER / capture
         retired = folder.with_name(f".{capture}.retired")
@@ -315,6 +326,7 @@ class Captures:
             and (free := self._free_bytes()) < wanted_bytes + outstanding + self._limits.keep_free_bytes
         ):
             raise DiskFullError(
-                f"The capture needs {wanted_bytes} bytes of disk, and of {free} free ones {outstanding} are promised to open captures and"
-                f" {self._limits.keep_free_bytes} kept back; free some space on the server, or delete captures."
+                f"The capture needs {wanted_bytes} bytes of disk, and of {free} free ones {outstanding} are promised to"
+                f" open captures and {self._limits.keep_free_bytes} kept back; free some space on the server, or delete"
+                " captures."
             )

@@ -19,7 +19,8 @@ from services.core.settings import UploadLimits
 from services.core.slab.folder import SlabFolder
 
 MAX_TIMES_PACKED = 1100
-"""Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a torn file."""
+"""Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a
+torn file."""
 _ITEM_BYTES = {
     "bool": 1,
     "int8": 1,
@@ -71,7 +72,10 @@ def _image_fault(path: Path, name: str, suffix: str, limits: UploadLimits) -> st
         return None
     size = path.stat().st_size
     if image.decoded_bytes > limits.largest_image_bytes:
-        return f"Image {name} declares {image.size}, more than {limits.largest_image_bytes} bytes when decoded; crop or bin it."
+        return (
+            f"Image {name} declares {image.size}, more than {limits.largest_image_bytes} bytes when decoded; crop or"
+            " bin it."
+        )
     if image.file_bytes is not None and image.file_bytes != size:
         return (
             f"Image {name} declares {image.size} and has {size} bytes instead of {image.file_bytes}; export it again."
@@ -87,7 +91,10 @@ def _description_fault(
     for camera in description.cameras:
         if math.prod(camera.size) * len(description.channels) * _PIXEL_BYTES > limits.largest_image_bytes:
             size = " x ".join(map(str, camera.size))
-            return f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when decoded; crop or bin its images."
+            return (
+                f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when"
+                " decoded; crop or bin its images."
+            )
     for image in description.images:
         for file in (image.file, image.variance_file):
             if file is not None and str(PurePosixPath(file)) not in names:
@@ -99,7 +106,10 @@ def _raw_fault(name: str, folder: RawFolder, limits: UploadLimits, names: frozen
     for camera in folder.camera:
         if math.prod(camera.size) * len(camera.channels) * _PIXEL_BYTES > limits.largest_image_bytes:
             size = " x ".join(map(str, camera.size))
-            return f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when decoded; crop or bin its images."
+            return (
+                f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when"
+                " decoded; crop or bin its images."
+            )
     files = [(f"image file {frame.file}", frame.file) for frame in folder.frame]
     files += [(f"reference {chart.reference}", chart.reference) for chart in folder.chart]
     files += [] if folder.scan is None else [(f"scan {folder.scan.file}", folder.scan.file)]
@@ -132,5 +142,8 @@ def _array_fault(name: str, array: Any, limits: UploadLimits) -> str | None:
     lengths = [int(length) for length in array["chunk_grid"]["configuration"]["chunk_shape"]]
     if math.prod(lengths) * _ITEM_BYTES.get(str(array["data_type"]), 8) > limits.largest_image_bytes:
         size = " x ".join(map(str, lengths))
-        return f"{name} declares chunks of {size} numbers, more than {limits.largest_image_bytes} bytes when decoded; export it in smaller ones."
+        return (
+            f"{name} declares chunks of {size} numbers, more than {limits.largest_image_bytes} bytes when decoded;"
+            " export it in smaller ones."
+        )
     return None

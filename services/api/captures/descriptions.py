@@ -16,7 +16,8 @@ from services.core.settings import UploadLimits
 from services.core.store import MANIFEST
 
 MAX_DESCRIPTION_BYTES = 4 * 2**20
-"""Of a JSON file that is parsed: five thousand images with the longest names, under a thousand lights, take a third of it."""
+"""Of a JSON file that is parsed: five thousand images with the longest names, under a thousand lights, take a third of
+it."""
 MAX_CAMERAS = 1000
 """More than any rig has; with as many lights, what is told of a capture stays below a megabyte."""
 _PLACES = ("capture.json", DESCRIPTION, MANIFEST, f"capture/{MANIFEST}")
@@ -36,7 +37,9 @@ class CaptureReader(Protocol):
     def content_faults(
         self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        """Names of files, which are given with where they lie, and what is wrong with their contents; see ``contents``."""
+        """Names of files, which are given with where they lie, and what is wrong with their contents; see
+        ``contents``.
+        """
 
     def describe(self, capture: Path) -> Described:
         """See ``describe``."""

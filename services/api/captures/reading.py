@@ -1,6 +1,7 @@
 """The processes that read what uploads hold, so that no file of anybody takes the server's memory or its time.
 
-They are started when there is something to read and live on; one that takes too long or dies is replaced. See ``reading_process``.
+They are started when there is something to read and live on; one that takes too long or dies is replaced. See
+``reading_process``.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from services.core.settings import UploadLimits
 PROCESSES = 2
 """That read side by side; whoever finds both at work waits."""
 MAX_BYTES = 96 * 2**20
-"""Memory of one beyond the 45 MB that it has at its start. The description of five thousand images under a thousand lights takes 37 MB."""
+"""Memory of one beyond the 45 MB that it has at its start. The description of five thousand images under a thousand
+lights takes 37 MB."""
 MAX_S = 60.0
 """For one file, of which the largest takes a second on a machine that is not busy."""
 MAX_ANSWER_BYTES = 4 * 2**20
@@ -102,7 +104,9 @@ class ReadApart:
     def content_faults(
         self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        """Names of files and what is wrong with their contents; ends with the first that cannot be told of within the bounds."""
+        """Names of files and what is wrong with their contents; ends with the first that cannot be told of within the
+        bounds.
+        """
         parsed, others = list[tuple[Path, str]](), list[tuple[Path, str]]()
         for path, name in files:
             (parsed if Path(name).suffix.lower() in _PARSED else others).append((path, name))
@@ -112,7 +116,10 @@ class ReadApart:
             if is_parsed and (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:
                 yield (
                     name,
-                    f"{name} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed of a description; leave out what describes no image.",
+                    (
+                        f"{name} has {size} bytes and {MAX_DESCRIPTION_BYTES} are allowed of a description; leave out"
+                        " what describes no image."
+                    ),
                 )
                 continue
             asked = [(str(path), name) for path, name in batch]
@@ -178,7 +185,8 @@ def _started() -> ReadingProcess:
         return ReadingProcess()
     except OSError as problem:
         raise PlatformError(
-            f"The server cannot start a process to read the capture in ({problem.strerror}); free some memory and try again."
+            f"The server cannot start a process to read the capture in ({problem.strerror}); free some memory and try"
+            " again."
         ) from problem
 
 

@@ -1,6 +1,7 @@
-"""``python -m services.api.captures.reading_process BYTES``: reads what others have written, in so much memory. Requests and answers are lines of JSON.
+"""``python -m services.api.captures.reading_process BYTES``: reads what others have written, in so much memory.
 
-What a file makes of it ends with this process: too much memory, too much time, a fault in a parser. It can write to no file and leaves no dump.
+Requests and answers are lines of JSON. What a file makes of it ends with this process: too much memory, too much time,
+a fault in a parser. It can write to no file and leaves no dump.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from services.core.errors import DentineError
 from services.core.settings import UploadLimits
 
 GROWN_BYTES = 64 * 2**20
-"""Whoever has taken so much more than at its start ends after its answer, as the memory of what was parsed stays with the process."""
+"""Whoever has taken so much more than at its start ends after its answer, as the memory of what was parsed stays with
+the process."""
 
 
 def main(most_bytes: int) -> None:

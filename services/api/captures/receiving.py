@@ -1,7 +1,7 @@
 """The bytes of one request on their way to disk, with bounded memory.
 
-Blocks are written behind the recorded offset, made durable, and only then recorded. A request with a checksum is recorded as a whole
-once the checksum holds; without one, what came before the connection broke is kept.
+Blocks are written behind the recorded offset, made durable, and only then recorded. A request with a checksum is
+recorded as a whole once the checksum holds; without one, what came before the connection broke is kept.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ async def receive(
     """Append a request's bytes to an upload and verify the file once it is whole.
 
     Raises:
-        LockedError, OffsetError, TooLargeError, ChecksumError, CorruptUploadError, DiskFullError: see ``Uploads`` and ``PartialFile``.
+        LockedError, OffsetError, TooLargeError, ChecksumError, CorruptUploadError, DiskFullError: see ``Uploads`` and
+            ``PartialFile``.
         SilenceError: nothing came for too long; what came before is kept as if the connection had broken.
     """
     body = _audible(stream, uploads.limits.silence_s)
@@ -114,7 +115,8 @@ class _Tail:
         file = self._upload.row.file
         if self._written + len(block) > file.bytes:
             raise TooLargeError(
-                f"More bytes were sent of file {file.path!r} than the {file.bytes} of the manifest; send only what is missing."
+                f"More bytes were sent of file {file.path!r} than the {file.bytes} of the manifest; send only what is"
+                " missing."
             )
         self._partial.write(block)
         self._written += len(block)
@@ -137,7 +139,8 @@ class _Tail:
             and not hmac.compare_digest(self._hash.digest(), self._checksum.digest)
         ):
             raise ChecksumError(
-                f"The bytes sent of file {self._upload.row.file.path!r} do not have the {self._checksum.algorithm} that was sent with them; send them again."
+                f"The bytes sent of file {self._upload.row.file.path!r} do not have the {self._checksum.algorithm} that"
+                " was sent with them; send them again."
             )
 
 

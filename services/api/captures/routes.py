@@ -74,7 +74,10 @@ def build_captures_router(captures: Captures) -> APIRouter:
         asker: Asker,
         idempotency_key: Annotated[str | None, Header(max_length=200)] = None,
     ) -> Response:
-        """Announce a capture and learn which of its files are known already. The same manifest gives the same capture, and status 200."""
+        """Announce a capture and learn which of its files are known already.
+
+        The same manifest gives the same capture, and status 200.
+        """
         creation = captures.create(manifest, idempotency_key, asker)
         headers = {"Location": f"/v1/captures/{creation.capture.id}"}
         return Response(creation.capture.model_dump_json(), 201 if creation.is_new else 200, headers, JSON)
@@ -102,7 +105,10 @@ def build_captures_router(captures: Captures) -> APIRouter:
         dependencies=[needs("submit")],
     )
     def commit(capture: str, request: Request) -> Response:
-        """Check the capture and make it usable by jobs; lists every file that is missing, corrupt or refused. Repeating it changes nothing."""
+        """Check the capture and make it usable by jobs; lists every file that is missing, corrupt or refused.
+
+        Repeating it changes nothing.
+        """
         if faults := captures.commit(capture):
             detail = f"Capture {capture} cannot be committed: {faults[0].detail}" + (
                 f" It is one of {len(faults)} such files." if len(faults) > 1 else ""

@@ -1,4 +1,7 @@
-"""tus 1.0 below ``/v1/uploads``: one file of a capture each. Annotations are evaluated here, because FastAPI reads them."""
+"""tus 1.0 below ``/v1/uploads``: one file of a capture each.
+
+Annotations are evaluated here, because FastAPI reads them.
+"""
 
 from contextlib import suppress
 from typing import Annotated
@@ -75,7 +78,10 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
         upload_length: Annotated[int, Header(ge=0, le=2**53)],
         upload_metadata: Annotated[str, Header(max_length=2000)],
     ) -> Response:
-        """Start to send one file of an open capture; Upload-Metadata names 'capture' and 'path'. Starting again changes nothing."""
+        """Start to send one file of an open capture; Upload-Metadata names 'capture' and 'path'.
+
+        Starting again changes nothing.
+        """
         metadata = tus.parse_metadata(upload_metadata)
         if missing := {"capture", "path"} - set(metadata):
             raise UploadError(
@@ -111,7 +117,10 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
         content_type: Annotated[str | None, Header(json_schema_extra={"const": tus.CHUNK_TYPE})] = None,
         upload_checksum: Annotated[str | None, Header(max_length=200)] = None,
     ) -> Response:
-        """Send the next bytes. The answer comes once they are durable, and to the last ones once the file's SHA-256 is verified."""
+        """Send the next bytes.
+
+        The answer comes once they are durable, and to the last ones once the file's SHA-256 is verified.
+        """
         if content_type != tus.CHUNK_TYPE:
             raise HTTPException(415, f"Header Content-Type must be {tus.CHUNK_TYPE}; send it")
         checksum = tus.parse_checksum(upload_checksum) if upload_checksum is not None else None

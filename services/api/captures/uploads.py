@@ -1,4 +1,7 @@
-"""One file of a capture on its way here: what is recorded of it, and what may be done next. ``receiving`` moves the bytes, ``tus_routes`` speaks."""
+"""One file of a capture on its way here: what is recorded of it, and what may be done next.
+
+``receiving`` moves the bytes, ``tus_routes`` speaks.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,8 @@ class Uploads:
         """Ask to send one file of a capture that whoever asks may see; asking again changes nothing.
 
         Raises:
-            UnknownCaptureError: no such capture or file. CorruptUploadError: its size is another. ExpiredError, CaptureStateError: the capture is not open.
+            UnknownCaptureError: no such capture or file. CorruptUploadError: its size is another. ExpiredError,
+                CaptureStateError: the capture is not open.
         """
         if not viewer.may_see(self._table.get(capture).owner):
             raise unknown_capture(capture)
@@ -55,7 +59,8 @@ class Uploads:
         row = self._table.file_at(capture, path)
         if row.file.bytes != size_bytes:
             raise CorruptUploadError(
-                f"File {path!r} has {row.file.bytes} bytes by the manifest and {size_bytes} by Upload-Length; correct the wrong one."
+                f"File {path!r} has {row.file.bytes} bytes by the manifest and {size_bytes} by Upload-Length; correct"
+                " the wrong one."
             )
         self._table.change_file(capture, row.number, is_created=True)
         return self.find(capture, row.number)
@@ -84,7 +89,8 @@ class Uploads:
         upload = self.find(capture, number)
         if upload.offset != offset:
             raise OffsetError(
-                f"File {upload.row.file.path!r} is here up to byte {upload.offset}, not {offset}; ask for Upload-Offset and send from there."
+                f"File {upload.row.file.path!r} is here up to byte {upload.offset}, not {offset}; ask for Upload-Offset"
+                " and send from there."
             )
         return upload
 
@@ -108,7 +114,8 @@ class Uploads:
         if not self.is_known(row) and not self._blobs.adopt(row.capture, row.number, file.sha256):
             self._table.change_file(row.capture, row.number, received_bytes=0, is_corrupt=True)
             raise CorruptUploadError(
-                f"File {file.path!r} was received whole, but its SHA-256 is not the manifest's; it was discarded, so send it again."
+                f"File {file.path!r} was received whole, but its SHA-256 is not the manifest's; it was discarded, so"
+                " send it again."
             )
         self._table.mark_known(file.sha256, row.capture)
         self._blobs.discard_partial(row.capture, row.number)
@@ -130,7 +137,8 @@ class Uploads:
     def is_known(self, row: FileRow) -> bool:
         """Whether the whole content is here and verified, and its owner has sent it.
 
-        A content that others have sent must be sent again: who knows its SHA-256 alone shall neither get it nor learn that it is here.
+        A content that others have sent must be sent again: who knows its SHA-256 alone shall neither get it nor learn
+        that it is here.
         """
         return row.is_known and self._blobs.holds(row.file.sha256, row.file.bytes)
 
@@ -144,7 +152,8 @@ class Uploads:
         """Refuse a capture that takes no bytes.
 
         Raises:
-            UnknownCaptureError: there is none. ExpiredError: it was not committed in time. CaptureStateError: it is committed.
+            UnknownCaptureError: there is none. ExpiredError: it was not committed in time. CaptureStateError: it is
+                committed.
         """
         found = self._table.get(capture)
         if found.state is CaptureState.EXPIRED or (

@@ -16,10 +16,12 @@ from services.pipeline.database import open_database, parse_database_url, read_p
 def change_database_password(url: str, file: Path) -> None:
     """Change the password in the database, then in the file.
 
-    The new one is written beside the file first, so that none is lost if this is cut short between the two: the next call tries it.
+    The new one is written beside the file first, so that none is lost if this is cut short between the two: the next
+    call tries it.
 
     Raises:
-        SettingsError: the database is not Postgres, or the file is absent. PlatformError: the database refuses both passwords.
+        SettingsError: the database is not Postgres, or the file is absent. PlatformError: the database refuses both
+            passwords.
     """
     parsed = parse_database_url(url)
     if parsed.get_backend_name() != "postgresql":

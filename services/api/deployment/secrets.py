@@ -1,4 +1,5 @@
-"""What the parts of one system know of each other and nobody else does: an authority with its certificate for all parts, and the database's password.
+"""What the parts of one system know of each other and nobody else does: an authority with its certificate for all
+parts, and the database's password.
 
 ::
 
@@ -27,12 +28,14 @@ from services.core.files.private import write_private
 AUTHORITY_LIFE = timedelta(days=3650)
 CERTIFICATE_LIFE = timedelta(days=365)
 RENEW_BEFORE = timedelta(days=60)
-"""A certificate with less life than this is made anew when the system starts: a system that is restarted twice a quarter never meets its end."""
+"""A certificate with less life than this is made anew when the system starts: a system that is restarted twice a
+quarter never meets its end."""
 CLOCK_STEP = timedelta(minutes=5)
 """How far the clocks of hosts may differ when a certificate is new."""
 PASSWORD_BYTES = 24
 READABLE_BY_ALL = 0o444
-"""Of the password's file: the database runs as another user than the parts that ask it. The folder is what keeps others out."""
+"""Of the password's file: the database runs as another user than the parts that ask it. The folder is what keeps others
+out."""
 
 
 def make_missing(folder: Path, *, renew: bool = False) -> list[str]:
@@ -86,7 +89,8 @@ def _signing_key(path: Path) -> ec.EllipticCurvePrivateKey:
         if isinstance(key, ec.EllipticCurvePrivateKey):
             return key
     raise SettingsError(
-        f"{path} is no plain elliptic-curve key in PEM; restore it, or remove the folder so that another authority is made."
+        f"{path} is no plain elliptic-curve key in PEM; restore it, or remove the folder so that another authority is"
+        " made."
     )
 
 

@@ -1,4 +1,7 @@
-"""What can be done with the dome by hand: look, ALL OFF, one light, preflight. What drives it is a process of its own; see ``process``."""
+"""What can be done with the dome by hand: look, ALL OFF, one light, preflight.
+
+What drives it is a process of its own; see ``process``.
+"""
 
 from __future__ import annotations
 
@@ -102,14 +105,15 @@ class Dome:
     def all_off(self, viewer: Viewer = LOCAL_VIEWER) -> AllOff:
         """Switch every light off and stop every capture; waits for nobody who has the dome.
 
-        The dome refuses light from then on. Captures are cancelled as well, queued ones too, as whichever begins next would arm the dome anew; then the
-        dome is stopped again, for one that has done so meanwhile.
+        The dome refuses light from then on. Captures are cancelled as well, queued ones too, as whichever begins next
+        would arm the dome anew; then the dome is stopped again, for one that has done so meanwhile.
 
         Raises:
             UnknownDomeError: this server has none. RigError: darkness could not be confirmed.
         """
         with ThreadPoolExecutor(1, "stop captures") as stopping:
-            # Beside each other: captures may have other domes, and neither a dome nor a database that hangs keeps the other from being told.
+            # Beside each other: captures may have other domes, and neither a dome nor a database that hangs keeps the
+            # other from being told.
             stopped = stopping.submit(self._stop_captures)
             with suppress(DentineError):
                 self._switch_off()
@@ -121,11 +125,13 @@ class Dome:
         """Switch one light on for a while.
 
         Raises:
-            UnknownDomeError: this server has none. DomeBusyError: a capture or a preflight has it. SettingsError: no such light. RigError and its kinds.
+            UnknownDomeError: this server has none. DomeBusyError: a capture or a preflight has it. SettingsError: no
+                such light. RigError and its kinds.
         """
         if wanted.level > self._settings.max_level:
             raise SettingsError(
-                f"'level': {wanted.level:g} is above this server's {self._settings.max_level:g} (DENTINE__SERVER__DOME__MAX_LEVEL); lower it."
+                f"'level': {wanted.level:g} is above this server's {self._settings.max_level:g}"
+                " (DENTINE__SERVER__DOME__MAX_LEVEL); lower it."
             )
         with self._driven_by_hand(viewer):
             return _status(self._ask(ANSWER_S, do="light", **wanted.model_dump()))
@@ -142,7 +148,8 @@ class Dome:
         """Light every light for a moment and look through the cameras.
 
         Raises:
-            UnknownDomeError: this server has none. DomeBusyError: a capture has it. SettingsError, CaptureInputError: the rig. RigError and its kinds.
+            UnknownDomeError: this server has none. DomeBusyError: a capture has it. SettingsError, CaptureInputError:
+                the rig. RigError and its kinds.
         """
         if "dome" in rig.model_fields_set and rig.dome != self._address:
             raise SettingsError(f"'dome': this server works the dome at {self._address} and no other; leave it out.")
@@ -195,13 +202,15 @@ class Dome:
             return self._process_ask(timeout_s, **command)
         except TimeoutError:
             raise RigUnreachableError(
-                f"The dome at {self._address} did not do it within {timeout_s:g} s; press ALL OFF, or its emergency stop."
+                f"The dome at {self._address} did not do it within {timeout_s:g} s; press ALL OFF, or its emergency"
+                " stop."
             ) from None
 
     def _process_ask(self, timeout_s: float, **command: object) -> DomeAnswer:
         if self._address is None:
             raise UnknownDomeError(
-                "This server has no dome to work by hand; set DENTINE__SERVER__DOME__ADDRESS to its controller's host:port."
+                "This server has no dome to work by hand; set DENTINE__SERVER__DOME__ADDRESS to its controller's"
+                " host:port."
             )
         return self._process.ask(timeout_s, **command)
 

@@ -1,4 +1,6 @@
-"""The process that works the dome for this server; ``services.capture.console`` by name, as it is not installed with every server."""
+"""The process that works the dome for this server; ``services.capture.console`` by name, as it is not installed with
+every server.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,10 @@ END_S = 10.0
 
 
 class DomeProcess:
-    """Started when it is first needed and again after it died. It ends dark with the pipe to it, however this process ends.
+    """Started when it is first needed and again after it died.
 
-    A thread of its own writes to the pipe, as a process that no longer reads lets whoever writes wait: nobody else does, and the lock is free for ``kill``.
+    It ends dark with the pipe to it, however this process ends. A thread of its own writes to the pipe, as a process
+    that no longer reads lets whoever writes wait: nobody else does, and the lock is free for ``kill``.
     """
 
     def __init__(self, settings: DomeSettings) -> None:
@@ -42,7 +45,8 @@ class DomeProcess:
         """Have a command carried out, beside whatever else is being carried out.
 
         Raises:
-            DentineError: what the command ended in. TimeoutError: no answer in time. PlatformError: the packages of the dome are not installed.
+            DentineError: what the command ended in. TimeoutError: no answer in time. PlatformError: the packages of the
+                dome are not installed.
         """
         asked = DomeCommand.model_validate({"number": next(self._numbers)} | command)
         future: Future[DomeAnswer] = Future()
@@ -139,6 +143,7 @@ def _tell_ended(waiting: dict[int, Future[DomeAnswer]], *numbers: int) -> None:
         if (future := waiting.pop(number, None)) is not None:
             future.set_exception(
                 RigError(
-                    "The process that works the dome ended, and so did its light; ask again, the server's log says why it ended."
+                    "The process that works the dome ended, and so did its light; ask again, the server's log says why"
+                    " it ended."
                 )
             )

@@ -24,7 +24,10 @@ def build_dome_router(dome: Dome, darkeners: ThreadPool, operators: ThreadPool) 
     @router.post("/off", dependencies=[needs("operate-dome", darkens=True)])
     @darkeners.answering
     def off(asker: Asker) -> AllOff:
-        """ALL OFF: every light dark at once and every capture stopped. The dome refuses light until somebody starts anew."""
+        """ALL OFF: every light dark at once and every capture stopped.
+
+        The dome refuses light until somebody starts anew.
+        """
         return dome.all_off(asker)
 
     @router.put("/light", dependencies=[needs("operate-dome")])

@@ -1,4 +1,7 @@
-"""What Prometheus may scrape, in a registry of the application's own. Labels take only values that the program itself names."""
+"""What Prometheus may scrape, in a registry of the application's own.
+
+Labels take only values that the program itself names.
+"""
 
 from __future__ import annotations
 

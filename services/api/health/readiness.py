@@ -84,7 +84,8 @@ class Readiness:
     def _database(self) -> str:
         if _identity(self._engine) != self._file:
             raise StoreError(
-                "The database file was removed or replaced while the server ran; stop the server, restore the file and start again."
+                "The database file was removed or replaced while the server ran; stop the server, restore the file and"
+                " start again."
             )
         writing_once = self._prober.submit(self._take_write_lock)
         try:
@@ -162,7 +163,9 @@ def _check(name: CheckName, attempt: Callable[[], str]) -> Check:
 
 
 def _identity(engine: sql.Engine) -> tuple[int, int] | None:
-    """Device and inode of a SQLite file, None where there is none: open connections would go on with a removed file unawares."""
+    """Device and inode of a SQLite file, None where there is none: open connections would go on with a removed file
+    unawares.
+    """
     if engine.dialect.name != "sqlite" or engine.url.database is None:
         return None
     try:

@@ -17,7 +17,9 @@ def build_workers_router(workers: Workers, repository: Repository) -> APIRouter:
     @router.get("/workers", dependencies=[needs("read")])
     @in_json
     def every(asker: Asker) -> WorkerList:
-        """The workers, what each does of the caller's jobs, and how many jobs they got done; 503 where their scheduler does not answer."""
+        """The workers, what each does of the caller's jobs, and how many jobs they got done; 503 where their scheduler
+        does not answer.
+        """
         return list_workers(workers, repository, asker)
 
     return router

@@ -33,10 +33,15 @@ ANSWERS = refusals(416) | {
 """What the description says of routes that answer with a file."""
 
 MAX_BYTES_AT_ONCE = 2**20
-"""Files and ranges up to here are read in the handler's own thread; longer ones block by block, in a hop to a thread each."""
+"""Files and ranges up to here are read in the handler's own thread; longer ones block by block, in a hop to a thread
+each."""
 
-REPORT_POLICY = "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
-"""A report or a drawing opens alone and carries all it needs; it may reach nothing, this server included, and no page may show it inside itself."""
+REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:;"
+    " frame-ancestors 'none'"
+)
+"""A report or a drawing opens alone and carries all it needs; it may reach nothing, this server included, and no page
+may show it inside itself."""
 
 
 class Artifact(Record):
@@ -74,7 +79,10 @@ def open_artifact(root: Path, name: str) -> Path:
 
 
 def artifact_response(request: Request, path: Path) -> Response:
-    """The file with an ETag; answers conditional and range requests. A Range header that cannot be read is ignored (RFC 9110, 14.2)."""
+    """The file with an ETag; answers conditional and range requests.
+
+    A Range header that cannot be read is ignored (RFC 9110, 14.2).
+    """
     from fastapi.responses import FileResponse, Response
 
     stat = path.stat()
@@ -102,7 +110,9 @@ def artifact_response(request: Request, path: Path) -> Response:
 
 
 def _ranges(asked: str, size_bytes: int) -> list[tuple[int, int]] | None:
-    """Where each range that a Range header names begins, and what it stops before; None if it is malformed or counts in another unit (RFC 9110, 14.1)."""
+    """Where each range that a Range header names begins, and what it stops before; None if it is malformed or counts in
+    another unit (RFC 9110, 14.1).
+    """
     unit, _, ranges = asked.partition("=")
     found = [_RANGE.fullmatch(part.strip()) for part in ranges.split(",")]
     parts = [(part["first"], part["last"]) for part in found if part is not None]

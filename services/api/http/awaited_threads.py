@@ -11,7 +11,9 @@ R = TypeVar("R")
 
 
 async def in_thread(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
-    """Run a function in a thread and, also when this task is cancelled, return only after it: it has a file, a claim or a connection."""
+    """Run a function in a thread and, also when this task is cancelled, return only after it: it has a file, a claim or
+    a connection.
+    """
     running = asyncio.create_task(asyncio.to_thread(function, *arguments, **options))
     try:
         return await asyncio.shield(running)

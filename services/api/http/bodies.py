@@ -1,7 +1,7 @@
 """Bodies in JSON: bounded before they are parsed, long ones parsed off the loop, and refused at their first faults.
 
-To parse hundreds of thousands of values, or to list as many faults, takes seconds in which the loop serves nobody. A thread alone
-does not help, as parsers keep the interpreter for as long as they run: what they are given must be small.
+To parse hundreds of thousands of values, or to list as many faults, takes seconds in which the loop serves nobody. A
+thread alone does not help, as parsers keep the interpreter for as long as they run: what they are given must be small.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ MAX_MEMBERS = 1000
 MAX_VALUES = 40_000
 """In one body: a manifest of five thousand files, the most by default, has twenty thousand."""
 BYTES_PER_VALUE = 20
-"""A body may hold more values than that if it has so many bytes for each. A longer manifest, which the settings may allow, has 25
-at least: four values a file, of which the SHA-256 alone takes 66 bytes."""
+"""A body may hold more values than that if it has so many bytes for each. A longer manifest, which the settings may
+allow, has 25 at least: four values a file, of which the SHA-256 alone takes 66 bytes."""
 SHORT_BYTES = 2**14
 """A body up to here is parsed on the loop, in a millisecond; a longer one waits its turn in a thread."""
 T = TypeVar("T")
@@ -62,7 +62,8 @@ def parse(body: bytes) -> Any:
     values, most = sum(map(body.count, (b",", b"[", b"{"))), max(MAX_VALUES, len(body) // BYTES_PER_VALUE)
     if values > most:
         raise SettingsError(
-            f"The body has up to {values} values and {most} are allowed in its {len(body)} bytes; send what the route asks for."
+            f"The body has up to {values} values and {most} are allowed in its {len(body)} bytes; send what the route"
+            " asks for."
         )
     return json.loads(body, object_pairs_hook=_of_few_members)
 
@@ -70,7 +71,8 @@ def parse(body: bytes) -> Any:
 def _of_few_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) > MAX_MEMBERS:
         raise SettingsError(
-            f"An object of the body has {len(members)} members and {MAX_MEMBERS} are allowed; send what the route asks for."
+            f"An object of the body has {len(members)} members and {MAX_MEMBERS} are allowed; send what the route asks"
+            " for."
         )
     return dict(members)
 

@@ -1,4 +1,6 @@
-"""Refuses bodies that are long or slow as they come in, whatever Content-Length says; plain ASGI, so that nothing is buffered."""
+"""Refuses bodies that are long or slow as they come in, whatever Content-Length says; plain ASGI, so that nothing is
+buffered.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,14 @@ if TYPE_CHECKING:
 EXEMPT = "/v1/uploads"
 """Uploads are long by nature and bound their own size and silence."""
 MAX_BODY_S = 60.0
-"""From the head of a request to the end of its body: a connection that is kept busy with a body is one less for others, ALL OFF among them."""
+"""From the head of a request to the end of its body: a connection that is kept busy with a body is one less for others,
+ALL OFF among them."""
 
 
 class BodyLimit:
-    """Counts what is received; beyond the limit the client gets 413, after too long a time 408, and the application a disconnect."""
+    """Counts what is received; beyond the limit the client gets 413, after too long a time 408, and the application a
+    disconnect.
+    """
 
     def __init__(self, app: ASGIApp, limit_bytes: int) -> None:
         self._app, self._limit_bytes = app, limit_bytes

@@ -1,7 +1,9 @@
-"""The connections of one server: how many there may be, and how long each may keep a request to itself before its head is whole.
+"""The connections of one server: how many there may be, and how long each may keep a request to itself before its head
+is whole.
 
-Whoever opens connections and sends no whole request, by mistake or to keep others out, loses them: after ``header_s``, or at once where a newcomer
-finds all places taken; those that have sent a request before are closed last. So there is always one for ALL OFF.
+Whoever opens connections and sends no whole request, by mistake or to keep others out, loses them: after ``header_s``,
+or at once where a newcomer finds all places taken; those that have sent a request before are closed last. So there is
+always one for ALL OFF.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ _TOO_SLOW = b"HTTP/1.1 408 Request Timeout\r\nconnection: close\r\ncontent-lengt
 
 
 class Crowd:
-    """The open connections, and of those the ones without a request, longest waiting first: those that never sent one, and those that did."""
+    """The open connections, and of those the ones without a request, longest waiting first: those that never sent one,
+    and those that did.
+    """
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.most, self.header_s = min(limits.most, round(MAX_SHARE * raise_descriptors())), limits.header_s
@@ -44,7 +48,9 @@ class Crowd:
         self._told_at: dict[str, float] = {}
 
     def admit(self, newcomer: BoundedProtocol) -> bool:
-        """Let a connection in, in place of the one that has waited longest where all places are taken; False where all are at work."""
+        """Let a connection in, in place of the one that has waited longest where all places are taken; False where all
+        are at work.
+        """
         if len(self.open) >= self.most and not self.shed(1):
             self.tell(
                 "All %d connections are at work; further ones are refused. See DENTINE__SERVER__CONNECTIONS__MOST.",
@@ -86,7 +92,9 @@ class Crowd:
             logging.getLogger(__name__).warning(message, *values)
 
     def handle_exception(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Of the event loop: an accept without descriptors, of which it would tell some hundred times a second, makes room and is told once."""
+        """Of the event loop: an accept without descriptors, of which it would tell some hundred times a second, makes
+        room and is told once.
+        """
         problem = context.get("exception")
         if (
             isinstance(problem, OSError)

@@ -17,8 +17,8 @@ P = ParamSpec("P")
 def in_json(handler: Callable[P, Any]) -> Callable[P, Response]:
     """Let a handler answer 200 with its result as JSON; the description still says what it returns.
 
-    FastAPI would check the result a second time, in another hop to a thread, and write it on the loop that serves everybody. For results that are records,
-    which were checked when they were made.
+    FastAPI would check the result a second time, in another hop to a thread, and write it on the loop that serves
+    everybody. For results that are records, which were checked when they were made.
     """
     adapter: TypeAdapter[Any] = TypeAdapter(inspect.signature(handler).return_annotation)
 

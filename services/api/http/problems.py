@@ -66,7 +66,8 @@ _PHRASES = {
     422: "Unprocessable Entity",
     CHECKSUM_MISMATCH: "Checksum Mismatch",
 }
-"""Those that Python 3.13 names anew, after RFC 9110, as they were: a problem's title and code stay the same whatever the server runs on."""
+"""Those that Python 3.13 names anew, after RFC 9110, as they were: a problem's title and code stay the same whatever
+the server runs on."""
 
 
 def phrase_of(status: int) -> str:
@@ -136,7 +137,9 @@ _STATUS: dict[type[DentineError], int] = {
 
 
 def status_of(problem: DentineError) -> int:
-    """The HTTP status that an error means: that of its kind, else of the nearest kind above it, in whatever order they are listed."""
+    """The HTTP status that an error means: that of its kind, else of the nearest kind above it, in whatever order they
+    are listed.
+    """
     return next(_STATUS[kind] for kind in type(problem).__mro__ if kind in _STATUS)
 
 
@@ -160,7 +163,9 @@ def database_lost(path: str) -> Response:
 
 
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What the description says of routes that may answer so, besides what browser protection, authentication and a lost database answer everywhere."""
+    """What the description says of routes that may answer so, besides what browser protection, authentication and a
+    lost database answer everywhere.
+    """
     chosen = sorted({400, 401, 403, 429, 503, *statuses})
     return {
         status: {"model": Problem, "description": phrase_of(status), "content": {MEDIA_TYPE: {}}} for status in chosen
@@ -199,7 +204,10 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(DataError)
     def _unstorable(request: Request, _problem: DataError) -> Response:
-        detail = "The request holds text or a number that the database does not take, such as the character NUL; leave it out."
+        detail = (
+            "The request holds text or a number that the database does not take, such as the character NUL; leave it"
+            " out."
+        )
         return answer(request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", detail)
 
     @app.exception_handler(NoConnectionError)

@@ -34,7 +34,10 @@ class MovingWindow:
 
 
 class Rates:
-    """Counts requests; every method answers how many seconds to wait, 0 where the request may go on. To be called from one thread."""
+    """Counts requests; every method answers how many seconds to wait, 0 where the request may go on.
+
+    To be called from one thread.
+    """
 
     def __init__(self, settings: RateSettings) -> None:
         self._reads = MovingWindow(settings.reads_per_10_s, 10.0)

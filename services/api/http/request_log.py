@@ -1,4 +1,6 @@
-"""Gives every request an id, a log line and its place in the metrics, as plain ASGI so that streams pass through unbuffered."""
+"""Gives every request an id, a log line and its place in the metrics, as plain ASGI so that streams pass through
+unbuffered.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,16 @@ if TYPE_CHECKING:
 
 HEADER = "X-Request-ID"
 UNROUTED = "unrouted"
-"""Stands for the route of a request that none took, so that neither logs nor metrics repeat what a stranger asked for."""
+"""Stands for the route of a request that none took, so that neither logs nor metrics repeat what a stranger asked
+for."""
 
 _WELL_FORMED = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 class RequestLog:
-    """Takes the client's request id if it is well-formed, else makes one; answers with it, logs it, and keeps it in the request's state."""
+    """Takes the client's request id if it is well-formed, else makes one; answers with it, logs it, and keeps it in the
+    request's state.
+    """
 
     def __init__(self, app: ASGIApp, metrics: RequestMetrics) -> None:
         self._app, self._metrics = app, metrics
@@ -67,7 +72,9 @@ class RequestLog:
 
 
 def method_of(scope: Scope) -> str:
-    """The request's method, ``other`` for one that HTTP does not know: that is whatever a stranger wrote, at any length."""
+    """The request's method, ``other`` for one that HTTP does not know: that is whatever a stranger wrote, at any
+    length.
+    """
     method: str = scope["method"]
     return method if method in METHODS else "other"
 

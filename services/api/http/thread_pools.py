@@ -28,7 +28,9 @@ class ThreadPool:
 
     @classmethod
     def reading(cls, engine: sql.Engine) -> Self:
-        """One where the database is a file: it answers sooner than threads wrest the interpreter from each other, which each of them must after every query."""
+        """One where the database is a file: it answers sooner than threads wrest the interpreter from each other, which
+        each of them must after every query.
+        """
         return cls(1 if engine.dialect.name == "sqlite" else MAX_READERS)
 
     async def ask(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:

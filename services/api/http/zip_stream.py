@@ -15,7 +15,10 @@ _EARLIEST = (1980, 1, 1, 0, 0, 0)
 
 
 def stream_zip(root: Path, names: Iterable[str]) -> Iterator[bytes]:
-    """The bytes of a zip of files below ``root``. A file that vanishes before its turn is left out; one that grows is cut at the size it had."""
+    """The bytes of a zip of files below ``root``.
+
+    A file that vanishes before its turn is left out; one that grows is cut at the size it had.
+    """
     sink = _Sink()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:
         for name in names:

@@ -25,7 +25,8 @@ from services.core.records import JobSpec
 from services.core.store import MANIFEST
 
 DISK_PER_CAPTURE = 6.0
-"""Bytes that a job stores per byte of its capture: the demo's stores 4.8 MB of 0.85 MB, of which compressed images are most."""
+"""Bytes that a job stores per byte of its capture: the demo's stores 4.8 MB of 0.85 MB, of which compressed images are
+most."""
 MIN_DISK_BYTES = 64 * 2**20
 """What a job stores of a small capture: pictures, checkpoint and asset."""
 RIG_CAPTURE_BYTES = 2 * 2**30
@@ -41,9 +42,9 @@ _DESCRIPTIONS = ("capture.json", "raw.toml", "slab.json", MANIFEST, f"capture/{M
 KEPT_FREE_BYTES = 256 * 2**20
 """Disk that no job may count on."""
 AT_ONCE = 4
-"""Jobs that run side by side unless the settings say otherwise. Each further one ends none of them sooner, as they share the
-same workers, and holds memory; but two long jaws should not keep a short tooth waiting, and while one job is prepared or solves,
-another one keeps the workers busy."""
+"""Jobs that run side by side unless the settings say otherwise. Each further one ends none of them sooner, as they
+share the same workers, and holds memory; but two long jaws should not keep a short tooth waiting, and while one job is
+prepared or solves, another one keeps the workers busy."""
 RETRY_S = 10.0
 """How long a job waits after it was paused."""
 
@@ -69,8 +70,9 @@ def predict(spec: JobSpec) -> Needs:
 
 
 def _stored_bytes(folder: Path) -> int:
-    # What lies on the disk, of as many files as a capture may have. What is no capture, such as '/', is refused by its stage and not walked through here. Nor
-    # does a folder that cannot be listed, as on a mount that went away, keep other jobs from starting.
+    # What lies on the disk, of as many files as a capture may have. What is no capture, such as '/', is refused by its
+    # stage and not walked through here. Nor does a folder that cannot be listed, as on a mount that went away, keep
+    # other jobs from starting.
     total = 0
     with suppress(OSError):
         if not any((folder / one).is_file() for one in _DESCRIPTIONS):
@@ -122,7 +124,8 @@ class Admission:
 
     Args:
         look: what the machine has now.
-        at_once: most jobs that run side by side. A capture needs no place: it has a worker of its own, and a person waits.
+        at_once: most jobs that run side by side. A capture needs no place: it has a worker of its own, and a person
+            waits.
         lacks: why no worker can capture (True) or run other stages (False); None if one can.
     """
 
@@ -167,12 +170,14 @@ class Admission:
         needs, machine = predict(spec), self._look()
         if needs.disk_bytes > machine.disk_bytes - KEPT_FREE_BYTES:
             raise JobTooLargeError(
-                f"The job needs about {_gib(needs.disk_bytes)} of disk and there are {_gib(machine.disk_bytes)} in all; put the server's data on a larger one.",
+                f"The job needs about {_gib(needs.disk_bytes)} of disk and there are {_gib(machine.disk_bytes)} in all;"
+                " put the server's data on a larger one.",
                 {"needed_disk_bytes": needs.disk_bytes, "disk_bytes": machine.disk_bytes},
             )
         if machine.memory_bytes is not None and needs.memory_bytes > machine.memory_bytes:
             raise JobTooLargeError(
-                f"{spec.workers} workers need about {_gib(needs.memory_bytes)} of memory and there are {_gib(machine.memory_bytes)}; ask for fewer workers.",
+                f"{spec.workers} workers need about {_gib(needs.memory_bytes)} of memory and there are"
+                f" {_gib(machine.memory_bytes)}; ask for fewer workers.",
                 {"needed_memory_bytes": needs.memory_bytes, "memory_bytes": machine.memory_bytes},
             )
 
@@ -190,7 +195,9 @@ class Admission:
                     del known[job_id]
 
     def holds(self, job_id: str, spec: JobSpec, *, is_to_capture: bool = False) -> bool:
-        """Whether a queued job must wait; ``reason`` then says why, without waiting, as the disk of a capture may hang."""
+        """Whether a queued job must wait; ``reason`` then says why, without waiting, as the disk of a capture may
+        hang.
+        """
         reason = self._obstacle(job_id, spec, is_to_capture=is_to_capture)
         with self._lock:
             self._reasons.pop(job_id, None)
@@ -225,7 +232,9 @@ class Admission:
             self._stalled.pop(job_id, None)
 
     def look_for_stalled(self) -> None:
-        """Find the running jobs whose next task no worker can take; ``stalled`` then says why, until a later look finds one that can."""
+        """Find the running jobs whose next task no worker can take; ``stalled`` then says why, until a later look finds
+        one that can.
+        """
         with self._lock:
             captures = {job_id: job.dome is not None for job_id, job in self._running.items()}
         lacking = {kind: self._lacks(kind) for kind in set(captures.values())}
@@ -301,7 +310,10 @@ class Admission:
         held = sum(job.needs.memory_bytes for job in placed)
         if memory_bytes is None or not placed or held + needs.memory_bytes <= memory_bytes:
             return ""
-        what = f"about {_gib(needs.memory_bytes)} are needed beside the {_gib(held)} of those that run, and there are {_gib(memory_bytes)}"
+        what = (
+            f"about {_gib(needs.memory_bytes)} are needed beside the {_gib(held)} of those that run, and there are"
+            f" {_gib(memory_bytes)}"
+        )
         return f"Waits for memory: {_named(placed)}; {what}."
 
     def _no_disk(self, needs: Needs, machine: Machine) -> str:

@@ -24,7 +24,9 @@ class Erased:
 
 
 def erase(folder: Path) -> Erased:
-    """Remove a folder and everything below it; an absent one counts as empty. A removal that was cut short is gone on with, and counts from its beginning.
+    """Remove a folder and everything below it; an absent one counts as empty.
+
+    A removal that was cut short is gone on with, and counts from its beginning.
 
     Raises:
         StoreError: something could not be read or removed, or what is removed not be noted.

@@ -1,4 +1,6 @@
-"""Event streams: one query finds which jobs have new events, and one read serves all streams that are equally far, however many there are."""
+"""Event streams: one query finds which jobs have new events, and one read serves all streams that are equally far,
+however many there are.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +74,10 @@ class EventBatch:
 
 @dataclass
 class Epoch:
-    """From one growth of the event table to the next. Streams walk from epoch to epoch, so that they miss none while they send."""
+    """From one growth of the event table to the next.
+
+    Streams walk from epoch to epoch, so that they miss none while they send.
+    """
 
     number: int
     ended: asyncio.Event = field(default_factory=asyncio.Event)
@@ -83,7 +88,9 @@ class Epoch:
 
 
 class EventFeed:
-    """Follows the event table while ``run`` runs. Made before the first stream, so that no event falls between what that has read and what is looked for.
+    """Follows the event table while ``run`` runs.
+
+    Made before the first stream, so that no event falls between what that has read and what is looked for.
 
     Args:
         ask: calls a reader in a thread.
@@ -110,7 +117,8 @@ class EventFeed:
             await asyncio.sleep(PERIOD_S)
 
     async def answer(self, job_id: str, after: int) -> Response:
-        """A job's events after an id as a response: a stream, or at once where the job has ended and few are left to tell.
+        """A job's events after an id as a response: a stream, or at once where the job has ended and few are left to
+        tell.
 
         Raises:
             UnknownJobError: there is no such job.
@@ -124,7 +132,8 @@ class EventFeed:
     async def follow(
         self, job_id: str, after: int, opening: tuple[Epoch, EventBatch] | None = None
     ) -> AsyncIterator[bytes]:
-        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state or the job's deletion.
+        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state or
+        the job's deletion.
 
         Args:
             opening: was read already.
@@ -198,7 +207,10 @@ class EventFeed:
             due &= reached.keys()
 
     def _after(self, epoch: Epoch) -> Epoch | None:
-        """The epoch after one that has ended; None if it is not remembered. Epochs do not know it, or a stalled stream would keep all that came after."""
+        """The epoch after one that has ended; None if it is not remembered.
+
+        Epochs do not know it, or a stalled stream would keep all that came after.
+        """
         back = self._epochs[-1].number - epoch.number
         return self._epochs[-back] if back <= len(self._epochs) else None
 

@@ -1,9 +1,10 @@
-"""How long something will take, learned from how long it took before. Pure; few observations make the range wide, not wrong.
+"""How long something will take, learned from how long it took before.
 
-Logarithms of durations are taken as linear in what describes a job: ``log T = a + x·b + e``, ``e`` normal. With a flat prior on ``a``, a normal one on ``b``
-whose width goes with the noise, the next duration's logarithm follows Student's t (the conjugate linear model; Gelman et al., Bayesian Data Analysis, 14.2
-and 14.8). A job that differs from all the earlier ones, or that follows few of them, so gets a wide range by itself. What has lasted for some time already is
-conditioned on having done so.
+Pure; few observations make the range wide, not wrong. Logarithms of durations are taken as linear in what describes a
+job: ``log T = a + x·b + e``, ``e`` normal. With a flat prior on ``a``, a normal one on ``b`` whose width goes with the
+noise, the next duration's logarithm follows Student's t (the conjugate linear model; Gelman et al., Bayesian Data
+Analysis, 14.2 and 14.8). A job that differs from all the earlier ones, or that follows few of them, so gets a wide
+range by itself. What has lasted for some time already is conditioned on having done so.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ OUTLIVED = 0.02
 SLOPE_VARIANCE = 25.0
 """Of each slope, over that of the noise: at a noise of 10 %, slopes within 0.5 of what was expected."""
 NOISE = 0.1
-"""Relative noise that is added with the weight of one observation, so that a few equal durations do not make a range of no width."""
+"""Relative noise that is added with the weight of one observation, so that a few equal durations do not make a range of
+no width."""
 
 PERSISTENCE = 0.5
-"""Expected share of the last case's surprise in the next one: a machine that others use too stays as busy for a while."""
+"""Expected share of the last case's surprise in the next one: a machine that others use too stays as busy for a
+while."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,9 @@ class Outlook:
     degrees: int
 
     def remaining_s(self, elapsed_s: float = 0.0, share: float = SHARE) -> tuple[float, float] | None:
-        """Range that holds what remains after ``elapsed_s`` in a share of all cases; None if too few cases last that long."""
+        """Range that holds what remains after ``elapsed_s`` in a share of all cases; None if too few cases last that
+        long.
+        """
         lasting = 1.0 if elapsed_s <= 0 else survival((math.log(elapsed_s) - self.centre) / self.spread, self.degrees)
         if lasting < OUTLIVED:
             return None

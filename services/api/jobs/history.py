@@ -97,7 +97,9 @@ def read_previews(log: EventLog, job_id: str, after: int, limit: int) -> Preview
 
 
 def read_history(log: EventLog, points: int, channel: str | None = None) -> History:
-    """Steps of every channel, evenly thinned to ``points`` each, the first and the last kept; a step that a later attempt repeats replaces the earlier one."""
+    """Steps of every channel, evenly thinned to ``points`` each, the first and the last kept; a step that a later
+    attempt repeats replaces the earlier one.
+    """
     thinned: dict[str, _Thinned] = {}
     for told in log.data_of("step"):
         name = str(told.data.get("channel", ""))
@@ -107,7 +109,10 @@ def read_history(log: EventLog, points: int, channel: str | None = None) -> Hist
 
 
 class Histories:
-    """Curves as JSON. Rows of the event table are never changed, so that a curve is read again only after its job's newest event is another one.
+    """Curves as JSON.
+
+    Rows of the event table are never changed, so that a curve is read again only after its job's newest event is
+    another one.
 
     Args:
         most_bytes: what is kept at most; those that were asked for longest ago go first.
@@ -144,7 +149,9 @@ def _kept_bytes(channel: str | None, text: bytes) -> int:
 
 
 class _Thinned:
-    """Every n-th step of a channel, n doubling as steps come, so that a long fit needs no more memory than a short one."""
+    """Every n-th step of a channel, n doubling as steps come, so that a long fit needs no more memory than a short
+    one.
+    """
 
     def __init__(self, points: int) -> None:
         self._points, self._stride = points, 1

@@ -1,4 +1,7 @@
-"""Routes that show what a job did and does, and the presets. Annotations are evaluated here, because FastAPI reads them."""
+"""Routes that show what a job did and does, and the presets.
+
+Annotations are evaluated here, because FastAPI reads them.
+"""
 
 from typing import Annotated, Literal
 
@@ -110,7 +113,9 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
     )
     @openers.answering
     def parameters(job_id: str) -> Response:
-        """What the job has measured, for a spreadsheet: a row per channel and parameter with value, standard error and unit."""
+        """What the job has measured, for a spreadsheet: a row per channel and parameter with value, standard error and
+        unit.
+        """
         job = jobs.repository.get(job_id)
         table = parameter_table(job.id, open_artifact(jobs.folder(job.id), PARAMETERS))
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.csv"', "Cache-Control": "no-store"}

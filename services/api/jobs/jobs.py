@@ -138,9 +138,11 @@ class Jobs:
         """Queue a job, under a label where it is given one.
 
         Raises:
-            SettingsError: a path is relative, absent or may not be named, or an uploaded capture is not committed or somebody else's.
+            SettingsError: a path is relative, absent or may not be named, or an uploaded capture is not committed or
+                somebody else's.
             JobTooLargeError: the machine could never run it.
-            ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another job.
+            ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another
+                job.
         """
         spec = self.calibrations.by_content(spec, viewer)
         if key is not None and (earlier := self.repository.submitted(spec, key, viewer)) is not None:
@@ -187,7 +189,8 @@ class Jobs:
             logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
 
     def retry(self, job_id: str) -> Job:
-        """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from what it had published and is still good.
+        """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from what it
+        had published and is still good.
 
         Raises:
             UnknownJobError: there is no such job. JobStateError: there is nothing to do again.
@@ -201,7 +204,8 @@ class Jobs:
         """Remove everything that is stored of a job that has ended, and give a receipt.
 
         Raises:
-            UnknownJobError: there is no such job. JobStateError: it has not ended. StoreError: a file could not be removed; delete it again.
+            UnknownJobError: there is no such job. JobStateError: it has not ended. StoreError: a file could not be
+                removed; delete it again.
         """
         self.repository.apply(job_id, Trigger.DELETE)
         with self._deleting:

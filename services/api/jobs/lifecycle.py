@@ -1,4 +1,6 @@
-"""A job's life as a pure state machine: (state, trigger) -> (state, instruction). No I/O; the repository persists, the runner obeys.
+"""A job's life as a pure state machine: (state, trigger) -> (state, instruction).
+
+There is no I/O here: the repository persists, the runner obeys.
 
 ==========  =====================  ==================  ==================  =====================  =================
 state       cancel                 start               succeed             fail                   lose
@@ -10,13 +12,13 @@ CANCELLING  CANCELLING             -                   SUCCEEDED           FAILE
 DELETING    -                      -                   -                   -                      DELETING, erase
 ==========  =====================  ==================  ==================  =====================  =================
 
-Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED, launch; SUCCEEDED -revise-> QUEUED,
-launch, where its masks were changed; RUNNING -pause-> QUEUED, launch.
-What has ended can be deleted: -delete-> DELETING, erase; so can what is DELETING, as the erasing itself may have been cut short.
+Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED,
+launch; SUCCEEDED -revise-> QUEUED, launch, where its masks were changed; RUNNING -pause-> QUEUED, launch. What has
+ended can be deleted: -delete-> DELETING, erase; so can what is DELETING, as the erasing itself may have been cut short.
 
-``lose`` says that no process works on the job any more, as after a crash: whatever ran is queued again and resumes from what it had
-published. ``pause`` says that it cannot go on for now, for lack of disk. A job that ends before it notices a cancel has succeeded: the state tells what
-happened, not what was wished.
+``lose`` says that no process works on the job any more, as after a crash: whatever ran is queued again and resumes from
+what it had published. ``pause`` says that it cannot go on for now, for lack of disk. A job that ends before it notices
+a cancel has succeeded: the state tells what happened, not what was wished.
 """
 
 from __future__ import annotations

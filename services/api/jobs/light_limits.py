@@ -1,4 +1,7 @@
-"""How far a job may go with a dome: what the server allows, whatever the job asks for. There is a person's face in the dome."""
+"""How far a job may go with a dome: what the server allows, whatever the job asks for.
+
+There is a person's face in the dome.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,8 @@ class LightLimits:
         """Refuse a rig that the server does not allow, before anything is connected to or lit.
 
         Raises:
-            SettingsError: its dome, level or exposure is not allowed. ExposureLimitError: one of its exposures passes the dose of a light.
+            SettingsError: its dome, level or exposure is not allowed. ExposureLimitError: one of its exposures passes
+                the dose of a light.
         """
         settings = self._settings
         if rig.dome not in settings.allowed_addresses:
@@ -33,11 +37,17 @@ class LightLimits:
             raise SettingsError(f"{what}; lower it.")
         on_s = rig.settle_s + rig.exposure_s
         if on_s > settings.max_exposure_s:
-            what = f"Option 'rig.exposure_s': {on_s:g} s with 'rig.settle_s' are longer than this server's {settings.max_exposure_s:g} s"
+            what = (
+                f"Option 'rig.exposure_s': {on_s:g} s with 'rig.settle_s' are longer than this server's"
+                f" {settings.max_exposure_s:g} s"
+            )
             raise SettingsError(f"{what} ({_PREFIX}MAX_EXPOSURE_S); shorten them.")
         dose_s, limit_s = rig.level * on_s, min(rig.light_exposure_limit_s, settings.light_exposure_limit_s)
         if dose_s > limit_s:
-            what = f"One exposure at rig.level {rig.level:g} for {on_s:g} s is {dose_s:.3g} level-seconds, over the limit of {limit_s:g} of one light"
+            what = (
+                f"One exposure at rig.level {rig.level:g} for {on_s:g} s is {dose_s:.3g} level-seconds, over the limit"
+                f" of {limit_s:g} of one light"
+            )
             raise ExposureLimitError(f"{what}; lower rig.level or rig.exposure_s.")
 
     def lowered(self, spec: JobSpec) -> JobSpec:

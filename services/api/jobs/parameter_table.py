@@ -12,7 +12,8 @@ from services.client.errors import JobStateError
 from services.core.results import Estimate
 
 COLUMNS = ("job", "channel", "parameter", "value", "se", "unit", "determined")
-"""``se`` is one standard error, empty where nothing was fitted. With the job, tables of several jobs go one below another."""
+"""``se`` is one standard error, empty where nothing was fitted. With the job, tables of several jobs go one below
+another."""
 _FORMULA_MARKS = ("=", "+", "-", "@", "'")
 """Spreadsheets compute what begins so. A channel's name comes with the capture, so it is shown and not computed."""
 _TABLES: TypeAdapter[dict[str, dict[str, Estimate]]] = TypeAdapter(dict[str, dict[str, Estimate]])

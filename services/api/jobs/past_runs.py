@@ -1,4 +1,7 @@
-"""How jobs that succeeded went: when they reached each tenth of each stage. Kept in a table of its own, as a fit's events are many."""
+"""How jobs that succeeded went: when they reached each tenth of each stage.
+
+Kept in a table of its own, as a fit's events are many.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,9 @@ def tenth_of(done: float) -> int:
 
 
 def course_of(events: Iterable[JobEvent]) -> Course | None:
-    """The course that events tell of, oldest first; None if the job did not succeed, was interrupted, or the clock stepped back."""
+    """The course that events tell of, oldest first; None if the job did not succeed, was interrupted, or the clock
+    stepped back.
+    """
     began_s = ended_s = None
     machines, reached = set[str](), dict[StageName, list[float]]()
     for event in events:

@@ -57,7 +57,9 @@ class Job(Record):
     owner: str = Field(default=DEFAULT_GROUP, description="group that it belongs to, or token:ID of a token in none")
     verdict: Verdict | None = Field(
         default=None,
-        description="how well the fit of a job that succeeded went; null before, and where an earlier version fitted it",
+        description=(
+            "how well the fit of a job that succeeded went; null before, and where an earlier version fitted it"
+        ),
     )
 
     def seen_by(self, viewer: Viewer) -> Job:

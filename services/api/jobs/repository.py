@@ -1,7 +1,7 @@
 """Jobs beside the event table; a change of state and its event are one transaction.
 
-Whoever runs a job holds its lease: a number, one more than any before, and a time until which it is his. A lease that is not renewed is lost, and what its
-holder still says of the job is refused.
+Whoever runs a job holds its lease: a number, one more than any before, and a time until which it is his. A lease that
+is not renewed is lost, and what its holder still says of the job is refused.
 """
 
 from __future__ import annotations
@@ -243,7 +243,8 @@ class Repository:
 
         Args:
             keep: hold whatever the clock says: the caller's own, who knows that it works on those jobs.
-            length_s: of every lease. One that ends more than twice as far ahead was taken before the clock stepped back, and counts as run out.
+            length_s: of every lease. One that ends more than twice as far ahead was taken before the clock stepped
+                back, and counts as run out.
         """
         now_s = self._clock()
         held: sql.ColumnElement[bool] = lease_table.c.until_s.between(now_s, now_s + 2 * length_s)

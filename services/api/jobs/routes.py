@@ -1,4 +1,7 @@
-"""The REST routes below ``/v1``. Annotations are evaluated here, because FastAPI reads them and they name local dependencies."""
+"""The REST routes below ``/v1``.
+
+Annotations are evaluated here, because FastAPI reads them and they name local dependencies.
+"""
 
 import asyncio
 import json
@@ -108,7 +111,10 @@ def build_router(
                 return await lookers.ask(jobs.time_range, job)
         except TimeoutError:
             return TimeRange(
-                reason=f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask again."
+                reason=(
+                    f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask"
+                    " again."
+                )
             )
 
     @router.post(
@@ -177,7 +183,8 @@ def build_router(
 
     @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
     def retry(job_id: str, request: Request) -> Job:
-        """Queue a failed or cancelled job again, or one that succeeded before its masks were changed; it resumes from what it had published.
+        """Queue a failed or cancelled job again, or one that succeeded before its masks were changed; it resumes from
+        what it had published.
 
         A job that has yet to capture needs scope operate-dome too, unless its dome is simulated.
         """

@@ -82,7 +82,9 @@ class Runner:
         self._threads = [threading.Thread(target=part, name=name) for name, part in parts.items()]
 
     def start(self, *, alone: bool) -> None:
-        """Begin; ``alone`` says that no other server shares the database, so that whatever is under way there was left by one that died."""
+        """Begin; ``alone`` says that no other server shares the database, so that whatever is under way there was left
+        by one that died.
+        """
         if alone:
             self._repository.lose()
         self._wake.set()
@@ -90,7 +92,9 @@ class Runner:
             thread.start()
 
     def stop(self) -> None:
-        """Ask the running jobs to stop, and wait for nothing; they stay queued and resume when a server starts again."""
+        """Ask the running jobs to stop, and wait for nothing; they stay queued and resume when a server starts
+        again.
+        """
         self._closing.set()
         self._wake.set()
         for lease in self._leases():
@@ -169,8 +173,8 @@ class Runner:
             thread.start()
 
     def _tell_obstacle(self, job_id: str, located: JobSpec) -> None:
-        # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its numbers
-        # change all the time. That others are before it is nothing to act on.
+        # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its
+        # numbers change all the time. That others are before it is nothing to act on.
         reason = self._admission.reason(job_id, besides_turn=True)
         kind = None if reason is None else reason.partition(":")[0]
         if kind != self._told_obstacles.get(job_id):
@@ -244,7 +248,10 @@ class Runner:
             if not is_begun:
                 raise  # nothing of the job broke; whoever leases it next may have better luck
             logging.getLogger(__name__).exception("Job broke.")
-            message = f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the server's log."
+            message = (
+                f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the"
+                " server's log."
+            )
             trigger, failure = (
                 Trigger.FAIL,
                 Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job)),
@@ -273,7 +280,8 @@ class Runner:
                 request_cancel(folder)
 
     def _after_cancel(self, job: Job) -> Trigger:
-        # A user's, this server's end, or nobody's: whoever cancels tasks in Dask itself finds the job going on, but not at once and over and over.
+        # A user's, this server's end, or nobody's: whoever cancels tasks in Dask itself finds the job going on, but not
+        # at once and over and over.
         if patiently(lambda: self._repository.get(job.id).state) is JobState.CANCELLING:
             return Trigger.STOPPED
         if self._closing.is_set():

@@ -1,4 +1,6 @@
-"""Which folders of the server a job may name: those below the roots that the settings allow, and none where callers need tokens and no root is set."""
+"""Which folders of the server a job may name: those below the roots that the settings allow, and none where callers
+need tokens and no root is set.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,8 @@ class ServerPaths:
         return cls(None if settings.access == "open" and not named else named, settings.data)
 
     def require(self, option: str, path: Path, remedy: str = "check the path") -> None:
-        """Refuse a path that means nothing on the server, or may not be named; ``remedy`` says what to do about one that is absent.
+        """Refuse a path that means nothing on the server, or may not be named; ``remedy`` says what to do about one
+        that is absent.
 
         What may not be named is refused in the same words whether it is there or not.
 
@@ -76,7 +79,8 @@ def without_folders(spec: JobSpec) -> JobSpec:
 
 
 def told_without_folders(text: str, located: JobSpec, data: Path) -> str:
-    """A sentence about a job without the folders on the server that its files lie in: those who read it need not be those who may name them.
+    """A sentence about a job without the folders on the server that its files lie in: those who read it need not be
+    those who may name them.
 
     Args:
         located: the job's options with the files of what the server stores.

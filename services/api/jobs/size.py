@@ -62,6 +62,8 @@ def method_of(spec: JobSpec) -> str:
 
 @lru_cache(maxsize=256)
 def _images(describe: Describe, folder: Path, _version: tuple[Path, int]) -> tuple[int, int]:
-    """Pixels of all images together, and channels; known of a description whose file and time of change are the same."""
+    """Pixels of all images together, and channels; known of a description whose file and time of change are the
+    same.
+    """
     found = describe(folder)
     return found.image_px, len(found.calibration.channels)

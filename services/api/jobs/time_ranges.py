@@ -1,4 +1,6 @@
-"""How long until a job ends: an 80 % range learned from past jobs that did the same on the same class of machine, or a reason why there is none."""
+"""How long until a job ends: an 80 % range learned from past jobs that did the same on the same class of machine, or a
+reason why there is none.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,8 @@ class TimeRange(Record):
     reason: str | None = Field(default=None, description="why there is no range")
 
     def after(self, running: Sequence[Self], ahead: Sequence[Self], places: int) -> Self:
-        """The range of what begins when a place is free for it: jobs end that run, and those ahead of it have had theirs.
+        """The range of what begins when a place is free for it: jobs end that run, and those ahead of it have had
+        theirs.
 
         Lower limits go with lower ones and upper with upper, as on a busy machine all jobs are late together.
         """
@@ -108,7 +111,10 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
     pace = 0.0 if position.took_s is None else weight * math.log(max(position.took_s, SHORTEST_S))
     outlook = foresee(past, (*job_size, pace), (*[SIZE_SLOPE * (1 - weight)] * len(job_size), 1.0))
     if outlook is None:
-        what = f"{len(past)} jobs like this one have succeeded on such a machine, and {MIN_OBSERVATIONS} are needed to tell a time."
+        what = (
+            f"{len(past)} jobs like this one have succeeded on such a machine, and {MIN_OBSERVATIONS} are needed to"
+            " tell a time."
+        )
         return TimeRange(past_jobs=len(past), reason=what)
     left = outlook.remaining_s(position.since_s)
     if left is None:
@@ -201,7 +207,9 @@ class TimeRanges:
 
 
 class _Past:
-    """Past runs while one range is told: jobs in a queue are mostly alike, and what is asked for one is known for the others."""
+    """Past runs while one range is told: jobs in a queue are mostly alike, and what is asked for one is known for the
+    others.
+    """
 
     def __init__(self, repository: Repository) -> None:
         self._runs = repository.past_runs
@@ -220,7 +228,9 @@ class _Past:
 
 
 def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position | None:
-    """Where a job is; None within a stage that was begun more than once, as past jobs do not tell how much of it is left."""
+    """Where a job is; None within a stage that was begun more than once, as past jobs do not tell how much of it is
+    left.
+    """
     stages = stages_of(job.spec, [event.stage for event in latest])
     if job.state is JobState.QUEUED:
         if not latest:

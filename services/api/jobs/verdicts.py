@@ -27,7 +27,10 @@ _UNREAD: Any = object()
 
 
 class Verdicts:
-    """Of the jobs of one database. A fit that has succeeded is judged once; one that runs again succeeds at another time."""
+    """Of the jobs of one database.
+
+    A fit that has succeeded is judged once; one that runs again succeeds at another time.
+    """
 
     def __init__(self, engine: sql.Engine) -> None:
         self._engine = engine

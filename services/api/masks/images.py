@@ -43,7 +43,8 @@ def _require_header(header: PngHeader, camera: Camera) -> None:
 
 
 def _require_rows(content: bytes, camera: Camera) -> None:
-    # Inflates little more than the header promises, in pieces, as a mask may grow a thousandfold; every row begins with the number of its filter.
+    # Inflates little more than the header promises, in pieces, as a mask may grow a thousandfold; every row begins with
+    # the number of its filter.
     (width, height), depth = camera.size, png_header(content).depth
     expected_bytes = height * (1 + -(-width * depth // 8))
     inflater, inflated_bytes, place = zlib.decompressobj(), 0, len(PNG_SIGNATURE)

@@ -22,7 +22,8 @@ from services.core.records import PreparedManifest
 from services.core.store import StoredArray, is_published, open_stage, write_atomic
 
 MAX_PREPARED_PX = 2**26
-"""Of a camera whose prepared mask is shown: 67 million, more than any camera of a dome has. Some 5 bytes a pixel are in memory meanwhile."""
+"""Of a camera whose prepared mask is shown: 67 million, more than any camera of a dome has. Some 5 bytes a pixel are in
+memory meanwhile."""
 _AT_WORK = frozenset({JobState.RUNNING, JobState.CANCELLING, JobState.DELETING})
 
 
@@ -69,7 +70,8 @@ class Masks:
         path = mask_path(self._jobs.folder(job.id), camera, light)
         if len(path.name) > LONGEST_NAME or not path.is_file():
             raise UnknownMaskError(
-                f"The job has no mask by hand of camera {camera} and light {light}; list its masks to see which there are."
+                f"The job has no mask by hand of camera {camera} and light {light}; list its masks to see which there"
+                " are."
             )
         return path
 
@@ -77,7 +79,8 @@ class Masks:
         """Store a mask without metadata, in place of an earlier one.
 
         Raises:
-            MaskError: it is no mask of this camera. UnknownMaskError: no such camera or light. JobStateError: the job is at work.
+            MaskError: it is no mask of this camera. UnknownMaskError: no such camera or light. JobStateError: the job
+                is at work.
         """
         require_mask(content, self._camera(job, camera, light))
         self._require_rest(job)
@@ -98,7 +101,8 @@ class Masks:
         """A PNG of the bits of ``MaskBit`` that the preparation has set, 0 where the fit may look.
 
         Raises:
-            UnknownMaskError: nothing is prepared, or no such camera or light. MaskError: the camera has too many pixels.
+            UnknownMaskError: nothing is prepared, or no such camera or light. MaskError: the camera has too many
+                pixels.
         """
         root = self._jobs.folder(job.id)
         if not is_published(root, "prepared"):
@@ -107,13 +111,14 @@ class Masks:
         cameras, lights = [one.name for one in manifest.cameras], [one.name for one in manifest.lights]
         if camera not in cameras or light not in lights:
             raise UnknownMaskError(
-                f"Job {job.id} has prepared no camera {camera} under light {light}; it has {', '.join(cameras)} and {', '.join(lights)}."
+                f"Job {job.id} has prepared no camera {camera} under light {light}; it has {', '.join(cameras)} and"
+                f" {', '.join(lights)}."
             )
         width, height = manifest.cameras[cameras.index(camera)].size
         if width * height > MAX_PREPARED_PX:
             raise MaskError(
-                f"Camera {camera} has {width} x {height} pixels, and prepared masks of up to {MAX_PREPARED_PX} are shown;"
-                " bin its images."
+                f"Camera {camera} has {width} x {height} pixels, and prepared masks of up to {MAX_PREPARED_PX} are"
+                " shown; bin its images."
             )
         with self._drawing:
             valid = StoredArray(folder / "prepared.zarr" / "valid")
@@ -126,7 +131,8 @@ class Masks:
         if found is None or light not in {*lights, ALL_LIGHTS}:
             cameras = ", ".join(one.name for one in description.cameras)
             raise UnknownMaskError(
-                f"The job's capture has no camera {camera} with light {light}; it has {cameras} and {', '.join(lights)}, or '{ALL_LIGHTS}'."
+                f"The job's capture has no camera {camera} with light {light}; it has {cameras} and"
+                f" {', '.join(lights)}, or '{ALL_LIGHTS}'."
             )
         if len(mask_path(Path(), camera, light).name) > LONGEST_NAME:
             raise UnknownMaskError(

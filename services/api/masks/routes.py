@@ -39,14 +39,18 @@ def build_masks_router(jobs: Jobs, masks: Masks) -> APIRouter:
     def get(
         job: Found, camera: str, light: str, request: Request, which: Literal["hand", "prepared"] = "hand"
     ) -> Response:
-        """A mask as PNG: by hand, as put, without metadata; prepared, the sum of the reasons why a pixel is out (MaskBit), 0 where the fit may look."""
+        """A mask as PNG: by hand, as put, without metadata; prepared, the sum of the reasons why a pixel is out
+        (MaskBit), 0 where the fit may look.
+        """
         if which == "prepared":
             return Response(masks.prepared(job, camera, light), media_type=PNG)
         return artifact_response(request, masks.get(job, camera, light))
 
     @router.put("/{camera}/{light}", status_code=204, openapi_extra=_BODY, dependencies=[needs("submit")])
     async def put(job: Found, camera: str, light: str, request: Request) -> None:
-        """Put a mask by hand, for one light or for 'all': a grey PNG of the camera's size, not 0 where the fit must not look. A retry takes it in."""
+        """Put a mask by hand, for one light or for 'all': a grey PNG of the camera's size, not 0 where the fit must not
+        look. A retry takes it in.
+        """
         await run_in_threadpool(masks.put, job, camera, light, await request.body())
 
     @router.delete("/{camera}/{light}", status_code=204, dependencies=[needs("submit")])

@@ -16,7 +16,9 @@ FIRST = "0001"
 
 
 def upgrade(engine: sql.Engine, to: str = "head") -> None:
-    """Take all steps that are missing, up to one, and close what was opened for that. Servers that start together wait for each other.
+    """Take all steps that are missing, up to one, and close what was opened for that.
+
+    Servers that start together wait for each other.
 
     Raises:
         PlatformError: the database cannot be reached, or refuses the password.
@@ -44,7 +46,10 @@ def _telling_refusals(engine: sql.Engine) -> Iterator[None]:
         if engine.dialect.name == "sqlite":
             raise
         reason = str(problem.orig).strip().splitlines()[-1].rpartition("FATAL:")[2].strip()
-        remedy = "check that it runs, its address, and the password, whose file DENTINE__SERVER__DATABASE_PASSWORD_FILE names"
+        remedy = (
+            "check that it runs, its address, and the password, whose file DENTINE__SERVER__DATABASE_PASSWORD_FILE"
+            " names"
+        )
         raise PlatformError(
             f"The database at {engine.url.host} does not let this server in ({reason}); {remedy}."
         ) from problem

@@ -23,7 +23,8 @@ _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
 _EXAMPLES = ipaddress.IPv6Network("3fff::/20")
 """For documentation (RFC 9637); Python 3.12 takes it for public."""
 _ISATAP = frozenset({0x0000_5EFE, 0x0200_5EFE})
-"""Of the last 64 bits the first 32, which say that an IPv4 address follows to which packets are tunnelled (RFC 5214)."""
+"""Of the last 64 bits the first 32, which say that an IPv4 address follows to which packets are tunnelled (RFC
+5214)."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,14 @@ class AddressPolicy:
         """Check an address before it is connected to.
 
         Raises:
-            WebhookAddressError: it is not public and the settings do not allow that, or plain http would leave for a public one.
+            WebhookAddressError: it is not public and the settings do not allow that, or plain http would leave for a
+                public one.
         """
         if not is_public(address):
             if not self.allow_private or address.is_multicast or address.is_unspecified:
                 raise WebhookAddressError(
-                    f"Webhooks may not go to {address}, which is no public address; set private_webhooks to allow private ones."
+                    f"Webhooks may not go to {address}, which is no public address; set private_webhooks to allow"
+                    " private ones."
                 )
         elif scheme == "http":
             raise WebhookAddressError(f"A webhook to the public address {address} must be https.")

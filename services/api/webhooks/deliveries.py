@@ -110,7 +110,10 @@ class Deliveries:
             ]
 
     def settle(self, claim: Claim, attempt: Attempt, retry_s: float, *, is_gone: bool = False) -> None:
-        """Log a try; after a failed one plan the next in ``retry_s``, or give up. ``is_gone``: the receiver wants no more."""
+        """Log a try; after a failed one plan the next in ``retry_s``, or give up.
+
+        ``is_gone``: the receiver wants no more.
+        """
         now_s = attempt.time_s + attempt.duration_s
         with writing(self._engine) as connection:
             webhook = (

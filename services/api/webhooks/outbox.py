@@ -1,7 +1,8 @@
 """From the event table to what is to be delivered. Everything here runs inside the caller's transaction.
 
-A cursor says how far the event table was read; it moves in the same transaction that adds the deliveries, so that a restart neither loses nor
-repeats one. That rests on event ids becoming visible in their order, for which ``database.writing`` lets one writer in at a time.
+A cursor says how far the event table was read; it moves in the same transaction that adds the deliveries, so that a
+restart neither loses nor repeats one. That rests on event ids becoming visible in their order, for which
+``database.writing`` lets one writer in at a time.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ def has_news(connection: sql.Connection) -> bool:
 
 
 def collect_changes(connection: sql.Connection, now_s: float) -> int:
-    """Add a delivery for each new change of state and each active webhook that asked for it, and move the cursor; returns how many."""
+    """Add a delivery for each new change of state and each active webhook that asked for it, and move the cursor;
+    returns how many.
+    """
     webhooks = connection.execute(sql.select(webhook_table).where(webhook_table.c.active)).mappings().all()
     cursor, newest, added = _cursor(connection), _newest(connection), 0
     while changes := _changes(connection, cursor, _BATCH):

@@ -1,4 +1,6 @@
-"""Sends what is due to webhooks, signed as Standard Webhooks says, one message at a time to each and many receivers at once."""
+"""Sends what is due to webhooks, signed as Standard Webhooks says, one message at a time to each and many receivers at
+once.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def sign(secret: str, message: str, timestamp: int, payload: str) -> str:
 
 
 def retry_s(tries: int, draw: float) -> float:
-    """How long to wait after so many tries: doubling from 10 s, jittered by ``draw`` in [0, 1) to between half and one and a half of it."""
+    """How long to wait after so many tries: doubling from 10 s, jittered by ``draw`` in [0, 1) to between half and one
+    and a half of it.
+    """
     return float(FIRST_RETRY_S * 2.0 ** (tries - 1) * (0.5 + draw))
 
 
@@ -121,7 +125,9 @@ class WebhookSender:
             )
 
     async def _post(self, http: httpx.AsyncClient, claim: Claim) -> int:
-        """Connect to a checked address under the name that the certificate must prove; the answer's body is not read."""
+        """Connect to a checked address under the name that the certificate must prove; the answer's body is not
+        read.
+        """
         url, timestamp = httpx.URL(claim.url), int(self._clock())
         host = url.raw_host.decode()
         port = url.port or (443 if url.scheme == "https" else 80)

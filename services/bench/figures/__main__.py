@@ -1,7 +1,7 @@
 """Figures of teeth 2018 by this project's own fits: ``python -m services.bench.figures --out DIR``.
 
-Each figure is a PNG with its caption beside it, and ``index.html`` shows all that are there. Captures and fits are made once, by the command line, and
-kept below ``DIR/work``; what is finished is used again.
+Each figure is a PNG with its caption beside it, and ``index.html`` shows all that are there. Captures and fits are made
+once, by the command line, and kept below ``DIR/work``; what is finished is used again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""How far light from all around, which the model of a capture does not know, moves what a fit finds (teeth 2018, section 7)."""
+"""How far light from all around, which the model of a capture does not know, moves what a fit finds (teeth 2018,
+section 7).
+"""
 
 from __future__ import annotations
 
@@ -38,8 +40,8 @@ def under_ambient_light(cast: Cast) -> Drawn:
     rows = ambient_rows(cast)
     return Drawn(
         plot(rows),
-        f"A procedural incisor of known dentin from one side, with constant light from all around added to every photograph, its mirror "
-        f"image included. {sentence(rows)}",
+        "A procedural incisor of known dentin from one side, with constant light from all around added to every"
+        f" photograph, its mirror image included. {sentence(rows)}",
     )
 
 
@@ -47,7 +49,8 @@ def ambient_rows(cast: Cast) -> list[Row]:
     """A fit for each strength of ambient light, none first.
 
     Returns:
-        Rows of ``fraction`` of the mean radiance of fitted photographs, ``fit_error``, ``held_out_error``, and ``value``, ``se`` and ``truth`` by quantity.
+        Rows of ``fraction`` of the mean radiance of fitted photographs, ``fit_error``, ``held_out_error``, and
+        ``value``, ``se`` and ``truth`` by quantity.
     """
     case = cast.lone_view
     source = case.capture.rendered(cast.work)
@@ -139,14 +142,18 @@ def sentence(rows: Sequence[Row]) -> str:
 
 def table(rows: Sequence[Row]) -> str:
     """The same as a table in Markdown, with errors and truth."""
-    head = "| ambient light | σs' enamel, per mm | 1 − α' enamel | σs' dentin, per mm | 1 − α' dentin | fit | held out |\n|---|---|---|---|---|---|---|\n"
+    head = (
+        "| ambient light | σs' enamel, per mm | 1 − α' enamel | σs' dentin, per mm | 1 − α' dentin | fit | held out"
+        " |\n|---|---|---|---|---|---|---|\n"
+    )
     lines = ["| truth | " + " | ".join(f"{rows[0][quantity]['truth']:.3g}" for quantity in QUANTITIES) + " | | |"]
     for row in rows:
         found = " | ".join(
             f"{row[q]['value']:.3g}" + ("" if row[q]["se"] is None else f" ± {row[q]['se']:.1g}") for q in QUANTITIES
         )
         lines.append(
-            f"| {100 * row['fraction']:.0f} % | {found} | {100 * row['fit_error']:.1f} % | {100 * row['held_out_error']:.1f} % |"
+            f"| {100 * row['fraction']:.0f} % | {found} | {100 * row['fit_error']:.1f} % |"
+            f" {100 * row['held_out_error']:.1f} % |"
         )
     return head + "\n".join(lines) + "\n"
 

@@ -1,4 +1,6 @@
-"""The captures and fits behind the figures, made once by ``dentine phantom`` and ``dentine run`` and kept below one folder."""
+"""The captures and fits behind the figures, made once by ``dentine phantom`` and ``dentine run`` and kept below one
+folder.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +95,8 @@ def job_of(folder: Path) -> tuple[Path, JobSpec]:
 
 
 def write_photographs(source: Path, target: Path, case: Case, added: Mapping[str, Array], seed: int = 1) -> None:
-    """Copy a capture's images of the case's cameras, with sensor noise and what else is added, marked as fitted or held out.
+    """Copy a capture's images of the case's cameras, with sensor noise and what else is added, marked as fitted or held
+    out.
 
     Raises:
         InputError: the case names a camera or light that the capture lacks, or nothing is left to fit.
@@ -106,7 +109,8 @@ def write_photographs(source: Path, target: Path, case: Case, added: Mapping[str
         for name in wanted:
             if name not in {one.name for one in known}:
                 raise InputError(
-                    f"Figure's fit {case.name} names {kind} {name}, which its capture does not have; it has {len(known)}."
+                    f"Figure's fit {case.name} names {kind} {name}, which its capture does not have; it has"
+                    f" {len(known)}."
                 )
     images = [
         image.model_copy(update={"held_out": not case.is_fitted(image.camera, image.light)})
@@ -143,5 +147,6 @@ def run_dentine(*arguments: str) -> None:
     done = subprocess.run([sys.executable, "-m", "services", *arguments], check=False)  # noqa: S603 - our own command
     if done.returncode:
         raise InputError(
-            f"dentine {arguments[0]} ended with status {done.returncode} for a reason given above; remove that, and run this again."
+            f"dentine {arguments[0]} ended with status {done.returncode} for a reason given above; remove that, and run"
+            " this again."
         )

@@ -47,7 +47,8 @@ class Effort:
 
 FULL = Effort(
     0.4, 0.6, 1.0, 2, 256, 512, 512,
-    {"samples_per_pixel": 64, "max_samples_per_pixel": 1024, "max_steps": 6, "search_candidates": 5000, "advise": False},
+    {"samples_per_pixel": 64, "max_samples_per_pixel": 1024, "max_steps": 6, "search_candidates": 5000,
+     "advise": False},
     {"samples_per_pixel": 16, "max_samples_per_pixel": 32, "max_steps": 4, "search_candidates": 1000, "advise": False},
     256, 240, (0.0, 0.02, 0.05, 0.1),
 )  # fmt: skip

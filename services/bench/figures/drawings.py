@@ -42,8 +42,9 @@ def front_and_side(cast: Cast) -> Drawn:
     errors = [error_of(comparisons, [(camera, light) for light in lights]) for camera, lights in groups]
     return Drawn(
         mosaic(rows, columns, scale=2),
-        f"An isolated tooth ({cast.tooth_name}) of known dentin, fitted to nine front lights of one camera (left): error {_percent(errors[0])}. Not fitted: "
-        f"a side view under the same lights (centre) {_percent(errors[1])}, and nine side lights (right) {_percent(errors[2])}. {DIFFERENCE}",
+        f"An isolated tooth ({cast.tooth_name}) of known dentin, fitted to nine front lights of one camera (left):"
+        f" error {_percent(errors[0])}. Not fitted: a side view under the same lights (centre) {_percent(errors[1])},"
+        f" and nine side lights (right) {_percent(errors[2])}. {DIFFERENCE}",
     )
 
 
@@ -87,9 +88,10 @@ def stages(cast: Cast) -> Drawn:
     unseen = ", ".join(_percent(error_of(one, others)) for one in found)
     return Drawn(
         mosaic(rows, columns, [f"{camera} {light}" for camera, light in shown], scale=4),
-        f"Stages of the fit of a stained incisor beside the photograph, and their differences to it. The number is the loss, the relative squared error of all "
-        f"fitted images with their noise; it falls by {_percent(1 - losses[1] / losses[0])} and {_percent(1 - losses[2] / losses[1])}. Error on the "
-        f"{len(others)} images that were not fitted: {unseen}. Light l3 was not fitted. {DIFFERENCE}",
+        "Stages of the fit of a stained incisor beside the photograph, and their differences to it. The number is the"
+        " loss, the relative squared error of all fitted images with their noise; it falls by"
+        f" {_percent(1 - losses[1] / losses[0])} and {_percent(1 - losses[2] / losses[1])}. Error on the {len(others)}"
+        f" images that were not fitted: {unseen}. Light l3 was not fitted. {DIFFERENCE}",
     )
 
 
@@ -115,8 +117,8 @@ def five_lights(cast: Cast) -> Drawn:
     )
     return Drawn(
         mosaic(rows, columns, scale=2),
-        f"One tooth in colour ({cast.tooth_name}, dentin known), fitted to three cameras under five lights (left half): error {_percent(fit)}; "
-        f"under five lights that were not fitted (right half): {_percent(unseen)}.",
+        f"One tooth in colour ({cast.tooth_name}, dentin known), fitted to three cameras under five lights (left half):"
+        f" error {_percent(fit)}; under five lights that were not fitted (right half): {_percent(unseen)}.",
     )
 
 
@@ -138,8 +140,9 @@ def unseen_camera(cast: Cast) -> Drawn:
     )
     return Drawn(
         mosaic(rows, columns, FIVE_LIGHTS, scale=3),
-        f"Two cameras fitted (c1 and c2, five lights; {cast.tooth_name}, dentin known), the third (c0, left) was not: error {_percent(seen)} on the fitted "
-        f"ones, {_percent(unseen)} on the third, a ratio of {unseen / max(seen, 1e-9):.2f}. {DIFFERENCE}",
+        f"Two cameras fitted (c1 and c2, five lights; {cast.tooth_name}, dentin known), the third (c0, left) was not:"
+        f" error {_percent(seen)} on the fitted ones, {_percent(unseen)} on the third, a ratio of"
+        f" {unseen / max(seen, 1e-9):.2f}. {DIFFERENCE}",
     )
 
 
@@ -160,9 +163,9 @@ def _jaw(cast: Cast, case: Case) -> Drawn:
     counts = ", ".join(f"{states.count(state)} {state}" for state in ("fitted", "tied", "failed") if state in states)
     return Drawn(
         mosaic(rows, columns, [" ".join(image) for image in shown], scale=4),
-        f"A whole upper jaw of {len(states)} teeth ({counts}) with gums and the wall of the mouth, {len(case.cameras)} views under two of "
-        f"{len(case.fitted_lights)} fitted lights: error {_percent(fit)} on all fitted images, {_percent(unseen)} under "
-        f"the light that was not fitted. {DIFFERENCE}",
+        f"A whole upper jaw of {len(states)} teeth ({counts}) with gums and the wall of the mouth, {len(case.cameras)}"
+        f" views under two of {len(case.fitted_lights)} fitted lights: error {_percent(fit)} on all fitted images,"
+        f" {_percent(unseen)} under the light that was not fitted. {DIFFERENCE}",
     )
 
 
@@ -179,7 +182,8 @@ def caption_page(captions: Iterable[tuple[str, str]]) -> str:
     from html import escape
 
     parts = [
-        f'<figure><img src="{escape(name)}.png" alt="{escape(name)}"><figcaption><b>{escape(name)}</b> {escape(text)}</figcaption></figure>'
+        f'<figure><img src="{escape(name)}.png" alt="{escape(name)}"><figcaption><b>{escape(name)}</b>'
+        f" {escape(text)}</figcaption></figure>"
         for name, text in captions
     ]
     style = "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto}img{max-width:100%}figure{margin:0 0 3em}"

@@ -1,4 +1,6 @@
-"""Fitted teeth in other light than a dome's: under a photographed environment, with the highlights that a fit leaves out."""
+"""Fitted teeth in other light than a dome's: under a photographed environment, with the highlights that a fit leaves
+out.
+"""
 
 from __future__ import annotations
 
@@ -66,9 +68,9 @@ def under_an_environment(cast: Cast) -> Drawn:
     columns = [Column(f"turned by {turn:.0f} degrees") for turn in TURNS_DEGREES]
     return Drawn(
         mosaic(pictures, columns, ["fitted", "with GGX"], scale=1),
-        f"The tooth of fig10 ({cast.tooth_name}, fitted in colour) under the light of a church, an ordinary photograph wrapped around it, turned three ways; "
-        f"above as a fit sees teeth, below with the mirror image in its enamel put back (GGX, roughness {ROUGHNESS:g}). "
-        f"By similar media of mean cosine {SIMILAR_G:g}.",
+        f"The tooth of fig10 ({cast.tooth_name}, fitted in colour) under the light of a church, an ordinary photograph"
+        " wrapped around it, turned three ways; above as a fit sees teeth, below with the mirror image in its enamel"
+        f" put back (GGX, roughness {ROUGHNESS:g}). By similar media of mean cosine {SIMILAR_G:g}.",
     )
 
 

@@ -1,8 +1,8 @@
 """Pictures of a tooth in an ordinary Mitsuba scene, by the ``dentine`` integrator.
 
-``python -m services.bench.figures.gallery --out DIR`` stands an incisor on a table and writes one PNG per view. Other teeth come with
-``--outer`` and ``--dentin``, other surroundings with ``--environment``, and a scene of one's own with ``--scene FILE.xml
---enamel ID --core ID``: the shapes of these ids become a tooth, and every sensor gives a picture.
+``python -m services.bench.figures.gallery --out DIR`` stands an incisor on a table and writes one PNG per view. Other
+teeth come with ``--outer`` and ``--dentin``, other surroundings with ``--environment``, and a scene of one's own with
+``--scene FILE.xml --enamel ID --core ID``: the shapes of these ids become a tooth, and every sensor gives a picture.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ ROUGHNESS = 0.12
 TABLE_GAP_MM = 0.02
 """A tooth that touches nothing has room for the distance grid of its own."""
 SIMILAR_G = 0.25
-"""Mean cosine of the similar media that pictures are rendered with: 1 to 3 % darker here, equal noise for about a sixth of the cost."""
+"""Mean cosine of the similar media that pictures are rendered with: 1 to 3 % darker here, equal noise for about a sixth
+of the cost."""
 PASS_SAMPLES = 32
 SIZE_PX = (320, 400)
 SHOWN_MM = 13.6
@@ -47,7 +48,10 @@ SHOWN_MM = 13.6
 
 @dataclass(frozen=True)
 class GalleryView:
-    """One picture: from where, and how it is lit. Positions in mm; x mesial, y buccal, z occlusal, the tooth at the origin."""
+    """One picture: from where, and how it is lit.
+
+    Positions in mm; x mesial, y buccal, z occlusal, the tooth at the origin.
+    """
 
     eye_mm: tuple[float, float, float]
     lamp_mm: tuple[float, float, float]
@@ -153,12 +157,14 @@ def tooth_integrator(enamel: str, dentin: str | None, *, exact: bool) -> SceneDi
 
 
 def tooth_surfaces(outer: Path | None, dentin: Path | None, buccal: Vector3 | None) -> dict[str, Mesh]:
-    """``outer`` and perhaps ``dentin``, upright with the crown at the origin; the procedural incisor's where no file is given.
+    """``outer`` and perhaps ``dentin``, upright with the crown at the origin; the procedural incisor's where no file is
+    given.
 
     Args:
         outer: enamel surface.
         dentin: dentin surface.
-        buccal: direction in their coordinates from which the front is seen; None where z is occlusal and y buccal already.
+        buccal: direction in their coordinates from which the front is seen; None where z is occlusal and y buccal
+            already.
 
     Raises:
         InputError: dentin alone. CaptureInputError: no such mesh. MeshError: it cannot bound a medium.

@@ -50,7 +50,8 @@ def mosaic(
     """
     if not rows or any(len(row) != len(columns) for row in rows) or (names and len(names) != len(rows)):
         raise InputError(
-            f"A figure of {len(rows)} rows and {len(columns)} columns needs as many pictures in every row and a name for each; correct it."
+            f"A figure of {len(rows)} rows and {len(columns)} columns needs as many pictures in every row and a name"
+            " for each; correct it."
         )
     heights = [scale * max((image.shape[0] for image in row if image is not None), default=1) for row in rows]
     by_column = [[image for row in rows if (image := row[k]) is not None] for k in range(len(columns))]

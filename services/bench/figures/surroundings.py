@@ -1,4 +1,6 @@
-"""A tooth of given media under light from all around, by the ``dentine`` integrator, one colour channel after the other."""
+"""A tooth of given media under light from all around, by the ``dentine`` integrator, one colour channel after the
+other.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def read_environment(path: Path) -> Array:
 
 
 def environment_light(image: Array, turn_degrees: float) -> dict[str, Any]:
-    """An emitter of one channel (H, W) around a tooth whose z axis is occlusal, the top of the image towards the roots, as a person sits."""
+    """An emitter of one channel (H, W) around a tooth whose z axis is occlusal, the top of the image towards the roots,
+    as a person sits.
+    """
     prepare_device()
     import mitsuba as mi
 

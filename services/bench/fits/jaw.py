@@ -1,9 +1,10 @@
 """A jaw's fit: errors of images and of media against processor time, stage by stage.
 
-The jaw is the procedural one of subject 1 (14 teeth with gums and wall), photographed by stock Mitsuba with sensor noise: three views, five lights to fit and
-two held out. The fit runs in this process on one thread, and seconds are its processor time, scenes and kernels included. After every joint step the whole
-mouth is judged, off the clock: exact media, two renders of this engine, sensor noise and the renderer's taken out. No renderer but ours gives derivatives
-of a whole mouth's scene in hours, so there is no peer.
+The jaw is the procedural one of subject 1 (14 teeth with gums and wall), photographed by stock Mitsuba with sensor
+noise: three views, five lights to fit and two held out. The fit runs in this process on one thread, and seconds are its
+processor time, scenes and kernels included. After every joint step the whole mouth is judged, off the clock: exact
+media, two renders of this engine, sensor noise and the renderer's taken out. No renderer but ours gives derivatives of
+a whole mouth's scene in hours, so there is no peer.
 """
 
 from __future__ import annotations
@@ -53,7 +54,10 @@ QUICK = Case(
 
 
 class JawRow(Row):
-    """Where a jaw's fit stood after so many seconds of processor time. ``error`` is the relative error on the held-out images."""
+    """Where a jaw's fit stood after so many seconds of processor time.
+
+    ``error`` is the relative error on the held-out images.
+    """
 
     error_se: float
     """By the judge's own samples."""
@@ -81,9 +85,12 @@ class Judge:
         fitted, held_out = self.case.errors(mouth, samples=self.samples, seed=11)
         fdi = [str(tooth.fdi) for tooth in self.case.observations.teeth]
         row = JawRow(
-            benchmark="jaw", peer="dentine", seconds=seconds, error=held_out.resolved_error or 0.0, error_se=held_out.error_se or 0.0,
-            fitted_error=fitted.resolved_error or 0.0, stage=stage, step=step,
-            off={one: tooth_off(found, true) for one, found, true in zip(fdi, mouth.teeth, self.truth.teeth, strict=True)},
+            benchmark="jaw", peer="dentine", seconds=seconds, error=held_out.resolved_error or 0.0,
+            error_se=held_out.error_se or 0.0, fitted_error=fitted.resolved_error or 0.0, stage=stage, step=step,
+            off={
+                one: tooth_off(found, true)
+                for one, found, true in zip(fdi, mouth.teeth, self.truth.teeth, strict=True)
+            },
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         )  # fmt: skip
         self.rows.append(row)
@@ -139,7 +146,9 @@ def write_photographs(folder: Path, case: Case) -> None:
 
 
 def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
-    """Prepare a jaw's capture below ``job``, unless that is done, and build its scene; its views tell what each pixel shows."""
+    """Prepare a jaw's capture below ``job``, unless that is done, and build its scene; its views tell what each pixel
+    shows.
+    """
     from services.fit.inputs.observations import channel_scene, read_channel, read_observations
     from services.fit.jaw.driver import jaw_dentins
     from services.fit.jaw.views import label_views
@@ -214,7 +223,9 @@ def reported_mouth(report: FitReport, like: Mouth) -> Mouth:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Errors of images, and the median tooth's errors of its media, against processor time; what ends a stage is ringed."""
+    """Errors of images, and the median tooth's errors of its media, against processor time; what ends a stage is
+    ringed.
+    """
     from services.bench.plots import finish, grid
 
     figure, (images, media) = grid(2)

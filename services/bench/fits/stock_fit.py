@@ -1,7 +1,8 @@
 """The peer of a tooth's fit: stock ``prbvolpath`` and ``mitsuba.ad.Adam`` on the same meshes and photographs.
 
-What its tutorials do: a loss over linear images under each light, backward through each render, one step of Adam per round of all lights. Extinction and
-albedo of both media are free, in the same unbounded domain as ours, with equal rates for all; g is held at the same value.
+What its tutorials do: a loss over linear images under each light, backward through each render, one step of Adam per
+round of all lights. Extinction and albedo of both media are free, in the same unbounded domain as ours, with equal
+rates for all; g is held at the same value.
 """
 
 from __future__ import annotations

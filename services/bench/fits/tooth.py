@@ -1,13 +1,15 @@
 """A tooth's fit: held-out error against processor time, ours and the stock recipe, on the smallest real case.
 
-Everyone fits the same noisy photographs of five lights, from nothing to parameters: extinction and albedo of enamel and dentin, the peer with g held, the
-product as it is. Scenes are loaded and kernels compiled on the clock. At marks along the way everyone's parameters are judged alike, off the clock: three
-held-out lights, exact media, 1,024 paths per pixel and two seeds of this engine, sensor noise and the truth's Monte Carlo noise taken out.
+Everyone fits the same noisy photographs of five lights, from nothing to parameters: extinction and albedo of enamel and
+dentin, the peer with g held, the product as it is. Scenes are loaded and kernels compiled on the clock. At marks along
+the way everyone's parameters are judged alike, off the clock: three held-out lights, exact media, 1,024 paths per pixel
+and two seeds of this engine, sensor noise and the truth's Monte Carlo noise taken out.
 
-Everyone has one thread, and seconds are its processor time, which other jobs on the machine hardly move. The peer chooses one of three learning rates, five
-minutes each, by its error on the fitted images; the best one goes on until 40 minutes, of which those five count. Its ratio is its time to the target over
-ours; the target is our last error times ``MARGIN``, or what the photographs' noise resolves where that is more. A peer that never got there has a lower
-bound there, and beside it the ratio at the error that it ended with.
+Everyone has one thread, and seconds are its processor time, which other jobs on the machine hardly move. The peer
+chooses one of three learning rates, five minutes each, by its error on the fitted images; the best one goes on until 40
+minutes, of which those five count. Its ratio is its time to the target over ours; the target is our last error times
+``MARGIN``, or what the photographs' noise resolves where that is more. A peer that never got there has a lower bound
+there, and beside it the ratio at the error that it ended with.
 """
 
 from __future__ import annotations
@@ -45,7 +47,10 @@ Keep = Callable[[list[dict[str, Any]]], None]
 
 
 class ToothRow(Row):
-    """Where a fit stood after so many seconds of processor time. ``error`` is the relative error on the held-out images."""
+    """Where a fit stood after so many seconds of processor time.
+
+    ``error`` is the relative error on the held-out images.
+    """
 
     error_se: float
     """By the judge's own samples."""
@@ -76,8 +81,9 @@ class Judge:
             for leaf in ("sigma", "alpha", "sigma_s_reduced")
         }
         row = ToothRow(
-            benchmark="tooth", peer=peer, seconds=seconds, error=held_out.resolved_error or 0.0, error_se=held_out.error_se or 0.0,
-            fitted_error=fitted.resolved_error or 0.0, stage=stage, parameters=values, **more,
+            benchmark="tooth", peer=peer, seconds=seconds, error=held_out.resolved_error or 0.0,
+            error_se=held_out.error_se or 0.0, fitted_error=fitted.resolved_error or 0.0, stage=stage,
+            parameters=values, **more,
         )  # fmt: skip
         self.rows.append(row)
         self.keep([one.model_dump() for one in self.rows])
@@ -167,7 +173,8 @@ def _descend(judge: Judge, fit: StockFit, rows: list[ToothRow], until_s: float) 
 def summary(ours: list[ToothRow], peer: list[ToothRow], target: float, name: str = "tooth-summary") -> ToothRow:
     """The peer's time to the target over ours; of its last point, and a lower bound, where it never got there.
 
-    The peer is there when it first shows the target; we are when no later point, of another start say, is above it by more than the judge's error.
+    The peer is there when it first shows the target; we are when no later point, of another start say, is above it by
+    more than the judge's error.
     """
     above = [k for k, row in enumerate(ours) if row.error - row.error_se > target]
     settled = ours[min(above[-1] + 1, len(ours) - 1) if above else 0]

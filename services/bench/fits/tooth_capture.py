@@ -80,7 +80,9 @@ def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> 
 
 @dataclass(frozen=True)
 class PreparedTooth:
-    """A prepared capture in one channel, of a tooth or a jaw, and what judges a fit of it: exact media, the same for everyone measured."""
+    """A prepared capture in one channel, of a tooth or a jaw, and what judges a fit of it: exact media, the same for
+    everyone measured.
+    """
 
     job: Path
     """Folder with the stage ``prepared``."""
@@ -143,7 +145,9 @@ def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> Prepared
 
 
 def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> PreparedTooth:
-    """Write and prepare the smallest real case below ``folder``: one view, five lights to fit and those its capture holds out."""
+    """Write and prepare the smallest real case below ``folder``: one view, five lights to fit and those its capture
+    holds out.
+    """
     source = real_tooth()
     if source is None:
         from services.phantom.tooth import write_phantom

@@ -1,8 +1,9 @@
-"""A single tooth as captured, three views under 54 lights at 0.064 mm, about 28,000 pixels per view, fitted on one and on two workers.
+"""A single tooth as captured, three views under 54 lights at 0.064 mm, about 28,000 pixels per view, fitted on one and
+on two workers.
 
-The photographs are this engine's own, as no peer renders 162 of them in hours; they are kept in ``.cache`` below the working directory for the next run.
-Seconds are those of a clock, as two workers share two cores: run it on an idle machine. ``error`` is the held-out error. The answers of both runs must agree
-to the last bit, with one thread each.
+The photographs are this engine's own, as no peer renders 162 of them in hours; they are kept in ``.cache`` below the
+working directory for the next run. Seconds are those of a clock, as two workers share two cores: run it on an idle
+machine. ``error`` is the held-out error. The answers of both runs must agree to the last bit, with one thread each.
 """
 
 from __future__ import annotations
@@ -93,8 +94,9 @@ def _measure(capture: Path, workers: int) -> tuple[FitReport, ScaleRow]:
         raise InputError("The scale case lost its held-out lights; remove its folder from .cache and run it again.")
     pixels, images = _size(capture)
     row = ScaleRow(
-        benchmark="tooth-scale", peer=f"dentine-{workers}-workers", seconds=seconds, error=report.held_out_error["green"], workers=workers,
-        fit_seconds=report.seconds, pixels_per_view=pixels, images=images, idle_cores=idle,
+        benchmark="tooth-scale", peer=f"dentine-{workers}-workers", seconds=seconds,
+        error=report.held_out_error["green"], workers=workers, fit_seconds=report.seconds, pixels_per_view=pixels,
+        images=images, idle_cores=idle,
     )  # fmt: skip
     return report, row
 

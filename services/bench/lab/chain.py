@@ -1,4 +1,5 @@
-"""From the raw frames of a virtual laboratory to a measured tooth, by what a real laboratory's commands do; no truth is read here.
+"""From the raw frames of a virtual laboratory to a measured tooth, by what a real laboratory's commands do; no truth is
+read here.
 
 LAB/calibration/    what ``dentine calibrate LAB/session --out LAB/calibration`` writes
 LAB/mouth/          gets teeth, gums and registration.json, as by ``dentine register LAB/mouth``
@@ -52,7 +53,9 @@ def calibrated(root: Path, tell: Callable[[str], None]) -> None:
 
 
 def registered(root: Path, pixel_mm: float, tell: Callable[[str], None]) -> Registration:
-    """Find where the scan's teeth stand, unless that is done; outlines of coarse pixels may lie as far off as one of them."""
+    """Find where the scan's teeth stand, unless that is done; outlines of coarse pixels may lie as far off as one of
+    them.
+    """
     folder = root / MOUTH
     if (folder / REGISTRATION).is_file():
         return read_record(folder / REGISTRATION, Registration)
@@ -78,7 +81,8 @@ def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpe
         "channels": ("green",),
         "pixel_step": max(round(PIXELS_MM / pixel_mm), 1),
         "advise": False,
-        # So small a rig's images leave the lights' distances open to a centimetre, which their light at the teeth hardly shows.
+        # So small a rig's images leave the lights' distances open to a centimetre, which their light at the teeth
+        # hardly shows.
         "accept_calibration": True,
     }
     return JobSpec.model_validate(told | dict(options))

@@ -1,4 +1,6 @@
-"""What the chain measured, beside what perfect calibration and pose give and beside the truth: the only place that reads it."""
+"""What the chain measured, beside what perfect calibration and pose give and beside the truth: the only place that
+reads it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from services.phantom.lab.make import CALIBRATION, CALIBRATION_FILE, LAB_RECORD,
 Floats = NDArray[np.float64]
 QUANTITIES = tuple(f"{part}.{name}" for part in ("enamel", "dentin") for name in ("sigma_s_reduced", "sigma_a"))
 MAX_ERROR_RATIO, MAX_Z, MAX_SE_RATIO = 1.3, 3.0, 3.0
-"""Of held-out errors, of a value's distance from the truth over its ±, and of the ±, to those with perfect calibration and pose."""
+"""Of held-out errors, of a value's distance from the truth over its ±, and of the ±, to those with perfect calibration
+and pose."""
 
 
 class Measured(Record):

@@ -32,7 +32,8 @@ class Known:
     """What of the truth is given.
 
     Attributes:
-        cameras, lights, radiometry: of the rig; radiometry is the lights' intensities and the cameras' radiance per count.
+        cameras, lights, radiometry: of the rig; radiometry is the lights' intensities and the cameras' radiance per
+            count.
         pose: of the teeth.
     """
 

@@ -1,7 +1,8 @@
 """Speed of preparing one synthetic image, step by step, beside the bare library calls that each step is made of.
 
-Both sides run in one process on one thread, in turns, and the fastest of some turns counts, in seconds of processor time: other work on the
-machine then changes little. A step's bare calls do its arithmetic and nothing else: no checks, no masks, results into buffers that are there.
+Both sides run in one process on one thread, in turns, and the fastest of some turns counts, in seconds of processor
+time: other work on the machine then changes little. A step's bare calls do its arithmetic and nothing else: no checks,
+no masks, results into buffers that are there.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ Work = Callable[[], object]
 
 
 def run(quick: bool = False) -> list[dict[str, Any]]:
-    """Rows: step, megapixels, seconds and megapixels a second of it and of its bare calls, their ratio; then the sum and the peak memory."""
+    """Rows: step, megapixels, seconds and megapixels a second of it and of its bare calls, their ratio; then the sum
+    and the peak memory.
+    """
     import cv2
     import numcodecs.blosc
 
@@ -170,7 +173,9 @@ class BareImage:
 
 
 class BareMask:
-    """The products with fixed vectors, quotients, roots, comparisons and the growing of regions that a mask of highlights is made of."""
+    """The products with fixed vectors, quotients, roots, comparisons and the growing of regions that a mask of
+    highlights is made of.
+    """
 
     def __init__(
         self, radiance: NDArray[np.float32], variance: NDArray[np.float32], normal: NDArray[np.float32]
@@ -181,7 +186,9 @@ class BareMask:
         ]
 
     def __call__(self) -> None:
-        """Light and its part along the chroma, three variances, four products of the normal; then a quotient a pixel for each of six estimates."""
+        """Light and its part along the chroma, three variances, four products of the normal; then a quotient a pixel
+        for each of six estimates.
+        """
         import cv2
 
         colour, spread, cosines = (

@@ -1,7 +1,8 @@
-"""``dentine bench slab-map``: what a cell can tell over thickness, albedo and phase function (Gkioulekas et al. 2013, figure 6).
+"""``dentine bench slab-map``: what a cell can tell over thickness, albedo and phase function (Gkioulekas et al. 2013,
+figure 6).
 
-The bound is computed on a grid, at a fraction of a fit's cost each; real fits of images by plain photons stand on twelve points
-that are spread over it, so that the map is seen to be kept.
+The bound is computed on a grid, at a fraction of a fit's cost each; real fits of images by plain photons stand on
+twelve points that are spread over it, so that the map is seen to be kept.
 """
 
 from __future__ import annotations
@@ -119,7 +120,9 @@ def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) ->
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Bounds as maps over albedo and thickness, the worst of the phase functions; the fits' errors as numbers on them."""
+    """Bounds as maps over albedo and thickness, the worst of the phase functions; the fits' errors as numbers on
+    them.
+    """
     from matplotlib.colors import LogNorm
 
     from services.bench.plots import grid

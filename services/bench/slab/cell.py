@@ -11,7 +11,8 @@ def near_beam_folder(**changes: Any) -> SlabFolder:
     """A cell of 1 mm without glass: three lights, and three cameras a side, one of which looks 3 degrees beside a beam.
 
     Args:
-        changes: top-level keys of ``slab.json`` to be replaced, but for the images, which are of every camera under every light.
+        changes: top-level keys of ``slab.json`` to be replaced, but for the images, which are of every camera under
+            every light.
     """
     angles = {"f": (-5, -15, -25), "b": (8, 18, -15)}
     sides = {"f": "front", "b": "back"}

@@ -1,7 +1,9 @@
-"""``dentine bench slab-mie``: nano-dispersions of known size through the whole measurement (Gkioulekas et al. 2013, 6.3).
+"""``dentine bench slab-mie``: nano-dispersions of known size through the whole measurement (Gkioulekas et al. 2013,
+6.3).
 
-Polystyrene spheres in water: Lorenz-Mie theory gives phase function and scattering cross-section, so the truth is physics. Each
-dispersion is diluted to sigma_t w near 2, where a cell tells most; three are also measured as they are, at 1 % by weight.
+Polystyrene spheres in water: Lorenz-Mie theory gives phase function and scattering cross-section, so the truth is
+physics. Each dispersion is diluted to sigma_t w near 2, where a cell tells most; three are also measured as they are,
+at 1 % by weight.
 """
 
 from __future__ import annotations

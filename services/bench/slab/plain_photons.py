@@ -1,10 +1,10 @@
 """Images of a cell by the plainest walk of photons: a truth for the slab's fit that shares no code with its kernel.
 
-Every photon starts in the beam's profile, is refracted at the face, flies exponential distances, is reflected inside by chance
-as Fresnel says, and turns by a finely tabulated phase function. From every collision it sends to its camera what would
-reach it directly and after up to three internal reflections; a fourth would add less than 1e-5 at an index of 1.5. Nothing is
-forced, split, scored or done by quadrature. Every image has photons of its own, so that its noise is its own as well: photons
-that reach all cameras of a light err alike in all of them, as no measurement does.
+Every photon starts in the beam's profile, is refracted at the face, flies exponential distances, is reflected inside by
+chance as Fresnel says, and turns by a finely tabulated phase function. From every collision it sends to its camera what
+would reach it directly and after up to three internal reflections; a fourth would add less than 1e-5 at an index of
+1.5. Nothing is forced, split, scored or done by quadrature. Every image has photons of its own, so that its noise is
+its own as well: photons that reach all cameras of a light err alike in all of them, as no measurement does.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def plain_images(
                 image, one = place
                 view = np.array([_leaving(cameras[folder.images[image].camera], index)])
                 images = np.zeros((1, *shape[1:]))
-                _trace(np.random.default_rng(one), photons // BATCHES, beam, view, extinction_per_mm, albedo, phase, cosines,
-                       cell.width_mm, index, grid, images)  # fmt: skip
+                _trace(np.random.default_rng(one), photons // BATCHES, beam, view, extinction_per_mm, albedo, phase,
+                       cosines, cell.width_mm, index, grid, images)  # fmt: skip
                 return np.asarray(images[0])
 
             batches = np.stack(list(pool.map(batch, places))) * folder.beam.power / (photons // BATCHES)
@@ -88,7 +88,9 @@ def _normalised(phase: Array, angles: Array) -> tuple[Array, Array]:
 
 
 def _arriving(folder: SlabFolder, light: Light, index: float) -> tuple[float, ...]:
-    """Sine in the medium, sign of z, face's depth, footprint in x and y as standard deviation or radius, and whether it is a disc."""
+    """Sine in the medium, sign of z, face's depth, footprint in x and y as standard deviation or radius, and whether it
+    is a disc.
+    """
     slant = math.cos(math.radians(light.angle_deg))
     front = light.side == "front"
     return (
@@ -123,7 +125,8 @@ def _send(
 ) -> None:  # fmt: skip
     """Add what a collision sends to one camera: straight and after two reflections, or, where odd, after one and three.
 
-    ``sine`` and ``sign`` (of z) are those of the end of the flight; after an odd number of reflections it began the other way.
+    ``sine`` and ``sign`` (of z) are those of the end of the flight; after an odd number of reflections it began the
+    other way.
     """
     x_from, x_to, y_from, y_to, columns, rows = grid
     cosine = math.sqrt(1 - sine * sine)
@@ -147,8 +150,8 @@ def _send(
 
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _trace(
-    random: np.random.Generator, photons: int, beam: tuple[float, float, float, float, float, float], views: Array, sigma_t: float,
-    albedo: float, phase: Array, cosines: Array, width: float, index: float,
+    random: np.random.Generator, photons: int, beam: tuple[float, float, float, float, float, float], views: Array,
+    sigma_t: float, albedo: float, phase: Array, cosines: Array, width: float, index: float,
     grid: tuple[float, float, float, float, int, int], images: Array,
 ) -> None:  # fmt: skip
     """Trace photons and add what they send (cameras, rows, columns)."""

@@ -91,7 +91,8 @@ def photographed(truth: Truth, photons: int, seed: int) -> tuple[Array, Array]:
     images, variances = plain_images(
         truth.folder, extinction, truth.scattering_per_mm / extinction, truth.phase, photons, seed
     )
-    # A pixel's own variance is drawn with its value, so the walk's noise is told as one that is proportional to the image.
+    # A pixel's own variance is drawn with its value, so the walk's noise is told as one that is proportional to the
+    # image.
     shares = variances.sum(axis=(1, 2)) / images.sum(axis=(1, 2))
     means = images.mean(axis=(1, 2), keepdims=True)
     total = (NOISE**2 * means + shares[:, None, None]) * np.maximum(images, 0.01 * means)

@@ -1,7 +1,9 @@
-"""``dentine bench slab-solvers``: error against core-seconds for the default solver and the paper's, from the same start on the same walk.
+"""``dentine bench slab-solvers``: error against core-seconds for the default solver and the paper's, from the same
+start on the same walk.
 
-The paper's projected gradient descent (Gkioulekas et al. 2013, Algorithms 1 and 2, corrected) is run at several rates, as its text
-gives none. The paper states 9,600 to 19,200 core-hours for a wavelength of its own measurements; the picture has them as a line.
+The paper's projected gradient descent (Gkioulekas et al. 2013, Algorithms 1 and 2, corrected) is run at several rates,
+as its text gives none. The paper states 9,600 to 19,200 core-hours for a wavelength of its own measurements; the
+picture has them as a line.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ EFFORTS, QUICK_EFFORTS = (0.02, 0.1, 0.3, 1.0), (0.02,)
 """Of the default solver, in units of its budget of paths."""
 ITERATIONS, QUICK_ITERATIONS = (20, 80, 320), (5,)
 RATES = (1e-12, 1e-11, 1e-10)
-"""Of the paper's steps: five of the largest throw the weights about (error 0.11 to 0.70), five of 1e-11 hardly move them (0.115)."""
+"""Of the paper's steps: five of the largest throw the weights about (error 0.11 to 0.70), five of 1e-11 hardly move
+them (0.115)."""
 PAPERS_CORE_SECONDS = 9_600 * 3600.0
 PAPER = "projected descent"
 

@@ -1,8 +1,9 @@
-"""``dentine bench slab-surface``: the error of images over all mixtures of three phase functions (Gkioulekas et al. 2013, figure 5).
+"""``dentine bench slab-surface``: the error of images over all mixtures of three phase functions (Gkioulekas et al.
+2013, figure 5).
 
-The problem is not convex, so the paper looks at it: if the surface has one minimum, at the truth, a descent cannot be caught
-elsewhere. Images of every mixture are compared with those of the true one; two independent renders each keep the walk's noise
-out of the error's mean.
+The problem is not convex, so the paper looks at it: if the surface has one minimum, at the truth, a descent cannot be
+caught elsewhere. Images of every mixture are compared with those of the true one; two independent renders each keep the
+walk's noise out of the error's mean.
 """
 
 from __future__ import annotations
@@ -39,7 +40,10 @@ BATCHES, PATHS = 8, 1000
 
 
 class SurfaceRow(Row):
-    """One mixture. ``error`` is the relative L2 difference of its images, with the walk's noise taken out, 0 where it is negative."""
+    """One mixture.
+
+    ``error`` is the relative L2 difference of its images, with the walk's noise taken out, 0 where it is negative.
+    """
 
     extinction_per_mm: float
     truth: tuple[float, ...]
@@ -110,7 +114,9 @@ def _squared_error(batches: Array, truth: Array) -> tuple[float, float]:
 
 
 def other_minima(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mixtures of one surface, but for the lowest, with no neighbour that is lower by more than their noise explains."""
+    """Mixtures of one surface, but for the lowest, with no neighbour that is lower by more than their noise
+    explains.
+    """
     at = {row["weights"]: row for row in rows}
     lowest = min(rows, key=lambda row: row["squared"])
     step = min(weight for row in rows for weight in row["weights"] if weight > 0)

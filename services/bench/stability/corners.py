@@ -64,7 +64,9 @@ class Corners:
 
 
 def draw(count: int, seed: int) -> Corners:
-    """``count`` sets, the regions in turn: what a region does not push into its corner lies anywhere in the whole range."""
+    """``count`` sets, the regions in turn: what a region does not push into its corner lies anywhere in the whole
+    range.
+    """
     rng = np.random.default_rng(seed)
     region = np.arange(count) % len(REGIONS)
     pair = (2, count)

@@ -1,4 +1,6 @@
-"""Small teeth that strain the geometry: slivers, rays along a face, enamel as thin as allowed, lights very near and very far."""
+"""Small teeth that strain the geometry: slivers, rays along a face, enamel as thin as allowed, lights very near and
+very far.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,8 @@ class Seen:
     numbers: int
     """Pixels x lights, as many for every derivative."""
     negative: int
-    """Lights whose image, summed, is below zero by more than ``LARGEST_Z`` standard errors; one pixel's estimate may be negative."""
+    """Lights whose image, summed, is below zero by more than ``LARGEST_Z`` standard errors; one pixel's estimate may be
+    negative."""
     error: float
     """Relative standard error of the image of all pixels and lights."""
     z: float | None
@@ -116,7 +119,9 @@ def ellipsoid(semi_axes_mm: NDArray[np.float64]) -> Mesh:
 
 
 def with_slivers(mesh: Mesh) -> Mesh:
-    """The same surface with edges parted ``SPLIT`` of their length from one end, both triangles of the edge with them."""
+    """The same surface with edges parted ``SPLIT`` of their length from one end, both triangles of the edge with
+    them.
+    """
     vertices, faces = list(mesh.vertices_mm), [list(face) for face in mesh.faces.tolist()]
     beside: dict[tuple[int, int], list[int]] = {}
     for number, face in enumerate(faces):

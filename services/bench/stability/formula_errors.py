@@ -1,4 +1,6 @@
-"""The kernels' formulas in single precision, and the fit's domains in double, against independent forms in NumPy float64."""
+"""The kernels' formulas in single precision, and the fit's domains in double, against independent forms in NumPy
+float64.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def single(values: Floats) -> Floats:
 
 
 def _deviations(corners: Corners, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Mean cosine of the first layer's first lobe, and deviations 1 - sign(g) cos(theta) from its tip to straight behind."""
+    """Mean cosine of the first layer's first lobe, and deviations 1 - sign(g) cos(theta) from its tip to straight
+    behind.
+    """
     g = single(corners.g1[0])
     return g, single(np.minimum((1 - np.abs(g)) ** 2 * 10.0 ** rng.uniform(-3, 9, len(g)), 2.0))
 
@@ -133,7 +137,9 @@ def transmittance(corners: Corners, rng: np.random.Generator) -> Floats:
 
 
 def albedo_power(corners: Corners, rng: np.random.Generator) -> Floats:
-    """What absorption leaves after 1 to 1e7 scatterings, relative; no path is kept that carries less than exp(-``DARK``)."""
+    """What absorption leaves after 1 to 1e7 scatterings, relative; no path is kept that carries less than
+    exp(-``DARK``).
+    """
     count = np.floor(10.0 ** rng.uniform(0, 7, len(corners)))
     log_alpha = Media(corners.media()).log_alpha[0]
     ours = np.array(dr.exp(mi.Float(count.astype(np.float32)) * log_alpha), dtype=np.float64)
@@ -143,7 +149,9 @@ def albedo_power(corners: Corners, rng: np.random.Generator) -> Floats:
 
 
 def dual_domain(corners: Corners, rng: np.random.Generator) -> Floats:  # noqa: ARG001 - all formulas are called alike
-    """Fit coordinates there and back, and their chain-rule factors, relative; values outside the fit's bounds are clipped to them."""
+    """Fit coordinates there and back, and their chain-rule factors, relative; values outside the fit's bounds are
+    clipped to them.
+    """
     worst = np.zeros(len(corners))
     values = {"sigma": corners.sigma[0], "alpha": 1 - corners.absorbed[0], "g1": corners.g1[0], "beta": corners.beta[0]}
     for kind, natural in values.items():

@@ -1,7 +1,8 @@
-"""Numerical stress: parameter sets from the corners as lanes of one kernel, formulas against float64, and difficult scenes.
+"""Numerical stress: parameter sets from the corners as lanes of one kernel, formulas against float64, and difficult
+scenes.
 
-Every set is a slab of two layers with its own media, thicknesses, faces and source, traced with all derivatives on. Paths end
-after so many flights; what they still carried is reported.
+Every set is a slab of two layers with its own media, thicknesses, faces and source, traced with all derivatives on.
+Paths end after so many flights; what they still carried is reported.
 """
 
 from __future__ import annotations
@@ -39,7 +40,10 @@ WHITE = "alpha = 1"
 
 
 class StabilityRow(Row):
-    """One region of parameter space, or one scene. ``error`` is a formula's worst relative error, else the relative standard error of the result."""
+    """One region of parameter space, or one scene.
+
+    ``error`` is a formula's worst relative error, else the relative standard error of the result.
+    """
 
     region: str
     quantity: str
@@ -131,7 +135,9 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Every formula's error in every region with its bound; errors of regions and scenes against run time, without lines, as they are different things."""
+    """Every formula's error in every region with its bound; errors of regions and scenes against run time, without
+    lines, as they are different things.
+    """
     from services.bench.plots import draw_errors, grid
 
     figure, (formulas, walk, scenes) = grid(3)
@@ -159,8 +165,9 @@ def formula_rows(corners: Corners, seed: int = 2) -> list[StabilityRow]:
     seconds = (time.perf_counter() - begun) / worst.size
     return [
         StabilityRow(
-            benchmark="stability-formula", peer="dentine", seconds=seconds, error=worst[row, column], bound=formula.bound,
-            region=region, quantity=formula.name, sets=int(np.count_nonzero(corners.region == column)), non_finite=int(broken[row, column]),
+            benchmark="stability-formula", peer="dentine", seconds=seconds, error=worst[row, column],
+            bound=formula.bound, region=region, quantity=formula.name,
+            sets=int(np.count_nonzero(corners.region == column)), non_finite=int(broken[row, column]),
         )
         for row, formula in enumerate(FORMULAS) for column, region in enumerate(REGIONS)
     ]  # fmt: skip
@@ -182,16 +189,19 @@ def walk_rows(corners: Corners, *, most_steps: int, seed: int = 3) -> list[Stabi
         gain_error = float(gain.std(ddof=1) / np.sqrt(len(gain)))
         rows.append(
             StabilityRow(
-                benchmark="stability-walk", peer="dentine", seconds=seconds * here.mean(), error=gain_error / float(entering[here].mean()),
-                region=region, quantity="R + T", sets=int(here.sum()), non_finite=int(bad[here].sum()),
-                cut=float(totals[:, 2].mean() / entering[here].mean()), gain=float(gain.mean()), gain_error=gain_error,
+                benchmark="stability-walk", peer="dentine", seconds=seconds * here.mean(),
+                error=gain_error / float(entering[here].mean()), region=region, quantity="R + T", sets=int(here.sum()),
+                non_finite=int(bad[here].sum()), cut=float(totals[:, 2].mean() / entering[here].mean()),
+                gain=float(gain.mean()), gain_error=gain_error,
             )
         )  # fmt: skip
     return rows
 
 
 def scene_rows(*, samples: int, seed: int = 4) -> list[StabilityRow]:
-    """Images and derivatives of difficult scenes; a value that is not finite ends the benchmark with the engine's own sentence."""
+    """Images and derivatives of difficult scenes; a value that is not finite ends the benchmark with the engine's own
+    sentence.
+    """
     rows = []
     for scene in scenes():
         begun = time.perf_counter()
@@ -199,7 +209,8 @@ def scene_rows(*, samples: int, seed: int = 4) -> list[StabilityRow]:
         rows.append(
             StabilityRow(
                 benchmark="stability-scene", peer="dentine", seconds=time.perf_counter() - begun, error=seen.error,
-                region=scene.name, quantity="images and derivatives", sets=seen.numbers, non_finite=0, negative=seen.negative, z=seen.z,
+                region=scene.name, quantity="images and derivatives", sets=seen.numbers, non_finite=0,
+                negative=seen.negative, z=seen.z,
             )
         )  # fmt: skip
     return rows

@@ -1,15 +1,18 @@
-"""Gradients of an L2 loss over the images of an incisor under all lights of a dome, against the best that is at hand without this engine.
+"""Gradients of an L2 loss over the images of an incisor under all lights of a dome, against the best that is at hand
+without this engine.
 
-Media: 1/2 sum (C - reference)^2 to sigma, alpha, g and the lobes' weight of enamel and dentin. Ours is J'(C - reference) from a few Jacobian passes, each
-one's derivatives with the images of the others, so that the two always have independent seeds. The peer is stock ``prbvolpath``, an image and backward,
-light by light on a few of the lights, scaled to all. Shape and stains: see ``shape_gradient`` and ``stain_gradient``.
+Media: 1/2 sum (C - reference)^2 to sigma, alpha, g and the lobes' weight of enamel and dentin. Ours is J'(C -
+reference) from a few Jacobian passes, each one's derivatives with the images of the others, so that the two always have
+independent seeds. The peer is stock ``prbvolpath``, an image and backward, light by light on a few of the lights,
+scaled to all. Shape and stains: see ``shape_gradient`` and ``stain_gradient``.
 
-Noise of the images times noise of the derivatives falls as 1 / paths squared and rules short runs on both sides, so they are compared at nearly equal
-error: the peer at its largest count, ours at the count whose error is nearest.
+Noise of the images times noise of the derivatives falls as 1 / paths squared and rules short runs on both sides, so
+they are compared at nearly equal error: the peer at its largest count, ours at the count whose error is nearest.
 
-Efficiency is 1 / (variance x time). Time is processor time of all threads, after everything is compiled: it is the same measure for either side on
-equal threads, and other jobs on the machine move it less than they move a clock. Variances come from independent repeats; pixels (ours) and lights (the
-peer's) have random numbers of their own, so a gradient's variance is the sum of theirs.
+Efficiency is 1 / (variance x time). Time is processor time of all threads, after everything is compiled: it is the same
+measure for either side on equal threads, and other jobs on the machine move it less than they move a clock. Variances
+come from independent repeats; pixels (ours) and lights (the peer's) have random numbers of their own, so a gradient's
+variance is the sum of theirs.
 """
 
 from __future__ import annotations
@@ -46,7 +49,9 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 
 def media_rows(*, quick: bool) -> list[GradientRow]:
-    """Gradient to the media against ``prbvolpath``: either side's rows at growing sample counts, the peer's summary by parameter and over all."""
+    """Gradient to the media against ``prbvolpath``: either side's rows at growing sample counts, the peer's summary by
+    parameter and over all.
+    """
     stack = incisor_stack(18 if quick else 54)
     engine, names = Engine(stack.recipe()), shared_names(TISSUE)
     view = stack.tooth_view(engine, TISSUE)

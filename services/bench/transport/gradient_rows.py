@@ -21,12 +21,15 @@ class GradientRow(Row):
     gradient: float | None = None
     """To the natural parameter; the row's ``error`` is relative to it."""
     z: float | None = None
-    """In a peer's summary row: its gradient less ours under the same lights, in standard errors; in the one over all parameters the rms of theirs."""
+    """In a peer's summary row: its gradient less ours under the same lights, in standard errors; in the one over all
+    parameters the rms of theirs."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A gradient (F,), the variance of a single such estimate, the variance of ``mean``, and the time a single one takes."""
+    """A gradient (F,), the variance of a single such estimate, the variance of ``mean``, and the time a single one
+    takes.
+    """
 
     mean: Array
     variance: Array

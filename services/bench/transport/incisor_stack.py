@@ -1,4 +1,6 @@
-"""What the transport benchmarks share: a procedural incisor under the lights of a dome, for this engine and for stock Mitsuba."""
+"""What the transport benchmarks share: a procedural incisor under the lights of a dome, for this engine and for stock
+Mitsuba.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,11 @@
-"""What lights and pixels cost: an incisor under 1 to 155 lights of a dome, and one view of it at 1 to 64 times as many pixels.
+"""What lights and pixels cost: an incisor under 1 to 155 lights of a dome, and one view of it at 1 to 64 times as many
+pixels.
 
-The cost of a stack is variance x time, variance = sum of the pixels' variances / sum of their squares over all its images. The peer renders one light at a
-time: each of the six alone, and what they cost on average times the number of lights. Rounds are interleaved, times are medians over them of the
-processor time of all threads, which other jobs on the machine move less than they move a clock; the scene is built, its light maps traced and kernels
-compiled before. Lights that a view does not list are in none of its kernels (see ``transport-skip``).
+The cost of a stack is variance x time, variance = sum of the pixels' variances / sum of their squares over all its
+images. The peer renders one light at a time: each of the six alone, and what they cost on average times the number of
+lights. Rounds are interleaved, times are medians over them of the processor time of all threads, which other jobs on
+the machine move less than they move a clock; the scene is built, its light maps traced and kernels compiled before.
+Lights that a view does not list are in none of its kernels (see ``transport-skip``).
 """
 
 from __future__ import annotations
@@ -71,7 +73,8 @@ class Case:
         seconds, view = float(np.median(self.seconds)), self.views[0]
         return LightsRow(
             benchmark=benchmark, peer="dentine", seconds=seconds, error=float(np.sqrt(np.mean(self.squared_errors))),
-            lights=len(view.lights or ()), pixels=len(view), samples=self.samples, seconds_per_path=seconds / len(view) / self.samples,
+            lights=len(view.lights or ()), pixels=len(view), samples=self.samples,
+            seconds_per_path=seconds / len(view) / self.samples,
             relative_cost=None if one is None else self.cost / one.cost,
         )  # fmt: skip
 
@@ -111,7 +114,9 @@ def light_rows(engine: Engine, view: View, counts: tuple[int, ...], rounds: int)
 
 
 def pixel_rows(engine: Engine, view: View, samples: int, rounds: int) -> list[LightsRow]:
-    """The same tooth at the same paths per pixel; fewer pixels are a random choice of them, so that each choice sees all of the tooth."""
+    """The same tooth at the same paths per pixel; fewer pixels are a random choice of them, so that each choice sees
+    all of the tooth.
+    """
     order = np.random.default_rng(1).permutation(len(view))
     choices = [order[: len(view) // share] for share in SHARES]
     cases = [

@@ -1,7 +1,9 @@
-"""The walk as it would be had it never learnt anything but the plainest tooth: one medium of one lobe, index-matched, images only.
+"""The walk as it would be had it never learnt anything but the plainest tooth: one medium of one lobe, index-matched,
+images only.
 
-Starts, ray tracing, connections to lights and sums are the engine's own; what happens to a path from step to step is written
-out here without a choice left to make. The engine's kernel for such a scene must be no larger, and its images the same bits.
+Starts, ray tracing, connections to lights and sums are the engine's own; what happens to a path from step to step is
+written out here without a choice left to make. The engine's kernel for such a scene must be no larger, and its images
+the same bits.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ class PlainEngine(Engine):
 
 
 class PlainWalk(Walk):
-    """Free flights, crossings, connections, turns and roulette; of a walker's state only what these need is ever touched."""
+    """Free flights, crossings, connections, turns and roulette; of a walker's state only what these need is ever
+    touched.
+    """
 
     def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
         # Fly to a scattering or to the surface.

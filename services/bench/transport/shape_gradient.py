@@ -1,13 +1,15 @@
 """The derivative to the dentin's shape against central differences with the engine itself.
 
-The derivative is that of the images projected on one picture, sum w C, where w is the residual that an L2 loss would show for dentin of another shape.
-Ours is one ``shape_gradient`` for all modes, photons and camera walks included. One Jacobian pass (both border terms), for all modes too, stands beside it as
-a row of its own. The peer is two image passes per mode with common random numbers, the surfaces already in place.
+The derivative is that of the images projected on one picture, sum w C, where w is the residual that an L2 loss would
+show for dentin of another shape. Ours is one ``shape_gradient`` for all modes, photons and camera walks included. One
+Jacobian pass (both border terms), for all modes too, stands beside it as a row of its own. The peer is two image passes
+per mode with common random numbers, the surfaces already in place.
 
-Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2, fitted to all steps. Asked for an
-error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its best step. Ours has a bias too, of its series and its texels: the
-distance to the peer's D(0). On either side a bias counts once it is known from noise. Part of our variance falls as 1 / paths squared (photons times
-walks), so ours is taken at paths that come near the error asked for.
+Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2,
+fitted to all steps. Asked for an error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its
+best step. Ours has a bias too, of its series and its texels: the distance to the peer's D(0). On either side a bias
+counts once it is known from noise. Part of our variance falls as 1 / paths squared (photons times walks), so ours is
+taken at paths that come near the error asked for.
 """
 
 from __future__ import annotations
@@ -114,7 +116,8 @@ def _compare(
     scores: Estimate,
     differences: dict[float, Estimate],
 ) -> list[GradientRow]:
-    # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias, from their own steps alone.
+    # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias, from their own steps
+    # alone.
     steps = np.array([*differences])
     values = np.array([d.mean[0] for d in differences.values()])
     spread = np.sqrt([d.mean_variance[0] for d in differences.values()])

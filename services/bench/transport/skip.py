@@ -1,8 +1,10 @@
-"""What a scene lacks costs nothing: each feature switched off, against a scene that never had it and against itself switched on.
+"""What a scene lacks costs nothing: each feature switched off, against a scene that never had it and against itself
+switched on.
 
-Of every case three calls are compared: ``off``, where the feature is there and not used; ``without``, where there is nothing to switch off; and
-``on``. Operations are those of a call's largest kernel, by Dr.Jit's kernel history. Times are medians over interleaved pairs of ``off`` and
-``without`` with equal seeds, each going first in every other pair; all kernels are compiled before.
+Of every case three calls are compared: ``off``, where the feature is there and not used; ``without``, where there is
+nothing to switch off; and ``on``. Operations are those of a call's largest kernel, by Dr.Jit's kernel history. Times
+are medians over interleaved pairs of ``off`` and ``without`` with equal seeds, each going first in every other pair;
+all kernels are compiled before.
 """
 
 from __future__ import annotations
@@ -64,7 +66,9 @@ class Case:
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
-    """Per feature a row of this engine with the feature off, a row of the peer without it, and the peer's summary row."""
+    """Per feature a row of this engine with the feature off, a row of the peer without it, and the peer's summary
+    row.
+    """
     samples = 32 if quick else 128
     return [row.model_dump() for case in cases() for row in _compare(case, samples)]
 
@@ -144,7 +148,8 @@ def kernel_operations(call: Call, samples: int) -> int:
     """Operations of the largest kernel that a call launches."""
     import drjit as dr
 
-    # Equal expressions are traced once while the first is alive; what a finished trace left behind must not stand in for operations of this one.
+    # Equal expressions are traced once while the first is alive; what a finished trace left behind must not stand in
+    # for operations of this one.
     gc.collect()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
@@ -195,7 +200,8 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     names = [row["benchmark"].removeprefix("transport-skip ") for row in compared]
     figure, (times, operations) = grid(2)
     measures = (("off", [row["time_ratio"] for row in compared], [row["operations"] for row in compared]),
-                ("on", [row["seconds_on"] / row["seconds"] for row in compared], [row["operations_on"] for row in compared]))  # fmt: skip
+                ("on", [row["seconds_on"] / row["seconds"] for row in compared],
+                 [row["operations_on"] for row in compared]))  # fmt: skip
     for label, ratios, counts in measures:
         times.plot(ratios, names, "o", label=label)
         operations.plot(counts, names, "o", label=label)

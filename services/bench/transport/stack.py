@@ -1,7 +1,7 @@
 """An incisor under all lights of a dome: one walk for all of them against stock ``prbvolpath`` light by light.
 
-Efficiency is 1 / (variance x time) with variance = sum of the pixels' variances / sum of their squares, both measured in this
-run on this machine with the same threads. The peer renders a few of the lights and its time is scaled to all.
+Efficiency is 1 / (variance x time) with variance = sum of the pixels' variances / sum of their squares, both measured
+in this run on this machine with the same threads. The peer renders a few of the lights and its time is scaled to all.
 """
 
 from __future__ import annotations

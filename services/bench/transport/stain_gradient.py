@@ -1,8 +1,9 @@
 """The derivative to the texels of a stain against central differences with the engine itself.
 
-The derivative is that of the images projected on one picture, the residual that an L2 loss would show for a clean tooth. Ours is one pass for all texels; the
-peer is two image passes per texel with common random numbers. Nearly every path crosses two faces, so images are quadratic in a texel and differences have
-no bias: the peer is given the widest step that the texture's bounds allow. It is measured on some of the texels that the camera sees; ours is charged for
+The derivative is that of the images projected on one picture, the residual that an L2 loss would show for a clean
+tooth. Ours is one pass for all texels; the peer is two image passes per texel with common random numbers. Nearly every
+path crosses two faces, so images are quadratic in a texel and differences have no bias: the peer is given the widest
+step that the texture's bounds allow. It is measured on some of the texels that the camera sees; ours is charged for
 each of them its share of the pass that makes them all.
 """
 

@@ -25,7 +25,9 @@ def shared_names(tissue: Tissue) -> tuple[str, ...]:
 
 
 class StockGradient:
-    """Gradient of 1/2 sum (C - reference)^2 over a view's pixels under the light of a ``mitsuba_scene.nested_scene``."""
+    """Gradient of 1/2 sum (C - reference)^2 over a view's pixels under the light of a
+    ``mitsuba_scene.nested_scene``.
+    """
 
     def __init__(self, scene: Any, tissue: Tissue, view: View) -> None:
         import drjit as dr

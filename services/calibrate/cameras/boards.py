@@ -17,7 +17,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Detection:
-    """Corners of a board in one photograph: numbers (N,), places on the board (N, 3) mm, pixels (N, 2), and markers found (M,)."""
+    """Corners of a board in one photograph: numbers (N,), places on the board (N, 3) mm, pixels (N, 2), and markers
+    found (M,).
+    """
 
     ids: NDArray[np.int64]
     corners_mm: Floats
@@ -72,8 +74,8 @@ def opencv_board(board: Board) -> Any:
 def detect(image: NDArray[np.uint8], board: Board) -> Detection:
     """Find a board's corners in a grey 8-bit photograph (H, W).
 
-    A board that is not there gives no corners. A chessboard has no numbers on its squares, so it is found whole or not at all,
-    and a board that looks the same turned by 180° must be photographed less than 90° turned between cameras.
+    A board that is not there gives no corners. A chessboard has no numbers on its squares, so it is found whole or not
+    at all, and a board that looks the same turned by 180° must be photographed less than 90° turned between cameras.
     """
     find = {"charuco": _detect_charuco, "chessboard": _detect_chessboard, "aruco": _detect_aruco}[board.type]
     ids, pixels, markers = find(image, board)

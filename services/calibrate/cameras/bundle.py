@@ -1,9 +1,9 @@
 """Bundle adjustment: lenses, camera poses and board poses that together draw the corners where they were seen.
 
-The world's frame is that of the board at place 0, so that place has no parameters. A camera draws a corner c of the board at
-place p at π(R (R_p c + t_p) + t). Corners' errors are independent and of one σ a camera. A fit with Huber's loss comes first;
-corners that it leaves far outside are left out, and a plain fit of the others gives value and covariance σ² (JᵀJ)⁻¹, with σ²
-from the residuals and their degrees of freedom (Triggs et al., Bundle Adjustment, 2000).
+The world's frame is that of the board at place 0, so that place has no parameters. A camera draws a corner c of the
+board at place p at π(R (R_p c + t_p) + t). Corners' errors are independent and of one σ a camera. A fit with Huber's
+loss comes first; corners that it leaves far outside are left out, and a plain fit of the others gives value and
+covariance σ² (JᵀJ)⁻¹, with σ² from the residuals and their degrees of freedom (Triggs et al., Bundle Adjustment, 2000).
 """
 
 from __future__ import annotations
@@ -30,18 +30,21 @@ ROBUST_ROUNDS = 3
 SETTLED_SCALE = 0.1
 """Of the robust scale between two rounds: outliers lie far beyond a tenth of σ."""
 STEP_PRECISION = 1e-10
-"""Of the linear solver within a step: with less the steps are no Gauss–Newton steps and a hundred of them are needed."""
+"""Of the linear solver within a step: with less the steps are no Gauss–Newton steps and a hundred of them are
+needed."""
 MAD_TO_SIGMA = 1.4826
 MISPLACED_PX, MISPLACED_TIMES = 10.0, 10.0
-"""Median distance of a photograph's corners from where the first guess draws them, in px and over that of all photographs: first
-guesses are off by some pixels, and frames that were interchanged by hundreds."""
+"""Median distance of a photograph's corners from where the first guess draws them, in px and over that of all
+photographs: first guesses are off by some pixels, and frames that were interchanged by hundreds."""
 MIN_INLIERS = 4
 """Corners that fix a pose."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Parameters of a bundle: K lenses, K poses camera_from_world (K, 6), and P poses world_from_board (P, 6), the first zero."""
+    """Parameters of a bundle: K lenses, K poses camera_from_world (K, 6), and P poses world_from_board (P, 6), the
+    first zero.
+    """
 
     lenses: tuple[Lens, ...]
     cameras: Floats
@@ -109,7 +112,8 @@ class BundleFit:
         rig: lenses and poses.
         layout: the order of the covariance.
         covariance: of all parameters (length, length), in the frame of place 0.
-        sigma_px: standard deviation of one coordinate of a corner, by camera (K,); the common scale is from the residuals.
+        sigma_px: standard deviation of one coordinate of a corner, by camera (K,); the common scale is from the
+            residuals.
         residuals_px: seen minus drawn (N, 2), of all corners in the order of the views, outliers too.
         inliers: which corners the final fit used (N,).
         corners: the corners.
@@ -158,8 +162,8 @@ def derivative_blocks(
     """What moves the drawn corners of one camera.
 
     Returns:
-        Which rows it sees (M,), their pixels (M, 2), and derivatives to its lens (M, 2, 4 + D), its pose (M, 2, 6) and the
-        pose of each corner's place (M, 2, 6).
+        Which rows it sees (M,), their pixels (M, 2), and derivatives to its lens (M, 2, 4 + D), its pose (M, 2, 6) and
+        the pose of each corner's place (M, 2, 6).
     """
     rows = np.flatnonzero(corners.camera == camera)
     place = rig.places[corners.place[rows]]
@@ -188,8 +192,9 @@ def fit_bundle(
     Args:
         views: photographs of boards; every camera and every place must be linked to place 0 by shared views.
         start: a first guess, as from ``services.calibrate.cameras.start``.
-        sigma_px: how the cameras' corners scatter against each other (K,), as single cameras' fits tell; all alike by default.
-            It is not estimated here: in a joint fit the camera of the smallest residuals would draw all weight to itself.
+        sigma_px: how the cameras' corners scatter against each other (K,), as single cameras' fits tell; all alike by
+            default. It is not estimated here: in a joint fit the camera of the smallest residuals would draw all weight
+                to itself.
         lenses_fixed: keep the guess's intrinsics.
         robust: look for outliers.
 
@@ -239,8 +244,8 @@ def _without_outliers(
 def _misplaced(corners: Corners, drawn: Floats) -> NDArray[np.bool_]:
     """Corners (N,) of photographs that the first guess draws elsewhere altogether, as frames that were interchanged.
 
-    Huber's loss bounds the pull of single corners, and a whole photograph of them still bends its place's and its camera's pose.
-    Of every camera and every place at least one photograph stays.
+    Huber's loss bounds the pull of single corners, and a whole photograph of them still bends its place's and its
+    camera's pose. Of every camera and every place at least one photograph stays.
     """
     off = np.linalg.norm(corners.pixels - drawn, axis=1)
     median = np.array([float(np.median(off[corners.view == view])) for view in range(corners.view.max() + 1)])
@@ -264,8 +269,8 @@ def _require_inliers(views: Sequence[View], corners: Corners, inliers: NDArray[n
             if np.count_nonzero(inliers & mine) < MIN_INLIERS:
                 name = views[int(corners.view[mine][0])].name
                 raise CaptureInputError(
-                    f"The photographs of {what}, among them {name}, fit no common pose: the board or a camera moved there, or frames are "
-                    "interchanged; leave them out or take them again."
+                    f"The photographs of {what}, among them {name}, fit no common pose: the board or a camera moved"
+                    " there, or frames are interchanged; leave them out or take them again."
                 )
 
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 MODELS = {"pinhole": 0, "radial-tangential-4": 4, "radial-tangential-5": 5, "rational-8": 8}
-"""Distortion models by their number of coefficients, from the simplest: k1, k2, p1, p2; k3; k4, k5, k6 (OpenCV's order)."""
+"""Distortion models by their number of coefficients, from the simplest: k1, k2, p1, p2; k3; k4, k5, k6 (OpenCV's
+order)."""
 HALF_PIXEL = 0.5
 """Pixel centres lie at half-integers here and at integers in OpenCV."""
 UNDISTORTION_STEPS = 40

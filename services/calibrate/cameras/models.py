@@ -29,7 +29,8 @@ class ModelChoice:
     Attributes:
         lens: of the chosen model, from all boards.
         sigma_px: scatter of one coordinate of its corners about a fit of this camera alone.
-        held_out_px: rms distance of the corners of boards that were left out, by model; empty where there were too few boards.
+        held_out_px: rms distance of the corners of boards that were left out, by model; empty where there were too few
+            boards.
     """
 
     lens: Lens
@@ -48,9 +49,10 @@ def choose_lens(
 ) -> ModelChoice:
     """The simplest distortion model that no other beats on held-out boards by more than its standard error.
 
-    Corners that fit nowhere are left out first. Each fold then leaves every ``folds``-th board out, fits the others, and judges
-    the lens by how well it draws the left out boards with a pose of their own. The difference of two models is a mean over
-    boards, and so is its standard error. Of fewer than six boards none can be left out, and the model is held.
+    Corners that fit nowhere are left out first. Each fold then leaves every ``folds``-th board out, fits the others,
+    and judges the lens by how well it draws the left out boards with a pose of their own. The difference of two models
+    is a mean over boards, and so is its standard error. Of fewer than six boards none can be left out, and the model is
+    held.
 
     Raises:
         CaptureInputError: the camera shows fewer than three boards.
@@ -71,7 +73,9 @@ def without_outliers(views: Sequence[View], fit: BundleFit) -> list[View]:
 
 
 def held_out_squares(views: Sequence[View], lens: Lens) -> Floats:
-    """Mean squared distance in px² of each view's corners from where a lens draws them, with the view's best pose (V,)."""
+    """Mean squared distance in px² of each view's corners from where a lens draws them, with the view's best pose
+    (V,).
+    """
     drawn = (lens.project(pose_apply(board_pose(view, lens), view.corners_mm)) for view in views)
     return np.array([((d - view.pixels) ** 2).sum(axis=1).mean() for d, view in zip(drawn, views, strict=True)])
 

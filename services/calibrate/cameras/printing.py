@@ -42,7 +42,9 @@ def board_pdf(board: Board) -> bytes:
 
 
 def _squares(board: Board) -> Iterator[Rectangle]:
-    """Black squares; OpenCV's boards begin with a black one, ChArUco's of the legacy pattern with even rows with a white one."""
+    """Black squares; OpenCV's boards begin with a black one, ChArUco's of the legacy pattern with even rows with a
+    white one.
+    """
     columns, rows = board.squares
     first = 1 if board.legacy_pattern and rows % 2 == 0 else 0
     side = board.square_mm

@@ -1,9 +1,10 @@
 """How far off a calibrated camera may draw a point, all over its image.
 
-Lens and pose are exchangeable in part: a lens that is wrong by a shift of its principal point, with boards turned to fit, draws
-almost as before. So the question is asked as mrcal asks it (Kogan, mrcal's documentation of projection uncertainty, "mean-pcam"):
-a point that the camera sees is fixed to the boards as they were solved; when all parameters err, the boards carry it along, the
-mean over the boards says where the camera then believes it to be, and the erring lens draws that.
+Lens and pose are exchangeable in part: a lens that is wrong by a shift of its principal point, with boards turned to
+fit, draws almost as before. So the question is asked as mrcal asks it (Kogan, mrcal's documentation of projection
+uncertainty, "mean-pcam"): a point that the camera sees is fixed to the boards as they were solved; when all parameters
+err, the boards carry it along, the mean over the boards says where the camera then believes it to be, and the erring
+lens draws that.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ def image_grid(size: tuple[int, int], columns: int, rows: int) -> Floats:
 
 
 def projection_covariance(fit: BundleFit, camera: int, pixels: Floats, distance_mm: float) -> Floats:
-    """Covariance in px² (N, 2, 2) of where a camera draws the points that it sees at pixels (N, 2) and a distance in mm."""
+    """Covariance in px² (N, 2, 2) of where a camera draws the points that it sees at pixels (N, 2) and a distance in
+    mm.
+    """
     lens, pose = fit.rig.lenses[camera], fit.rig.cameras[camera]
     directions = lens.undistort(pixels)
     points = distance_mm * directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -25,7 +25,9 @@ def rotation_matrix(rotation_vector: Floats) -> Floats:
 
 
 def left_jacobian(rotation_vector: Floats) -> Floats:
-    """J (..., 3, 3) with exp(w + dw) = exp(J dw) exp(w) to first order (Barfoot, State Estimation for Robotics, eq. 7.77)."""
+    """J (..., 3, 3) with exp(w + dw) = exp(J dw) exp(w) to first order (Barfoot, State Estimation for Robotics, eq.
+    7.77).
+    """
     vector = np.asarray(rotation_vector, dtype=np.float64)
     cross, (_, versine, cubic) = cross_matrix(vector), _coefficients(vector)
     return np.eye(3) + versine * cross + cubic * (cross @ cross)
@@ -57,7 +59,9 @@ def inverse_pose(pose: Floats) -> Floats:
 
 
 def _coefficients(vector: Floats) -> tuple[Floats, Floats, Floats]:
-    """The series or closed forms of sin a ÷ a, (1 − cos a) ÷ a² and (a − sin a) ÷ a³ of the vectors' lengths a, (..., 1, 1) each."""
+    """The series or closed forms of sin a ÷ a, (1 − cos a) ÷ a² and (a − sin a) ÷ a³ of the vectors' lengths a, (...,
+    1, 1) each.
+    """
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     square, small = angle**2, angle < SERIES_BELOW_RAD
     safe = np.where(small, 1.0, angle)

@@ -1,4 +1,6 @@
-"""First guesses for bundle adjustment: each camera's lens from its own boards, then poses by cameras that see one board."""
+"""First guesses for bundle adjustment: each camera's lens from its own boards, then poses by cameras that see one
+board.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,8 @@ def board_pose(view: View, lens: Lens) -> Floats:
 
 
 def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str]) -> Rig:
-    """Poses of all cameras and boards: from place 0 on, always through the pair of camera and board that shares most corners.
+    """Poses of all cameras and boards: from place 0 on, always through the pair of camera and board that shares most
+    corners.
 
     Raises:
         CaptureInputError: a camera or a place shares no board with the others.
@@ -125,7 +128,8 @@ def _vote(
 ) -> None:
     """Give each camera, then each place but the first, the pose that draws most of its corners where they are.
 
-    The poses are those that its own photographs propose, so a photograph that is not what its frame says does not lead the others astray.
+    The poses are those that its own photographs propose, so a photograph that is not what its frame says does not lead
+    the others astray.
     """
     linked = [number for number in poses if views[number].camera in cameras and views[number].place in places]
     for camera in cameras:
@@ -145,7 +149,9 @@ def _vote(
 
 
 def _best(drawn: Sequence[tuple[View, Lens, list[Floats]]]) -> int:
-    """Which of the proposed poses camera_from_board, one list a view, has the least median distance over all corners."""
+    """Which of the proposed poses camera_from_board, one list a view, has the least median distance over all
+    corners.
+    """
     offs = [
         [
             np.linalg.norm(lens.project(pose_apply(pose_vector(pose), view.corners_mm)) - view.pixels, axis=1)

@@ -41,7 +41,8 @@ def read_reference(path: Path, chart: str) -> Floats:
     header = [cell.strip().upper() for cell in rows[0]] if rows else []
     if not {"X", "Y", "Z"} <= set(header):
         raise CaptureInputError(
-            f"Reference {path.name} of chart {chart} has no columns X, Y and Z; give XYZ under D50 with Y = 100 for white."
+            f"Reference {path.name} of chart {chart} has no columns X, Y and Z; give XYZ under D50 with Y = 100 for"
+            " white."
         )
     try:
         table = np.array([[float(row[header.index(axis)]) for axis in "XYZ"] for row in rows[1:]]) / 100
@@ -83,7 +84,9 @@ def patch_means(values: NDArray[np.float32], saturated: NDArray[np.bool_], corne
 
 
 def find_corners(eight_bit: NDArray[np.uint8]) -> Floats | None:
-    """Centres (4, 2) of patches 1, 6, 24, 19 in a colour photograph (H, W, 3), blue first; None where no chart is found."""
+    """Centres (4, 2) of patches 1, 6, 24, 19 in a colour photograph (H, W, 3), blue first; None where no chart is
+    found.
+    """
     import cv2
 
     detector = cv2.mcc.CCheckerDetector.create()
@@ -103,7 +106,8 @@ def over_white(patches: Patches, xyz: Floats, camera: str) -> Floats:
     good[NEUTRALS] = patches.usable[NEUTRALS]
     if np.count_nonzero(good) < 3:
         raise CaptureInputError(
-            f"Camera {camera} shows fewer than three of the chart's grey patches below saturation; expose the chart less."
+            f"Camera {camera} shows fewer than three of the chart's grey patches below saturation; expose the chart"
+            " less."
         )
     luminance = xyz[good, 1:2]
     # Least squares through the origin: the white that makes greys as bright as their luminance says.

@@ -20,7 +20,9 @@ def lab_from_xyz(xyz: Floats, white: Floats = D50) -> Floats:
 
 
 def delta_e_2000(one: Floats, two: Floats) -> Floats:
-    """ΔE2000 (N,) of L*a*b* colours (N, 3) (Sharma, Wu & Dalal, Color Research and Application 30, 2005, eqs. 2 to 22)."""
+    """ΔE2000 (N,) of L*a*b* colours (N, 3) (Sharma, Wu & Dalal, Color Research and Application 30, 2005, eqs. 2 to
+    22).
+    """
     (l1, a1, b1), (l2, a2, b2) = np.asarray(one).T, np.asarray(two).T
     mean_chroma = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2
     stretch = 1.5 - 0.5 * np.sqrt(mean_chroma**7 / (mean_chroma**7 + 25.0**7))

@@ -1,4 +1,6 @@
-"""A camera's channels to XYZ: a 3 × 3 matrix or a root polynomial, whichever draws patches better that it has not seen."""
+"""A camera's channels to XYZ: a 3 × 3 matrix or a root polynomial, whichever draws patches better that it has not
+seen.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ class ColourFit:
 
 
 def root_terms(rgb: Floats) -> Floats:
-    """Terms of degree 2 (N, 6), which double where the light doubles (Finlayson, Mackiewicz & Hurlbert 2015, table I)."""
+    """Terms of degree 2 (N, 6), which double where the light doubles (Finlayson, Mackiewicz & Hurlbert 2015, table
+    I).
+    """
     r, g, b = np.maximum(rgb, 0).T
     return np.stack([r, g, b, np.sqrt(r * g), np.sqrt(g * b), np.sqrt(r * b)], axis=1)
 
@@ -56,8 +60,8 @@ def least_squares_matrix(terms: Floats, xyz: Floats) -> Floats:
 def fit_colour(rgb: Floats, xyz: Floats, camera: str, white: Floats = D50) -> ColourFit:
     """Fit a camera's colours to patches.
 
-    A root polynomial has twice the coefficients, so it is taken only where it draws patches that were left out better by more than
-    the standard error of the difference.
+    A root polynomial has twice the coefficients, so it is taken only where it draws patches that were left out better
+    by more than the standard error of the difference.
 
     Args:
         rgb: patch means (N, 3), radiance over that of a perfect diffuser in the same light.
@@ -70,7 +74,8 @@ def fit_colour(rgb: Floats, xyz: Floats, camera: str, white: Floats = D50) -> Co
     """
     if len(rgb) < MIN_PATCHES:
         raise CaptureInputError(
-            f"Camera {camera} shows {len(rgb)} patches of the chart that are not saturated, and {MIN_PATCHES} are needed; expose it less."
+            f"Camera {camera} shows {len(rgb)} patches of the chart that are not saturated, and {MIN_PATCHES} are"
+            " needed; expose it less."
         )
     models = {"matrix": np.asarray(rgb), "root polynomial": root_terms(rgb)}
     target = lab_from_xyz(xyz, white)

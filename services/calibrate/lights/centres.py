@@ -14,7 +14,8 @@ from services.calibrate.reweighted import solve_reweighted
 
 Floats = NDArray[np.float64]
 EDGE_SE_PX = 0.1
-"""Of one edge point, against which the shift that all edges of a camera share is held; the answer hardly depends on it."""
+"""Of one edge point, against which the shift that all edges of a camera share is held; the answer hardly depends on
+it."""
 STEP_MM = 1e-3
 
 
@@ -31,8 +32,8 @@ class OutlineView:
 def fit_centres(views: Sequence[OutlineView], eyes: Sequence[Eye]) -> Floats:
     """Centres (P, 3) by place, in mm.
 
-    All edges of a camera may be found outside or inside of the true outline alike. One camera would take that for a nearer or
-    farther sphere; cameras together tell it from distance.
+    All edges of a camera may be found outside or inside of the true outline alike. One camera would take that for a
+    nearer or farther sphere; cameras together tell it from distance.
     """
     count = max(view.place for view in views) + 1
     start = np.zeros(3 * count + len(eyes))

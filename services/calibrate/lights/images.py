@@ -16,7 +16,8 @@ SEARCH_WIDTH = 640
 RADII = (0.5, 2.0)
 """Of a sphere's image, as a multiple of the one that it has at the boards' distance."""
 CIRCLE_QUALITY = (0.85, 0.6, 0.35)
-"""Of OpenCV's circle search, from nearly perfect outlines to half hidden ones; the first that finds any circle counts."""
+"""Of OpenCV's circle search, from nearly perfect outlines to half hidden ones; the first that finds any circle
+counts."""
 RAYS = 180
 BANDS = (0.12, 0.04, 0.02)
 """Half widths, as parts of the radius, in which the edge is searched around the last outline."""
@@ -42,7 +43,9 @@ class Outline:
 
 @dataclass(frozen=True)
 class Logs:
-    """Logarithm of the light in a part of an image (h, w), where the part begins (2,) as column and row, and the whole image's size."""
+    """Logarithm of the light in a part of an image (h, w), where the part begins (2,) as column and row, and the whole
+    image's size.
+    """
 
     values: Image
     first_px: NDArray[np.int64]
@@ -59,8 +62,8 @@ def about_outline(outline_px: Floats, shape: tuple[int, ...]) -> tuple[slice, sl
 def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) -> Outline | None:
     """The outline of a sphere of known radius at about a distance, or None.
 
-    A circle search in a small image comes first. Then the steepest brightness along rays from the middle is followed to a fraction of a
-    pixel, each time in a narrower band about the outline of the sphere that fits the last points.
+    A circle search in a small image comes first. Then the steepest brightness along rays from the middle is followed to
+    a fraction of a pixel, each time in a narrower band about the outline of the sphere that fits the last points.
     """
     import cv2
 
@@ -97,7 +100,8 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
 def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
     """The centre (2,) in pixels of the brightest highlight within a sphere's outline, or None.
 
-    It is the mean place of the patch that is brighter than half of the peak and holds it, weighted by the light above a quarter.
+    It is the mean place of the patch that is brighter than half of the peak and holds it, weighted by the light above a
+    quarter.
     """
     import cv2
 

@@ -1,10 +1,10 @@
 """How bright each light is in each channel, from white spheres of known reflectance.
 
-A Lambertian sphere under a point light has the radiance ρ ÷ π · I · cos θ ÷ d². Every photograph of a white sphere under one light
-gives one number a channel: the slope of its pixels against that known factor. Its logarithm is a sum of what belongs to the camera
-(counts per radiance), to the light (its intensity) and, where the sphere stood in several places, of the lights' common lobe.
-So all photographs together are linear least squares. Only products of intensity and radiance per count are measurable: the mean of
-the intensities is 1 in every channel.
+A Lambertian sphere under a point light has the radiance ρ ÷ π · I · cos θ ÷ d². Every photograph of a white sphere
+under one light gives one number a channel: the slope of its pixels against that known factor. Its logarithm is a sum of
+what belongs to the camera (counts per radiance), to the light (its intensity) and, where the sphere stood in several
+places, of the lights' common lobe. So all photographs together are linear least squares. Only products of intensity and
+radiance per count are measurable: the mean of the intensities is 1 in every channel.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ LOBE_SIGMAS = 4.0
 SIGMA_FLOOR = 1e-6
 MAD_TO_SIGMA = 1.4826
 WRONG_SIGMAS, MIN_WRONG = 8.0, 0.05
-"""A photograph that the others put off by more, robustly, and by 5 %: another light, exposure or level than raw.toml says."""
+"""A photograph that the others put off by more, robustly, and by 5 %: another light, exposure or level than raw.toml
+says."""
 MAX_WRONG_SHARE = 0.1
 """Of the photographs: with more of them wrong the list as a whole is not to be trusted."""
 MIN_FREEDOM = 0.2
@@ -68,14 +69,16 @@ class IntensityFit:
     """Lights and cameras by channel.
 
     Attributes:
-        intensity: towards the mean of the spheres, mean 1 over the lights (L, C); NaN for lights that no photograph shows.
+        intensity: towards the mean of the spheres, mean 1 over the lights (L, C); NaN for lights that no photograph
+            shows.
         radiance_per_count: of each camera (K, C).
         exponent: of the lights' common lobe about their direction to the spheres' mean, and its standard error.
-        covariance: of the logarithms of the S seen lights' intensities, by light and then channel, from the photographs' scatter
-            and the positions together (S · C, S · C).
+        covariance: of the logarithms of the S seen lights' intensities, by light and then channel, from the
+            photographs' scatter and the positions together (S · C, S · C).
         by_positions: derivative of those logarithms to the lights' positions (S · C, 3 L), for errors that are shared.
         sigma: scatter of one photograph's slope, relative, by channel (C,).
-        residuals: of the slopes' logarithms (photographs that could be used, C), also of those that fit no other and were left out.
+        residuals: of the slopes' logarithms (photographs that could be used, C), also of those that fit no other and
+            were left out.
         used: numbers of those photographs.
     """
 
@@ -91,7 +94,9 @@ class IntensityFit:
 
 
 def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """The factor cos θ ÷ (π d²) in mm⁻² at pixels (N,), and which of them show a part of the sphere that can be used."""
+    """The factor cos θ ÷ (π d²) in mm⁻² at pixels (N,), and which of them show a part of the sphere that can be
+    used.
+    """
     rays, origin = eye.directions(pixels), eye.centre_mm
     towards = sphere.centre_mm - origin
     middle = rays @ towards
@@ -107,7 +112,9 @@ def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> 
 
 
 def slope(photo: WhitePhoto, eye: Eye, sphere: WhiteSphere, light_mm: Floats) -> Floats | None:
-    """Values over the known factor (C,), by least squares over the pixels with shot noise; None where too few can be used."""
+    """Values over the known factor (C,), by least squares over the pixels with shot noise; None where too few can be
+    used.
+    """
     factor, usable = shading(eye, sphere, light_mm, photo.pixels)
     if np.count_nonzero(usable) < MIN_PIXELS:
         return None
@@ -143,7 +150,8 @@ def fit_intensity(
         raise CaptureInputError("No photograph of a white sphere shows enough of its lit side; photograph it larger.")
     if dark := next((photo for photo, value in kept if value.min() <= 0), None):
         raise CaptureInputError(
-            f"Light {light_names[dark.light]} leaves a white sphere dark in some channel; look whether it was on, or another in its place."
+            f"Light {light_names[dark.light]} leaves a white sphere dark in some channel; look whether it was on, or"
+            " another in its place."
         )
     used = [photo for photo, _ in kept]
     logs = np.log(np.array([value for _, value in kept]))
@@ -173,7 +181,8 @@ def fit_intensity(
 
 
 def _without_wrong_photographs(design: Floats, logs: Floats) -> NDArray[np.bool_]:
-    """Which photographs (R,) agree with the others; the one that is furthest off leaves first, as it draws its light's others with it.
+    """Which photographs (R,) agree with the others; the one that is furthest off leaves first, as it draws its light's
+    others with it.
 
     Args:
         design: which light and camera each shows (R, P).
@@ -206,7 +215,9 @@ def _design(photos: Sequence[WhitePhoto], seen: NDArray[np.int64], n_cameras: in
 
 
 def _log_cosines(photos: Sequence[WhitePhoto], spheres: Sequence[WhiteSphere], lights_mm: Floats) -> Floats:
-    """Logarithm of the cosine between a light's direction to the photographed sphere and to the mean of all spheres (R,)."""
+    """Logarithm of the cosine between a light's direction to the photographed sphere and to the mean of all spheres
+    (R,).
+    """
     middle = np.mean([sphere.centre_mm for sphere in spheres], axis=0)
     lights = lights_mm[[photo.light for photo in photos]]
     centres = np.array([spheres[photo.place].centre_mm for photo in photos])
@@ -252,7 +263,9 @@ def _covariance(
     relative: Floats,
     position_covariance: Floats | None,
 ) -> tuple[Floats, Floats]:
-    """Covariance (S · C, S · C) of the seen lights' logarithms, by light and then channel, and their derivative to positions."""
+    """Covariance (S · C, S · C) of the seen lights' logarithms, by light and then channel, and their derivative to
+    positions.
+    """
     n_lights, n_channels = relative.shape
     size = n_lights * n_channels
     covariance, moved = np.zeros((size, size)), np.zeros((size, by_positions.shape[1]))

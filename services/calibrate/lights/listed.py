@@ -1,4 +1,6 @@
-"""A list of light positions that somebody measured in a frame of its own, laid over the lights that highlights found."""
+"""A list of light positions that somebody measured in a frame of its own, laid over the lights that highlights
+found.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ OUTLIER_SIGMAS = 5.0
 MIRRORED_TIMES = 5.0
 """Lights in one plane fit as well mirrored; a right-handed list never fits five times better so."""
 MIN_OUTLIER_MM = 20.0
-"""Of a list measured by hand coordinates are off by some 4 mm, so nearer lights lie where they are listed, however well few lights fit."""
+"""Of a list measured by hand coordinates are off by some 4 mm, so nearer lights lie where they are listed, however well
+few lights fit."""
 MAD_OF_DISTANCES = 1.538
 """Of the length of a vector with three normal coordinates: its median is 1.538 σ."""
 

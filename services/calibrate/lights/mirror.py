@@ -48,8 +48,8 @@ class Eye:
 def sphere_from_outline(eye: Eye, outline_px: Floats, radius_mm: float) -> Floats:
     """Centre (3,) in mm of a sphere of known radius from pixels (E, 2) of its outline.
 
-    The rays to the outline form a right cone, so w · d = 1 for all their unit directions d: its axis is w's, and the cosine of its
-    opening is 1 ÷ |w|. That is linear, and holds for the ellipse that the outline is in the image.
+    The rays to the outline form a right cone, so w · d = 1 for all their unit directions d: its axis is w's, and the
+    cosine of its opening is 1 ÷ |w|. That is linear, and holds for the ellipse that the outline is in the image.
     """
     rays = eye.directions(outline_px)
     axis = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]
@@ -77,8 +77,8 @@ def outline_errors(eye: Eye, outline_px: Floats, centres_mm: Floats, radii_mm: F
 def highlight_points(eyes_mm: Floats, lights_mm: Floats, centres_mm: Floats, radii_mm: Floats | float) -> Floats:
     """Points (N, 3) of spheres that mirror lights (N, 3) into eyes (N, 3) or (3,): Alhazen's problem.
 
-    The point lies in the plane of eye, centre and light, at an angle from the eye's direction that makes both angles to the normal
-    alike. Their difference grows with that angle, so Newton's steps find it, halved brackets keeping them.
+    The point lies in the plane of eye, centre and light, at an angle from the eye's direction that makes both angles to
+    the normal alike. Their difference grows with that angle, so Newton's steps find it, halved brackets keeping them.
     Centres are (N, 3) or (3,), radii (N,) or a number.
     """
     to_light = lights_mm - centres_mm
@@ -107,7 +107,9 @@ def highlight_points(eyes_mm: Floats, lights_mm: Floats, centres_mm: Floats, rad
 
 
 def _from_normal(angle: Floats, distance_mm: Floats, radii_mm: Floats | float) -> tuple[Floats, Floats]:
-    """At a point of a sphere: the angle between its normal and a thing, whose direction from the centre is ``angle`` away, and the derivative."""
+    """At a point of a sphere: the angle between its normal and a thing, whose direction from the centre is ``angle``
+    away, and the derivative.
+    """
     cosine = np.cos(angle)
     found = np.arctan2(distance_mm * np.sin(angle), distance_mm * cosine - radii_mm)
     squared = distance_mm**2 - 2 * distance_mm * radii_mm * cosine + np.square(radii_mm)

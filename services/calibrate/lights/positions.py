@@ -1,9 +1,9 @@
 """Positions of lights from their highlights on mirror spheres, all spheres, cameras and lights at once.
 
-Unknown are the spheres' centres, the lights, for each camera by how far its edges are found outside the true outline (blur and
-contrast shift all edges of a camera alike; a radius that is given wrongly shows there too), and the cameras themselves within the
-covariance that their own calibration left. Observed are outlines and highlights in pixels. So lights and cameras err together, and
-the spheres may mend the cameras a little.
+Unknown are the spheres' centres, the lights, for each camera by how far its edges are found outside the true outline
+(blur and contrast shift all edges of a camera alike; a radius that is given wrongly shows there too), and the cameras
+themselves within the covariance that their own calibration left. Observed are outlines and highlights in pixels. So
+lights and cameras err together, and the spheres may mend the cameras a little.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ from services.calibrate.reweighted import solve_reweighted
 
 Floats = NDArray[np.float64]
 EDGE_SHIFT_SE_PX = 0.3
-"""By how far a camera's edges may be found off: half a pixel of blur, seen against a background of another brightness."""
+"""By how far a camera's edges may be found off: half a pixel of blur, seen against a background of another
+brightness."""
 HUBER_SIGMAS = 1.345
 OUTLIER_SIGMAS = 5.0
 SIGMA_FLOOR_PX = 1e-6
 MAD_TO_SIGMA = 1.4826
 ROBUST_ROUNDS = 3
 STEP = 1e-4
-"""Of a central difference, mm or px: a millionth of the distances, so its error is 1e-12 and rounding's 1e-9 of the derivative."""
+"""Of a central difference, mm or px: a millionth of the distances, so its error is 1e-12 and rounding's 1e-9 of the
+derivative."""
 
 
 STEP_SIGMAS = 0.01
@@ -55,8 +57,8 @@ class LightsFit:
         centres_mm: of the spheres by place (P, 3).
         edge_shifts_px: by camera (K,).
         eyes: the cameras, as spheres and boards together say.
-        covariance: of lights (3 M, mm), centres (3 P, mm), edge shifts (K, px), and, where the cameras' was given, the lens values
-            and pose of each camera in turn.
+        covariance: of lights (3 M, mm), centres (3 P, mm), edge shifts (K, px), and, where the cameras' was given, the
+            lens values and pose of each camera in turn.
         highlight_sigma_px, outline_sigma_px: scatter of the two kinds of observation.
         highlight_errors_px: found minus drawn (N, 2), in the order of the views' highlights.
         outliers: what was left out.
@@ -76,7 +78,10 @@ class LightsFit:
 
 @dataclass(frozen=True)
 class _Weighted:
-    """The problem with weights: residuals in units of their σ. Cameras are moved by ``spread @ z`` with z of unit prior."""
+    """The problem with weights: residuals in units of their σ.
+
+    Cameras are moved by ``spread @ z`` with z of unit prior.
+    """
 
     problem: Problem
     eyes: tuple[Eye, ...]
@@ -104,7 +109,10 @@ class _Weighted:
         )
 
     def by_own(self, values: Floats) -> Floats:
-        """Derivative to lights, centres and shifts. No residual depends on two of a kind, so one axis of all is moved at once."""
+        """Derivative to lights, centres and shifts.
+
+        No residual depends on two of a kind, so one axis of all is moved at once.
+        """
         problem, eyes = self.problem, self.moved_eyes(values)
         n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
         derivative = np.zeros((n_highlights + n_edges + len(values) - problem.first_shift, problem.length))
@@ -129,7 +137,9 @@ class _Weighted:
         return derivative
 
     def by_cameras(self, values: Floats) -> Floats:
-        """Derivative to z, through that to the cameras' own values: no residual depends on two cameras, so one value of all is moved at once."""
+        """Derivative to z, through that to the cameras' own values: no residual depends on two cameras, so one value of
+        all is moved at once.
+        """
         problem, eyes = self.problem, self.moved_eyes(values)
         n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
         count = self.spread.shape[1]
@@ -220,7 +230,8 @@ def _square_root(covariance: Floats) -> Floats:
 
 
 def _without_outliers(weighted: _Weighted, values: Floats) -> tuple[Floats, _Weighted]:
-    """Fits by Huber's loss with the cameras held, first over pixels, then over the scatter that is left; outliers leave the weights.
+    """Fits by Huber's loss with the cameras held, first over pixels, then over the scatter that is left; outliers leave
+    the weights.
 
     Of a light that would lose all highlights but one, all stay, and its large errors show in the residuals.
     """

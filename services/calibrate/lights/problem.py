@@ -44,7 +44,10 @@ class SphereView:
 
 
 class Problem:
-    """Residuals of all views. The unknowns stand in the order lights (3 each), spheres' centres by place (3 each), edge shifts by camera."""
+    """Residuals of all views.
+
+    The unknowns stand in the order lights (3 each), spheres' centres by place (3 each), edge shifts by camera.
+    """
 
     def __init__(self, views: Sequence[SphereView], n_cameras: int, light_names: Sequence[str]) -> None:
         self.views = views
@@ -52,8 +55,8 @@ class Problem:
         self.lights, counts = np.unique(seen, return_counts=True)
         if few := [int(n) for n, count in zip(self.lights, counts, strict=True) if count < MIN_HIGHLIGHTS]:
             raise CaptureInputError(
-                f"Light {light_names[few[0]]} shows on a mirror sphere only once, which tells a direction and no place; "
-                "photograph the sphere in a second place or by a second camera."
+                f"Light {light_names[few[0]]} shows on a mirror sphere only once, which tells a direction and no place;"
+                " photograph the sphere in a second place or by a second camera."
             )
         self.n_places, self.n_cameras = max(view.place for view in views) + 1, n_cameras
         self.row = np.searchsorted(self.lights, seen)

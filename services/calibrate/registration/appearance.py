@@ -1,4 +1,6 @@
-"""How much a pixel looks like tooth: learned in each photograph from the teeth's present outline, and from what lies around it."""
+"""How much a pixel looks like tooth: learned in each photograph from the teeth's present outline, and from what lies
+around it.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,9 @@ BINS = 20
 """Along each feature, between its 1st and 99th percentile."""
 SMOOTH_BINS = 1.0
 INSIDE_PX, OUTSIDE_PX, BAND_PX = 1, 3, 25
-"""Pixels this far inside an outline teach what tooth is; those from so far outside to this far, what it is not. Teeth darken towards
-their rims, so that what is learned from their middles alone puts an outline up to 1.5 pixels too far in."""
+"""Pixels this far inside an outline teach what tooth is; those from so far outside to this far, what it is not. Teeth
+darken towards their rims, so that what is learned from their middles alone puts an outline up to 1.5 pixels too far
+in."""
 TOOTH_BINS = 2.0
 """Of brightness, that tooth is smoothed by: it comes in more shades than the few pixels at its rims show."""
 PERHAPS = 0.3
@@ -23,10 +26,12 @@ PERHAPS = 0.3
 LOOKS = 3
 """How often that is learned, each time without such pixels."""
 MIN_LEFT = 1 / 3
-"""Share of the pixels outside that must go on teaching; where teeth and their surroundings look alike, all would be left out."""
+"""Share of the pixels outside that must go on teaching; where teeth and their surroundings look alike, all would be
+left out."""
 SMOOTH_PX = 1.0
 MAX_CHANNELS = 3
-"""Of a camera with more, neighbouring ones are averaged: the features' joint histogram grows as the power of their number."""
+"""Of a camera with more, neighbouring ones are averaged: the features' joint histogram grows as the power of their
+number."""
 FLOOR = 1e-3
 """Of the brightest pixels, added before the logarithm: darker ones are noise."""
 

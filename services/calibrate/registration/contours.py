@@ -1,4 +1,6 @@
-"""Outlines of teeth as a camera sees them at a pose: points on the surface, with the direction across the line in the image."""
+"""Outlines of teeth as a camera sees them at a pose: points on the surface, with the direction across the line in the
+image.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from services.calibrate.registration.visible import NOTHING, seen_surfaces
 from services.core.geometry import Camera, Mesh
 
 SMOOTH_PX = 1.5
-"""Width of the Gaussian that a tooth's mask is smoothed with before its slope gives the direction across the outline."""
+"""Width of the Gaussian that a tooth's mask is smoothed with before its slope gives the direction across the
+outline."""
 MARGIN_PX = 6
 """Around a tooth's box, so that smoothing sees all of its mask."""
 

@@ -1,8 +1,9 @@
 """Where an edge lies to a small part of a pixel: by how much light it lets through, not by what its pixels look like.
 
-A pixel that shows two things is a mean of their light, so the share of the inner one's light across an edge sums to where the edge is,
-however wide the lens, the pixels and a mosaic's interpolation make it. Likeness to tooth is no such mean: a pixel of the dark with a
-fifth of tooth in it has a tooth's colour and a shaded tooth's brightness, and looks like tooth.
+A pixel that shows two things is a mean of their light, so the share of the inner one's light across an edge sums to
+where the edge is, however wide the lens, the pixels and a mosaic's interpolation make it. Likeness to tooth is no such
+mean: a pixel of the dark with a fifth of tooth in it has a tooth's colour and a shaded tooth's brightness, and looks
+like tooth.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from services.calibrate.registration.pose import Floats
 STEP_PX = 0.5
 """Between samples across an edge."""
 HALF_PX, LEVEL_PX = 4.0, 2.0
-"""Samples reach so far to both sides; those beyond the second tell the light of either side. A pixel, a mosaic's interpolation and a lens
-together blur an edge by up to 1 px of standard deviation, of which 2 px leave a fortieth."""
+"""Samples reach so far to both sides; those beyond the second tell the light of either side. A pixel, a mosaic's
+interpolation and a lens together blur an edge by up to 1 px of standard deviation, of which 2 px leave a fortieth."""
 FARTHEST_PX = 1.5
 """An edge farther from where it was looked for is another one's."""
 COLOURED = 0.05
-"""Of the inner light: how far the outer one lies from its colour where a shade across both can be told from the edge. Gums come to 0.15,
-the dark of the mouth to less than 0.01."""
+"""Of the inner light: how far the outer one lies from its colour where a shade across both can be told from the edge.
+Gums come to 0.15, the dark of the mouth to less than 0.01."""
 DARKEST = 0.2
 """Of both sides' light together: in a darker shade nothing is told."""
 SAMPLES = np.arange(-HALF_PX, HALF_PX + STEP_PX / 2, STEP_PX)
@@ -71,7 +72,8 @@ def _sampled(image: NDArray[np.float32], place: Floats) -> tuple[Floats, NDArray
 
 
 def _share(seen: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    # A tooth darkens towards its rim, so its light is carried on along a line; what is behind it knows nothing of the rim.
+    # A tooth darkens towards its rim, so its light is carried on along a line; what is behind it knows nothing of the
+    # rim.
     line = np.stack([np.ones_like(SAMPLES), SAMPLES], axis=1)
     inside = np.einsum("sk,kt,ntc->nsc", line, np.linalg.pinv(line[INNER]), seen[:, INNER])
     # The way from the outer light to the inner, along their difference at the edge.

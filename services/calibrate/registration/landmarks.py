@@ -1,9 +1,10 @@
 """First pose of a scan: clicked points in the scan and in photographs, over all cameras at once.
 
-Starts come from landmarks that several cameras see, whose lines of sight meet in the rig, and from one camera's points by
-perspective-n-point (Terzakis and Lourakis, "A Consistently Fast and Globally Optimal Solution to the Perspective-n-Point
-Problem", ECCV 2020); each from all points and from drawn few, so that a wrong click spoils only some starts. The starts that most
-clicks of all cameras agree with are refined by robust least squares over all, and the best of them is taken.
+Starts come from landmarks that several cameras see, whose lines of sight meet in the rig, and from one camera's points
+by perspective-n-point (Terzakis and Lourakis, "A Consistently Fast and Globally Optimal Solution to the
+Perspective-n-Point Problem", ECCV 2020); each from all points and from drawn few, so that a wrong click spoils only
+some starts. The starts that most clicks of all cameras agree with are refined by robust least squares over all, and the
+best of them is taken.
 """
 
 from __future__ import annotations
@@ -83,15 +84,17 @@ def fit_landmarks(
     most = max((sum(one.camera == name for one in clicks) for name in cameras), default=0)
     if most < MIN_CLICKS:
         raise CaptureInputError(
-            f"No camera sees {MIN_CLICKS} landmarks of the scan (the most are {most}); add [[landmark]] entries to raw.toml, "
-            "spread over the arch."
+            f"No camera sees {MIN_CLICKS} landmarks of the scan (the most are {most}); add [[landmark]] entries to"
+            " raw.toml, spread over the arch."
         )
     starts = list(_starts(cameras, clicks))
     if not starts:
         raise CaptureInputError(
-            "The landmarks lie in one line or at one place, which leaves the scan's pose open; spread them over the arch."
+            "The landmarks lie in one line or at one place, which leaves the scan's pose open; spread them over the"
+            " arch."
         )
-    # Far cameras see little perspective, so that a start may lean to the wrong side; refined over all cameras, it shows.
+    # Far cameras see little perspective, so that a start may lean to the wrong side; refined over all cameras, it
+    # shows.
     best = _best(cameras, clicks, starts, click_mm, TRIED)
     refined = [_refined(cameras, clicks, start, centre_mm, click_mm)[0] for start in best]
     (best_start,) = _best(cameras, clicks, [*best, *refined], click_mm, 1)
@@ -140,7 +143,8 @@ def _best(
 
 
 def _triangulated(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> tuple[Floats, Floats]:
-    # Landmarks (N, 3) that several cameras see: in the scan, and in the rig where their lines of sight come nearest to each other.
+    # Landmarks (N, 3) that several cameras see: in the scan, and in the rig where their lines of sight come nearest to
+    # each other.
     scan, rig = [], []
     for name in dict.fromkeys(one.name for one in clicks):
         own = [one for one in clicks if one.name == name]
@@ -244,4 +248,7 @@ def _contradiction(cameras: Mapping[str, Camera], clicks: Sequence[Click], pose:
         f"{len(wrong)} of {len(clicks)} landmarks contradict the others; the worst is {worst.name} in camera "
         f"{worst.camera}, {_offset_px(cameras, worst, pose):.0f} px from where the scan has it"
     )
-    return f"{said}; see whether landmarks are exchanged, left with right or tooth with tooth, and whether the scan is this person's."
+    return (
+        f"{said}; see whether landmarks are exchanged, left with right or tooth with tooth, and whether the scan is"
+        " this person's."
+    )

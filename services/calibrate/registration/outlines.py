@@ -1,8 +1,9 @@
 """The pose at which a scan's outlines meet those in the photographs.
 
-Each round draws the outlines at the present pose, looks for the photograph's own along the line across each of their points
-(Harris, "Tracking with rigid models", 1992), and moves the pose so that the distances across vanish, far ones counting less.
-A tooth's border to gums, lips or the dark is where likeness to tooth falls; that to another tooth is a dark line.
+Each round draws the outlines at the present pose, looks for the photograph's own along the line across each of their
+points (Harris, "Tracking with rigid models", 1992), and moves the pose so that the distances across vanish, far ones
+counting less. A tooth's border to gums, lips or the dark is where likeness to tooth falls; that to another tooth is a
+dark line.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ POINTS = 1500
 CLEAR = 0.25
 """Share of the strong edges' strength (their 90th percentile) that an edge needs to be taken for one."""
 TUKEY = 2.5
-"""Standard errors beyond which a point counts nothing (Tukey's biweight). The usual 4.7 would save a fifth of the variance of clean edges,
-but lips, whose edges cross the outlines, lie nearer than that: with 4.7 they turned drawn phantoms by 0.12° in place of 0.08°."""
+"""Standard errors beyond which a point counts nothing (Tukey's biweight). The usual 4.7 would save a fifth of the
+variance of clean edges, but lips, whose edges cross the outlines, lie nearer than that: with 4.7 they turned drawn
+phantoms by 0.12° in place of 0.08°."""
 MIN_SPREAD_PX = 0.15
 OTHER_TOOTH = 0.5
 """Likeness to tooth beyond an outline from which on another tooth is taken to be there."""
@@ -42,13 +44,14 @@ MIN_FOUND = 0.3
 SECTORS = 6
 """Parts of a tooth's outline whose errors are taken to be of one piece, for the covariance."""
 SHIFT_PX = (0.15, 0.1, 0.5)
-"""Standard errors of what all outlines beside the same thing, nothing, gums and another tooth, are shifted by in all photographs: a rim that
-darkens, or a dark line between teeth, which lies behind the nearer one's edge. They are unknowns of the pose's equations; where outlines lie
-on both sides of a tooth they tell them. On phantoms at their true pose the medians were, as rms, 0.09 to 0.2, 0.01 to 0.1 and 0.1 to 0.8 px."""
+"""Standard errors of what all outlines beside the same thing, nothing, gums and another tooth, are shifted by in all
+photographs: a rim that darkens, or a dark line between teeth, which lies behind the nearer one's edge. They are
+unknowns of the pose's equations; where outlines lie on both sides of a tooth they tell them. On phantoms at their true
+pose the medians were, as rms, 0.09 to 0.2, 0.01 to 0.1 and 0.1 to 0.8 px."""
 
 SIDE_PX = 0.1
-"""The same of one side of all teeth in one photograph beyond that, for the covariance: by the light that falls on it. On the same phantoms
-0.03 to 0.12 px beside nothing and gums."""
+"""The same of one side of all teeth in one photograph beyond that, for the covariance: by the light that falls on it.
+On the same phantoms 0.03 to 0.12 px beside nothing and gums."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +138,11 @@ def pose_from_outlines(
     sizes = [millimetres_a_pixel(view.camera, centre[None])[0] for view in views if view.camera.name in apart]
     residual_mm = float(np.mean([px * size for px, size in zip(apart.values(), sizes, strict=True)]))
     missing = [
-        f"{1 - one.is_found.mean():.0%} of the outlines in camera {view.camera.name}"
-        if len(one.is_found)
-        else f"camera {view.camera.name}, which sees no tooth at this pose"
+        (
+            f"{1 - one.is_found.mean():.0%} of the outlines in camera {view.camera.name}"
+            if len(one.is_found)
+            else f"camera {view.camera.name}, which sees no tooth at this pose"
+        )
         for view, one in zip(views, found, strict=True)
     ]
     return PoseStep(
@@ -150,8 +155,8 @@ def outline_misfit_mm(
 ) -> float:
     """Median distance at the teeth between their outlines, as drawn at a pose, and the photographs'.
 
-    The nearest edges of a narrow search always lie close, whoever's teeth are seen; so the strongest one within a wide reach
-    counts here, and a point without a clear one counts as the reach. Borders between teeth are left out.
+    The nearest edges of a narrow search always lie close, whoever's teeth are seen; so the strongest one within a wide
+    reach counts here, and a point without a clear one counts as the reach. Borders between teeth are left out.
     """
     distances = []
     for view in views:
@@ -268,8 +273,8 @@ def _sandwich(
     normal: Floats,
     prior: Floats,
 ) -> Floats:
-    # Errors along one part of an outline go together in all cameras, so scores are summed over it before they are squared
-    # (cluster-robust); so do those of one side of all teeth in one camera, by the light that falls on it.
+    # Errors along one part of an outline go together in all cameras, so scores are summed over it before they are
+    # squared (cluster-robust); so do those of one side of all teeth in one camera, by the light that falls on it.
     scores, sides = np.zeros((teeth * SECTORS, len(normal))), []
     for view, one in zip(views, found, strict=True):
         jacobian, residual, weight, _ = _equations(view.camera, one, centre_mm, shifts_px)
@@ -291,6 +296,6 @@ def _require_edges(found: Sequence[Found]) -> None:
     if total == 0 or seen < MIN_FOUND * total:
         share = 0.0 if total == 0 else seen / total
         raise CaptureInputError(
-            f"Only {share:.0%} of the teeth's outlines are seen as edges in the photographs; see in the overlay pictures whether "
-            "the landmarks put the scan on the teeth, and whether the frames are sharp and bright."
+            f"Only {share:.0%} of the teeth's outlines are seen as edges in the photographs; see in the overlay"
+            " pictures whether the landmarks put the scan on the teeth, and whether the frames are sharp and bright."
         )

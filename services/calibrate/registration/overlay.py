@@ -32,7 +32,9 @@ def write_overlay(
     steps: Sequence[PoseStep],
     clicks: Sequence[Click],
 ) -> None:
-    """Write a PNG: outlines after each step, clicks as rings, and where the last step has them as dots joined to them."""
+    """Write a PNG: outlines after each step, clicks as rings, and where the last step has them as dots joined to
+    them.
+    """
     import cv2
 
     picture = _displayed(view.image)

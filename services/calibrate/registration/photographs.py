@@ -24,7 +24,8 @@ from services.core.raw.records import RawCamera, RawFolder, RawFrame
 WIDEST_PX = 2400
 """Photographs are made smaller than this before anything else: a pixel is then some 0.05 mm at the teeth."""
 CUT_PX = 700
-"""Width of the part around the teeth in which outlines are looked for: 0.1 mm a pixel, and edges are found to a fraction of it."""
+"""Width of the part around the teeth in which outlines are looked for: 0.1 mm a pixel, and edges are found to a
+fraction of it."""
 MARGIN_MM = 4.0
 """Around the teeth in that part."""
 MAX_LIGHTS = 12
@@ -43,7 +44,8 @@ def photographs(root: Path, folder: RawFolder, calibration: Calibration) -> dict
         frames = folder.frames_of(raw.name, "tracking")[:1] or _some(folder.frames_of(raw.name, "light"))
         if not frames:
             raise CaptureInputError(
-                f"Camera {raw.name} has no frame of kind tracking or light; add one that shows the teeth, or remove the camera."
+                f"Camera {raw.name} has no frame of kind tracking or light; add one that shows the teeth, or remove the"
+                " camera."
             )
         black = _black_counts(root, folder, raw.name, camera)
         images = [_image(root, folder, frame, black) for frame in frames]
@@ -80,7 +82,8 @@ def cut_out(view: View, points_mm: Floats) -> View:
     high = np.minimum(np.ceil(pixels.max(axis=0) + margin), camera.size).astype(int)
     if (depth <= 0).any() or (high - low < 16).any():
         raise CaptureInputError(
-            f"The landmarks put the teeth beside the picture of camera {camera.name}; correct them, or the camera's pose."
+            f"The landmarks put the teeth beside the picture of camera {camera.name}; correct them, or the camera's"
+            " pose."
         )
     part = view.image[low[1] : high[1], low[0] : high[0]]
     scale = min(1.0, CUT_PX / part.shape[1])
@@ -107,7 +110,8 @@ def require_facing(cameras: Sequence[Camera], pose: RigidPose, arch_from_scan: F
         if max(axes[1] @ towards, axes[2] @ towards) > 0:
             return
     raise CaptureInputError(
-        "The landmarks turn the teeth's back and their roots to every camera; exchange left and right, or give the other jaw's scan."
+        "The landmarks turn the teeth's back and their roots to every camera; exchange left and right, or give the"
+        " other jaw's scan."
     )
 
 
@@ -116,12 +120,14 @@ def _calibrated(calibration: Calibration, name: str, size: tuple[int, int]) -> C
     if found is None:
         known = ", ".join(camera.name for camera in calibration.cameras)
         raise CaptureInputError(
-            f"Camera {name} of the raw folder is not in the calibration, which has {known}; calibrate it or correct its name."
+            f"Camera {name} of the raw folder is not in the calibration, which has {known}; calibrate it or correct its"
+            " name."
         )
     if found.size != size:
         theirs, ours = (" x ".join(map(str, one)) for one in (found.size, size))
         raise CaptureInputError(
-            f"The calibration is for images of {theirs} pixels of camera {name}, but the raw folder's are {ours}; calibrate anew."
+            f"The calibration is for images of {theirs} pixels of camera {name}, but the raw folder's are {ours};"
+            " calibrate anew."
         )
     return found
 

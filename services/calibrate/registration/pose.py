@@ -35,7 +35,9 @@ class RigidPose:
         return points_mm @ self.rotation.T + self.translation_mm
 
     def moved(self, twist: Floats, centre_mm: Floats) -> RigidPose:
-        """After a turn by ``twist[:3]`` (rotation vector, rad) about a point of the rig and a move by ``twist[3:]`` (mm)."""
+        """After a turn by ``twist[:3]`` (rotation vector, rad) about a point of the rig and a move by ``twist[3:]``
+        (mm).
+        """
         from scipy.spatial.transform import Rotation
 
         turn = Rotation.from_rotvec(twist[:3]).as_matrix()

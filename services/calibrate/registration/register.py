@@ -28,12 +28,14 @@ from services.core.store import read_record, write_atomic, write_record
 
 PICTURES, PAGE = "registration", "registration.html"
 FARTHEST_LANDMARK_MM = 2.0
-"""Of a landmark from its tooth's nearest vertex: clicks lie on the surface, and vertices some tenths of a millimetre apart."""
+"""Of a landmark from its tooth's nearest vertex: clicks lie on the surface, and vertices some tenths of a millimetre
+apart."""
 REACH_MM = 1.5
 """How far outlines are looked for at first: clicks leave a pose open by less."""
 MAX_MISFIT_MM = 0.10
-"""Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to 0.05 mm in a
-calibrated rig, those of others to 0.13 mm and more; photographs by an uncalibrated telephone come to 0.16 to 0.3 mm."""
+"""Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to
+0.05 mm in a calibrated rig, those of others to 0.13 mm and more; photographs by an uncalibrated telephone come to 0.16
+to 0.3 mm."""
 
 
 @dataclass(frozen=True)
@@ -189,8 +191,8 @@ def require_on_their_teeth(clicks: Sequence[Click], scanned: ScannedTeeth) -> No
         off_mm = float(np.linalg.norm(mesh.vertices_mm - one.point_mm, axis=1).min())
         if off_mm > FARTHEST_LANDMARK_MM:
             raise CaptureInputError(
-                f"Landmark {one.name} lies {off_mm:.3g} mm from its tooth in the scan; give xyz_mm in the scan's own coordinates, "
-                "in mm, and see whether its tooth is right."
+                f"Landmark {one.name} lies {off_mm:.3g} mm from its tooth in the scan; give xyz_mm in the scan's own"
+                " coordinates, in mm, and see whether its tooth is right."
             )
 
 

@@ -98,8 +98,8 @@ def adjust_cameras(
         raise CaptureInputError(f"No board is found in any frame; in {file} {why}.")
     if not any(view.place == 0 for view in good):
         raise CaptureInputError(
-            f"No camera shows the board at {first}, the first of raw.toml, which is to be the world's frame; photograph it again, "
-            "or list another place first."
+            f"No camera shows the board at {first}, the first of raw.toml, which is to be the world's frame; photograph"
+            " it again, or list another place first."
         )
     choices = {
         name: choose_lens([view for view in views if view.camera == camera], sizes[name], name)

@@ -35,7 +35,8 @@ class ColourStep:
         fits: by camera.
         rgb: patches over white (24, 3), by camera; those that cannot be used are NaN.
         xyz: the chart's reference (24, 3).
-        between_cameras: mean ΔE2000 between the cameras' answers to the patches that all of them show, or None of one camera.
+        between_cameras: mean ΔE2000 between the cameras' answers to the patches that all of them show, or None of one
+            camera.
     """
 
     fits: dict[str, ColourFit]

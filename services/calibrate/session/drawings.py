@@ -26,7 +26,9 @@ SRGB_FROM_XYZ_D50 = np.array(
 
 
 def corners_drawing(fit: BundleFit, camera: int) -> str:
-    """All corners of a camera with their residuals, as arrows of a common scale; those of corners that were left out are marked."""
+    """All corners of a camera with their residuals, as arrows of a common scale; those of corners that were left out
+    are marked.
+    """
     size = fit.rig.lenses[camera].size
     scale = WIDTH / size[0]
     mine = fit.corners.camera == camera
@@ -35,7 +37,8 @@ def corners_drawing(fit: BundleFit, camera: int) -> str:
     length = np.linalg.norm(off, axis=1, keepdims=True)
     off = off * np.minimum(1, 2 * ARROW_PX / np.maximum(length, 1e-12))
     shapes = [
-        f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}" class="{"used" if good else "left-out"}"/>'
+        f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}"'
+        f' class="{"used" if good else "left-out"}"/>'
         for (x, y), (dx, dy), good in zip(places, off, fit.inliers[mine], strict=True)
     ]
     return _svg(shapes, WIDTH, size[1] * scale)
@@ -49,8 +52,9 @@ def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tupl
     largest, (columns, rows) = float(sigma.max()), GRID
     width, height = WIDTH / columns, lens.size[1] * scale / rows
     shapes = [
-        f'<rect x="{(n % columns) * width:.1f}" y="{(n // columns) * height:.1f}" width="{width:.1f}" height="{height:.1f}" '
-        f'class="share" fill-opacity="{value / largest:.3f}"><title>{value:.3f} px</title></rect>'
+        f'<rect x="{(n % columns) * width:.1f}" y="{(n // columns) * height:.1f}" width="{width:.1f}"'
+        f' height="{height:.1f}" class="share" fill-opacity="{value / largest:.3f}"><title>{value:.3f}'
+        " px</title></rect>"
         for n, value in enumerate(sigma)
     ]
     return _svg(shapes, WIDTH, lens.size[1] * scale), largest
@@ -69,7 +73,8 @@ def lights_drawing(lights_mm: Floats, names: Sequence[str], cameras_mm: Floats, 
             x, y = ((lights_mm[number] - low) * scale)[list(axes)]
             radius = max(float(reach[number, 0]) * scale, 2.5)
             shapes.append(
-                f'<circle cx="{left + x:.1f}" cy="{20 + y:.1f}" r="{radius:.1f}" class="lamp"><title>{_safe(name)}</title></circle>'
+                f'<circle cx="{left + x:.1f}" cy="{20 + y:.1f}" r="{radius:.1f}"'
+                f' class="lamp"><title>{_safe(name)}</title></circle>'
             )
         for camera in cameras_mm:
             x, y = ((camera - low) * scale)[list(axes)]
@@ -78,7 +83,9 @@ def lights_drawing(lights_mm: Floats, names: Sequence[str], cameras_mm: Floats, 
 
 
 def chart_drawing(reference: Floats, before: Floats, after: Floats) -> str:
-    """A chart's patches: around, the reference; in the middle, on the left as the sensor sees them and on the right corrected."""
+    """A chart's patches: around, the reference; in the middle, on the left as the sensor sees them and on the right
+    corrected.
+    """
     side, shapes = 44.0, []
     for patch in range(len(reference)):
         x, y = patch % 6 * side, patch // 6 * side
@@ -86,7 +93,8 @@ def chart_drawing(reference: Floats, before: Floats, after: Floats) -> str:
         for dx, dy, width, height, colours in parts:
             if np.isfinite(colours[patch]).all():
                 shapes.append(
-                    f'<rect x="{x + dx:.0f}" y="{y + dy:.0f}" width="{width:.0f}" height="{height:.0f}" fill="{_hex(colours[patch])}"/>'
+                    f'<rect x="{x + dx:.0f}" y="{y + dy:.0f}" width="{width:.0f}" height="{height:.0f}"'
+                    f' fill="{_hex(colours[patch])}"/>'
                 )
     return _svg(shapes, 6 * side, 4 * side)
 

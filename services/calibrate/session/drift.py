@@ -1,7 +1,7 @@
 """What changed between two calibrations of one rig, each change over its ±.
 
-Both have a world of their own, that of their first board, so only what no choice of world moves is compared: lenses, the lights' distances
-from their common middle, and their intensities.
+Both have a world of their own, that of their first board, so only what no choice of world moves is compared: lenses,
+the lights' distances from their common middle, and their intensities.
 """
 
 from __future__ import annotations

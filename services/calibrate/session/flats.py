@@ -18,8 +18,8 @@ MIN_LIGHT = 0.05
 def fall_of_light(photos: Photos, camera: str, principal_px: Floats) -> tuple[float, float, float] | None:
     """a, b, c of 1 + a q + b q² + c q³ from a camera's flat frames; None without any.
 
-    q is the squared distance from the principal point in units of half the image's diagonal. All channels share one fall of light,
-    each with a brightness of its own.
+    q is the squared distance from the principal point in units of half the image's diagonal. All channels share one
+    fall of light, each with a brightness of its own.
 
     Raises:
         CaptureInputError: a flat frame is saturated or uneven beyond what a lens does.
@@ -33,7 +33,8 @@ def fall_of_light(photos: Photos, camera: str, principal_px: Floats) -> tuple[fl
         seen = photos.channels(frame)
         if seen.saturated.mean() > 0.001:
             raise CaptureInputError(
-                f"Frame {frame.file} (camera {camera}) is saturated in {seen.saturated.mean():.1%} of its pixels; expose the flat field less."
+                f"Frame {frame.file} (camera {camera}) is saturated in {seen.saturated.mean():.1%} of its pixels;"
+                " expose the flat field less."
             )
         q, values = _cells(seen, size, principal_px)
         # Cells over the middle's brightness, so that frames of different exposure and channels weigh alike.
@@ -56,7 +57,8 @@ def fit_fall(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, flo
     edge = np.linspace(0, max(float(q.max()) for q, _ in rows), 50)
     if (1 + edge * (a + edge * (b + edge * c))).min() < MIN_LIGHT:
         raise CaptureInputError(
-            f"Camera {camera}'s flat frames fall to nothing at the image's edge; photograph an even source that fills the view."
+            f"Camera {camera}'s flat frames fall to nothing at the image's edge; photograph an even source that fills"
+            " the view."
         )
     return a, b, c
 

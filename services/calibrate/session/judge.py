@@ -30,8 +30,12 @@ CHANNELS_OF_COLOUR = 3
 """XYZ is fitted to three channels alone; a chart tells nothing of other numbers of them."""
 AGAIN = {"boards": "boards", "spheres": "spheres, larger or further apart,", "chart": "the chart"}
 PLAN = {
-    "boards": "take boards in ten places and more, tilted by 20° to 40° in several directions, and fill the image with them",
-    "spheres": "take the mirror sphere in ten places that lie far apart, sharp and as large as the teeth's surroundings allow",
+    "boards": (
+        "take boards in ten places and more, tilted by 20° to 40° in several directions, and fill the image with them"
+    ),
+    "spheres": (
+        "take the mirror sphere in ten places that lie far apart, sharp and as large as the teeth's surroundings allow"
+    ),
     "chart": "take the chart sharp, evenly lit and not overexposed",
 }
 MAX_TIMES = 10
@@ -40,7 +44,9 @@ MAX_TIMES = 10
 
 @dataclass(frozen=True)
 class Limit:
-    """One figure that a calibration must keep: what it is, its value, the limit, the unit, and what photographs would mend it."""
+    """One figure that a calibration must keep: what it is, its value, the limit, the unit, and what photographs would
+    mend it.
+    """
 
     what: str
     value: float
@@ -121,7 +127,9 @@ def _limits(
 
 
 def uncertainty_at_the_boards(fit: BundleFit, camera: int, distance_mm: float) -> Floats:
-    """How far off in mm, one σ, a camera draws points at the boards' distance, on a grid over its image, inside of what boards covered."""
+    """How far off in mm, one σ, a camera draws points at the boards' distance, on a grid over its image, inside of what
+    boards covered.
+    """
     lens = fit.rig.lenses[camera]
     grid = image_grid(lens.size, *GRID)
     covered = grid[covered_cells(fit, camera)]
@@ -150,12 +158,17 @@ def _advice(
     colours: ColourStep | None,
     wrong: tuple[str, ...],
 ) -> str:
-    """One sentence on what to photograph again, and what that would buy: errors fall with the root of the number of photographs."""
+    """One sentence on what to photograph again, and what that would buy: errors fall with the root of the number of
+    photographs.
+    """
     worst = max(limits, key=lambda one: one.value / one.limit)
     if not worst.is_kept:
         return _again(worst, is_anything_wrong=bool(wrong))
     if lights is None:
-        return "Photograph a mirror sphere light by light in three or more places: without it the lights are where the list says."
+        return (
+            "Photograph a mirror sphere light by light in three or more places: without it the lights are where the"
+            " list says."
+        )
     if intensity is None:
         return "Photograph a white sphere light by light: without it all lights count as equally bright."
     if colours is None and len(folder.channels) == CHANNELS_OF_COLOUR:
@@ -163,9 +176,15 @@ def _advice(
     empty = {name: 1 - float(covered_cells(cameras.fit, number).mean()) for number, name in enumerate(cameras.names)}
     name, share = max(empty.items(), key=lambda pair: pair[1])
     if share > MAX_EMPTY:
-        return f"All limits are kept; boards nearer to the edges of camera {name} would cover the {share:.0%} of its image that none touches."
+        return (
+            f"All limits are kept; boards nearer to the edges of camera {name} would cover the {share:.0%} of its image"
+            " that none touches."
+        )
     if len(cameras.fit.rig.places) < FEW_PLACES:
-        return f"All limits are kept by {len(cameras.fit.rig.places)} places of the board; twice as many would make lenses 1.4 times surer."
+        return (
+            f"All limits are kept by {len(cameras.fit.rig.places)} places of the board; twice as many would make lenses"
+            " 1.4 times surer."
+        )
     return "All limits are kept; nothing needs to be photographed again."
 
 

@@ -27,12 +27,12 @@ def why_missed(image: NDArray[np.uint8], board: Board, found: Detection) -> str:
             return remedy
     if len(found.markers) or len(found.ids):
         return (
-            f"only {len(found.markers)} markers and {len(found.ids)} corners of board {board.name} show: it is cut off, hidden or out of "
-            "focus; photograph more of it"
+            f"only {len(found.markers)} markers and {len(found.ids)} corners of board {board.name} show: it is cut off,"
+            " hidden or out of focus; photograph more of it"
         )
     return (
-        f"nothing of board {board.name} shows: check that the board of raw.toml (type, squares, dictionary) is the one that was "
-        "photographed, whole, lit and in focus"
+        f"nothing of board {board.name} shows: check that the board of raw.toml (type, squares, dictionary) is the one"
+        " that was photographed, whole, lit and in focus"
     )
 
 

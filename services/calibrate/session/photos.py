@@ -17,16 +17,20 @@ Image = NDArray[np.float32]
 Part = tuple[slice, slice]
 WHOLE: Part = (slice(None), slice(None))
 FINDER_VALUES = 2_000_000
-"""Of a photograph: percentiles of every n-th are those of all, and sorting twenty million takes longer than reading them."""
+"""Of a photograph: percentiles of every n-th are those of all, and sorting twenty million takes longer than reading
+them."""
 ROUNDING = 1 / 12
 """Variance of rounding to whole counts."""
 LOW_PERCENTILE, HIGH_PERCENTILE = 1.0, 99.5
-"""Of a photograph's grey values: what is drawn black and white for the finders of boards, so that a few glints do not darken it."""
+"""Of a photograph's grey values: what is drawn black and white for the finders of boards, so that a few glints do not
+darken it."""
 
 
 @dataclass(frozen=True)
 class Black:
-    """A camera without light: mean counts over the image, and the scatter of a pixel from one frame to the next, before rounding."""
+    """A camera without light: mean counts over the image, and the scatter of a pixel from one frame to the next, before
+    rounding.
+    """
 
     counts: float
     noise: float
@@ -61,7 +65,8 @@ class Photos:
         self.black = {camera.name: self._black(camera.name) for camera in folder.camera}
 
     def grey(self, frame: RawFrame, part: Part = WHOLE) -> Image:
-        """Brightness (h, w) above black over exposure, gain and level, of a part of a photograph; of a mosaic interpolated.
+        """Brightness (h, w) above black over exposure, gain and level, of a part of a photograph; of a mosaic
+        interpolated.
 
         Parts of a mosaic begin at even rows and columns.
         """
@@ -108,8 +113,9 @@ class Photos:
 def black_of(frames: Iterable[NDArray[np.generic]]) -> Black:
     """Black level and noise of all frames without light, one in memory at a time.
 
-    Of two or more frames the noise is each pixel's own scatter (Welford 1962), so that a sensor's fixed pattern is no noise; of one
-    it is the scatter over the image. Rounding to whole counts adds a variance of 1/12, which is taken off.
+    Of two or more frames the noise is each pixel's own scatter (Welford 1962), so that a sensor's fixed pattern is no
+    noise; of one it is the scatter over the image. Rounding to whole counts adds a variance of 1/12, which is taken
+    off.
     """
     mean = squares = np.zeros(())
     count = 0

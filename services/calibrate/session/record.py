@@ -20,7 +20,8 @@ from services.core.raw.records import RawFolder
 
 Floats = NDArray[np.float64]
 REFLECTANCE_SE = 0.01
-"""Relative, of a white sphere's reflectance where raw.toml does not say it: a white standard is certified to about 1 %."""
+"""Relative, of a white sphere's reflectance where raw.toml does not say it: a white standard is certified to about 1
+%."""
 LIGHT_DRIFT = 1e-4
 """Relative: a lamp's brightness changes by so much while it warms, whatever the fit says."""
 
@@ -61,22 +62,26 @@ def record_of(
         made=made,
         valid_days=valid_days,
         inputs=inputs,
-        colour=None
-        if colours is None
-        else {
-            name: CameraColour.model_validate(
-                {
-                    "xyz_from_rgb": fit.matrix.tolist(),
-                    "root_polynomial": None if fit.root_polynomial is None else fit.root_polynomial.tolist(),
-                }
-            )
-            for name, fit in colours.fits.items()
-        },
+        colour=(
+            None
+            if colours is None
+            else {
+                name: CameraColour.model_validate(
+                    {
+                        "xyz_from_rgb": fit.matrix.tolist(),
+                        "root_polynomial": None if fit.root_polynomial is None else fit.root_polynomial.tolist(),
+                    }
+                )
+                for name, fit in colours.fits.items()
+            }
+        ),
     )
 
 
 def light_positions(folder: RawFolder, lights: LightsStep | None) -> dict[int, Floats]:
-    """Positions (3,) by number of the light: from highlights, else from the list laid over them, else from the list as it is."""
+    """Positions (3,) by number of the light: from highlights, else from the list laid over them, else from the list as
+    it is.
+    """
     found = {} if lights is None else dict(zip(lights.fit.lights.tolist(), lights.fit.positions_mm, strict=True))
     positions = {}
     for number, light in enumerate(folder.light):
@@ -92,8 +97,8 @@ def light_positions(folder: RawFolder, lights: LightsStep | None) -> dict[int, F
 def twist_derivative(pose: Floats) -> Floats:
     """Derivative (6, 6) of a camera's twist, about its own centre in world axes, to its pose camera_from_world.
 
-    The rotation R = exp(r) becomes R exp(−w) under the twist's rotation w, so w = −Rᵀ J dr; and the centre c = −Rᵀ t moves by
-    −Rᵀ dt + w × c.
+    The rotation R = exp(r) becomes R exp(−w) under the twist's rotation w, so w = −Rᵀ J dr; and the centre c = −Rᵀ t
+    moves by −Rᵀ dt + w × c.
     """
     R = rotation_matrix(pose[:3])
     centre = -R.T @ pose[3:]
@@ -125,7 +130,8 @@ def uncertainty_of(
         names += [f"light_gain.{folder.light[n].name}.{channel}" for n in seen for channel in folder.channels]
         moved = np.zeros((len(fit.covariance), covariance.shape[1]))
         if lights is not None:
-            # A light that is believed nearer than it is comes out dimmer: gains go with the positions that highlights found.
+            # A light that is believed nearer than it is comes out dimmer: gains go with the positions that highlights
+            # found.
             for place, number in enumerate(lights.fit.lights):
                 moved[:, 3 * place : 3 * place + 3] = fit.by_positions[:, 3 * number : 3 * number + 3]
         rows = np.concatenate([rows, moved])
@@ -143,8 +149,8 @@ def uncertainty_of(
 def gain_covariance(intensity: IntensityStep) -> Floats:
     """Of the brightness of all photographs together by channel, relative (C, C).
 
-    The white sphere's reflectance is wrong alike in all channels; the photographs' scatter is each channel's own. What the lights'
-    places add is hundredths of a per cent, so it is left out.
+    The white sphere's reflectance is wrong alike in all channels; the photographs' scatter is each channel's own. What
+    the lights' places add is hundredths of a per cent, so it is left out.
     """
     shared = REFLECTANCE_SE if intensity.reflectance_se is None else intensity.reflectance_se
     scatter = intensity.fit.sigma / len(intensity.photos) ** 0.5

@@ -102,7 +102,8 @@ def _lights(session: Session) -> dict[str, Any] | None:
     if session.lights is not None:
         fit = session.lights.fit
         told.append(
-            f"Highlights scatter by {fit.highlight_sigma_px:.3f} px and outlines by {fit.outline_sigma_px:.3f} px about the fit."
+            f"Highlights scatter by {fit.highlight_sigma_px:.3f} px and outlines by {fit.outline_sigma_px:.3f} px about"
+            " the fit."
         )
     if session.intensity is not None:
         scatter = ", ".join(f"{100 * one:.2f} %" for one in session.intensity.fit.sigma)
@@ -131,15 +132,18 @@ def _assumed(session: Session) -> Iterator[str]:
         if camera.vignetting is None:
             yield f"Camera {camera.name} has no flat frame: light is taken to be even over its image."
     if session.lights is None:
-        yield "No mirror sphere was photographed: lights stand where raw.toml lists them, in the frame of the first board."
+        yield (
+            "No mirror sphere was photographed: lights stand where raw.toml lists them, in the frame of the first"
+            " board."
+        )
     if session.intensity is None:
         yield "No white sphere was photographed: all lights count as equally bright."
     elif session.intensity.fit.exponent == 0:
         yield "Lights shine alike in all directions: the white spheres' places tell of no lobe."
     if session.intensity is not None and session.intensity.reflectance_se is None:
         yield (
-            f"The white sphere's reflectance is right to {100 * REFLECTANCE_SE:g} %, as raw.toml gives no reflectance_se: "
-            "so well is the gain of all photographs known."
+            f"The white sphere's reflectance is right to {100 * REFLECTANCE_SE:g} %, as raw.toml gives no"
+            " reflectance_se: so well is the gain of all photographs known."
         )
     if session.colours is not None:
         yield "Light on the chart is even, also in the image; its white is that of its grey patches."

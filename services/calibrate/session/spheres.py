@@ -25,7 +25,8 @@ from services.core.raw.records import FrameKind, RawFrame
 Floats = NDArray[np.float64]
 Fall = tuple[float, float, float]
 WHITE_PIXELS_ACROSS = 60
-"""A white sphere is sampled on a grid of about so many values across: more add no knowledge, as paint and lens limit it."""
+"""A white sphere is sampled on a grid of about so many values across: more add no knowledge, as paint and lens limit
+it."""
 
 
 LIGHTS_OF_AN_OUTLINE = 12
@@ -197,8 +198,8 @@ def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: fl
     if outline is None:
         first = frames[0]
         raise CaptureInputError(
-            f"Frame {first.file} (camera {first.camera}) shows no whole outline of sphere {first.sphere} of radius {radius_mm:g} mm; "
-            "photograph it whole against a background of another brightness, or correct radius_mm."
+            f"Frame {first.file} (camera {first.camera}) shows no whole outline of sphere {first.sphere} of radius"
+            f" {radius_mm:g} mm; photograph it whole against a background of another brightness, or correct radius_mm."
         )
     return outline
 
@@ -217,8 +218,8 @@ def _sampled(photos: Photos, frame: RawFrame, outline: Outline) -> tuple[Floats,
     good = ~channels.saturated[rows, columns]
     if good.mean() < MIN_UNSATURATED:
         raise CaptureInputError(
-            f"Frame {frame.file} (camera {frame.camera}, light {frame.light}) is saturated on {1 - good.mean():.0%} of the white sphere; "
-            "expose it less."
+            f"Frame {frame.file} (camera {frame.camera}, light {frame.light}) is saturated on {1 - good.mean():.0%} of"
+            " the white sphere; expose it less."
         )
     rows, columns = rows[good], columns[good]
     return channels.centres(rows, columns), channels.values[rows, columns].astype(np.float64)

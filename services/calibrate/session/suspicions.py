@@ -18,7 +18,8 @@ from services.calibrate.session.spheres import IntensityStep, LightsStep
 from services.core.raw.records import RawFolder
 
 MAX_EDGE_SHIFT_PX = 1.0
-"""Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was said."""
+"""Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was
+said."""
 MAX_BAD_SHARE = 0.5
 """Of a view's corners: single ones are hidden or glare, most of them are another pose."""
 MAX_FOCAL_SE = 0.01
@@ -26,7 +27,8 @@ MAX_FOCAL_SE = 0.01
 MIN_APART_MM = 1.0
 """Two lamps are wider than that."""
 MANY_SIGMAS = 6.0
-"""Of a photograph's robust scatter: a hundred photographs of three channels pass it by chance once in a million sessions."""
+"""Of a photograph's robust scatter: a hundred photographs of three channels pass it by chance once in a million
+sessions."""
 MIN_OFF_SHARE = 0.03
 """Paint, shadow and glare leave a per cent; another light or exposure is a step of more than three."""
 MIN_MOVE_PX = 1.0
@@ -100,16 +102,17 @@ def _about_boards(cameras: CamerasStep) -> Iterator[str]:
         yield f"{many if files[1:] else f'Frame {files[0]} shows no board'}: {why}."
     if not fit.converged:
         yield (
-            "The adjustment of cameras and boards stopped before it settled, so its errors cannot be trusted: look for boards that moved "
-            "while the cameras took them, and photograph more places and tilts."
+            "The adjustment of cameras and boards stopped before it settled, so its errors cannot be trusted: look for"
+            " boards that moved while the cameras took them, and photograph more places and tilts."
         )
     for number, name in enumerate(cameras.names):
         columns = fit.layout.lens_columns(number)[:2]
         focal = fit.rig.lenses[number].values[0]
         if len(columns) and np.sqrt(fit.covariance[columns[0], columns[0]]) > MAX_FOCAL_SE * focal:
             yield (
-                f"Boards tell the focal length of camera {name} to {np.sqrt(fit.covariance[columns[0], columns[0]]) / focal:.1%} only: "
-                "they all face it alike; tilt them by 20° to 40° in several directions."
+                f"Boards tell the focal length of camera {name} to"
+                f" {np.sqrt(fit.covariance[columns[0], columns[0]]) / focal:.1%} only: they all face it alike; tilt"
+                " them by 20° to 40° in several directions."
             )
     for number, view in enumerate(cameras.views):
         mine = fit.corners.view == number
@@ -138,7 +141,10 @@ def _of_a_bad_view(cameras: CamerasStep, number: int, name: str) -> str:
                 f"Frame {name} is what camera {cameras.names[other]} sees and not {cameras.names[camera]}; "
                 "frames of two cameras are interchanged."
             )
-    return f"Most corners of {name} fit no pose: the board or the camera moved there between photographs; leave the place out or take it again."
+    return (
+        f"Most corners of {name} fit no pose: the board or the camera moved there between photographs; leave the place"
+        " out or take it again."
+    )
 
 
 def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
@@ -146,8 +152,8 @@ def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
     for number, shift in enumerate(fit.edge_shifts_px):
         if abs(shift) > MAX_EDGE_SHIFT_PX:
             yield (
-                f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera {cameras.names[number]}; "
-                "measure the sphere's radius_mm and the board's square_mm again."
+                f"Outlines of the mirror spheres lie {shift:+.1f} px from where their radius says in camera"
+                f" {cameras.names[number]}; measure the sphere's radius_mm and the board's square_mm again."
             )
     rms = np.empty(len(lights.views))
     for number, view in enumerate(lights.views):
@@ -160,19 +166,22 @@ def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
     }
     for name in moved.values():
         yield (
-            f"The sphere's outline in {name} does not fit those of the other cameras: it moved, or the place is another; "
-            "keep the sphere still until all lights and cameras are through."
+            f"The sphere's outline in {name} does not fit those of the other cameras: it moved, or the place is"
+            " another; keep the sphere still until all lights and cameras are through."
         )
 
 
 def _about_highlights(names: list[str], cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
     for outlier in lights.fit.outliers:
         yield (
-            f"The highlight of light {names[outlier.light]} in camera {cameras.names[outlier.camera]} is {outlier.off_px:.1f} px off: "
-            "something else may shine there, so it was left out."
+            f"The highlight of light {names[outlier.light]} in camera {cameras.names[outlier.camera]} is"
+            f" {outlier.off_px:.1f} px off: something else may shine there, so it was left out."
         )
     if lights.no_highlight:
-        yield f"{len(lights.no_highlight)} frames show no highlight, among them {lights.no_highlight[0]}: was the light on?"
+        yield (
+            f"{len(lights.no_highlight)} frames show no highlight, among them {lights.no_highlight[0]}: was the"
+            " light on?"
+        )
 
 
 def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
@@ -186,14 +195,20 @@ def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
         )
         return
     if aligned.is_mirrored:
-        yield "The lights' list is of a left-handed frame, as its mirror image fits; change the sign of one axis in position_mm."
+        yield (
+            "The lights' list is of a left-handed frame, as its mirror image fits; change the sign of one axis in"
+            " position_mm."
+        )
         return
     found = np.full((len(names), 3), np.nan)
     found[lights.fit.lights] = lights.fit.positions_mm
     swapped = dict(swapped_names(found, aligned))
     for number in aligned.outliers:
         if number in swapped:
-            yield f"Light {names[number]} shines where the list has {names[swapped[number]]}; their names are interchanged."
+            yield (
+                f"Light {names[number]} shines where the list has {names[swapped[number]]}; their names are"
+                " interchanged."
+            )
         else:
             off = aligned.off_mm[number]
             yield f"Light {names[number]} lies {off:.0f} mm from where the list has it; measure it again."
@@ -207,7 +222,9 @@ def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
             apart = float(np.linalg.norm(positions[one] - positions[two]))
             if apart < MIN_APART_MM:
                 first, second = names[lights.fit.lights[two]], names[lights.fit.lights[one]]
-                yield f"Lights {first} and {second} lie {apart:.1f} mm apart: one light was photographed under two names."
+                yield (
+                    f"Lights {first} and {second} lie {apart:.1f} mm apart: one light was photographed under two names."
+                )
 
 
 def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensityStep) -> Iterator[str]:
@@ -217,6 +234,7 @@ def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensitySte
     for number in np.flatnonzero(np.abs(off) > max(MANY_SIGMAS * scatter, MIN_OFF_SHARE)):
         photo = intensity.photos[intensity.fit.used[number]]
         yield (
-            f"The white sphere under light {names[photo.light]} in camera {cameras.names[photo.camera]} is {100 * np.expm1(off[number]):+.0f} % off: "
-            "another light was on, or its exposure, gain or level is not what raw.toml says."
+            f"The white sphere under light {names[photo.light]} in camera {cameras.names[photo.camera]} is"
+            f" {100 * np.expm1(off[number]):+.0f} % off: another light was on, or its exposure, gain or level is not"
+            " what raw.toml says."
         )

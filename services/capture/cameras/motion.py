@@ -16,8 +16,8 @@ SWAY_SHARE = 0.3
 class SubjectMotion:
     """Displacement fields over the frames of one capture.
 
-    A frame shows the still at ``p + flow_px(p)``; the field is zero up to the reference frame, changes smoothly with the frame's
-    number, and never exceeds ``motion_px`` anywhere.
+    A frame shows the still at ``p + flow_px(p)``; the field is zero up to the reference frame, changes smoothly with
+    the frame's number, and never exceeds ``motion_px`` anywhere.
 
     Attributes:
         motion_px: bound of the displacement, pixels.

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 class Cameras(Protocol):
     """All cameras of a rig on one trigger line.
 
-    Counts become scene radiance by ``(count - black_level) * radiance_per_count / (level * exposure_s)``, with ``level`` the
-    fraction of full scale of the light that was on: the radiance that the light would cause at ``Light.intensity``, which holds
-    at level 1.
+    Counts become scene radiance by ``(count - black_level) * radiance_per_count / (level * exposure_s)``, with
+    ``level`` the fraction of full scale of the light that was on: the radiance that the light would cause at
+    ``Light.intensity``, which holds at level 1.
     """
 
     @property

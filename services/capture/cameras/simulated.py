@@ -24,9 +24,9 @@ RGB_OF_CHANNEL = {"red": 0, "green": 1, "blue": 2, "r": 0, "g": 1, "b": 2}
 class SensorModel:
     """From radiance and light to counts.
 
-    ``count = black + level * exposure_s * radiance / radiance_per_count + noise``, rounded and clipped to 0 .. 2**bits - 1, with
-    noise of variance ``(noise_relative * signal)² + (noise_floor * full scale)²``. The gain puts ``peak_radiance`` at 0.7 of the
-    range above black for the rig's level and exposure.
+    ``count = black + level * exposure_s * radiance / radiance_per_count + noise``, rounded and clipped to 0 ..
+    2**bits - 1, with noise of variance ``(noise_relative * signal)² + (noise_floor * full scale)²``. The gain puts
+    ``peak_radiance`` at 0.7 of the range above black for the rig's level and exposure.
     """
 
     def __init__(self, spec: SimulatedCameraSpec, peak_radiance: float, level: float, exposure_s: float) -> None:
@@ -53,8 +53,8 @@ class SensorModel:
 class SimulatedCameras:
     """``Cameras`` that see only what the dome's output registers say, over a read-only connection of their own.
 
-    The subject's motion and the noise depend on the frame's number and not on the clock, so that a resumed capture equals an
-    undisturbed one.
+    The subject's motion and the noise depend on the frame's number and not on the clock, so that a resumed capture
+    equals an undisturbed one.
     """
 
     def __init__(

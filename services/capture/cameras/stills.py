@@ -13,14 +13,16 @@ from services.core.records import FolderCapture
 
 
 class Stills:
-    """Linear images (height, width, channel) per camera and light of a folder capture; checked once, read when asked for."""
+    """Linear images (height, width, channel) per camera and light of a folder capture; checked once, read when asked
+    for.
+    """
 
     def __init__(self, folder: Path, description: FolderCapture) -> None:
         """Check every file.
 
         Raises:
-            CaptureInputError: an image entry names an unknown camera or light, a pair has no image, or a file is missing,
-                truncated, of the wrong shape, not finite or negative.
+            CaptureInputError: an image entry names an unknown camera or light, a pair has no image, or a file is
+                missing, truncated, of the wrong shape, not finite or negative.
         """
         self.description = description
         self._files = _find(folder, description)
@@ -54,7 +56,8 @@ def _find(folder: Path, description: FolderCapture) -> dict[tuple[int, int], Pat
         for kind, name, known in (("camera", entry.camera, cameras), ("light", entry.light, lights)):
             if name not in known:
                 raise CaptureInputError(
-                    f"Image {entry.file} in {folder / 'capture.json'} names unknown {kind} '{name}'; known are {', '.join(known)}."
+                    f"Image {entry.file} in {folder / 'capture.json'} names unknown {kind} '{name}'; known are"
+                    f" {', '.join(known)}."
                 )
         path = folder / entry.file
         if not path.is_file():
@@ -66,6 +69,7 @@ def _find(folder: Path, description: FolderCapture) -> dict[tuple[int, int], Pat
         for light, j in lights.items():
             if (i, j) not in files:
                 raise CaptureInputError(
-                    f"{folder / 'capture.json'} has no image of camera {camera} and light {light}; add it or remove the light."
+                    f"{folder / 'capture.json'} has no image of camera {camera} and light {light}; add it or remove the"
+                    " light."
                 )
     return files

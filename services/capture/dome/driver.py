@@ -1,12 +1,16 @@
 """The dome over Modbus TCP. Safety first: there is a face in the dome.
 
-* A light is on only between ``light`` and ``dark``; every exception, signal, cancel and process end goes through ``dark``.
-* The controller goes dark by itself when the keep-alive thread stops feeding its watchdog (a killed process), and when a light
-  has been on for its strobe time (a hung one).
+* A light is on only between ``light`` and ``dark``; every exception, signal, cancel and process end goes through
+  ``dark``.
+* The controller goes dark by itself when the keep-alive thread stops feeding its watchdog (a killed process), and when
+  a light has been on for its strobe time (a hung one).
 * Nothing is believed before it is read back, from the commanded levels and from the emitted ones.
-* ``interrupt`` darkens in mid-exposure, from another thread and over the keep-alive's connection; the driver lights nothing after it.
-* ``all_off`` needs no driver and stops whichever there is: the controller then refuses light until a driver arms the watchdog anew.
-* A device that says it is no dome gets no write. One that does not say what it is may be a dome under light, and is switched off.
+* ``interrupt`` darkens in mid-exposure, from another thread and over the keep-alive's connection; the driver lights
+  nothing after it.
+* ``all_off`` needs no driver and stops whichever there is: the controller then refuses light until a driver arms the
+  watchdog anew.
+* A device that says it is no dome gets no write. One that does not say what it is may be a dome under light, and is
+  switched off.
 """
 
 from __future__ import annotations
@@ -110,7 +114,8 @@ class ModbusDome:
             self._require_wanted()
             if not lights or lights.stop > self._light_count or lights.start < 0:
                 raise RigError(
-                    f"Light {index} does not exist, the dome at {self.address} has {self._light_count}; correct the plan."
+                    f"Light {index} does not exist, the dome at {self.address} has {self._light_count}; correct the"
+                    " plan."
                 )
             self._budget.require(lights, level, on_s)
             self._require_safe()
@@ -162,7 +167,8 @@ class ModbusDome:
         self._keepalive.stop()
         self._account()
         raise ReadbackError(
-            f"The dome at {self.address} is not confirmed dark ({problem}); its watchdog cuts the supply within {self.watchdog_s:g} s, switch the dome off."
+            f"The dome at {self.address} is not confirmed dark ({problem}); its watchdog cuts the supply within"
+            f" {self.watchdog_s:g} s, switch the dome off."
         ) from problem
 
     def pause(self, seconds: float) -> None:
@@ -173,12 +179,14 @@ class ModbusDome:
 
     def interrupt(self, why: Exception) -> None:
         """Go dark at once, from any thread; see ``Dome.interrupt``."""
-        # The reason comes before the order, so that a light that the driver sends meanwhile is found unwanted after it was sent.
+        # The reason comes before the order, so that a light that the driver sends meanwhile is found unwanted after it
+        # was sent.
         self._why_interrupted = why
         self._interrupted.set()
         with suppress(LinkError):
             self._keepalive.darken()
-        # Confirmed here too, as the driver's own thread may be held by a camera. Where it fails, the watchdog is starved.
+        # Confirmed here too, as the driver's own thread may be held by a camera. Where it fails, the watchdog is
+        # starved.
         with suppress(RigError):
             self.dark()
 
@@ -232,8 +240,8 @@ class ModbusDome:
                 self._require_armed()
                 light = int(wrong[0])
                 raise ReadbackError(
-                    f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of {wanted[light].tolist()}; "
-                    "all lights were switched off, check that light and the controller."
+                    f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of"
+                    f" {wanted[light].tolist()}; all lights were switched off, check that light and the controller."
                 )
         first = lit[0].start if lit else 0
         return int(held[first, 0]), int(held[first, 1]), int(held[first, 2])
@@ -253,19 +261,22 @@ class ModbusDome:
         firmware = self._link.read(reg.FIRMWARE)[0]
         if firmware >> 8 != reg.FIRMWARE_MAJOR:
             raise RigError(
-                f"The dome at {self.address} runs firmware {firmware >> 8}, this driver needs {reg.FIRMWARE_MAJOR}; update one of them."
+                f"The dome at {self.address} runs firmware {firmware >> 8}, this driver needs {reg.FIRMWARE_MAJOR};"
+                " update one of them."
             )
         self._light_count = self._link.read(reg.LIGHT_COUNT)[0]
         if not 1 <= self._light_count <= reg.MAX_LIGHTS:
             raise RigError(
-                f"The dome at {self.address} reports {self._light_count} lights, outside 1 to {reg.MAX_LIGHTS}; check its configuration."
+                f"The dome at {self.address} reports {self._light_count} lights, outside 1 to {reg.MAX_LIGHTS}; check"
+                " its configuration."
             )
 
     def _require_safe(self) -> None:
         closed, pressed = self._link.read(reg.INTERLOCK_CLOSED, 2)
         if pressed:
             raise InterlockError(
-                f"The emergency stop of the dome at {self.address} is pressed; release it when the subject is safe and run again."
+                f"The emergency stop of the dome at {self.address} is pressed; release it when the subject is safe and"
+                " run again."
             )
         if not closed:
             raise InterlockError(f"The interlock of the dome at {self.address} is open; close it and run again.")
@@ -277,7 +288,8 @@ class ModbusDome:
     def _require_armed(self) -> None:
         if self._link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS:
             raise RigStoppedError(
-                f"ALL OFF was pressed for the dome at {self.address} and it stays dark; start again when the subject is ready."
+                f"ALL OFF was pressed for the dome at {self.address} and it stays dark; start again when the subject is"
+                " ready."
             )
 
     def _require_no_fault(self) -> None:
@@ -285,7 +297,8 @@ class ModbusDome:
         if faults:
             self._require_armed()
             raise RigError(
-                f"The dome at {self.address} reports {' and '.join(fault_names(faults))}; remove the cause and run again."
+                f"The dome at {self.address} reports {' and '.join(fault_names(faults))}; remove the cause and run"
+                " again."
             )
 
     def _rgb(self, register: reg.Register) -> NDArray[np.int64]:
@@ -297,7 +310,8 @@ class ModbusDome:
         held = self._link.read(register)
         if held != values:
             raise ReadbackError(
-                f"The dome at {self.address} holds {register.name} = {held} instead of {values}; restart the controller."
+                f"The dome at {self.address} holds {register.name} = {held} instead of {values}; restart the"
+                " controller."
             )
 
     def _account(self) -> None:

@@ -13,7 +13,9 @@ FEEDS_PER_WATCHDOG = 5
 
 
 class KeepAlive:
-    """Feeds the watchdog from a thread, over its own connection, so that a slow transaction elsewhere does not starve it."""
+    """Feeds the watchdog from a thread, over its own connection, so that a slow transaction elsewhere does not starve
+    it.
+    """
 
     def __init__(self, link: ModbusLink, watchdog_s: float) -> None:
         self._link = link

@@ -1,8 +1,8 @@
 """One Modbus TCP connection that is honest about what it does not know.
 
-Facts about the library that shape it: a timeout leaves the connection open and a late answer in its buffer; its retries send a
-write again; it checks neither the request's length nor the echoed address. So every timeout closes the connection, reads alone
-are repeated, and lengths and echoes are checked here.
+Facts about the library that shape it: a timeout leaves the connection open and a late answer in its buffer; its retries
+send a write again; it checks neither the request's length nor the echoed address. So every timeout closes the
+connection, reads alone are repeated, and lengths and echoes are checked here.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ class ModbusLink:
         self._lock = threading.RLock()
 
     def read(self, register: Register, count: int | None = None, *, repeated: bool = True) -> list[int]:
-        """First ``count`` values of a register, in requests of at most 125; unless told not to, repeated once over a new connection."""
+        """First ``count`` values of a register, in requests of at most 125; unless told not to, repeated once over a
+        new connection.
+        """
         total = register.count if count is None else count
         values: list[int] = []
         for start in range(0, total, MAX_READ):
@@ -110,7 +112,8 @@ class ModbusLink:
                 raise NoReplyError(f"the controller at {self.address} does not answer for {register.name}") from problem
             if answer.isError():
                 raise RefusedError(
-                    f"the controller at {self.address} refuses {register.name} with Modbus exception {answer.exception_code}"
+                    f"the controller at {self.address} refuses {register.name} with Modbus exception"
+                    f" {answer.exception_code}"
                 )
             return answer
 

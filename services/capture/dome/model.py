@@ -5,8 +5,8 @@
     supply on  =  watchdog fed in time  and  no latched fault  and  interlock closed  and  emergency stop released
     output     =  level if supply on else 0
 
-A level that would light something while the supply is off is refused. When the watchdog runs out under light, every level
-becomes 0 and the fault is latched; in the dark it only opens the supply until the next feed.
+A level that would light something while the supply is off is refused. When the watchdog runs out under light, every
+level becomes 0 and the fault is latched; in the dark it only opens the supply until the next feed.
 """
 
 from __future__ import annotations

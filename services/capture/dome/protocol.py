@@ -80,12 +80,13 @@ class ExposureBudget:
         total_s = sum(self.spent_s.values()) + dose_s * len(lights)
         if light_s > self.light_limit_s:
             raise ExposureLimitError(
-                f"Light {worst} would reach {light_s:.3g} level-seconds, over its limit of {self.light_limit_s:g}; lower rig.level or rig.exposure_s."
+                f"Light {worst} would reach {light_s:.3g} level-seconds, over its limit of {self.light_limit_s:g};"
+                " lower rig.level or rig.exposure_s."
             )
         if total_s > self.total_limit_s:
             raise ExposureLimitError(
-                f"All lights together would reach {total_s:.3g} level-seconds, over the limit of {self.total_limit_s:g}; "
-                "lower rig.level or rig.exposure_s, or use fewer lights."
+                f"All lights together would reach {total_s:.3g} level-seconds, over the limit of"
+                f" {self.total_limit_s:g}; lower rig.level or rig.exposure_s, or use fewer lights."
             )
 
     def spend(self, lights: range, level: float, on_s: float) -> None:

@@ -1,7 +1,7 @@
 """The dome controller's Modbus map: one typed table for driver, simulator and documentation.
 
-Every level is 16 bit, 65535 being full scale. ``LEVELS`` is what was commanded, ``OUTPUTS`` what the LEDs emit once the supply
-relay, faults and watchdog have had their say; a light is confirmed only when both agree.
+Every level is 16 bit, 65535 being full scale. ``LEVELS`` is what was commanded, ``OUTPUTS`` what the LEDs emit once the
+supply relay, faults and watchdog have had their say; a light is confirmed only when both agree.
 """
 
 from __future__ import annotations
@@ -150,7 +150,8 @@ FAULT_ORDER = Register(
     9000,
     5,
     "1",
-    "simulator only: kind, argument, times; space (1 coil, 2 discrete, 3 holding, 4 input, 0 any) and address of the requests meant",
+    "simulator only: kind, argument, times; space (1 coil, 2 discrete, 3 holding, 4 input, 0 any) and address of the"
+    " requests meant",
 )
 
 TABLE: tuple[Register, ...] = (

@@ -1,7 +1,7 @@
 """The simulated dome: a real Modbus TCP server around ``DomeModel``, with faults to order.
 
-Faults are ordered through the register ``fault_order``, so that any process can, and nothing below the registers is faked.
-Run alone (``serve_dome``), or as a process of its own that ends with its parent (``simulated_dome``).
+Faults are ordered through the register ``fault_order``, so that any process can, and nothing below the registers is
+faked. Run alone (``serve_dome``), or as a process of its own that ends with its parent (``simulated_dome``).
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def serve_dome(
     """
     if not 1 <= lights <= reg.MAX_LIGHTS:
         raise RigError(
-            f"A dome with {lights} lights cannot be simulated, the register map holds 1 to {reg.MAX_LIGHTS}; correct --lights."
+            f"A dome with {lights} lights cannot be simulated, the register map holds 1 to {reg.MAX_LIGHTS}; correct"
+            " --lights."
         )
     asyncio.run(_serve(host, port, DomeModel(lights, watchdog_s), announce, with_parent=False))
 

@@ -1,4 +1,6 @@
-"""A folder of named files as a raw folder: ``raw.toml`` from their names and what the first file of each camera holds."""
+"""A folder of named files as a raw folder: ``raw.toml`` from their names and what the first file of each camera
+holds.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,8 @@ class Imported:
     """What was made of a folder.
 
     Attributes:
-        folder: what ``raw.toml`` says now. missing: what a preparation lacks, or would be better with, one sentence each.
+        folder: what ``raw.toml`` says now. missing: what a preparation lacks, or would be better with, one sentence
+            each.
     """
 
     folder: RawFolder
@@ -76,7 +79,8 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         calibration: of the rig.
 
     Raises:
-        CaptureInputError: there is a description already, no file can be understood, or files of a camera differ; names the file.
+        CaptureInputError: there is a description already, no file can be understood, or files of a camera differ; names
+            the file.
     """
     if (root / DESCRIPTION).exists():
         raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")
@@ -99,7 +103,8 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
     if exposure_s is None and (silent := [one.file for one in frames if one.exposure_s is None]):
         which = f"File {silent[0]} does" if len(silent) == 1 else f"File {silent[0]} and {len(silent) - 1} more do"
         raise CaptureInputError(
-            f"{which} not say the exposure; rename them, such as left_L07_0.05s.tif, or give --exposure-s for all of those."
+            f"{which} not say the exposure; rename them, such as left_L07_0.05s.tif, or give --exposure-s for all of"
+            " those."
         )
     scans = sorted(p.name for p in root.iterdir() if p.suffix.lower() in FORMATS)
     content = (
@@ -111,7 +116,8 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
     write_atomic(root / DESCRIPTION, content)
     things = sorted({THING_OF[one.kind] for one in frames if one.kind in THING_OF})
     of_things = [
-        f"Frames of a {thing} are written as comments, since its measures are not known; give them in raw.toml and take the # away."
+        f"Frames of a {thing} are written as comments, since its measures are not known; give them in raw.toml and take"
+        " the # away."
         for thing in things
     ]
     return Imported(folder, (*unnamed, *of_things, *_missing(root, folder, scans)))
@@ -186,7 +192,10 @@ def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[st
     for camera in folder.camera:
         name = camera.name
         if camera.bits is not None:
-            yield f"Camera {name} is taken to have {camera.bits} bits, by its largest count; correct bits where that is wrong."
+            yield (
+                f"Camera {name} is taken to have {camera.bits} bits, by its largest count; correct bits where that is"
+                " wrong."
+            )
         if camera.channels == ("grey",):
             yield f"Camera {name} has one number a pixel and is taken to have no colours; give --mosaic if it has."
         if not folder.frames_of(name, "black"):
@@ -194,11 +203,15 @@ def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[st
         if not folder.frames_of(name, "flat"):
             yield f"Camera {name} has no flat frame; two of one exposure would tell its noise and its fall of light."
         if len(folder.frames_of(name, "tracking")) < MIN_TRACKING:
-            yield f"Camera {name} has fewer than {MIN_TRACKING} tracking frames (all lights on), so motion is followed less well."
+            yield (
+                f"Camera {name} has fewer than {MIN_TRACKING} tracking frames (all lights on), so motion is followed"
+                " less well."
+            )
         elif _is_out_of_order(folder, name):
             yield (
-                f"Tracking frames of camera {name} all stand before or after its lights, as names do not tell when they were taken, and motion "
-                "would be followed wrongly: put the [[frame]] entries in the order taken, or give each its time_s."
+                f"Tracking frames of camera {name} all stand before or after its lights, as names do not tell when they"
+                " were taken, and motion would be followed wrongly: put the [[frame]] entries in the order taken, or"
+                " give each its time_s."
             )
         if lacking := sorted(str(one) for one in lit - {frame.light for frame in folder.frames_of(name, "light")}):
             shown = ", ".join(lacking[:MAX_NAMED]) + (" and more" if len(lacking) > MAX_NAMED else "")

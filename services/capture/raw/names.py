@@ -1,7 +1,7 @@
 """What the name of a photograph says: camera, kind or light, exposure, gain.
 
-The parts of a path are parted by slashes, underscores and blanks. Parts that nothing else explains are the camera, then the
-light; numbers that follow are repetitions::
+The parts of a path are parted by slashes, underscores and blanks. Parts that nothing else explains are the camera, then
+the light; numbers that follow are repetitions::
 
     left_L07_0.05s.tif    left/black_50ms_2.png    right_tracking_003_1-20s.dng    left_flat_0.1s_gain4.npy
 """

@@ -26,7 +26,9 @@ def demo(
     name: Annotated[str, typer.Option(help="Label of the job on the server.")] = "Demonstration",
     as_json: Json = False,
 ) -> None:
-    """Run the demonstration: a simulated dome lights a virtual incisor, and the fit finds its optics; a few minutes on two cores."""
+    """Run the demonstration: a simulated dome lights a virtual incisor, and the fit finds its optics; a few minutes on
+    two cores.
+    """
     from services.api.presets import find_preset
     from services.core.records import JobSpec
 

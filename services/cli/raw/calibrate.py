@@ -21,7 +21,9 @@ def calibrate_command(
     ] = None,
     accept: Annotated[bool, typer.Option("--accept", help="End well though a limit is not kept.")] = False,
 ) -> None:
-    """Calibrate cameras, lights and colours, each with its error; a calibration beyond its limits ends with status 9."""
+    """Calibrate cameras, lights and colours, each with its error; a calibration beyond its limits ends with status
+    9.
+    """
     from services.calibrate.session.report import write_report
     from services.calibrate.session.run import calibrate, write_session
     from services.core.calibration.record import Calibration

@@ -1,11 +1,12 @@
 """Cameras and lights with what a calibration has measured of them beside where they are.
 
-A camera's radiance from its counts, with q the squared distance of the pixel from the principal point, in units of half the
-image's diagonal and in the image as it was taken:
+A camera's radiance from its counts, with q the squared distance of the pixel from the principal point, in units of half
+the image's diagonal and in the image as it was taken:
 
     radiance = (counts - black_counts) / (exposure_s * gain * (1 + a q + b q² + c q³)) * radiance_per_count
 
-Only the product of intensity and radiance can be measured, so the lights' intensities have a mean of 1 in every channel.
+Only the product of intensity and radiance can be measured, so the lights' intensities have a mean of 1 in every
+channel.
 """
 
 from __future__ import annotations
@@ -75,12 +76,17 @@ class Lobe(Record):
 
 
 class CalibratedLight(Light):
-    """A light with its lobe. Its intensity is that along the lobe's axis, which a calibration lays through the white spheres' middle."""
+    """A light with its lobe.
+
+    Its intensity is that along the lobe's axis, which a calibration lays through the white spheres' middle.
+    """
 
     lobe: Lobe | None = Field(default=None, exclude_if=is_absent, description="null for a light that is even")
 
     def towards(self, point_mm: Vector3) -> Light:
-        """The light with the intensity that it has towards a point, and without a lobe; dark where the point lies behind it."""
+        """The light with the intensity that it has towards a point, and without a lobe; dark where the point lies
+        behind it.
+        """
         if self.lobe is None:
             return self
         off = [there - here for there, here in zip(point_mm, self.position_mm, strict=True)]
@@ -94,7 +100,9 @@ class CalibratedLight(Light):
 
 
 class CameraColour(Record):
-    """From a camera's radiance, divided by that of a perfect diffuser in the same light, to XYZ with Y = 1 for that diffuser."""
+    """From a camera's radiance, divided by that of a perfect diffuser in the same light, to XYZ with Y = 1 for that
+    diffuser.
+    """
 
     xyz_from_rgb: Matrix3
     root_polynomial: tuple[tuple[float, ...], ...] | None = Field(

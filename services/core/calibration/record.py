@@ -46,7 +46,10 @@ class CalibrationLimit(Record):
 
 
 class Calibration(Record):
-    """``calibration.json``: cameras and lights of a rig. The part of ``capture.json`` that a rig is calibrated for is one, too."""
+    """``calibration.json``: cameras and lights of a rig.
+
+    The part of ``capture.json`` that a rig is calibrated for is one, too.
+    """
 
     units: Literal["mm"]
     channels: tuple[str, ...] = Field(fail_fast=True)
@@ -77,7 +80,8 @@ class Calibration(Record):
 
 
 def published_capture(capture: Path) -> tuple[Path, str] | None:
-    """Job folder and stage name of a published capture, or of the job that holds one; None for a folder of images or photographs.
+    """Job folder and stage name of a published capture, or of the job that holds one; None for a folder of images or
+    photographs.
 
     Raises:
         CaptureInputError: it is neither.
@@ -123,7 +127,8 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
             raise CaptureInputError(f"{origin} lists {what} {min(repeated)} twice; give each its own name.")
     if len(description.lights) > MAX_LIGHTS:
         raise CaptureInputError(
-            f"{origin} lists {len(description.lights)} lights, more than any rig has ({MAX_LIGHTS}); remove those without images."
+            f"{origin} lists {len(description.lights)} lights, more than any rig has ({MAX_LIGHTS}); remove those"
+            " without images."
         )
     for camera in description.cameras:
         _require_possible(camera, origin)
@@ -132,7 +137,8 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
     for light in description.lights:
         if len(light.intensity) != len(description.channels):
             raise CaptureInputError(
-                f"{origin}: light {light.name} has {len(light.intensity)} intensities for {len(description.channels)} channels; give one per channel."
+                f"{origin}: light {light.name} has {len(light.intensity)} intensities for {len(description.channels)}"
+                " channels; give one per channel."
             )
         dark = [
             channel
@@ -141,7 +147,10 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
         ]
         if dark:
             value = light.intensity[description.channels.index(dark[0])]
-            what = f"{origin}: light {light.name} has intensity {value:g} in channel {dark[0]}, outside {MIN_INTENSITY:g} to {MAX_INTENSITY:g}"
+            what = (
+                f"{origin}: light {light.name} has intensity {value:g} in channel {dark[0]}, outside {MIN_INTENSITY:g}"
+                f" to {MAX_INTENSITY:g}"
+            )
             raise CaptureInputError(f"{what}; give what was measured, or remove the light.")
         if max(map(abs, light.position_mm)) > MAX_DISTANCE_MM:
             raise CaptureInputError(
@@ -155,7 +164,8 @@ def _require_each_channel(camera: CalibratedCamera, channels: int, origin: str) 
         told = getattr(camera, key)
         if told is not None and len(told) != channels:
             raise CaptureInputError(
-                f"{origin}: camera {camera.name} has {key} of {len(told)} channels, and there are {channels}; give one per channel."
+                f"{origin}: camera {camera.name} has {key} of {len(told)} channels, and there are {channels}; give one"
+                " per channel."
             )
 
 
@@ -165,11 +175,15 @@ def _require_possible(camera: Camera, origin: str) -> None:
     width, height = camera.size
     if width * height > MAX_PIXELS:
         raise CaptureInputError(
-            f"{where} has {width} x {height} pixels, more than any camera here ({MAX_PIXELS / 2**20:.0f} million); correct its size."
+            f"{where} has {width} x {height} pixels, more than any camera here ({MAX_PIXELS / 2**20:.0f} million);"
+            " correct its size."
         )
     (fx, skew, cx), (zero, fy, cy), last = camera.K
     if not (0 < fx <= MAX_FOCAL_PX and 0 < fy <= MAX_FOCAL_PX):
-        what = f"{where} has focal lengths K[0][0] = {fx:g} and K[1][1] = {fy:g} pixels, which must lie between 0 and {MAX_FOCAL_PX:g}"
+        what = (
+            f"{where} has focal lengths K[0][0] = {fx:g} and K[1][1] = {fy:g} pixels, which must lie between 0 and"
+            f" {MAX_FOCAL_PX:g}"
+        )
         raise CaptureInputError(f"{what}; correct K.")
     if zero != 0 or last != (0, 0, 1) or abs(skew) > fx or max(abs(cx), abs(cy)) > MAX_FOCAL_PX:
         raise CaptureInputError(
@@ -198,7 +212,8 @@ def recalibrated(description: FolderCapture, calibration: Calibration, path: Pat
     if calibration.channels != description.channels:
         theirs, ours = ", ".join(calibration.channels), ", ".join(description.channels)
         raise CaptureInputError(
-            f"Calibration {path} is for channels {theirs}, but the capture has {ours}; choose the calibration of this rig."
+            f"Calibration {path} is for channels {theirs}, but the capture has {ours}; choose the calibration of this"
+            " rig."
         )
     cameras, lights = (
         {camera.name: camera for camera in calibration.cameras},
@@ -213,7 +228,8 @@ def recalibrated(description: FolderCapture, calibration: Calibration, path: Pat
         if cameras[camera.name].size != camera.size:
             theirs, ours = (" x ".join(map(str, size)) for size in (cameras[camera.name].size, camera.size))
             raise CaptureInputError(
-                f"Calibration {path} is for images of {theirs} pixels of camera {camera.name}, but the capture's are {ours}; calibrate anew."
+                f"Calibration {path} is for images of {theirs} pixels of camera {camera.name}, but the capture's are"
+                f" {ours}; calibrate anew."
             )
     changed: dict[str, object] = {
         "cameras": tuple(cameras[one.name] for one in description.cameras),
@@ -232,6 +248,7 @@ def lit_at(description: FolderCapture, point_mm: Vector3) -> FolderCapture:
     lights = [light.towards(point_mm) if isinstance(light, CalibratedLight) else light for light in description.lights]
     if dark := next((light.name for light in lights if not max(light.intensity) > 0), None):
         raise CaptureInputError(
-            f"Light {dark} shines away from the teeth, as the lobe of its calibration says; choose the calibration of this rig."
+            f"Light {dark} shines away from the teeth, as the lobe of its calibration says; choose the calibration of"
+            " this rig."
         )
     return description.model_copy(update={"lights": tuple(lights)})

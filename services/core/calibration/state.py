@@ -32,7 +32,8 @@ def age_days(made: str | None, now_s: float) -> float | None:
 def state_of(
     made: str | None, valid_days: float | None, broken: tuple[str, ...] | None, now_s: float
 ) -> CalibrationState:
-    """One word on a calibration: beyond its limits counts before old; not known where it states neither limits nor a life.
+    """One word on a calibration: beyond its limits counts before old; not known where it states neither limits nor a
+    life.
 
     Args:
         made, valid_days: of the record.
@@ -60,8 +61,8 @@ def warning_of_age(calibration: Calibration, name: str, now_s: float) -> str | N
     if age is None or calibration.valid_days is None or age <= calibration.valid_days:
         return None
     return (
-        f"Calibration {name} is {age:.0f} days old and was made to hold for {calibration.valid_days:g}: the rig may have moved since; "
-        "calibrate again, and compare the two with dentine calibrate --against."
+        f"Calibration {name} is {age:.0f} days old and was made to hold for {calibration.valid_days:g}: the rig may"
+        " have moved since; calibrate again, and compare the two with dentine calibrate --against."
     )
 
 

@@ -11,10 +11,10 @@ camera.CAMERA.AXIS             a camera moved; also its fx, fy, cx, cy          
 light.LIGHT.x, .y, .z          one light moved                                              mm
 =============================  ===========================================================  ==================
 
-AXIS is rx, ry, rz (a rotation vector, rad) or tx, ty, tz (mm), in the world's axes; teeth turn about the mean of their vertices,
-the dome about the mean of its lights. Moves of single cameras are read and checked, and no fit uses them yet; of single lights'
-moves a tooth's fit uses, with light_gain, what they do to the light's irradiance at the teeth. The brightest pixel of a camera is
-the greatest radiance among its valid pixels in that channel, over all its photographs.
+AXIS is rx, ry, rz (a rotation vector, rad) or tx, ty, tz (mm), in the world's axes; teeth turn about the mean of their
+vertices, the dome about the mean of its lights. Moves of single cameras are read and checked, and no fit uses them yet;
+of single lights' moves a tooth's fit uses, with light_gain, what they do to the light's irradiance at the teeth. The
+brightest pixel of a camera is the greatest radiance among its valid pixels in that channel, over all its photographs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ LENS = ("fx", "fy", "cx", "cy")
 
 
 class CalibrationUncertainty(Record):
-    """Covariance of a calibration's errors. Errors that it does not name take the fit's defaults, independent of these."""
+    """Covariance of a calibration's errors.
+
+    Errors that it does not name take the fit's defaults, independent of these.
+    """
 
     names: tuple[str, ...] = Field(max_length=MAX_ERRORS, fail_fast=True, description="such as gain.red")
     covariance: tuple[tuple[float, ...], ...] = Field(

@@ -14,7 +14,8 @@ MAX_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 def map_radiance(path: Path, shape: tuple[int, int, int], what: str) -> NDArray[np.floating[Any]]:
-    """Map a .npy file of floating-point numbers (height, width, channels); not a byte of its content is read yet, whatever its header declares.
+    """Map a .npy file of floating-point numbers (height, width, channels); not a byte of its content is read yet,
+    whatever its header declares.
 
     Args:
         shape: as the camera says; one channel may go without its axis.
@@ -36,7 +37,8 @@ def map_radiance(path: Path, shape: tuple[int, int, int], what: str) -> NDArray[
         raise CaptureInputError(f"{what} does not hold floating-point radiance; export linear values as float32.")
     if image.shape != shape and not (shape[2] == 1 and image.shape == shape[:2]):
         raise CaptureInputError(
-            f"{what} has shape {image.shape} instead of {shape} (height, width, channels); export it at the camera's size."
+            f"{what} has shape {image.shape} instead of {shape} (height, width, channels); export it at the camera's"
+            " size."
         )
     return image.reshape(shape)
 

@@ -22,7 +22,8 @@ def require_folder(path: Path, option: str) -> None:
         raise InputError(f"{option} {path} cannot be a folder, as {nearest} is a file; name another one.")
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise InputError(
-            f"{option} {path} cannot be written, as {nearest} takes no new file; correct its permissions or name another one."
+            f"{option} {path} cannot be written, as {nearest} takes no new file; correct its permissions or name"
+            " another one."
         )
 
 

@@ -100,7 +100,9 @@ def _png(head: bytes) -> Declared:
 
 @dataclass(frozen=True)
 class TiffLayout:
-    """How a TIFF's directories are written: byte order, ``struct`` formats of a count of entries and of an offset, and where the first one lies."""
+    """How a TIFF's directories are written: byte order, ``struct`` formats of a count of entries and of an offset, and
+    where the first one lies.
+    """
 
     order: str
     count: str

@@ -1,4 +1,7 @@
-"""What an image says beside its pixels: who, where, when, which device. Only what pixels need to be shown is let pass; everything else has a name here."""
+"""What an image says beside its pixels: who, where, when, which device.
+
+Only what pixels need to be shown is let pass; everything else has a name here.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from services.core.files.image_headers import HEADER_BYTES, PNG_SIGNATURE, exr_p
 
 _MAX_PARTS = 250_000
 _PNG_PLAIN = frozenset(
-    b"IHDR PLTE IDAT IEND tRNS cHRM gAMA iCCP sBIT sRGB cICP mDCV cLLI bKGD hIST pHYs sPLT acTL fcTL fdAT".split()  # colours, animation, aspect
+    b"IHDR PLTE IDAT IEND tRNS cHRM gAMA iCCP sBIT sRGB cICP mDCV cLLI bKGD hIST pHYs sPLT acTL fcTL fdAT".split()
 )
 _SOFTWARE = b"Software"
 _TIFF_PLAIN = frozenset(
@@ -142,7 +145,10 @@ def metadata_fault(path: Path, name: str, suffix: str) -> str | None:
     if not found:
         return None
     listed = ", ".join(found[:5]) + (f" and {len(found) - 5} more" if len(found) > 5 else "")
-    return f"Image {name} carries metadata ({listed}), which may say whose teeth these are; export it without metadata, or leave it out."
+    return (
+        f"Image {name} carries metadata ({listed}), which may say whose teeth these are; export it without metadata, or"
+        " leave it out."
+    )
 
 
 def plain_png(content: bytes) -> bytes:
@@ -179,7 +185,8 @@ def _png(stream: BinaryIO) -> Iterator[str]:
 
 
 def _tiff(stream: BinaryIO) -> Iterator[str]:
-    # Directories and lists of offsets may lie one over the other, so a small file can hold many long ones: what counts is their sum.
+    # Directories and lists of offsets may lie one over the other, so a small file can hold many long ones: what counts
+    # is their sum.
     layout = tiff_layout(stream.read(16))
     waiting, seen, parts = [layout.start], set[int](), 0
     while waiting:

@@ -1,4 +1,6 @@
-"""Read and write meshes: the one place that chooses a mesh file format. trimesh does the parsing; ``scans`` reads labelled scans."""
+"""Read and write meshes: the one place that chooses a mesh file format. trimesh does the parsing; ``scans`` reads
+labelled scans.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 def write_mapped_mesh(path: Path, mesh: Mesh, corners_uv: NDArray[np.float64]) -> None:
-    """Write a binary PLY with texture coordinates (F, 3, 2) as ``u`` and ``v``; vertices on a seam are written once for each side of it."""
+    """Write a binary PLY with texture coordinates (F, 3, 2) as ``u`` and ``v``; vertices on a seam are written once for
+    each side of it.
+    """
     corners = np.concatenate([mesh.vertices_mm[mesh.faces], corners_uv], axis=-1).astype("<f4").reshape(-1, 5)
     vertices, index = np.unique(corners, axis=0, return_inverse=True)
     faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
@@ -80,7 +84,8 @@ def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, .
     if unknown := next((number for number in numbers if number not in FDI_NUMBERS), None):
         what = f"{root / 'teeth' / str(unknown)} is of tooth {unknown}, which is no FDI number"
         raise CaptureInputError(
-            f"{what}; permanent teeth are 11 to 18, 21 to 28, 31 to 38 and 41 to 48, milk teeth 51 to 55 and so on to 85."
+            f"{what}; permanent teeth are 11 to 18, 21 to 28, 31 to 38 and 41 to 48, milk teeth 51 to 55 and so on"
+            " to 85."
         )
     if not numbers:
         raise CaptureInputError(f"No tooth mesh below {root / 'teeth'}; put teeth/<FDI>/outer.ply there.")
@@ -104,5 +109,8 @@ def _require_apart(teeth: list[Tooth]) -> None:
     for k, tooth in enumerate(teeth):
         for n in range(k):
             if np.linalg.norm(centres[k] - centres[n]) < MIN_SPACING_MM:
-                what = f"Teeth {teeth[n].fdi} and {tooth.fdi} lie in each other: their centres are less than {MIN_SPACING_MM:g} mm apart"
+                what = (
+                    f"Teeth {teeth[n].fdi} and {tooth.fdi} lie in each other: their centres are less than"
+                    f" {MIN_SPACING_MM:g} mm apart"
+                )
                 raise MeshError(f"{what}; export each in its own place.")

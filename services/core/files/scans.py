@@ -1,4 +1,6 @@
-"""Read a scan's file as it stands, with what it says of each triangle and of each vertex: VTK PolyData, PLY, STL and OBJ."""
+"""Read a scan's file as it stands, with what it says of each triangle and of each vertex: VTK PolyData, PLY, STL and
+OBJ.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from services.core.geometry import Mesh
 FORMATS = (".vtp", ".ply", ".stl", ".obj")
 SIDECARS = (".json", ".npy", ".txt", ".csv")
 MAX_TRIANGLES = 2_000_000
-"""Ten times those of a fine intra-oral scan; repairing more takes minutes and gigabytes, and shows nothing more of a tooth."""
+"""Ten times those of a fine intra-oral scan; repairing more takes minutes and gigabytes, and shows nothing more of a
+tooth."""
 STL_HEADER_BYTES, STL_TRIANGLE_BYTES = 84, 50
 """Of a binary STL file: 80 bytes of text and a count, then 50 bytes a triangle."""
 PLY_HEAD_BYTES = 65536
@@ -27,7 +30,9 @@ PLY_HEAD_BYTES = 65536
 
 @dataclass(frozen=True)
 class ScanFile:
-    """A surface in its file's unit, and arrays by name, of each triangle (F,) or (F, components) and of each vertex (V,)."""
+    """A surface in its file's unit, and arrays by name, of each triangle (F,) or (F, components) and of each vertex
+    (V,).
+    """
 
     mesh: Mesh
     triangle_arrays: dict[str, NDArray[Any]]
@@ -69,7 +74,8 @@ def require_few_triangles(path: Path, count: int) -> None:
 
 
 def read_sidecar(path: Path) -> NDArray[np.float64]:
-    """Labels from a file beside the scan: numbers one a line (.txt, .csv), an array (.npy), or ``labels`` of a .json file.
+    """Labels from a file beside the scan: numbers one a line (.txt, .csv), an array (.npy), or ``labels`` of a .json
+    file.
 
     Raises:
         CaptureInputError: absent, of another format, or no list of numbers.
@@ -84,7 +90,8 @@ def read_sidecar(path: Path) -> NDArray[np.float64]:
         return np.array(path.read_text().replace(",", " ").split(), dtype=np.float64)
     except (ValueError, KeyError, TypeError, EOFError) as problem:
         raise CaptureInputError(
-            f"Label file {path} cannot be read ({problem}); give one number a line, an .npy array or a .json file with 'labels'."
+            f"Label file {path} cannot be read ({problem}); give one number a line, an .npy array or a .json file with"
+            " 'labels'."
         ) from problem
 
 

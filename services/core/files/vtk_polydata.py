@@ -1,4 +1,5 @@
-"""Read triangle surfaces from VTK XML PolyData (.vtp): ascii, base64 and raw, inline and appended, plain and zlib-compressed.
+"""Read triangle surfaces from VTK XML PolyData (.vtp): ascii, base64 and raw, inline and appended, plain and
+zlib-compressed.
 
 Source: The VTK User's Guide, "VTK File Formats", XML file formats; the binary layout is that of vtkXMLDataParser.
 """
@@ -32,7 +33,9 @@ COMPRESSOR = "vtkZLibDataCompressor"
 
 @dataclass(frozen=True)
 class PolyData:
-    """Points (V, 3) in the file's unit, triangles (F, 3), and what the file says of each triangle, (F,) or (F, components)."""
+    """Points (V, 3) in the file's unit, triangles (F, 3), and what the file says of each triangle, (F,) or (F,
+    components).
+    """
 
     points: NDArray[np.float64]
     triangles: NDArray[np.int32]
@@ -41,7 +44,8 @@ class PolyData:
 
 @dataclass
 class _Document:
-    # What stands before the appended bytes: attributes of the file, of its pieces, and every DataArray with its section and text.
+    # What stands before the appended bytes: attributes of the file, of its pieces, and every DataArray with its section
+    # and text.
     file: dict[str, str] = field(default_factory=dict)
     pieces: list[dict[str, str]] = field(default_factory=list)
     appended: dict[str, str] = field(default_factory=dict)
@@ -69,7 +73,8 @@ def _polydata(path: Path, content: bytes) -> PolyData:
     document = _parse(head)
     if document.file.get("type") != "PolyData":
         raise CaptureInputError(
-            f"Mesh file {path} holds VTK {document.file.get('type', 'data of no type')}; export the surface as PolyData (.vtp)."
+            f"Mesh file {path} holds VTK {document.file.get('type', 'data of no type')}; export the surface as PolyData"
+            " (.vtp)."
         )
     compressor = document.file.get("compressor", COMPRESSOR)
     if compressor != COMPRESSOR:
@@ -106,7 +111,8 @@ def _polydata(path: Path, content: bytes) -> PolyData:
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:
-    # Appended bytes may be raw, which no XML parser reads; they lie between the first underscore and the last closing tag.
+    # Appended bytes may be raw, which no XML parser reads; they lie between the first underscore and the last closing
+    # tag.
     opening = content.find(b"<AppendedData")
     if opening < 0:
         return content, b""

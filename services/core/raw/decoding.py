@@ -1,7 +1,8 @@
 """Numbers of an image file as they were written: no colour management, no scaling, no rotation.
 
-The libraries are imported by the function that needs one. Whole numbers come from PNG, TIFF, NPY and camera raw files, single
-precision from EXR, TIFF and NPY. Decoders of two libraries are used, as OpenCV returns a part of a cut-off PNG without a word.
+The libraries are imported by the function that needs one. Whole numbers come from PNG, TIFF, NPY and camera raw files,
+single precision from EXR, TIFF and NPY. Decoders of two libraries are used, as OpenCV returns a part of a cut-off PNG
+without a word.
 """
 
 from __future__ import annotations
@@ -132,7 +133,8 @@ def _of_extra(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError as problem:
         raise PlatformError(
-            f"The package {name} is not installed; install dentine[raw] on this machine, or export PNG, TIFF or NPY files."
+            f"The package {name} is not installed; install dentine[raw] on this machine, or export PNG, TIFF or NPY"
+            " files."
         ) from problem
 
 

@@ -52,12 +52,13 @@ def read_calibration(root: Path, folder: RawFolder, chosen: Path | None) -> Cali
         if own.size != camera.size:
             theirs, ours = (" x ".join(map(str, size)) for size in (own.size, camera.size))
             raise CaptureInputError(
-                f"Calibration {path} is for images of {theirs} pixels of camera {camera.name}, but {root} has {ours}; calibrate anew."
+                f"Calibration {path} is for images of {theirs} pixels of camera {camera.name}, but {root} has {ours};"
+                " calibrate anew."
             )
         if own.radiance_per_count is None:
             raise CaptureInputError(
-                f"Calibration {path} does not say radiance_per_count of camera {camera.name}, so its counts have no scale; "
-                "calibrate the lights by a white sphere, or add it by hand."
+                f"Calibration {path} does not say radiance_per_count of camera {camera.name}, so its counts have no"
+                " scale; calibrate the lights by a white sphere, or add it by hand."
             )
     if calibration.channels != folder.channels:
         theirs, ours = ", ".join(calibration.channels), ", ".join(folder.channels)
@@ -83,7 +84,8 @@ def described(root: Path, folder: RawFolder, calibration: Calibration, teeth_roo
     if absent := [light.name for light in folder.light if light.name in lit and light.name not in known]:
         file = next(frame.file for frame in folder.frame if frame.light == absent[0])
         raise CaptureInputError(
-            f"The calibration of {root} lacks light {absent[0]}, under which frame {file} was taken; choose that of this rig."
+            f"The calibration of {root} lacks light {absent[0]}, under which frame {file} was taken; choose that of"
+            " this rig."
         )
     by_name = {camera.name: camera for camera in calibration.cameras}
     return FolderCapture(

@@ -15,13 +15,15 @@ from services.core.raw.records import RawCamera, RawFolder, RawFrame
 Counts = NDArray[np.uint16] | NDArray[np.float32]
 _LETTERS = {"red": "R", "green": "G", "blue": "B"}
 GREENS_APART = 4.0
-"""How many times further apart the two green pixels of a mosaic may be than its red and blue ones before it is taken for another."""
+"""How many times further apart the two green pixels of a mosaic may be than its red and blue ones before it is taken
+for another."""
 BRIGHT_PERCENT = 75
 """Cells brighter than so many others are looked at: the rest may be black."""
 MIN_CELLS = 32
 """Cells without which nothing is said."""
 CLEARLY_APART = 0.05
-"""Half of the relative difference of a cell's green pixels below which nothing is said: sensors' two greens differ by 1 or 2 %."""
+"""Half of the relative difference of a cell's green pixels below which nothing is said: sensors' two greens differ by 1
+or 2 %."""
 
 
 def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
@@ -101,8 +103,9 @@ def _significant(values: NDArray[np.generic], camera: RawCamera) -> Counts:
     held = 8 * values.dtype.itemsize
     if camera.bits + camera.shift > held:
         raise ValueError(
-            f"has {held} bits a count, but its camera has {camera.bits}{f' moved up by {camera.shift}' if camera.shift else ''}; "
-            "export it at the camera's depth, or correct bits and shift"
+            f"has {held} bits a count, but its camera has"
+            f" {camera.bits}{f' moved up by {camera.shift}' if camera.shift else ''}; export it at the camera's depth,"
+            " or correct bits and shift"
         )
     counts = values.astype(np.uint16) >> np.uint16(camera.shift)
     most = int(counts.max())
@@ -128,7 +131,8 @@ def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> Non
         return
     if min(counts.shape) < 2:
         raise ValueError("is too small to hold a mosaic; correct mosaic")
-    # Both greens see the same light. Where they differ in most cells and the other two agree, the pattern begins one pixel further.
+    # Both greens see the same light. Where they differ in most cells and the other two agree, the pattern begins one
+    # pixel further.
     height, width = (length // 2 * 2 for length in counts.shape)
     cells = [counts[k // 2 : height : 2, k % 2 : width : 2].astype(np.float32) for k in range(4)]
     bright = sum(cells) >= np.percentile(sum(cells), BRIGHT_PERCENT)

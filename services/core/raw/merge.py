@@ -1,4 +1,6 @@
-"""Several exposures of the same light as one image, each pixel weighted by its shot and read noise (Hasinoff et al. 2010)."""
+"""Several exposures of the same light as one image, each pixel weighted by its shot and read noise (Hasinoff et al.
+2010).
+"""
 
 from __future__ import annotations
 
@@ -37,9 +39,11 @@ class Exposure:
 
 
 def merge(exposures: Sequence[Exposure], noise: NoiseModel) -> tuple[Image, Image, BoolArray]:
-    """Counts per second at gain 1 and level 1, their variance, and where every exposure is full; shapes as the signals'.
+    """Counts per second at gain 1 and level 1, their variance, and where every exposure is full; shapes as the
+    signals'.
 
-    Weights are inverse variances at the *expected* signal. Those of the noisy count itself would prefer counts that came out low.
+    Weights are inverse variances at the *expected* signal. Those of the noisy count itself would prefer counts that
+    came out low.
     """
     order = sorted(exposures, key=lambda one: one.factor)
     usable = [order[0].headroom > 0]

@@ -25,7 +25,8 @@ def sites(counts: NDArray[N], mosaic: Mosaic) -> list[tuple[int, NDArray[N]]]:
 
 
 def binned(counts: NDArray[Any], mosaic: Mosaic) -> NDArray[np.float32]:
-    """Image of half the size (H // 2, W // 2, 3), each channel the mean of its pixels in each 2 x 2; nothing is interpolated.
+    """Image of half the size (H // 2, W // 2, 3), each channel the mean of its pixels in each 2 x 2; nothing is
+    interpolated.
 
     Red and blue are sampled a quarter of a binned pixel beside its centre, in opposite directions.
     """

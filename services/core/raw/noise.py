@@ -1,11 +1,12 @@
 """A camera's noise, measured from pairs of its own frames by photon transfer.
 
-Two frames of the same thing differ by noise alone, whatever pattern both share. The variance of a count above black s is
+Two frames of the same thing differ by noise alone, whatever pattern both share. The variance of a count above black s
+is
 
     variance(s) = (read * gain)² + 1/12 + counts_per_electron * gain * s
 
-(Janesick 2007, Photon Transfer; EMVA 1288): what reading adds, what rounding adds, and the Poisson noise of the electrons. So
-pairs of black frames tell the first, and pairs of lit ones the slope.
+(Janesick 2007, Photon Transfer; EMVA 1288): what reading adds, what rounding adds, and the Poisson noise of the
+electrons. So pairs of black frames tell the first, and pairs of lit ones the slope.
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ class LitPair:
 def read_noise(black: Sequence[Image], gain: float) -> float | None:
     """Read noise at gain 1 before rounding, counts, from black frames of one exposure; None from fewer than two.
 
-    Rounding adds 1/12 to the variance where the noise is above half a count; below that the result is a bound from above.
+    Rounding adds 1/12 to the variance where the noise is above half a count; below that the result is a bound from
+    above.
     """
     if len(black) < 2:
         return None
@@ -120,7 +122,9 @@ def clipped_variance(values: Image) -> float:
 
 
 def _bins(pair: LitPair) -> Iterable[tuple[float, float, float, int]]:
-    """Ratio of brightness, mean signal of the first frame, variance of the difference, number of pixels; per level of signal."""
+    """Ratio of brightness, mean signal of the first frame, variance of the difference, number of pixels; per level of
+    signal.
+    """
     usable = np.isfinite(pair.first) & np.isfinite(pair.second)
     first, second = pair.first[usable].astype(np.float64), pair.second[usable].astype(np.float64)
     if first.size < MIN_IN_BIN or second.sum() <= 0 or first.sum() <= 0:
@@ -128,7 +132,8 @@ def _bins(pair: LitPair) -> Iterable[tuple[float, float, float, int]]:
     # The ratio of the sums takes out a flickering light as well as another exposure.
     ratio = float(first.sum() / second.sum())
     difference = first - ratio * second
-    # The sum of both frames is uncorrelated with this difference where shot noise prevails, so binning by it selects no noise.
+    # The sum of both frames is uncorrelated with this difference where shot noise prevails, so binning by it selects no
+    # noise.
     level = (first + second) * ratio / (1 + ratio)
     for chosen in np.array_split(np.argsort(level, kind="stable"), max(1, min(BINS, first.size // MIN_IN_BIN))):
         if len(chosen) >= MIN_IN_BIN:

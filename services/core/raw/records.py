@@ -67,7 +67,8 @@ class RawCamera(Record):
             raise ValueError(f"bits = {self.bits} and shift = {self.shift} go beyond the {MAX_BITS} bits of a file")
         if self.bits is not None and self.saturation_counts is not None and self.saturation_counts > 2**self.bits - 1:
             raise ValueError(
-                f"saturation_counts = {self.saturation_counts:g} is more than {self.bits} bits hold ({2**self.bits - 1})"
+                f"saturation_counts = {self.saturation_counts:g} is more than {self.bits} bits hold"
+                f" ({2**self.bits - 1})"
             )
         if twice := _repeated(self.channels):
             raise ValueError(f"channel {twice} is listed twice")
@@ -176,7 +177,8 @@ class RawFolder(Record):
             if set(camera.channels) != set(self.channels):
                 ours, theirs = ", ".join(camera.channels), ", ".join(self.channels)
                 raise ValueError(
-                    f"camera {camera.name} has channels {ours}, but {self.camera[0].name} has {theirs}; all need the same"
+                    f"camera {camera.name} has channels {ours}, but {self.camera[0].name} has {theirs}; all need the"
+                    " same"
                 )
         self._require_known()
         if twice := _repeated(frame.file for frame in self.frame):

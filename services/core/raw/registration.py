@@ -25,7 +25,10 @@ class RegistrationStep(Record):
     name: Literal["landmarks", "outlines"]
     rig_from_scan: Matrix4 = Field(description="rigid transform, mm")
     covariance: tuple[tuple[float, ...], ...] = Field(
-        description="6 x 6 of a twist about the teeth's centre: rotation vector in rad, then translation in mm, in the rig's axes"
+        description=(
+            "6 x 6 of a twist about the teeth's centre: rotation vector in rad, then translation in mm, in the rig's"
+            " axes"
+        )
     )
     residual_px: dict[str, float] = Field(
         description="camera -> median distance between what is predicted and what is seen"
@@ -71,7 +74,8 @@ def teeth_root(capture: Path, job: Path) -> Path:
 
 
 def with_registration(root: Path, uncertainty: CalibrationUncertainty | None) -> CalibrationUncertainty | None:
-    """A calibration's uncertainty with that of the teeth's pose, where the teeth of a raw folder come from a registration.
+    """A calibration's uncertainty with that of the teeth's pose, where the teeth of a raw folder come from a
+    registration.
 
     What the calibration itself says of the teeth is replaced. Both are taken for independent.
 

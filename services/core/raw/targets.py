@@ -1,4 +1,6 @@
-"""What the photographs of a raw folder show beside teeth: boards, spheres, charts, and the scan that the teeth come from."""
+"""What the photographs of a raw folder show beside teeth: boards, spheres, charts, and the scan that the teeth come
+from.
+"""
 
 from __future__ import annotations
 
@@ -76,8 +78,10 @@ class Chart(Record):
     name: Name
     type: Literal["colorchecker-24"]
     reference: FileName = Field(
-        description=".csv of patches 1 to 24, row by row from the dark skin: X, Y, Z under D50 with Y = 100 for a perfect "
-        "diffuser, or one column a wavelength"
+        description=(
+            ".csv of patches 1 to 24, row by row from the dark skin: X, Y, Z under D50 with Y = 100 for a perfect "
+            "diffuser, or one column a wavelength"
+        )
     )
 
 
@@ -96,8 +100,10 @@ class ScanFile(Record):
     units: Literal["mm", "cm", "m", "um", "inch"]
     labels: str | None = Field(
         default=None,
-        description="property of the scan's faces or vertices that holds the labels, or a file beside it; default: Label "
-        "where the scan has it, else landmarks part the teeth, one at least on each",
+        description=(
+            "property of the scan's faces or vertices that holds the labels, or a file beside it; default: Label "
+            "where the scan has it, else landmarks part the teeth, one at least on each"
+        ),
     )
     jaw: Literal["upper", "lower", "both"]
 

@@ -42,7 +42,8 @@ class SlabExposure(Record):
         if self.bits is not None and self.saturation_counts is not None and self.saturation_counts > 2**self.bits - 1:
             most = 2**self.bits - 1
             raise ValueError(
-                f"exposure {self.file} has saturation_counts {self.saturation_counts:g}, more than {self.bits} bits hold ({most})"
+                f"exposure {self.file} has saturation_counts {self.saturation_counts:g}, more than {self.bits} bits"
+                f" hold ({most})"
             )
         return self
 
@@ -59,7 +60,10 @@ def exposures_fault(exposures: Sequence[SlabExposure], wavelengths_nm: Sequence[
         return f"file {min(twice)} is listed in two exposures; keep one of them"
     for one in exposures:
         if one.wavelength_nm is not None and one.wavelength_nm not in wavelengths_nm:
-            return f"exposure {one.file} has wavelength_nm {one.wavelength_nm:g}, which is not listed; add it or correct it"
+            return (
+                f"exposure {one.file} has wavelength_nm {one.wavelength_nm:g}, which is not listed; add it or"
+                " correct it"
+            )
     black = [one for one in exposures if one.kind == "black"]
     for one in exposures:
         if one.kind == "black":
@@ -67,7 +71,7 @@ def exposures_fault(exposures: Sequence[SlabExposure], wavelengths_nm: Sequence[
         wavelength_nm = wavelengths_nm[0] if one.wavelength_nm is None else one.wavelength_nm
         if not any(dark.camera == one.camera and dark.holds_at(wavelength_nm, wavelengths_nm) for dark in black):
             return (
-                f"camera {one.camera} has no black exposure, so the zero of {one.file} is unknown; take one with the beam off "
-                "and list it with kind black"
+                f"camera {one.camera} has no black exposure, so the zero of {one.file} is unknown; take one with the"
+                " beam off and list it with kind black"
             )
     return None

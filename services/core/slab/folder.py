@@ -51,8 +51,10 @@ class Beam(Record):
     radius_mm: Positive | None = None
     power: Positive = Field(
         default=1.0,
-        description="before any Fresnel loss; images are given per unit of it, exposures are divided by it, so there it is what the camera "
-        "would count of the whole beam: counts per s at gain 1, mm2 and sr",
+        description=(
+            "before any Fresnel loss; images are given per unit of it, exposures are divided by it, so there it is what"
+            " the camera would count of the whole beam: counts per s at gain 1, mm2 and sr"
+        ),
     )
 
     @model_validator(mode="after")
@@ -153,7 +155,8 @@ class SlabFolder(Record):
             key = image.camera, image.light, self.wavelength_of(image)
             if key in seen:
                 raise ValueError(
-                    f"image {image.file}: camera {key[0]} under light {key[1]} at {key[2]:g} nm is listed twice; keep one"
+                    f"image {image.file}: camera {key[0]} under light {key[1]} at {key[2]:g} nm is listed twice;"
+                    " keep one"
                 )
             seen.add(key)
         return self
@@ -187,7 +190,8 @@ class SlabFolder(Record):
             )
         if image.wavelength_nm is not None and image.wavelength_nm not in self.wavelengths_nm:
             raise ValueError(
-                f"image {image.file} has wavelength_nm {image.wavelength_nm:g}, which is not listed; add it or correct it"
+                f"image {image.file} has wavelength_nm {image.wavelength_nm:g}, which is not listed; add it or"
+                " correct it"
             )
 
     def _entries(self) -> tuple[SlabImage, ...]:

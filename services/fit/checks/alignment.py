@@ -24,14 +24,16 @@ LOOKED_AT = 0.05
 MIN_MM = 0.5
 """Least offset that is told; a registration of scan and photographs is good to about 0.1 mm."""
 MIN_PX = 0.75
-"""And in pixels of the fit, which may be a millimetre wide: nearer to the next pixel than to its own place. A whole pixel was too much: three rendered
-teeth 1 mm aside in pixels of 1 mm were told in 96 of 144 cameras with it, in 144 without, and in place in none of 72."""
+"""And in pixels of the fit, which may be a millimetre wide: nearer to the next pixel than to its own place. A whole
+pixel was too much: three rendered teeth 1 mm aside in pixels of 1 mm were told in 96 of 144 cameras with it, in 144
+without, and in place in none of 72."""
 MIN_GAIN = 0.55
 """Share of the unexplained squared difference that an offset has to take away. Rendered teeth off by 1 mm gave 0.53 to
-1; in place 0, with stains, gums or absorption that the render lacks too, and at most 0.5 with a third of the scattering."""
+1; in place 0, with stains, gums or absorption that the render lacks too, and at most 0.5 with a third of the
+scattering."""
 MIN_Z = 3.0
-"""Standard errors that what goes away has to reach. Noise passes at one shift with a chance of 1e-3, and is tried at some
-300 that are far from independent: of 720 draws in place, 480 of them of a dim image alone, none reached 2."""
+"""Standard errors that what goes away has to reach. Noise passes at one shift with a chance of 1e-3, and is tried at
+some 300 that are far from independent: of 720 draws in place, 480 of them of a dim image alone, none reached 2."""
 MIN_SE_MM = 0.01
 """Least ± that is told: what an offset is off by besides noise, such as by its pixels, is more."""
 MIN_PIXELS = 16
@@ -66,8 +68,8 @@ class Offset:
             f"about {self.length_mm:.1f} mm apart, ± {max(self.length_se_mm, MIN_SE_MM):.1g} mm by the noise of both"
         )
         return (
-            f"In camera {self.camera} images and {what} are {apart} (the images lie {' and '.join(parts)}); "
-            "how far along the line of sight cannot be seen in this way; recalibrate the camera or register the mesh again."
+            f"In camera {self.camera} images and {what} are {apart} (the images lie {' and '.join(parts)}); how far"
+            " along the line of sight cannot be seen in this way; recalibrate the camera or register the mesh again."
         )
 
 
@@ -108,7 +110,8 @@ def _compared(
             if camera != view.camera.name:
                 continue
             light = int(seen[shown])
-            # What lies beside the teeth is compared too: a mask that was drawn from a wrong pose hides the very pixels that tell.
+            # What lies beside the teeth is compared too: a mask that was drawn from a wrong pose hides the very pixels
+            # that tell.
             usable = whole_squares(
                 level.bits(number, light, whole_camera) & ~np.uint16(MaskBit.OUTSIDE) == 0, level.step
             )

@@ -2,9 +2,10 @@
 
     err^2 = [sum (C1 - ref)(C2 - ref) - sum var_ref] / [sum ref^2 - sum var_ref]
 
-over valid pixels, linear radiance, C1 and C2 two independent renders. Monte Carlo noise cancels in the product, sensor noise in the subtraction, so a
-perfect model scores 0 on average whatever the noise; a negative square is noise and counts as 0. What is reported is
-never below its own Monte Carlo error, so that few samples cannot look like a perfect fit.
+over valid pixels, linear radiance, C1 and C2 two independent renders. Monte Carlo noise cancels in the product, sensor
+noise in the subtraction, so a perfect model scores 0 on average whatever the noise; a negative square is noise and
+counts as 0. What is reported is never below its own Monte Carlo error, so that few samples cannot look like a perfect
+fit.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class ErrorSums:
     reference_squared: float = 0.0
     reference_variance: float = 0.0
     product_noise: float = 0.0
-    """Monte Carlo variance of ``product``; the lights of a pixel share their walks, so their errors are summed before they are squared."""
+    """Monte Carlo variance of ``product``; the lights of a pixel share their walks, so their errors are summed before
+    they are squared."""
 
     def __add__(self, other: ErrorSums) -> ErrorSums:
         return ErrorSums(
@@ -50,7 +52,9 @@ class ErrorSums:
 
     @property
     def loss(self) -> float | None:
-        """Relative squared error, the reference's noise included, and not below its own standard error: what the samples resolve."""
+        """Relative squared error, the reference's noise included, and not below its own standard error: what the
+        samples resolve.
+        """
         signal = self.reference_squared
         return float(max(self.product, np.sqrt(self.product_noise)) / signal) if signal > 0 else None
 
@@ -61,7 +65,9 @@ class ErrorSums:
 
     @property
     def error_se(self) -> float | None:
-        """One standard error of ``error`` by Monte Carlo noise; at error 0 the error whose square is one standard error of the square."""
+        """One standard error of ``error`` by Monte Carlo noise; at error 0 the error whose square is one standard error
+        of the square.
+        """
         error, signal = self.error, self.reference_squared - self.reference_variance
         if error is None:
             return None
@@ -70,7 +76,9 @@ class ErrorSums:
 
 
 def error_sums(first: Array, second: Array, reference: Array, variance: Array, chosen: NDArray[np.bool_]) -> ErrorSums:
-    """Sums over the chosen measurements of two independent renders against a reference; all arrays (L, N), or (N,) of one light."""
+    """Sums over the chosen measurements of two independent renders against a reference; all arrays (L, N), or (N,) of
+    one light.
+    """
     a, b, r, v = (np.where(chosen, values, 0.0) for values in (first, second, reference, variance))
     spread = np.atleast_2d((a - b) * (0.5 * (a + b) - r)).sum(axis=0)
     return ErrorSums(float(((a - r) * (b - r)).sum()), float((r * r).sum()), float(v.sum()), float(spread @ spread))
@@ -78,7 +86,9 @@ def error_sums(first: Array, second: Array, reference: Array, variance: Array, c
 
 @dataclass(frozen=True)
 class FrameSums:
-    """Sums over pixels that both lights have, (L, L): row the render's light, column the photograph's; blocks of one camera add."""
+    """Sums over pixels that both lights have, (L, L): row the render's light, column the photograph's; blocks of one
+    camera add.
+    """
 
     product: Array
     """(C1 - ref)(C2 - ref) less the reference's variance, of two independent renders."""
@@ -119,7 +129,8 @@ class Evaluation:
     parts: dict[int, tuple[ErrorSums, ErrorSums]] = field(default_factory=dict)
     """Of a jaw: sums on fitted and on held-out images by what the pixels show (``blocks.PixelParts``)."""
     spreads: dict[tuple[str, int], Array] = field(default_factory=dict)
-    """Of the images in ``renders``, half of what the two renders differ by (N,): one standard error of their mean, from two values."""
+    """Of the images in ``renders``, half of what the two renders differ by (N,): one standard error of their mean, from
+    two values."""
     frames: dict[str, FrameSums] = field(default_factory=dict)
     """By camera, each photograph against the media's renders under all lights; where they were asked for."""
 

@@ -1,7 +1,9 @@
-"""Whether each photograph is that of its light: each is compared with the renders under all lights of its camera, not with its own alone.
+"""Whether each photograph is that of its light: each is compared with the renders under all lights of its camera, not
+with its own alone.
 
-A photograph that another light's render explains far better than its own was filed under the wrong light, two that explain each other were exchanged,
-and one that nothing explains while the others are well explained was taken wrong. Such frames bend the media, and their share of an average hides them.
+A photograph that another light's render explains far better than its own was filed under the wrong light, two that
+explain each other were exchanged, and one that nothing explains while the others are well explained was taken wrong.
+Such frames bend the media, and their share of an average hides them.
 """
 
 from __future__ import annotations
@@ -19,16 +21,20 @@ from services.fit.inputs.observations import Observations, ViewStack
 Array = NDArray[np.float64]
 
 LOOKED_AT = 0.1
-"""Relative error of a photograph above which other lights are tried: below it a neighbour's light is hardly another picture."""
+"""Relative error of a photograph above which other lights are tried: below it a neighbour's light is hardly another
+picture."""
 BETTER = 0.5
-"""Another light's error has to be at most this part of its own light's. Lights 10 degrees apart differ by more than lights that are off by 10 mm."""
+"""Another light's error has to be at most this part of its own light's. Lights 10 degrees apart differ by more than
+lights that are off by 10 mm."""
 EXCHANGED = 0.75
-"""Two photographs are exchanged where each is better explained by the other's light, and both together have at most this part of their error. A fit bends
-its media towards them, so less is asked than of a single one; by chance two do not explain each other at all."""
+"""Two photographs are exchanged where each is better explained by the other's light, and both together have at most
+this part of their error. A fit bends its media towards them, so less is asked than of a single one; by chance two do
+not explain each other at all."""
 ODD = 0.3
 """Relative error of a photograph that is told where no other light explains it either."""
 ODD_RATIO = 5.0
-"""And by so many times it has to exceed the median of its camera's: where all are poorly explained, no single one is odd."""
+"""And by so many times it has to exceed the median of its camera's: where all are poorly explained, no single one is
+odd."""
 MIN_FRAMES = 3
 """Photographs that a camera needs for one of them to be odd."""
 
@@ -121,8 +127,9 @@ def frames_told(
     Args:
         sums: by channel and camera.
         lights: names, by channel.
-        is_placed: whether the mesh lies where the photographs show it. Renders of a misplaced one are like no photograph, so that single ones seem odd
-            or another light's; two that explain each other are exchanged there, too.
+        is_placed: whether the mesh lies where the photographs show it. Renders of a misplaced one are like no
+            photograph, so that single ones seem odd or another light's; two that explain each other are exchanged
+            there, too.
     """
     found: dict[tuple[str, str, str, bool], tuple[WrongFrame, list[str]]] = {}
     for channel, cameras in sums.items():
@@ -142,8 +149,8 @@ def _sentence(frame: WrongFrame, cameras: Sequence[str]) -> str:
     where = f"camera {cameras[0]}" if len(cameras) == 1 else f"cameras {', '.join(cameras[:-1])} and {cameras[-1]}"
     if frame.exchanged:
         return (
-            f"The photographs of {where} under lights {frame.light} and {frame.other} seem exchanged: each is what the other light makes; "
-            "check both lights' cables and the files' names."
+            f"The photographs of {where} under lights {frame.light} and {frame.other} seem exchanged: each is what the"
+            " other light makes; check both lights' cables and the files' names."
         )
     if frame.other:
         return (
@@ -151,6 +158,6 @@ def _sentence(frame: WrongFrame, cameras: Sequence[str]) -> str:
             "check that light's cable and the file's name."
         )
     return (
-        f"The photograph of {where} under light {frame.light} is {100 * frame.error:.0f} % off, far more than its camera's others; "
-        "look at it, and leave that light out or take it again."
+        f"The photograph of {where} under light {frame.light} is {100 * frame.error:.0f} % off, far more than its"
+        " camera's others; look at it, and leave that light out or take it again."
     )

@@ -21,7 +21,9 @@ EXCHANGEABLE = 0.9
 
 
 def correlation(known: Uncertainty) -> Correlation:
-    """Correlation of the tissue's coordinates' errors, but for what is left of the step to the minimum; one without any error has none with others."""
+    """Correlation of the tissue's coordinates' errors, but for what is left of the step to the minimum; one without any
+    error has none with others.
+    """
     count = known.domain.tissue_count
     covariance = (known.covariance if known.sandwich is None else known.sandwich.covariance)[:count, :count]
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -32,7 +34,9 @@ def correlation(known: Uncertainty) -> Correlation:
 
 
 def told(tables: Mapping[str, Mapping[str, Estimate]], correlations: Mapping[str, Correlation]) -> str:
-    """One or two sentences: what is known with unit and standard error, what is not and between which limits, and what looks alike."""
+    """One or two sentences: what is known with unit and standard error, what is not and between which limits, and what
+    looks alike.
+    """
     groups: dict[tuple[str, ...], list[str]] = {}
     for channel, table in tables.items():
         groups.setdefault(tuple(name for name in _quantities(table) if _is_told(table[name])), []).append(channel)
@@ -101,7 +105,10 @@ def _alike(correlations: Mapping[str, Correlation]) -> str:
                 found.append(
                     (
                         abs(one.matrix[a][b]),
-                        f"More {part_a} {word_a} with {'less' if less else 'more'} {part_b} {word_b} would look almost the same.",
+                        (
+                            f"More {part_a} {word_a} with {'less' if less else 'more'} {part_b} {word_b} would look"
+                            " almost the same."
+                        ),
                     )
                 )
     return max(found)[1] if found else ""

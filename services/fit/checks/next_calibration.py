@@ -1,4 +1,6 @@
-"""Which measurement of the instrument would help most: the covariance of a fit whose calibration knew one kind of error twice as well."""
+"""Which measurement of the instrument would help most: the covariance of a fit whose calibration knew one kind of error
+twice as well.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from services.fit.checks.next_capture import WORTH, in_percent, relative_errors
 from services.fit.instrument.errors import kind_of_error
 from services.fit.instrument.moves import MOVED
 from services.fit.optics.parameters import Tissue
-from services.fit.solve.covariance import Uncertainty, estimates
+from services.fit.solve.covariance import Uncertainty
+from services.fit.solve.estimates import estimates
 from services.fit.solve.information import Addition, covariance_after
 
 Array = NDArray[np.float64]
@@ -30,7 +33,8 @@ WORDS = {
 
 
 def calibration_advice(tissue: Tissue, parts: Sequence[str], known: Uncertainty) -> str:
-    """One sentence on the kind of error that is worth measuring, judged by the quantity whose relative error is largest, or the next; '' where none is.
+    """One sentence on the kind of error that is worth measuring, judged by the quantity whose relative error is
+    largest, or the next; '' where none is.
 
     Args:
         tissue: the solution.
@@ -55,7 +59,9 @@ def calibration_advice(tissue: Tissue, parts: Sequence[str], known: Uncertainty)
 
 
 def covariance_if_known(known: Uncertainty, kind: str) -> Array:
-    """Covariance (F, F) of a fit that knew a kind of error ``FEWER`` times as well beforehand; the step that was left stays left."""
+    """Covariance (F, F) of a fit that knew a kind of error ``FEWER`` times as well beforehand; the step that was left
+    stays left.
+    """
     if kind in MOVED:
         return np.asarray(known.covariance - (1 - FEWER**-2) * known.parts[kind])
     assert known.sandwich is not None

@@ -1,4 +1,6 @@
-"""Which further light or view would help most: Jacobians of images that were not taken, on a few hundred pixels, beside what the fit knows."""
+"""Which further light or view would help most: Jacobians of images that were not taken, on a few hundred pixels, beside
+what the fit knows.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ from services.fit.instrument.columns import columns
 from services.fit.instrument.errors import DEFAULT_SE
 from services.fit.instrument.moves import rigid
 from services.fit.optics.parameters import Tissue
-from services.fit.solve.covariance import Uncertainty, estimates
+from services.fit.solve.covariance import Uncertainty
+from services.fit.solve.estimates import estimates
 from services.fit.solve.information import Addition, addition, covariance_after
 from services.fit.solve.sandwich import Sandwich
 from services.fit.transport.scene.recipe import SceneRecipe, View
@@ -43,9 +46,9 @@ VIEW_ANGLE = np.radians(60)
 WORTH = 0.1
 """A candidate is named when it cuts the error by more than this part, and by more than the prediction is unsure of."""
 LIGHTS = {
-    "at the left": (-1, 0, 0), "at the right": (1, 0, 0), "above": (0, 1, 0), "below": (0, -1, 0), "beside the camera": (0, 0, 1),
-    "behind the tooth": (0, 0, -1), "at the left behind the tooth": (-1, 0, -1), "at the right behind the tooth": (1, 0, -1),
-    "above, behind the tooth": (0, 1, -1),
+    "at the left": (-1, 0, 0), "at the right": (1, 0, 0), "above": (0, 1, 0), "below": (0, -1, 0),
+    "beside the camera": (0, 0, 1), "behind the tooth": (0, 0, -1), "at the left behind the tooth": (-1, 0, -1),
+    "at the right behind the tooth": (1, 0, -1), "above, behind the tooth": (0, 1, -1),
 }  # fmt: skip
 """Directions from the tooth in the first camera's image: right, up, towards the camera."""
 VIEWS = {"60° further to the left": (0, -1, 0), "60° further to the right": (0, 1, 0), "60° higher": (-1, 0, 0)}
@@ -79,14 +82,17 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Probe:
-    """A view of images that were not taken, stored as a block, and how many times more measurements the fit would have of it."""
+    """A view of images that were not taken, stored as a block, and how many times more measurements the fit would have
+    of it.
+    """
 
     block: StoredFile
     words: tuple[str, ...]
     """Candidate that each light belongs to, '' for those that do not count."""
     ratio: float
     own_error: str = ""
-    """Kind of the error that such images have of their own: a new light's gain, a new camera's flare; '' where the instrument counts as perfect."""
+    """Kind of the error that such images have of their own: a new light's gain, a new camera's flare; '' where the
+    instrument counts as perfect."""
 
 
 def advice(
@@ -98,7 +104,8 @@ def advice(
     weight: float,
     samples: int,
 ) -> tuple[str, tuple[Candidate, ...]]:
-    """One sentence on the light or view that would cut the largest relative error most, and all candidates; '' where none would.
+    """One sentence on the light or view that would cut the largest relative error most, and all candidates; '' where
+    none would.
 
     Args:
         problem: at the solution, which is its base.
@@ -129,7 +136,9 @@ def advice(
 
 
 def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidates: Sequence[Candidate]) -> str:
-    """The best candidate in words, judged by the quantity whose relative error is largest now; by the next one where that stays out of every reach."""
+    """The best candidate in words, judged by the quantity whose relative error is largest now; by the next one where
+    that stays out of every reach.
+    """
     before = relative_errors(estimates(tissue, parts, known))
     if not before or not candidates:
         return ""
@@ -139,14 +148,22 @@ def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate
         candidate, (after, unsure) = min(((c, p[name]) for c, p in found), key=lambda entry: sum(entry[1]))
         if after + unsure <= (1 - WORTH) * min(before[name], 1.0):
             was = in_percent(before[name]) if before[name] <= 1 else "more than 100 %"
-            return f"{candidate.words} would help most: it would cut the error of {in_words(name)} from {was} to {in_percent(after)}."
-    return f"None of the {len(candidates)} further lights and views that were tried would cut the error of {in_words(names[0])} by more than a tenth."
+            return (
+                f"{candidate.words} would help most: it would cut the error of {in_words(name)} from {was} to"
+                f" {in_percent(after)}."
+            )
+    return (
+        f"None of the {len(candidates)} further lights and views that were tried would cut the error of"
+        f" {in_words(names[0])} by more than a tenth."
+    )
 
 
 def predicted(
     tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate: Candidate
 ) -> dict[str, tuple[float, float]]:
-    """Relative errors with a candidate's images, and how unsure these predictions are: half the pixels, counted twice, differ by noise alone."""
+    """Relative errors with a candidate's images, and how unsure these predictions are: half the pixels, counted twice,
+    differ by noise alone.
+    """
 
     def after(added: Addition) -> dict[str, float]:
         return relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_after(known, added))))
@@ -165,7 +182,9 @@ def relative_errors(table: Mapping[str, Estimate]) -> dict[str, float]:
 
 
 def probes_of(problem: StackProblem[Tissue], folder: Path) -> tuple[StoredFile, tuple[Probe, ...]]:
-    """The scene with the candidate lights added, and views to probe: the fit's own under these lights, further ones under the lights there are."""
+    """The scene with the candidate lights added, and views to probe: the fit's own under these lights, further ones
+    under the lights there are.
+    """
     blocks, recipe = problem.passes.read_blocks(), read_recipe(problem.passes.recipe)
     cameras = {block.view.camera.name: block.view.camera for block in blocks}
     first, lights = next(iter(cameras.values())), len(recipe.light_positions_mm)
@@ -300,7 +319,9 @@ def advice_task(
 
 
 def _own_errors(probe: Probe, image: Array, acting: BlockInstrument | None, fitted: tuple[str, ...]) -> Array:
-    """What one ± of the error that new images have of their own changes them by (K, L, N); none where the fit knows no errors."""
+    """What one ± of the error that new images have of their own changes them by (K, L, N); none where the fit knows no
+    errors.
+    """
     if not probe.own_error or acting is None or not fitted:
         return np.zeros((0, *image.shape))
     changed = image if probe.own_error == "light_gain" else np.full(image.shape, acting.brightest)

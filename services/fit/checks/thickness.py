@@ -38,9 +38,11 @@ class UncertainThickness:
 def uncertain_thickness(
     points_mm: NDArray[np.float64], shape: DentinShape, weights: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> UncertainThickness:
-    """Thickness at points (N, 3) of the outer surface for fitted blend weights c (M,) of covariance (M, M), to first order.
+    """Thickness at points (N, 3) of the outer surface for fitted blend weights c (M,) of covariance (M, M), to first
+    order.
 
-    The slope of the distance is a central difference over one standard error of each weight, cut at 0 and 1, so that it is that of the range that counts.
+    The slope of the distance is a central difference over one standard error of each weight, cut at 0 and 1, so that it
+    is that of the range that counts.
     """
 
     def thickness(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -76,7 +78,8 @@ def thickness_map(
     """What a camera sees of a fitted dentin; None where it does not see the tooth.
 
     Args:
-        covariance: of the weights (M, M); None where none were fitted: the dentin is known, or its weights are only assumed, which determines nothing.
+        covariance: of the weights (M, M); None where none were fitted: the dentin is known, or its weights are only
+            assumed, which determines nothing.
     """
     if covariance is None:
         image = thickness_image(outer, Mesh(shape.vertices_mm(weights), shape.base.faces), camera)

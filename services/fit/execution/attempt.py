@@ -1,4 +1,6 @@
-"""What every kind of fit needs of its job: the checkpoint's folder, the journal, workers, progress and previews out, and the records it publishes."""
+"""What every kind of fit needs of its job: the checkpoint's folder, the journal, workers, progress and previews out,
+and the records it publishes.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +61,8 @@ ALWAYS_NAMED = frozenset(
         "device",
     ]
 )
-"""Options of version 0.1, whose checkpoints name them all. A later one is named where it is not at its default, and so is to
-be added nowhere here: fits that were begun before there was such an option go on."""
+"""Options of version 0.1, whose checkpoints name them all. A later one is named where it is not at its default, and so
+is to be added nowhere here: fits that were begun before there was such an option go on."""
 PREVIEW_EVERY = 3
 """A preview after the first step and after every so many."""
 
@@ -96,7 +98,8 @@ class Attempt:
         )
         if journal.set_aside is not None:
             self.log(
-                f"The checkpoint is damaged or of another job, data or numerics: it is kept as {journal.set_aside.name} and this fit starts anew."
+                f"The checkpoint is damaged or of another job, data or numerics: it is kept as {journal.set_aside.name}"
+                " and this fit starts anew."
             )
         if journal.resumed:
             self.log(f"Attempt {self.context.attempt} continues after {journal.resumed} recorded results.")
@@ -164,7 +167,8 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
     off = {c: worst_error(fit) for c, fit in fits.items()}
     unexplained = [c for c, error in off.items() if error > MAX_ERROR]
     advice += [
-        f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the samples."
+        f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the"
+        " samples."
         for c in unexplained
     ]
     return not unexplained and all(fit.solution.result.converged for fit in fits.values()), advice

@@ -1,6 +1,7 @@
-"""What a fit's tasks need, as small files that every worker reads: scene recipes and blocks of measurements. No pickles.
+"""What a fit's tasks need, as small files that every worker reads: scene recipes and blocks of measurements.
 
-A job writes them once, at its start; they fix the block partition and the order of summation for the life of the job.
+No pickles. A job writes them once, at its start; they fix the block partition and the order of summation for the life
+of the job.
 """
 
 from __future__ import annotations
@@ -101,7 +102,8 @@ class Block:
     parts: PixelParts | None = None
     """None where the scene is one tooth."""
     cell: NDArray[np.int32] | None = None
-    """Number (N,) of the cell that each pixel lies in, within which losses are compared as means; None where pixels stand alone."""
+    """Number (N,) of the cell that each pixel lies in, within which losses are compared as means; None where pixels
+    stand alone."""
     instrument: BlockInstrument | None = None
     """None where the instrument counts as perfect."""
 
@@ -141,8 +143,8 @@ def pixels_per_block(lights: int) -> int:
 def split_pixels(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:
     """Pixels of a view parted into blocks, each of which one worker renders at a time.
 
-    Enough of them for two workers, none too small to fill a kernel, none too large to travel; the same however many workers
-    there are.
+    Enough of them for two workers, none too small to fill a kernel, none too large to travel; the same however many
+    workers there are.
     """
     wanted = min(-(-MIN_BLOCKS // views), max(1, len(pixels) // MIN_BLOCK_PIXELS))
     return np.array_split(pixels, max(wanted, -(-len(pixels) // pixels_per_block(lights))))

@@ -1,4 +1,6 @@
-"""What the stages of every fit share: the solver's loop through the journal, a report after each step, the errors and curvature at the end."""
+"""What the stages of every fit share: the solver's loop through the journal, a report after each step, the errors and
+curvature at the end.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,11 @@ from services.fit.solve.normal_equations import NormalEquations
 Array = NDArray[np.float64]
 
 SIMILAR_TOLERANCE = 0.02
-"""What the option ``image_tolerance`` is for exact media: a stage in similar ones has converged when its next step is within
-Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
+"""What the option ``image_tolerance`` is for exact media: a stage in similar ones has converged when its next step is
+within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
 SLOPE_ERROR = 0.5
-"""Relative error of what Jacobians of similar media promise for one tooth's exact images, however short the step; several are wrong independently."""
+"""Relative error of what Jacobians of similar media promise for one tooth's exact images, however short the step;
+several are wrong independently."""
 CLOSING_SHARE = 2
 """The closing measurement has so many times fewer paths: it joins what all exact steps know."""
 CLOSING_TRIALS = 2
@@ -52,7 +55,8 @@ class StepReport:
     step: int
     stage_step: int
     loss: float
-    """Relative squared error on fitted images, sensor noise included; dimensionless. This and the errors are not below what the step's samples resolve."""
+    """Relative squared error on fitted images, sensor noise included; dimensionless. This and the errors are not below
+    what the step's samples resolve."""
     fit_error: float | None
     held_out_error: float | None
     held_out_se: float | None
@@ -70,10 +74,12 @@ def history_key(channel: str, step: int) -> str:
 
 
 def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_count: int, samples: int) -> Array:
-    """The step from x (F,) by the closing measurement, or a shorter one; zeros where it promises no more than noise does, or is not better.
+    """The step from x (F,) by the closing measurement, or a shorter one; zeros where it promises no more than noise
+    does, or is not better.
 
     Args:
-        part_count: how many things the fit is about that images tell apart; what one of them promises is wrong independently of the others.
+        part_count: how many things the fit is about that images tell apart; what one of them promises is wrong
+            independently of the others.
         samples: paths per pixel of a comparison.
     """
     step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
@@ -115,7 +121,9 @@ class ChannelFit(Generic[Optics]):
 
 @dataclass(kw_only=True)
 class Stages(ABC, Generic[Optics]):
-    """Runs stages of one channel's fit; everything costly goes through the journal, under keys that begin with the seeds' channel."""
+    """Runs stages of one channel's fit; everything costly goes through the journal, under keys that begin with the
+    seeds' channel.
+    """
 
     files: ChannelFiles
     passes: Passes
@@ -180,7 +188,9 @@ class Stages(ABC, Generic[Optics]):
         return replace(options, max_steps=min(steps, options.max_steps), max_samples=samples)
 
     def in_similar_media(self, options: Options) -> Options:
-        """Limits of a stage whose images are off by more than a few samples resolve: it only finds the neighbourhood."""
+        """Limits of a stage whose images are off by more than a few samples resolve: it only finds the
+        neighbourhood.
+        """
         most = min(2 * self.spec.samples_per_pixel, options.max_samples)
         return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
 
@@ -218,7 +228,8 @@ class Stages(ABC, Generic[Optics]):
     def _run(
         self, solver: Any, kind: Any, problem: StackProblem[Optics], state: Any, burst: int = 1
     ) -> tuple[Optics, Solution]:
-        # A solver's loop from its first state; every ``burst`` steps are one journal entry, written and read by the solver's module ``kind``, and one report.
+        # A solver's loop from its first state; every ``burst`` steps are one journal entry, written and read by the
+        # solver's module ``kind``, and one report.
         def advance(state: Any) -> Any:
             for _ in range(burst):
                 state = state if solver.terminate(state) else solver.step(problem, state)
@@ -237,7 +248,8 @@ class Stages(ABC, Generic[Optics]):
         return problem.domain.tissue_at(solution.x, problem.base), solution
 
     def _finish(self, problem: StackProblem[Optics], solution: Solution) -> ChannelFit[Optics]:
-        # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the errors that are reported.
+        # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the
+        # errors that are reported.
         samples = max(
             solution.samples, self.fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel))
         )
@@ -270,8 +282,8 @@ class Stages(ABC, Generic[Optics]):
     def _close(
         self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int
     ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
-        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step made by it where it promises more than
-        # noise does, and is better by that promise and by images together.
+        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step
+        # made by it where it promises more than noise does, and is better by that promise and by images together.
         domain, x = problem.domain, solution.x
         if problem.jacobian_g is None or solution.result is Result.STALLED:
             found = uncertainty(domain, x, equations)

@@ -1,4 +1,6 @@
-"""The last measurement of a fit whose Jacobians were those of similar media (see ``solve.closing``): one task per block, on any worker."""
+"""The last measurement of a fit whose Jacobians were those of similar media (see ``solve.closing``): one task per
+block, on any worker.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
 Held = Mapping[tuple[str, ...], tuple[float, float]]
-"""Media whose mean cosine was held and may be wrong alike, with the mean and standard deviation of its prior in the unbounded domain."""
+"""Media whose mean cosine was held and may be wrong alike, with the mean and standard deviation of its prior in the
+unbounded domain."""
 
 MOVE_SAMPLES = 4
 """Images of moved scans and domes have so many times fewer paths than the rest: there are thirteen."""
@@ -68,7 +71,8 @@ def measure_closing(
 def _changes_by_moves(
     problem: StackProblem[Optics], tasks: Sequence[BlockTask], moves: Sequence[Move], label: str
 ) -> list[list[Any]]:
-    # By block and scene, what ``moves_task`` gives. All blocks of one scene before the next, as a worker keeps few scenes.
+    # By block and scene, what ``moves_task`` gives. All blocks of one scene before the next, as a worker keeps few
+    # scenes.
     seeds = problem.seed(0, "closing-moves-1"), problem.seed(0, "closing-moves-2")
     few = [replace(task, samples=max(task.samples // MOVE_SAMPLES, 1)) for task in tasks]
     by_moves = [
@@ -140,7 +144,8 @@ def closing_task(
 
 
 def _borrowed(domain: Domain) -> NDArray[np.bool_]:
-    # Which derivatives (F,) exact images share with similar media: of the dentin's shape, as they are not rendered again, and of the instrument's errors.
+    # Which derivatives (F,) exact images share with similar media: of the dentin's shape, as they are not rendered
+    # again, and of the instrument's errors.
     shapes = [coordinate.kind == "shape" for coordinate in domain.coordinates]
     return np.array(shapes + [True] * len(domain.errors.names))
 

@@ -1,8 +1,9 @@
 """How a stage's images are differentiated: by scores of the same walks, or as differences of images of changed media.
 
-A difference costs two images for each coordinate, which a jaw has by the hundred. But a tooth changes what is seen of itself and of its neighbours, and
-hardly anything beyond: so the same coordinate of every third tooth is moved at once, and each one's derivative is read where its own tooth is the nearest
-of those moved (a sparse Jacobian by groups of columns: Curtis, Powell and Reid 1974).
+A difference costs two images for each coordinate, which a jaw has by the hundred. But a tooth changes what is seen of
+itself and of its neighbours, and hardly anything beyond: so the same coordinate of every third tooth is moved at once,
+and each one's derivative is read where its own tooth is the nearest of those moved (a sparse Jacobian by groups of
+columns: Curtis, Powell and Reid 1974).
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ SCORES_SHARE = 4
 
 @dataclass(frozen=True)
 class Reach:
-    """How far from a coordinate's value the images lie whose difference gives its derivative, and their share of a task's paths, one part in so many."""
+    """How far from a coordinate's value the images lie whose difference gives its derivative, and their share of a
+    task's paths, one part in so many.
+    """
 
     below: float
     above: float
@@ -41,7 +44,8 @@ class Reach:
 REACH: Mapping[str, Reach] = MappingProxyType(
     {"shape": Reach(0.2, 0.2, 1), "sigma": Reach(0.7, 0.7, 4), "cosine": Reach(1.0, 0.0, 8)}
 )
-"""By kind of coordinate. The wider, the quieter, in proportion; the zero of J'Wr, and so the answer, hardly minds that a wide difference is no derivative."""
+"""By kind of coordinate. The wider, the quieter, in proportion; the zero of J'Wr, and so the answer, hardly minds that
+a wide difference is no derivative."""
 
 SLOPE_REACH = Reach(0.35, 0.35, 4)
 """Of a cosine in the closing measurement, where the derivative itself is wanted."""
@@ -49,7 +53,9 @@ SLOPE_REACH = Reach(0.35, 0.35, 4)
 
 @dataclass(frozen=True)
 class Secant:
-    """The derivatives to one coordinate, or to several of teeth that stand apart, as a difference of two images: quieter than border terms or scores."""
+    """The derivatives to one coordinate, or to several of teeth that stand apart, as a difference of two images:
+    quieter than border terms or scores.
+    """
 
     coordinates: tuple[int, ...]
     low: Tissue | Mouth
@@ -58,12 +64,15 @@ class Secant:
     """Of each coordinate, between both ends."""
     share: int
     teeth: tuple[int, ...] | None = None
-    """In whose pixels, and their neighbours', each coordinate's derivative is read; None where there is one coordinate, for all pixels."""
+    """In whose pixels, and their neighbours', each coordinate's derivative is read; None where there is one coordinate,
+    for all pixels."""
 
 
 @dataclass(frozen=True)
 class Differentiation:
-    """How a stage's images are differentiated: scores of some natural parameters, mapped to the coordinates, and secants."""
+    """How a stage's images are differentiated: scores of some natural parameters, mapped to the coordinates, and
+    secants.
+    """
 
     parameters: tuple[str, ...]
     chain: Array
@@ -143,7 +152,8 @@ def differentiation(
         neighbours: of a jaw's teeth.
     """
     x, tissue = x[: domain.tissue_count], domain.tissue_at(x, base)
-    # Scores of extinction are noisy, but in a jaw they are of all teeth at once; and the images' own media are the closing measurement's, which wants slopes.
+    # Scores of extinction are noisy, but in a jaw they are of all teeth at once; and the images' own media are the
+    # closing measurement's, which wants slopes.
     differing = WITHOUT_SCORES if jacobian_g is None or isinstance(base, Mouth) else WITHOUT_SCORES | {"sigma"}
     is_secant = [c.kind in differing for c in domain.coordinates]
     own = tuple(

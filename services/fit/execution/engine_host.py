@@ -1,9 +1,10 @@
 """Who owns the renderer: this process, or a child process of a Dask worker.
 
-A kernel can hold the interpreter lock for seconds, and a worker that cannot answer its scheduler is taken for dead. So each worker keeps one child, a
-fresh interpreter that owns Mitsuba, the built scenes and the kernels. The worker's task only waits on a pipe. A child that dies (out of memory, kill) is
-started again and asked once more; a child whose worker dies sees its pipe close and ends itself, also in mid-kernel. While it waits, the task looks at the
-child's memory and at the job's cancel flag, and ends the child where it must; the worker stays.
+A kernel can hold the interpreter lock for seconds, and a worker that cannot answer its scheduler is taken for dead. So
+each worker keeps one child, a fresh interpreter that owns Mitsuba, the built scenes and the kernels. The worker's task
+only waits on a pipe. A child that dies (out of memory, kill) is started again and asked once more; a child whose worker
+dies sees its pipe close and ends itself, also in mid-kernel. While it waits, the task looks at the child's memory and
+at the job's cancel flag, and ends the child where it must; the worker stays.
 """
 
 from __future__ import annotations
@@ -89,7 +90,8 @@ class ChildHost:
         """See EngineHost. One call at a time.
 
         Raises:
-            MemoryKillError: the child grew beyond its share, or the system killed it for memory. CrashError: it died twice in this call.
+            MemoryKillError: the child grew beyond its share, or the system killed it for memory. CrashError: it died
+                twice in this call.
             WorkerLostError: the host was closed meanwhile.
         """
         return self.call_until(lambda: False, method, recipe, *args, **options)
@@ -131,7 +133,10 @@ class ChildHost:
         raise AssertionError
 
     def close(self) -> None:
-        """End the child, also in mid-kernel: whoever waits for its answer meets WorkerLostError. There is no call after this."""
+        """End the child, also in mid-kernel: whoever waits for its answer meets WorkerLostError.
+
+        There is no call after this.
+        """
         self._is_closed.set()
         with self._lock:
             self._end()
@@ -196,7 +201,9 @@ def serve(descriptor: int, factory: str, threads: int | None) -> None:
 
 
 def _portable(problem: Exception) -> Exception:
-    """An exception as it comes out at the other end of a pipe; one that would not, as it needs more than its arguments, say, in words."""
+    """An exception as it comes out at the other end of a pipe; one that would not, as it needs more than its arguments,
+    say, in words.
+    """
     try:
         if type(pickle.loads(pickle.dumps(problem))) is type(problem):  # noqa: S301 - made on the line itself
             return problem

@@ -1,4 +1,7 @@
-"""Where tasks run: here, one after the other, or on the workers of a Dask cluster. A task is ``task(host, *args)``; arguments may be earlier results."""
+"""Where tasks run: here, one after the other, or on the workers of a Dask cluster.
+
+A task is ``task(host, *args)``; arguments may be earlier results.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,8 @@ Task = Callable[..., Any]
 Call = tuple[str, Task, tuple[Any, ...]]
 """What ``submit`` takes: a key, a task and its arguments."""
 TASKS_AHEAD = 2
-"""Tasks of a fit that are with the workers at once, for each of their threads: one that runs and one that follows at once."""
+"""Tasks of a fit that are with the workers at once, for each of their threads: one that runs and one that follows at
+once."""
 
 
 class Executor(Protocol):
@@ -33,7 +37,10 @@ class Executor(Protocol):
         """Results in the order given. Raises what a task raised."""
 
     def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
-        """Run tasks that wait for no other, and give the result of each as soon as it is there. Raises what a task raised."""
+        """Run tasks that wait for no other, and give the result of each as soon as it is there.
+
+        Raises what a task raised.
+        """
 
     def threads(self, expected: int = 1) -> int:
         """How many tasks can run at once, where so many workers were asked for and some may still be starting."""
@@ -95,7 +102,8 @@ class DaskExecutor:
     def submit(self, key: str, task: Task, *args: Any) -> _Planned:
         """See Executor. Dask answers for a key that it still knows with the old result, so each task has its own.
 
-        A task whose worker dies runs again elsewhere; what a task raises is final, as the same seeds would raise it again.
+        A task whose worker dies runs again elsewhere; what a task raises is final, as the same seeds would raise it
+        again.
         """
         planned = _Planned(f"{self._prefix}-{next(self._submitted)}-{key}", task, args)
         self._waiting.append(planned)
@@ -189,7 +197,9 @@ class _EnginePlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
 
 
 async def _prepare_worker(worker: Any, factory: str) -> _EnginePlugin:
-    """The plugin of an engine, made on the worker's loop where it has none, so that tasks in several threads make one."""
+    """The plugin of an engine, made on the worker's loop where it has none, so that tasks in several threads make
+    one.
+    """
     name = f"dentine-{factory}"
     if name not in worker.plugins:
         await worker.plugin_add(_EnginePlugin(factory), name=name, catch_errors=False)
@@ -232,7 +242,8 @@ def _surroundings() -> Surroundings | None:
 
 @contextmanager
 def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: float = 1.0) -> Iterator[Executor]:
-    """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this process.
+    """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this
+    process.
 
     On a cluster tasks run where this one may, and their keys begin with its own, which tells whose they are.
 

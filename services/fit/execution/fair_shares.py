@@ -1,10 +1,10 @@
 """How running fits share the workers: whoever has used less of them lately goes first.
 
-Decay-usage scheduling (J. Kay and P. Lauder, A Fair Share Scheduler, Communications of the ACM 31(1), 1988): each fit counts the
-worker time that its tasks took, old use fading away, and gives its next task a priority that is the lower the more it used.
-Priorities meet in the queues of the workers; no server has to tell a fit how many others there are. Each tells its level on
-the scheduler's board, and a newcomer begins at the lowest one there, or it would have the workers alone until it had caught up.
-A fit that is alone gets everything.
+Decay-usage scheduling (J. Kay and P. Lauder, A Fair Share Scheduler, Communications of the ACM 31(1), 1988): each fit
+counts the worker time that its tasks took, old use fading away, and gives its next task a priority that is the lower
+the more it used. Priorities meet in the queues of the workers; no server has to tell a fit how many others there are.
+Each tells its level on the scheduler's board, and a newcomer begins at the lowest one there, or it would have the
+workers alone until it had caught up. A fit that is alone gets everything.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from contextlib import suppress
 from typing import Any
 
 FADING_S = 120.0
-"""Use from so long ago counts 1/e. Long against a block, or shares would follow who has the longer blocks: a replay of two fits
-on two workers with blocks of 10 and 30 s gave 58 and 42 % with it, and 61 and 39 % with half of it. Short against a fit, or one
-that had nothing to do for a while would have the workers alone for long afterwards."""
+"""Use from so long ago counts 1/e. Long against a block, or shares would follow who has the longer blocks: a replay of
+two fits on two workers with blocks of 10 and 30 s gave 58 and 42 % with it, and 61 and 39 % with half of it. Short
+against a fit, or one that had nothing to do for a while would have the workers alone for long afterwards."""
 BOARD = "dentine-shares"
 TELL_S = 5.0
 """How often a fit that is busy tells its level."""

@@ -1,16 +1,18 @@
 """Durable execution: what a fit has done is written down, and a new attempt reads it instead of doing it again.
 
-The driver is a deterministic function. Each costly part runs as ``journal.once(key, compute)``; its JSON result is on disk before the next part starts.
-A later attempt runs the same function, gets the recorded results back in the same order, and goes on where the record ends. Every part depends only on
-recorded results and on seeds, so the answer of an interrupted fit is that of an undisturbed one.
+The driver is a deterministic function. Each costly part runs as ``journal.once(key, compute)``; its JSON result is on
+disk before the next part starts. A later attempt runs the same function, gets the recorded results back in the same
+order, and goes on where the record ends. Every part depends only on recorded results and on seeds, so the answer of an
+interrupted fit is that of an undisturbed one.
 
 ::
 
     {"format": 2, "fingerprint": "..."}     first line
     {"key": "...", "value": ...}            one line a result, appended; a last line that was cut short is no result
 
-An attempt that adds to a journal first writes it anew under the same name, once, so that an older attempt which still runs cannot write
-into it. Format 1, one JSON object that was replaced with every result, is read and continued as format 2.
+An attempt that adds to a journal first writes it anew under the same name, once, so that an older attempt which still
+runs cannot write into it. Format 1, one JSON object that was replaced with every result, is read and continued as
+format 2.
 """
 
 from __future__ import annotations
@@ -41,7 +43,8 @@ class Journal:
 
         Args:
             path: of the file; one of format 1 beside it, with the suffix ``.json``, is continued.
-            fingerprint: identifies job, data and numerics; a journal of another one is set aside, neither continued nor lost.
+            fingerprint: identifies job, data and numerics; a journal of another one is set aside, neither continued nor
+                lost.
             guard: called before every write; raises when this attempt has lost the right to write.
         """
         self.path, self._fingerprint, self._guard = path, fingerprint, guard
@@ -60,7 +63,10 @@ class Journal:
         self.resumed = len(self.entries)
 
     def once(self, key: str, compute: Callable[[], Any]) -> tuple[Any, bool]:
-        """The recorded result of ``key``, or compute, record and return it; the flag says whether it is new. Floats survive exactly."""
+        """The recorded result of ``key``, or compute, record and return it; the flag says whether it is new.
+
+        Floats survive exactly.
+        """
         if key in self.entries:
             return self.entries[key], False
         value = json.loads(json.dumps(compute(), allow_nan=False))

@@ -4,8 +4,9 @@
 
     image(block) ── residual, at most 4 MB ── jacobian(block) ── products ── ordered sum ── solve
 
-The Jacobian task renders its two seeds in one process and multiplies them there, by each other and by the residual. So Jacobians never leave their task,
-and what leaves a worker are residuals and sums over the block. A task whose worker dies runs again elsewhere from the same seeds, with the same result.
+The Jacobian task renders its two seeds in one process and multiplies them there, by each other and by the residual. So
+Jacobians never leave their task, and what leaves a worker are residuals and sums over the block. A task whose worker
+dies runs again elsewhere from the same seeds, with the same result.
 """
 
 from __future__ import annotations
@@ -206,11 +207,13 @@ class StackProblem(Generic[Optics]):
     base: Optics
     stage: str
     jacobian_g: float | None = None
-    """Derivatives are rendered in similar media of this mean cosine; None for the media themselves. Only for sigma, alpha and shape."""
+    """Derivatives are rendered in similar media of this mean cosine; None for the media themselves. Only for sigma,
+    alpha and shape."""
     image_g: float | None = None
     """The same for images: a fit of similar media."""
     neighbours: Neighbours | None = None
-    """Of a jaw's teeth: coordinates between which the curvature's noise is known, and which of them are told apart when moved at once."""
+    """Of a jaw's teeth: coordinates between which the curvature's noise is known, and which of them are told apart when
+    moved at once."""
 
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """See Problem: an image and a Jacobian task per block, summed in block order."""

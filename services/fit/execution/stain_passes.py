@@ -1,11 +1,13 @@
-"""The stain stage of one channel, after its media are fitted: steps of the texture in turn with steps of the media, each a journal entry.
+"""The stain stage of one channel, after its media are fitted: steps of the texture in turn with steps of the media,
+each a journal entry.
 
 ::
 
-    images(block), seed 1 ── cotangents w C and w ref ── stain_gradient(block), seed 2, of both ── sum in block order ── step
+    images(block), seed 1 ── cotangents w C and w ref ── stain_gradient(block), seed 2, of both ── sum in block order ──
+    step
 
-The common factor of a texture and the absorption of the media are nearly one parameter, so the first steps find the pattern up to a factor, media take that
-factor, and exact steps and media then end together.
+The common factor of a texture and the absorption of the media are nearly one parameter, so the first steps find the
+pattern up to a factor, media take that factor, and exact steps and media then end together.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ SURE_Z = 3.0
 def stain_task(
     host: EngineHost, task: BlockTask, similar: Tissue, seeds: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, TraceRow]:
-    """A block's derivatives of sum(w ref C) and of sum(w C1 C) to the texels (H, W), paths shared, and its sum of squares."""
+    """A block's derivatives of sum(w ref C) and of sum(w C1 C) to the texels (H, W), paths shared, and its sum of
+    squares.
+    """
     start, block = time.time(), read_block(task.block)
     view, weight = block.fitted_view, block.fit_weight
     image: StackEstimate = host.call("images", task.recipe, task.tissue, view, samples=task.samples, seed=seeds[0])
@@ -115,8 +119,10 @@ class StainStage:
         return StainSums(explained, carried, sum(part[2] for part in parts))
 
     def _step(
-        self, stage: str, step: int, tissue: Tissue, state: StainState, solve: Callable[[StainState, StainSums], StainState]
+        self, stage: str, step: int, tissue: Tissue, state: StainState,
+        solve: Callable[[StainState, StainSums], StainState]
     ) -> StainState:  # fmt: skip
+
         def compute() -> dict[str, object]:
             seeds = self.passes.seeds(stage, step, "image"), self.passes.seeds(stage, step, "gradient")
             return solve(state, self.sums(f"{stage}-{step}", self._with(tissue, state), seeds)).record()
@@ -132,7 +138,8 @@ class StainStage:
         return replace(tissue, stain=self.layout.texture(state.depth))
 
     def _is_better(self, plain: Tissue, stained: Tissue, state: StainState) -> bool:
-        # A texture follows noise by half a unit of F per texel that it fits, so it has to gain a whole one (Akaike 1974).
+        # A texture follows noise by half a unit of F per texel that it fits, so it has to gain a whole one (Akaike
+        # 1974).
         def compute() -> dict[str, float]:
             seeds = self.passes.seeds("stain.compare", 1), self.passes.seeds("stain.compare", 2)
             parts = self.passes.run(

@@ -6,12 +6,13 @@
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
     gums.ply, cavity.ply       of a jaw
     surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
-    teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer surface's u, v
-    rig.json                   cameras, lights and channels by name
-    parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number, ``11.enamel.sigma``
-    errors.json                fitted and held-out image error, whether the fit converged, correlations, what the capture tells; of a jaw's teeth too
-    NOT-CONVERGED.txt          only where it did not: what to do
-    render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for boundary thin
+    teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer
+    surface's u, v rig.json                   cameras, lights and channels by name
+    parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number,
+    ``11.enamel.sigma`` errors.json                fitted and held-out image error, whether the fit converged,
+    correlations, what the capture tells; of a jaw's teeth too NOT-CONVERGED.txt          only where it did not: what to
+    do render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for
+    boundary thin
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def write_asset(
     cavity: Mesh | None = None,
     stains: ToothStains | None = None,
 ) -> tuple[str, ...]:
-    """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; returns the files' paths relative to ``folder``.
+    """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; returns the files' paths relative
+    to ``folder``.
 
     Args:
         teeth: with the **fitted** dentin surface (``DentinShape.vertices_mm(shape)``) where the fit had one.
@@ -61,7 +63,8 @@ def write_asset(
         stains: of a single tooth.
 
     Raises:
-        CaptureInputError: a camera that Mitsuba cannot render. MeshError: surfaces of a jaw that cannot be cut along each other.
+        CaptureInputError: a camera that Mitsuba cannot render. MeshError: surfaces of a jaw that cannot be cut along
+            each other.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = {}

@@ -50,7 +50,8 @@ def log_chart(title: str, x_label: str, y_label: str, series: Sequence[Series], 
         f'<text x="{(LEFT + WIDTH - RIGHT) / 2:.0f}" y="{HEIGHT - 6}" text-anchor="middle">{escape(x_label)}</text>'
     )
     parts.append(
-        f'<text transform="translate(12 {(TOP + HEIGHT - BOTTOM) / 2:.0f}) rotate(-90)" text-anchor="middle">{escape(y_label)}</text>'
+        f'<text transform="translate(12 {(TOP + HEIGHT - BOTTOM) / 2:.0f}) rotate(-90)"'
+        f' text-anchor="middle">{escape(y_label)}</text>'
     )
     heights = _spread([place(*s.points[-1])[1] for s in lines])
     for number, line in enumerate(lines):

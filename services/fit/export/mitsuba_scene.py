@@ -17,7 +17,8 @@ from services.fit.optics.parameters import Medium, Tissue
 
 MAX_DEPTH = 5000
 ROULETTE_DEPTH = 100
-"""Russian roulette starts here: paths in enamel scatter hundreds of times, and an earlier start costs more variance than it saves."""
+"""Russian roulette starts here: paths in enamel scatter hundreds of times, and an earlier start costs more variance
+than it saves."""
 MAX_UNEVEN = 0.01
 """Of a camera's focal lengths along x and y: calibrations of square pixels leave a thousandth between them."""
 
@@ -42,9 +43,11 @@ def medium_dict(medium: Medium) -> SceneDict:
 
 
 def with_square_pixels(camera: Camera) -> Camera:
-    """A calibrated camera with its mean focal length in both directions; one whose focal lengths differ by more stays as it is.
+    """A calibrated camera with its mean focal length in both directions; one whose focal lengths differ by more stays
+    as it is.
 
-    Scenes are drawn with it: at a hundred pixels from its principal point a picture moves by some hundredths of a pixel.
+    Scenes are drawn with it: at a hundred pixels from its principal point a picture moves by some hundredths of a
+    pixel.
     """
     (fx, skew, cx), (zero, fy, cy), last = camera.K
     if abs(fx / fy - 1) > MAX_UNEVEN:
@@ -62,7 +65,8 @@ def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
     K, pose = np.asarray(camera.K), np.asarray(camera.camera_from_world)
     if abs(K[0, 0] / K[1, 1] - 1) > 1e-4 or abs(K[0, 1]) > 1e-6 * K[0, 0]:
         raise CaptureInputError(
-            f"Camera {camera.name} has unequal focal lengths or skew, which Mitsuba cannot render; resample its images to square pixels."
+            f"Camera {camera.name} has unequal focal lengths or skew, which Mitsuba cannot render; resample its images"
+            " to square pixels."
         )
     width, height = camera.size
     # Mitsuba looks along +z with x to the left and y up; OpenCV has x right and y down.
@@ -141,7 +145,8 @@ def nested_scene(
     samples: Any = 64,
     stains: Mapping[str, Path] = MappingProxyType({}),
 ) -> SceneDict:
-    """Scene of teeth of one tissue under one point light, for ``load_scene`` in a mono variant or for ``scene_xml.write_scene``.
+    """Scene of teeth of one tissue under one point light, for ``load_scene`` in a mono variant or for
+    ``scene_xml.write_scene``.
 
     Enamel lies between a tooth's two surfaces, dentin inside the inner one.
 
@@ -174,7 +179,8 @@ def load_scene(scene: SceneDict) -> Any:
 
 
 def _with_transforms(node: Any) -> Any:
-    # Dictionaries here hold plain arrays, so that they can be written as XML without Mitsuba; loading needs its own transform type.
+    # Dictionaries here hold plain arrays, so that they can be written as XML without Mitsuba; loading needs its own
+    # transform type.
     import mitsuba as mi
 
     if isinstance(node, dict):

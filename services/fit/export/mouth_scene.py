@@ -21,7 +21,8 @@ from services.fit.export.mitsuba_scene import (
 from services.fit.optics.parameters import Mouth
 
 SurfaceFiles = Mapping[str, Path]
-"""PLY files by the name of the surface: ``crown_11``, ``root_11``, ``dentin_11`` and ``contact_11_12`` by FDI number, ``gums``, ``cavity``."""
+"""PLY files by the name of the surface: ``crown_11``, ``root_11``, ``dentin_11`` and ``contact_11_12`` by FDI number,
+``gums``, ``cavity``."""
 
 
 def write_mouth_surfaces(

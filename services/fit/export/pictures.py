@@ -18,7 +18,8 @@ DIVERGING = (
     (0.75, (230, 130, 40)),
     (1.0, (140, 45, 4)),
 )
-"""Blue to orange through near-white: distinct for all common colour-vision deficiencies and in grey by its ends' darkness."""
+"""Blue to orange through near-white: distinct for all common colour-vision deficiencies and in grey by its ends'
+darkness."""
 SEQUENTIAL = (
     (0.0, (68, 1, 84)),
     (0.25, (59, 82, 139)),
@@ -54,7 +55,9 @@ class Picture:
 
 
 def white_level(radiance: NDArray[np.floating], valid: NDArray[np.bool_], percentile: float = 99.0) -> float:
-    """Radiance that is shown as white: a high percentile of the valid pixels, so that one hot pixel does not darken the picture."""
+    """Radiance that is shown as white: a high percentile of the valid pixels, so that one hot pixel does not darken the
+    picture.
+    """
     values = np.asarray(radiance)[valid]
     values = values[np.isfinite(values)]
     level = float(np.percentile(values, percentile)) if values.size else 0.0
@@ -62,7 +65,9 @@ def white_level(radiance: NDArray[np.floating], valid: NDArray[np.bool_], percen
 
 
 def tone_map(radiance: NDArray[np.floating], white: float) -> Image8:
-    """Linear radiance (H, W) or (H, W, C) to sRGB bytes (H, W, 3), IEC 61966-2-1; one channel becomes grey, values above ``white`` clip."""
+    """Linear radiance (H, W) or (H, W, C) to sRGB bytes (H, W, 3), IEC 61966-2-1; one channel becomes grey, values
+    above ``white`` clip.
+    """
     linear = np.clip(np.nan_to_num(np.asarray(radiance, dtype=np.float64)) / white, 0.0, 1.0)
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
     return as_rgb(np.round(255 * srgb).astype(np.uint8))

@@ -34,7 +34,9 @@ PICTURES = "pictures.npz"
 
 
 def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
-    """Images to show: per camera the brightest fitted and the brightest held-out one, by camera name and index among the lights anyone sees."""
+    """Images to show: per camera the brightest fitted and the brightest held-out one, by camera name and index among
+    the lights anyone sees.
+    """
     seen = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views], axis=0))
     shown = []
     for view in views:
@@ -85,7 +87,9 @@ def spacing(pixels: NDArray[np.int32]) -> int:
 def write_preview(
     root: Path, step: StepReport, evaluation: Evaluation, manifest: PreparedManifest, views: tuple[ViewStack, ...]
 ) -> list[dict[str, object]]:
-    """Write render, photograph and residual of one image as PNG; returns the preview event's data, paths relative to ``root``."""
+    """Write render, photograph and residual of one image as PNG; returns the preview event's data, paths relative to
+    ``root``.
+    """
     pictures = pictures_of({step.channel: evaluation}, manifest, {step.channel: views})
     chosen = [p for p in pictures if not p.held_out][:1] + [p for p in pictures if p.held_out][:1]
     (root / PREVIEWS).mkdir(exist_ok=True)
@@ -99,7 +103,8 @@ def write_preview(
         }
         event: dict[str, object] = {
             "camera": picture.camera, "light": picture.light, "held_out": picture.held_out,
-            "channel": step.channel, "step": step.step, "residual_limit": RESIDUAL_OF_WHITE * white, "residual_of_white": RESIDUAL_OF_WHITE,
+            "channel": step.channel, "step": step.step, "residual_limit": RESIDUAL_OF_WHITE * white,
+            "residual_of_white": RESIDUAL_OF_WHITE,
         }  # fmt: skip
         for kind, image in drawn.items():
             path = Path(PREVIEWS) / f"{step.channel}-{step.step:03d}-{picture.camera}-{picture.light}-{kind}.png"
@@ -136,7 +141,9 @@ def read_pictures(
     thickness: ThicknessMap | None = None,
     stains: ToothStains | None = None,
 ) -> ReportPictures:
-    """What the report shows; the thickness of enamel and stains where it is about one tooth, both as the first camera sees them."""
+    """What the report shows; the thickness of enamel and stains where it is about one tooth, both as the first camera
+    sees them.
+    """
     with np.load(folder / PICTURES, allow_pickle=False) as stored:
         count = sum(name.endswith(".name") for name in stored.files)
         pictures = []

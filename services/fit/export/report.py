@@ -57,9 +57,9 @@ SHAPE_LABELS = ("buccal", "proximal", "occlusal")
 LEADING = ("sigma_s_reduced", "alpha_reduced", "sigma_a")
 """What images fix best comes first."""
 THIN_CAVEAT = (
-    "The surface was modelled as a thin layer that does not bend light (teeth 2018). Its internal diffuse reflectance is 0.111 where a real surface of "
-    "index 1.631 has 0.666, so fitted absorption 1 − α comes out 3 to 6 times too large (half space: 3 at 1 − α′ = 0.1, 5 at 0.01, limit 7) and is not "
-    "comparable with the literature."
+    "The surface was modelled as a thin layer that does not bend light (teeth 2018). Its internal diffuse reflectance"
+    " is 0.111 where a real surface of index 1.631 has 0.666, so fitted absorption 1 − α comes out 3 to 6 times too"
+    " large (half space: 3 at 1 − α′ = 0.1, 5 at 0.01, limit 7) and is not comparable with the literature."
 )
 
 
@@ -86,7 +86,8 @@ def write_report(
     """Write the report as one HTML file without any outside reference.
 
     Args:
-        history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``, ``stage`` and ``channel``.
+        history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``,
+            ``stage`` and ``channel``.
         context: ``title``, ``boundary``, ``ior`` and ``provenance`` (a dict of label -> text); all optional.
     """
     verdict = verdict_of(report)
@@ -348,7 +349,8 @@ def _thickness(pictures: ReportPictures) -> dict[str, Any] | None:
 
 
 def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
-    # One map per channel from the darkest texel seen to a clean surface; of few channels that is plainer than one in colour.
+    # One map per channel from the darkest texel seen to a clean surface; of few channels that is plainer than one in
+    # colour.
     if pictures.stains is None or not np.isfinite(pictures.stains).any():
         return None
     low = float(np.floor(10 * np.nanmin(pictures.stains)) / 10)

@@ -1,4 +1,6 @@
-"""Fitted stains on their way out: kept beside the fit, written as textures of the asset, drawn as a camera sees them."""
+"""Fitted stains on their way out: kept beside the fit, written as textures of the asset, drawn as a camera sees
+them.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def kept_stains(folder: Path) -> ToothStains | None:
 
 
 def write_textures(folder: Path, stains: ToothStains) -> dict[str, Path]:
-    """Write ``stain_<channel>.npy``, a_t as fitted, and ``stain_<channel>.png``, what it takes, 1 - a_t in 16 bits; returns the pictures by channel."""
+    """Write ``stain_<channel>.npy``, a_t as fitted, and ``stain_<channel>.png``, what it takes, 1 - a_t in 16 bits;
+    returns the pictures by channel.
+    """
     written = {}
     for channel, stain in stains.textures.items():
         np.save(folder / f"stain_{channel}.npy", stain.transmittance.astype(np.float32))

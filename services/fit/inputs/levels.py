@@ -1,6 +1,7 @@
 """Prepared images at the resolution that is fitted: squares of pixels averaged to one, none left out.
 
-A square is the pixel of a camera with so many times fewer of them, so what a scene is rendered for is exactly what was averaged.
+A square is the pixel of a camera with so many times fewer of them, so what a scene is rendered for is exactly what was
+averaged.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ BoolArray = NDArray[np.bool_]
 
 
 def reduced_camera(camera: Camera, step: int) -> Camera:
-    """The camera whose pixels are squares of ``step`` by ``step`` pixels; what is left of a square at the right and below is dropped."""
+    """The camera whose pixels are squares of ``step`` by ``step`` pixels; what is left of a square at the right and
+    below is dropped.
+    """
     first, second, last = camera.K
     width, height = camera.size
     return camera.model_copy(
@@ -38,7 +41,9 @@ def averaged(values: NDArray[Any], step: int) -> Array:
 
 
 def whole_squares(chosen: BoolArray, step: int) -> BoolArray:
-    """Squares (height // step, width // step) of which every pixel is chosen; a part of one would have another mean than what is rendered."""
+    """Squares (height // step, width // step) of which every pixel is chosen; a part of one would have another mean
+    than what is rendered.
+    """
     height, width = (n // step for n in chosen.shape)
     return np.asarray(chosen[: height * step, : width * step].reshape(height, step, width, step).all(axis=(1, 3)))
 
@@ -57,7 +62,8 @@ class LevelReader:
         self._index, self.step = index, step
 
     def image(self, number: int, light: int, camera: Camera) -> tuple[Array, Array]:
-        """Radiance and its variance (H, W) of one image; errors of a square's pixels are independent, so their variances add.
+        """Radiance and its variance (H, W) of one image; errors of a square's pixels are independent, so their
+        variances add.
 
         Args:
             camera: as it was before it was reduced.

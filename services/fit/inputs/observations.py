@@ -16,6 +16,7 @@ from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import JobSpec, Loss, PreparedManifest
 from services.core.store import open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
+from services.fit.inputs.held_out import held_out_images
 from services.fit.inputs.levels import LevelReader, reduced_camera, whole_squares
 from services.fit.instrument.capture import Instrument
 from services.fit.instrument.errors import NO_ERRORS, InstrumentErrors
@@ -26,7 +27,8 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 Array = NDArray[np.float64]
 
 CELL_EDGE = 4
-"""Losses are compared as means over squares of so many pixels of the coarse grid: what parameters change is smooth, and noise is not."""
+"""Losses are compared as means over squares of so many pixels of the coarse grid: what parameters change is smooth, and
+noise is not."""
 MIN_CELLS = 24
 """Squares are smaller where a view would have about fewer, so that they still tell the comparison's error."""
 COARSE_PIXELS = 600
@@ -129,27 +131,32 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
     """Open and check the prepared stage.
 
     Raises:
-        CaptureInputError, SettingsError: what is asked cannot be fitted to what was captured; names the thing and the remedy.
+        CaptureInputError, SettingsError: what is asked cannot be fitted to what was captured; names the thing and the
+            remedy.
     """
     folder, manifest = open_stage(root, "prepared", PreparedManifest)
     if spec.kind == "tooth" and len(manifest.fdi) != 1:
         raise CaptureInputError(
-            f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); name one by the option 'fdi', or set kind to 'jaw'."
+            f"A tooth fit needs one tooth and the capture has {len(manifest.fdi)} ({manifest.fdi}); name one by the"
+            " option 'fdi', or set kind to 'jaw'."
         )
     if spec.kind == "jaw" and len(manifest.fdi) < 2:
         raise CaptureInputError(
-            "A jaw fit needs at least two teeth and the capture has one; add a folder below teeth/ for each, or set kind to 'tooth'."
+            "A jaw fit needs at least two teeth and the capture has one; add a folder below teeth/ for each, or set"
+            " kind to 'tooth'."
         )
     teeth = read_teeth(folder, manifest.fdi)
     if spec.dentin == "known" and not any(tooth.dentin is not None for tooth in teeth):
         whose = f"tooth {teeth[0].fdi}" if len(teeth) == 1 else "no tooth"
         raise SettingsError(
-            f"dentin = 'known' but {whose} has {'no' if len(teeth) == 1 else 'a'} dentin.ply; add it, or set dentin to 'fit' or 'none'."
+            f"dentin = 'known' but {whose} has {'no' if len(teeth) == 1 else 'a'} dentin.ply; add it, or set dentin to"
+            " 'fit' or 'none'."
         )
     for channel in spec.channels or ():
         if channel not in manifest.channels:
             raise SettingsError(
-                f"Option channels names '{channel}', which the capture does not have; it has {', '.join(manifest.channels)}."
+                f"Option channels names '{channel}', which the capture does not have; it has"
+                f" {', '.join(manifest.channels)}."
             )
     held_out = held_out_images(manifest, spec)
     if spec.kind == "tooth":
@@ -158,46 +165,6 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
         read_mesh(path) if path.is_file() else None for path in (folder / "gums.ply", folder / "cavity.ply")
     )
     return Observations(folder, manifest, teeth, held_out, gums, cavity)
-
-
-def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:
-    """Which images (camera, light) stay out of the fit: the job's choice, else the capture's, else every fourth light, at least one.
-
-    Raises:
-        SettingsError: a light or camera is unknown or none is left to fit. CaptureInputError: fewer than two lights.
-    """
-    cameras, lights = [c.name for c in manifest.cameras], [light.name for light in manifest.lights]
-    if len(lights) < 2:
-        raise CaptureInputError(
-            f"The capture has {len(lights)} light; a fit needs at least two, one of them to test with, so capture more lights."
-        )
-    chosen = np.zeros((len(cameras), len(lights)), dtype=bool)
-    if spec.held_out_lights is not None:
-        for name in spec.held_out_lights:
-            if name not in lights:
-                raise SettingsError(
-                    f"Option held_out_lights names '{name}', which the capture does not have; it has {', '.join(lights)}."
-                )
-            chosen[:, lights.index(name)] = True
-    elif spec.held_out_cameras:
-        pass
-    elif manifest.held_out:
-        for camera, light in manifest.held_out:
-            chosen[cameras.index(camera), lights.index(light)] = True
-    else:
-        chosen[:, 3::4] = True
-        chosen[:, -1] |= not chosen.any()
-    for name in spec.held_out_cameras:
-        if name not in cameras:
-            raise SettingsError(
-                f"Option held_out_cameras names '{name}', which the capture does not have; it has {', '.join(cameras)}."
-            )
-        chosen[cameras.index(name)] = True
-    if chosen.all():
-        raise SettingsError(
-            "Every image is held out and none is left to fit; name fewer in held_out_lights or held_out_cameras."
-        )
-    return chosen
 
 
 def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
@@ -231,7 +198,8 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
         )
     if not views:
         raise CaptureInputError(
-            "No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in millimetres."
+            "No pixel is valid in any image; check the masks, and that meshes and cameras share one frame in"
+            " millimetres."
         )
     require_signal(views, f"Channel {channel}")
     if (spec.held_out_lights != () or spec.held_out_cameras) and not any(
@@ -252,12 +220,14 @@ def require_signal(views: Sequence[ViewStack], name: str) -> None:
     fitted = [v.fitted for v in views]
     if not any(f.any() for f in fitted):
         raise CaptureInputError(
-            "No pixel is valid in any fitted image; name fewer in held_out_lights or held_out_cameras, or check the masks."
+            "No pixel is valid in any fitted image; name fewer in held_out_lights or held_out_cameras, or check the"
+            " masks."
         )
     signal = sum(float((v.reference[f] ** 2 - v.variance[f]).sum()) for v, f in zip(views, fitted, strict=True))
     if signal <= 0:
         raise CaptureInputError(
-            f"{name} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it out."
+            f"{name} is dark: no signal above its noise in any fitted image; check exposure and lights, or leave it"
+            " out."
         )
 
 
@@ -374,7 +344,9 @@ def write_channel(
 
 
 def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
-    """Which pixels (N, 2) are every n-th in x and y, n the least that leaves no more than ``most`` of the counted ones."""
+    """Which pixels (N, 2) are every n-th in x and y, n the least that leaves no more than ``most`` of the counted
+    ones.
+    """
     every = 1
     while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > most:
         every += 1
@@ -382,7 +354,9 @@ def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: 
 
 
 def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
-    """Number (N,) of each pixel's cell: squares of some pixels of the coarse grid, which has no more than ``most`` fitted ones, each of one part alone."""
+    """Number (N,) of each pixel's cell: squares of some pixels of the coarse grid, which has no more than ``most``
+    fitted ones, each of one part alone.
+    """
     counted = np.asarray(view.fitted.any(axis=0))
     coarse = view.pixels[counted & on_coarse_grid(view.pixels, counted, most)]
     if not len(coarse):

@@ -1,4 +1,6 @@
-"""Weights of the next round of a fit whose loss follows residuals: one render of all blocks, then the blocks written anew."""
+"""Weights of the next round of a fit whose loss follows residuals: one render of all blocks, then the blocks written
+anew.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Where stains lie: a chart of a tooth's outer surface in a coarse texture, made by xatlas, and which of its texels are neighbours on the surface."""
+"""Where stains lie: a chart of a tooth's outer surface in a coarse texture, made by xatlas, and which of its texels are
+neighbours on the surface.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +112,9 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
 
 
 def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64], Array]:
-    """Texels (N, 4), numbered row by row, and weights (N, 4) that a look-up at uv (N, 2) mixes; texel centres lie at half-integers, edges go on."""
+    """Texels (N, 4), numbered row by row, and weights (N, 4) that a look-up at uv (N, 2) mixes; texel centres lie at
+    half-integers, edges go on.
+    """
     height, width = size
     x, y = (np.clip(uv[:, k] * n - 0.5, 0, n - 1) for k, n in ((0, width), (1, height)))
     column, row = x.astype(np.int64), y.astype(np.int64)
@@ -123,7 +127,9 @@ def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64]
 
 
 def _surface_samples(mesh: Mesh, spacing_mm: float) -> tuple[NDArray[np.int64], Array, Array]:
-    """Faces (S,), barycentric weights (S, 3) and areas (S,) of a lattice of points on every face, its corners included."""
+    """Faces (S,), barycentric weights (S, 3) and areas (S,) of a lattice of points on every face, its corners
+    included.
+    """
     corners = mesh.vertices_mm[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     cuts = np.maximum(np.ceil(longest / spacing_mm).astype(int), 1)

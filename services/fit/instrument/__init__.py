@@ -1,1 +1,3 @@
-"""What an instrument may have wrong: gain, lights and flare as coordinates of a fit, with the calibration's covariance."""
+"""What an instrument may have wrong: gain, lights and flare as coordinates of a fit, with the calibration's
+covariance.
+"""

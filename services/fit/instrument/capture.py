@@ -18,8 +18,9 @@ from services.fit.instrument.moves import Move, move_covariance, write_moves
 from services.fit.transport.scene.recipe import SceneRecipe
 
 MAX_JAW_LIGHTS = 12
-"""A jaw under more lights takes the gain of each for exact. How noisy the products of derivatives and single lights' images are has to be kept
-for every tooth and its neighbours: 2 MB a tooth with 12 lights, which grows with their square. And where there are many, their errors average out."""
+"""A jaw under more lights takes the gain of each for exact. How noisy the products of derivatives and single lights'
+images are has to be kept for every tooth and its neighbours: 2 MB a tooth with 12 lights, which grows with their
+square. And where there are many, their errors average out."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ class Instrument:
 
 
 def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[np.float64]) -> Instrument | None:
-    """What is known of the instrument; None where the job takes it for perfect, and for the solver adam, which does not know it.
+    """What is known of the instrument; None where the job takes it for perfect, and for the solver adam, which does not
+    know it.
 
     Args:
         manifest: of what was prepared.

@@ -22,7 +22,9 @@ def photographed(image: Array, block: Block, errors: Mapping[str, float]) -> Arr
 
 
 def columns(image: Array, block: Block, names: Sequence[str]) -> Array:
-    """Derivatives (K, L N) of the photographs to each named error: the image, one light's, or the brightest pixel's value everywhere."""
+    """Derivatives (K, L N) of the photographs to each named error: the image, one light's, or the brightest pixel's
+    value everywhere.
+    """
     found = np.zeros((len(names), *image.shape))
     acting = block.instrument
     if acting is None:

@@ -1,8 +1,9 @@
 """The errors of an instrument that a fit of one channel knows, with their covariance.
 
-Photographs follow (1 + gain + light_gain) C + flare, C the image that the media make. The derivatives to the errors are the image itself for the gain, one
-light's for a light's gain, and the brightest pixel's value for a flare; they come from the renders of the residual and cost nothing. (The photographs in
-their place would hold the sensor's noise, which residuals hold too: that pulls a gain by 1e-4, one of the ± that it has where the tissue is known.)
+Photographs follow (1 + gain + light_gain) C + flare, C the image that the media make. The derivatives to the errors are
+the image itself for the gain, one light's for a light's gain, and the brightest pixel's value for a flare; they come
+from the renders of the residual and cost nothing. (The photographs in their place would hold the sensor's noise, which
+residuals hold too: that pulls a gain by 1e-4, one of the ± that it has where the tissue is known.)
 """
 
 from __future__ import annotations
@@ -20,13 +21,15 @@ from services.core.calibration.uncertainty import CalibrationUncertainty
 Array = NDArray[np.float64]
 
 DEFAULT_SE: Mapping[str, float] = MappingProxyType({"gain": 0.01, "light_gain": 0.01, "flare": 0.003})
-"""One standard error by kind where a calibration states none: relative, relative, and a share of the camera's brightest valid pixel in that channel.
-A white standard is certified to about 1 %, lights are compared on it to 1 %, and a lens shade leaves about 0.3 % of veiling glare."""
+"""One standard error by kind where a calibration states none: relative, relative, and a share of the camera's brightest
+valid pixel in that channel. A white standard is certified to about 1 %, lights are compared on it to 1 %, and a lens
+shade leaves about 0.3 % of veiling glare."""
 _DEGREE = math.radians(1)
 DEFAULT_MOVE_SE: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {"teeth": (0.1 * _DEGREE,) * 3 + (0.05,) * 3, "dome": (0.1 * _DEGREE,) * 3 + (2.0,) * 3}
 )
-"""One standard error of rotations (rad) and translations (mm) of the scan and of the dome: what registration reaches at best, and what a tape measure does."""
+"""One standard error of rotations (rad) and translations (mm) of the scan and of the dome: what registration reaches at
+best, and what a tape measure does."""
 LINEAR_REACH = 0.1
 """Length over which images count as linear in an error, for step lengths; they are exactly linear."""
 

@@ -9,7 +9,8 @@ from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec
 from services.fit.instrument.moves import MOVED
 from services.fit.instrument.sentences import assumed_names, instrument_sentences
-from services.fit.solve.covariance import Uncertainty, instrument_estimates
+from services.fit.solve.covariance import Uncertainty
+from services.fit.solve.estimates import instrument_estimates
 
 
 def instrument_report(

@@ -1,4 +1,6 @@
-"""How wrong each light's brightness is at the teeth, which is what photographs show: its intensity and its distance together."""
+"""How wrong each light's brightness is at the teeth, which is what photographs show: its intensity and its distance
+together.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from services.core.geometry import Light
 
 Array = NDArray[np.float64]
 DRIFT = 1e-4
-"""Of a light by itself, relative: what a lamp changes while it warms. Without it errors whose mean is 0 would have no inverse."""
+"""Of a light by itself, relative: what a lamp changes while it warms. Without it errors whose mean is 0 would have no
+inverse."""
 
 
 def at_the_teeth(
@@ -20,18 +23,18 @@ def at_the_teeth(
 ) -> CalibrationUncertainty | None:
     """A calibration's uncertainty whose ``light_gain`` is the error of a light's irradiance at the teeth.
 
-    A light that is taken to be farther away than it is comes out brighter on a white sphere, and at the teeth both errors
-    cancel: irradiance goes as I ÷ d², so its relative error is that of I less 2 (p − c) · δp ÷ |p − c|². Alone, the ± of I
-    would count an error of the distance that the teeth do not see.
+    A light that is taken to be farther away than it is comes out brighter on a white sphere, and at the teeth both
+    errors cancel: irradiance goes as I ÷ d², so its relative error is that of I less 2 (p − c) · δp ÷ |p − c|². Alone,
+    the ± of I would count an error of the distance that the teeth do not see.
 
-    Only products of intensity and radiance per count are measured, and a calibration sets the lights' mean intensity to 1.
-    If all lights are taken to be too far, all irradiances come out low, and all radiances too, by the same share; so
-    the part that all lights have in common is none of photographs against renders, and is taken off. What a white sphere's
-    reflectance leaves is ``gain``.
+    Only products of intensity and radiance per count are measured, and a calibration sets the lights' mean intensity to
+    1. If all lights are taken to be too far, all irradiances come out low, and all radiances too, by the same share; so
+    the part that all lights have in common is none of photographs against renders, and is taken off. What a white
+    sphere's reflectance leaves is ``gain``.
 
     Args:
-        stated: by the calibration; None stays None. Where it states no place of some light, or of a light that was not used,
-            all stays as it is.
+        stated: by the calibration; None stays None. Where it states no place of some light, or of a light that was not
+            used, all stays as it is.
         lights: where it says that they are, and how bright.
         channels: of the lights' intensities.
         centre_mm: of the teeth (3,).

@@ -1,10 +1,11 @@
 """Moves of the scan and of the dome as one: what they do to images enters the ±, and no fit moves them.
 
-Images of a moved tooth need many paths: 0.05 mm move an image by 2 %, and two images of 256 paths differ by as much by chance. As coordinates such moves
-would follow that noise. So they are considered and not estimated (Schmidt 1966): each changes the photographs by one standard deviation of its own, and
-the answer with them.
+Images of a moved tooth need many paths: 0.05 mm move an image by 2 %, and two images of 256 paths differ by as much by
+chance. As coordinates such moves would follow that noise. So they are considered and not estimated (Schmidt 1966): each
+changes the photographs by one standard deviation of its own, and the answer with them.
 
-A tooth that moves by T under cameras and lights that stay is a tooth that stays under cameras and lights that move by T^-1, so no surface is built again.
+A tooth that moves by T under cameras and lights that stay is a tooth that stays under cameras and lights that move by
+T^-1, so no surface is built again.
 """
 
 from __future__ import annotations
@@ -29,9 +30,11 @@ Array = NDArray[np.float64]
 MOVED = tuple(DEFAULT_MOVE_SE)
 """What moves as one: ``teeth`` and ``dome``."""
 REACH = 2.0
-"""Standard deviations between the two images of a difference: wider is quieter, and images of 0.1 mm or 4 mm apart are still about linear."""
+"""Standard deviations between the two images of a difference: wider is quieter, and images of 0.1 mm or 4 mm apart are
+still about linear."""
 MAX_LIGHTS = 80
-"""Of one scene, which holds the lights where they are and as several moves have them; more would cost memory for their maps."""
+"""Of one scene, which holds the lights where they are and as several moves have them; more would cost memory for their
+maps."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,9 @@ def by_scene(moves: Sequence[Move]) -> tuple[tuple[Move, ...], ...]:
 def moves_task(
     host: EngineHost, task: BlockTask, tissue: Tissue | Mouth, moves: tuple[Move, ...], seeds: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """By how much moves of one scene, of one standard deviation each, change a block's images: (K, 2, L, N) by move and seed."""
+    """By how much moves of one scene, of one standard deviation each, change a block's images: (K, 2, L, N) by move and
+    seed.
+    """
     block = read_block(task.block)
     view, count = block.fitted_view, len(block.reference)
     lit = view.lights if view.lights is not None else tuple(range(count))

@@ -1,4 +1,6 @@
-"""What to know of the instrument, in plain words: what was assumed of it, and which of its errors the images put down to a fault of the calibration."""
+"""What to know of the instrument, in plain words: what was assumed of it, and which of its errors the images put down
+to a fault of the calibration.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,10 @@ def instrument_sentences(
         )
     if not any(own.names for own in errors.values()):
         return (
-            f"The ± take the instrument for perfect: a fit of the solver {spec.solver} does not know its gain, lights and flare.",
+            (
+                f"The ± take the instrument for perfect: a fit of the solver {spec.solver} does not know its gain,"
+                " lights and flare."
+            ),
         )
     unmoved = (
         ("The ± of a fit with two lobes take the scan and the dome to lie where the calibration says.",)
@@ -99,7 +104,10 @@ def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
 
 def _exact_lights(errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
     if not any(kind_of_error(name) == "light_gain" for own in errors.values() for name in own.names):
-        yield "The ± take single lights for as bright as the calibration says: under so many a jaw's fit knows their common gain alone."
+        yield (
+            "The ± take single lights for as bright as the calibration says: under so many a jaw's fit knows their"
+            " common gain alone."
+        )
 
 
 def _faults(errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]]) -> Iterator[str]:

@@ -64,7 +64,8 @@ class JawDriver:
         """Fit all channels; files land in the stage's folder, the report is returned.
 
         Raises:
-            SettingsError: an option that only a tooth alone has. CaptureInputError, StoreError: what was prepared is no jaw that can be fitted.
+            SettingsError: an option that only a tooth alone has. CaptureInputError, StoreError: what was prepared is no
+                jaw that can be fitted.
         """
         attempt, spec = self.attempt, self.attempt.spec
         require_jaw_options(spec)
@@ -73,7 +74,8 @@ class JawDriver:
         for tooth, dentin in zip(observations.teeth, dentins, strict=True) if spec.dentin != "none" else ():
             if dentin is None:
                 attempt.log(
-                    f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check its mesh."
+                    f"Tooth {tooth.fdi} has no dentin and is fitted as enamel throughout; give its dentin.ply, or check"
+                    " its mesh."
                 )
         centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in observations.teeth]).mean(axis=0)
         channels, instrument = [], instrument_of(observations.manifest, spec, centre_mm)
@@ -124,7 +126,8 @@ def require_jaw_options(spec: JobSpec) -> None:
     for option, usual in job_kinds()["jaw"].fixed_options.items():
         if (asked := getattr(spec, option)) != usual:
             raise SettingsError(
-                f"A jaw is fitted with {option} = {usual!r}, not {asked!r}; leave it out, or fit its teeth one by one with kind 'tooth'."
+                f"A jaw is fitted with {option} = {usual!r}, not {asked!r}; leave it out, or fit its teeth one by one"
+                " with kind 'tooth'."
             )
 
 
@@ -187,7 +190,8 @@ class _ChannelRun:
             mouth, teeth=tuple(replace(tooth, shape=shape) for tooth, shape in zip(mouth.teeth, shapes, strict=True))
         )
 
-        # Pixels of a tooth that no medium could be fitted to would mislead its neighbours; no error is known of it, so the jaw's does not hold it.
+        # Pixels of a tooth that no medium could be fitted to would mislead its neighbours; no error is known of it, so
+        # the jaw's does not hold it.
         failed = [k for k, start in enumerate(starts) if start.state == "failed"]
         files, dentins = (
             self.channel.files,

@@ -13,12 +13,15 @@ from services.fit.execution.blocks import PixelParts
 from services.fit.optics.domain import Domain
 
 COLOURS = 3
-"""Teeth of one colour have at least two others between them: what is seen of any tooth tells which one of them was changed."""
+"""Teeth of one colour have at least two others between them: what is seen of any tooth tells which one of them was
+changed."""
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Teeth, by their positions in the scene, in the order in which they stand along the arch, one jaw after the other."""
+    """Teeth, by their positions in the scene, in the order in which they stand along the arch, one jaw after the
+    other.
+    """
 
     order: tuple[int, ...]
 
@@ -50,6 +53,8 @@ class Neighbours:
 
 
 def arch_place(fdi: int) -> int:
-    """Signed place along the arch from the midline: negative for the patient's right (quadrants 1, 4 and milk teeth's 5, 8), positive for the left."""
+    """Signed place along the arch from the midline: negative for the patient's right (quadrants 1, 4 and milk teeth's
+    5, 8), positive for the left.
+    """
     quadrant, place = divmod(fdi, 10)
     return -place if quadrant in {1, 4, 5, 8} else place

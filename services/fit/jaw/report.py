@@ -22,7 +22,7 @@ from services.fit.inputs.observations import Observations, ViewStack
 from services.fit.instrument.found import instrument_report
 from services.fit.jaw.starts import ToothStart
 from services.fit.optics.parameters import Mouth
-from services.fit.solve.covariance import estimates
+from services.fit.solve.estimates import estimates
 from services.fit.tooth.driver import shape_covariance
 
 STATES = ("fitted", "tied", "failed")
@@ -109,7 +109,8 @@ def _tooth(
     *,
     is_placed: bool,
 ) -> ToothReport:
-    # The worst state of all channels, and what it says; whether it lies elsewhere is asked only where the jaw as a whole lies where it should.
+    # The worst state of all channels, and what it says; whether it lies elsewhere is asked only where the jaw as a
+    # whole lies where it should.
     start = max((jaw.starts[k] for jaw in fits.values()), key=lambda s: STATES.index(s.state))
     fit_error, held_out_error = (_errors(_evaluations(fits), k, kind) for kind in (0, 1))
     worst = max([*fit_error.values(), *held_out_error.values()], default=0.0)

@@ -1,4 +1,5 @@
-"""The joint fit of a jaw's channel: all teeth, gums and the wall's colour at once, light passing between them (teeth 2018, section 7).
+"""The joint fit of a jaw's channel: all teeth, gums and the wall's colour at once, light passing between them (teeth
+2018, section 7).
 
 =========  ==============================================================  =======  ===========================
 stage      free                                                            media    ends
@@ -11,13 +12,16 @@ shape      the same, the mean cosine of all enamel, and each tooth's       exact
 exact      the same                                                        exact    converged, or max_steps
 =========  ==============================================================  =======  ===========================
 
-Before the first stage every tooth was looked at alone, as if homogeneous. Which of its two media is the denser one is asked with everything around it in
-place: alone, gums and wall are missing, and what they reflect is taken for the tooth's own.
+Before the first stage every tooth was looked at alone, as if homogeneous. Which of its two media is the denser one is
+asked with everything around it in place: alone, gums and wall are missing, and what they reflect is taken for the
+tooth's own.
 
-Gain, lights and flare of the instrument, and where scan and dome lie, are the same for all teeth. Like a tooth's they join in exact media.
+Gain, lights and flare of the instrument, and where scan and dome lie, are the same for all teeth. Like a tooth's they
+join in exact media.
 
-Teeth of which too little is seen, or whose own fit failed, have coordinates like all others, but with a Gaussian prior about the median of the front
-teeth, taken anew before each stage. So what little is seen of them still counts, and where nothing is, they follow.
+Teeth of which too little is seen, or whose own fit failed, have coordinates like all others, but with a Gaussian prior
+about the median of the front teeth, taken anew before each stage. So what little is seen of them still counts, and
+where nothing is, they follow.
 """
 
 from __future__ import annotations
@@ -166,7 +170,8 @@ class JawSchedule(Stages[Mouth]):
         return Domain(tuple(coordinates))
 
     def _exact_domain(self, mouth: Mouth) -> Domain:
-        # Enamel of one mouth has one mean cosine, which images of similar media would not show; tied teeth keep the blend weights of the start.
+        # Enamel of one mouth has one mean cosine, which images of similar media would not show; tied teeth keep the
+        # blend weights of the start.
         enamel = tuple(f"{k}.enamel.cosine" for k in range(len(mouth.teeth)))
         weights = [f"{k}.shape.{mode}" for k in self._shaped for mode in range(len(mouth.teeth[k].shape))]
         return Domain(

@@ -1,4 +1,6 @@
-"""Where a jaw's joint fit starts: each tooth from a fit of its own pixels, hidden and failed ones from the others, gums and wall from what is left."""
+"""Where a jaw's joint fit starts: each tooth from a fit of its own pixels, hidden and failed ones from the others, gums
+and wall from what is left.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,15 @@ from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 
 MIN_TOOTH_PIXELS = 16
-"""A tooth of fewer fitted pixels over all views is tied: four media numbers and their misfit cannot be told from so few."""
+"""A tooth of fewer fitted pixels over all views is tied: four media numbers and their misfit cannot be told from so
+few."""
 FRONT_PLACES = (1, 2, 3)
 """Incisors and canines, the last digit of their FDI numbers: lit and seen best (teeth 2018, section 7)."""
 TOOTH_FAULTS = (InputError, NonFiniteError)
 """What one tooth's data or meshes can cause; all else is the machine's or the operator's doing and ends the job."""
 GUMS_START = Medium(8.5, 0.97, g1=HELD_G)
-"""Generic soft tissue: reduced scattering 1.65 per mm at 540 nm (Jacques 2013), absorption between that of red and green."""
+"""Generic soft tissue: reduced scattering 1.65 per mm at 540 nm (Jacques 2013), absorption between that of red and
+green."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,8 @@ def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
 
 
 def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tissue:
-    """Median of the front teeth that were fitted, coordinate by coordinate, at mean cosine ``HELD_G``; of all that were where no front tooth was.
+    """Median of the front teeth that were fitted, coordinate by coordinate, at mean cosine ``HELD_G``; of all that were
+    where no front tooth was.
 
     Args:
         teeth: present optics of each tooth, None where there are none yet.

@@ -43,7 +43,8 @@ def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple
             labelled.append(replace(view.of(hits.hit), parts=PixelParts(shown, tooth)))
     if not labelled:
         raise CaptureInputError(
-            "No valid pixel shows a tooth, gums or cavity; check that meshes and cameras share one frame in millimetres."
+            "No valid pixel shows a tooth, gums or cavity; check that meshes and cameras share one frame in"
+            " millimetres."
         )
     return tuple(labelled)
 

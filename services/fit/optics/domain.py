@@ -1,4 +1,5 @@
-"""The unbounded domain in which parameters are fitted, and its chain-rule factors (teeth 2018 Eq. 22, 24; signs as in optics).
+"""The unbounded domain in which parameters are fitted, and its chain-rule factors (teeth 2018 Eq. 22, 24; signs as in
+optics).
 
 ===========  =====================  =======================  ==========================
 parameter    natural                d natural / d x          kept inside
@@ -42,7 +43,8 @@ BOUNDS = {
     "shape": (0.0, 1.0),
 }
 HELD_G = 0.8
-"""Mean cosine at which sigma and alpha are coordinates where the cosine is one too, and that a single lobe has where it is not."""
+"""Mean cosine at which sigma and alpha are coordinates where the cosine is one too, and that a single lobe has where it
+is not."""
 STEP_SCALE = {
     "sigma": math.log(2.0),
     "alpha": 0.4,
@@ -68,7 +70,9 @@ LOGISTIC = frozenset({"beta", "reflectance"})
 
 
 def kind_of(name: str) -> str:
-    """The kind of a parameter: the key into BOUNDS for ``enamel.sigma`` or ``3.enamel.sigma`` is ``sigma``, for ``shape.0`` it is ``shape``."""
+    """The kind of a parameter: the key into BOUNDS for ``enamel.sigma`` or ``3.enamel.sigma`` is ``sigma``, for
+    ``shape.0`` it is ``shape``.
+    """
     part, _, leaf = name.rpartition(".")
     kind = "shape" if part.rpartition(".")[2] == "shape" else leaf
     if kind not in BOUNDS:
@@ -185,7 +189,9 @@ class Domain:
 
     @property
     def prior(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Prior mean and precision 1/sd^2 of the tissue's coordinates, both (F,); precision 0 where the prior is flat, and of errors."""
+        """Prior mean and precision 1/sd^2 of the tissue's coordinates, both (F,); precision 0 where the prior is flat,
+        and of errors.
+        """
         none = [0.0] * len(self.errors.names)
         mean = np.array([0.0 if c.prior_mean is None else c.prior_mean for c in self.coordinates] + none)
         precision = np.array([0.0 if c.prior_mean is None else 1.0 / c.prior_sd**2 for c in self.coordinates] + none)
@@ -220,7 +226,8 @@ class Domain:
 
     @property
     def relation(self) -> NDArray[np.int_]:
-        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums, wall or all teeth, 2 of two teeth. All 0 for a tooth alone.
+        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums, wall or all teeth, 2 of two
+        teeth. All 0 for a tooth alone.
 
         With the instrument's errors 3 (row the tissue's), 4 (row an error's) and 5 (both errors').
         """
@@ -236,11 +243,16 @@ class Domain:
 
     @property
     def cosines(self) -> tuple[str, ...]:
-        """Parts whose mean cosine is a coordinate. Their sigma and alpha are coordinates at ``HELD_G``, so that the cosine changes neither reduced quantity."""
+        """Parts whose mean cosine is a coordinate.
+
+        Their sigma and alpha are coordinates at ``HELD_G``, so that the cosine changes neither reduced quantity.
+        """
         return tuple(target.rpartition(".")[0] for c in self.coordinates if c.kind == "cosine" for target in c.targets)
 
     def x_of(self, tissue: Optics, errors: Mapping[str, float] = MappingProxyType({})) -> NDArray[np.float64]:
-        """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value, an error that is not given 0."""
+        """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value, an error that is not
+        given 0.
+        """
         held = _at_cosines(tissue, dict.fromkeys(self.cosines, HELD_G))
 
         def value(name: str) -> float:
@@ -261,7 +273,8 @@ class Domain:
         return _at_cosines(_at_cosines(base, dict.fromkeys(cosines, HELD_G)).with_values(values), cosines)
 
     def chain(self, x: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative of each parameter to each of the tissue's coordinates, (P, F): maps derivatives to natural parameters onto coordinates.
+        """Derivative of each parameter to each of the tissue's coordinates, (P, F): maps derivatives to natural
+        parameters onto coordinates.
 
         Not with ``cosines``.
         """
@@ -275,7 +288,9 @@ class Domain:
 
 
 def similar_medium(medium: Medium, g: float) -> Medium:
-    """The medium of mean cosine g with the same reduced scattering and absorption (similarity theory); bright and fast to render where g is low."""
+    """The medium of mean cosine g with the same reduced scattering and absorption (similarity theory); bright and fast
+    to render where g is low.
+    """
     scattering, absorption = medium.sigma_s_reduced / (1 - g), (1 - medium.alpha) * medium.sigma
     sigma = scattering + absorption
     return Medium(sigma, scattering / sigma, g1=g)

@@ -9,8 +9,8 @@ import mitsuba as mi
 def reflectance(cosine: mi.Float, eta: mi.Float) -> mi.Float:
     """Reflectance for light arriving at ``cosine`` >= 0, eta = n_beyond / n_before; 1 under total internal reflection.
 
-    With q = eta cos(theta_t), q^2 = (eta^2 - 1) + cosine^2, both amplitudes carry the factor eta^2 - 1: no difference of nearly
-    equal numbers is taken, however close eta is to 1.
+    With q = eta cos(theta_t), q^2 = (eta^2 - 1) + cosine^2, both amplitudes carry the factor eta^2 - 1: no difference
+    of nearly equal numbers is taken, however close eta is to 1.
     """
     contrast = (eta - 1) * (eta + 1)
     cosine2 = dr.square(cosine)

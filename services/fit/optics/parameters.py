@@ -1,4 +1,6 @@
-"""Medium parameters in physical units, their names, and the unbounded domain they are fitted in (optics.md; teeth 2018 Eq. 22, 24)."""
+"""Medium parameters in physical units, their names, and the unbounded domain they are fitted in (optics.md; teeth 2018
+Eq. 22, 24).
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,10 @@ class Stain:
 
 @dataclass(frozen=True)
 class Tissue:
-    """Everything a fit may change, for one colour channel. Names: ``enamel.sigma`` ... ``dentin.g2``, ``shape.0`` ... ``shape.2``."""
+    """Everything a fit may change, for one colour channel.
+
+    Names: ``enamel.sigma`` ... ``dentin.g2``, ``shape.0`` ... ``shape.2``.
+    """
 
     enamel: Medium
     dentin: Medium

@@ -1,7 +1,8 @@
 """Phase functions given as tables: p(cos theta), linear in cos theta between nodes, normalised on the sphere.
 
-Piecewise linear in cos theta, all integrals are closed: a node's tent weighs pi times the cosines that it spans, and a distribution
-inverts by one square root. Nodes near a pole are kept as deviations 1 - |cos theta| from it, in which the narrowest peak has room.
+Piecewise linear in cos theta, all integrals are closed: a node's tent weighs pi times the cosines that it spans, and a
+distribution inverts by one square root. Nodes near a pole are kept as deviations 1 - |cos theta| from it, in which the
+narrowest peak has room.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ class PhaseTable:
     """Phase function values at angles between propagation directions. Given in any unit, they are normalised.
 
     Raises:
-        InputError: fewer than two nodes, angles that do not increase from 0 to pi, or values that are negative, not finite or all zero.
+        InputError: fewer than two nodes, angles that do not increase from 0 to pi, or values that are negative, not
+            finite or all zero.
     """
 
     angles_rad: tuple[float, ...]
@@ -40,7 +42,8 @@ class PhaseTable:
         for angle, value in zip(angles, values, strict=True):
             if not math.isfinite(value) or value < 0:
                 raise InputError(
-                    f"The phase table's value at {math.degrees(angle):.4g} degrees is {value:g}; it must be finite and not negative."
+                    f"The phase table's value at {math.degrees(angle):.4g} degrees is {value:g}; it must be finite and"
+                    " not negative."
                 )
         # Pi need not have all its digits.
         angles[-1] = math.pi if math.isclose(angles[-1], math.pi, rel_tol=1e-6) else math.nan

@@ -1,7 +1,8 @@
-"""Gaussian priors of the fit's coordinates, in the unbounded domain: weak ones, those of the literature, and those towards other teeth.
+"""Gaussian priors of the fit's coordinates, in the unbounded domain: weak ones, those of the literature, and those
+towards other teeth.
 
-sigma and g are nearly one parameter, and a fit holds g1 at ``HELD_G``. So a measured medium counts through its reduced scattering and its absorption: the
-medium with these at that mean cosine is what a fit of it would report.
+sigma and g are nearly one parameter, and a fit holds g1 at ``HELD_G``. So a measured medium counts through its reduced
+scattering and its absorption: the medium with these at that mean cosine is what a fit of it would report.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ WEAK: Priors = MappingProxyType(
 )
 """g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25 (one sigma)."""
 COSINE = (to_dual("cosine", 0.7), 0.35)
-"""Of the mean cosine of one lobe that stands for two: 0.48 to 0.84 (one sigma). Similarity of second order asks teeth's lobes for 0.5 to 0.7."""
+"""Of the mean cosine of one lobe that stands for two: 0.48 to 0.84 (one sigma). Similarity of second order asks teeth's
+lobes for 0.5 to 0.7."""
 SHAPE = (0.6, 0.3)
 """Of a blend weight: those nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3 to 1."""
 
@@ -64,7 +66,8 @@ LITERATURE_TABLE = (
 
 
 def towards(part: str, media: Iterable[Medium]) -> Priors:
-    """Prior around the mean of other media, as wide as they differ: teeth of the same mouth (teeth 2018, section 7), or other authors' teeth.
+    """Prior around the mean of other media, as wide as they differ: teeth of the same mouth (teeth 2018, section 7), or
+    other authors' teeth.
 
     Args:
         part: ``enamel`` or ``dentin``, or with a tooth's number before it.
@@ -80,7 +83,10 @@ def towards(part: str, media: Iterable[Medium]) -> Priors:
 
 
 def literature() -> Priors:
-    """Prior towards the table; a source without absorption takes the mean of the others', in the logarithm. Lobes keep the weak priors."""
+    """Prior towards the table; a source without absorption takes the mean of the others', in the logarithm.
+
+    Lobes keep the weak priors.
+    """
     priors = dict(WEAK)
     for part in ("enamel", "dentin"):
         rows = [row for row in LITERATURE_TABLE if row.tissue == part]

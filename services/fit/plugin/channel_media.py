@@ -1,8 +1,8 @@
 """Media that differ per colour channel, for paths that carry all channels at once.
 
-A path takes its flights and turns as one channel, the *leader*, picked by chance, and is worth f_k / mean_c(pdf_c) to channel k:
-the balance heuristic over all channels that could have led the whole path (Wilkie et al. 2014). Only ratios of the
-pdf_c enter, so they are carried relative to the largest. With one channel all of this is absent from the kernel.
+A path takes its flights and turns as one channel, the *leader*, picked by chance, and is worth f_k / mean_c(pdf_c) to
+channel k: the balance heuristic over all channels that could have led the whole path (Wilkie et al. 2014). Only ratios
+of the pdf_c enter, so they are carried relative to the largest. With one channel all of this is absent from the kernel.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from services.fit.transport.scene.media import Media, PhaseFunction
 
 @dataclass(frozen=True)
 class ToothOptics:
-    """What teeth are made of: one medium per colour channel, lengths in scene units (mm where the fit's values are used)."""
+    """What teeth are made of: one medium per colour channel, lengths in scene units (mm where the fit's values are
+    used).
+    """
 
     enamel: tuple[Medium, ...]
     dentin: tuple[Medium, ...]
@@ -79,7 +81,9 @@ class ChannelMedia:
         return result
 
     def rival(self, likely: mi.Spectrum, density: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
-        """Bring the channels' relative likelihoods up to date with one more choice, which each makes with this density."""
+        """Bring the channels' relative likelihoods up to date with one more choice, which each makes with this
+        density.
+        """
         if self.channels == 1:
             return likely
         product = likely * density

@@ -1,4 +1,6 @@
-"""The mirror image of the surroundings in a thin outer face, spread by a GGX roughness: what a fit masks and a picture wants back."""
+"""The mirror image of the surroundings in a thin outer face, spread by a GGX roughness: what a fit masks and a picture
+wants back.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from services.fit.optics import fresnel
 
 
 class Gloss:
-    """Rough reflection off the outside of a face (Walter et al. 2007, Eq. 20, 23, 33, 34); what is not reflected goes on unbent."""
+    """Rough reflection off the outside of a face (Walter et al. 2007, Eq. 20, 23, 33, 34); what is not reflected goes
+    on unbent.
+    """
 
     def __init__(self, roughness: float, ior: mi.Float) -> None:
         self.facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, roughness)

@@ -1,7 +1,8 @@
 """The walk as a Mitsuba integrator, ``dentine``, for teeth in anybody's scene.
 
-Call ``register_integrator()`` once a mono or RGB variant is set, then load a scene with ``optimize=False``. Media values are one
-number, or one for each colour channel; lengths are scene units, millimetres where sigma is per millimetre.
+Call ``register_integrator()`` once a mono or RGB variant is set, then load a scene with ``optimize=False``. Media
+values are one number, or one for each colour channel; lengths are scene units, millimetres where sigma is per
+millimetre.
 
 =============================  ====================================================================
 property                       meaning
@@ -96,7 +97,8 @@ def read_properties(given: Mapping[str, Any], channels: int) -> ToothProperties:
     for name in given:
         if name.startswith("dentin_") and not ids["dentin"]:
             raise InputError(
-                f"Property {name} is given but no dentin surface; name its shape as 'dentin', or leave the property out."
+                f"Property {name} is given but no dentin surface; name its shape as 'dentin', or leave the property"
+                " out."
             )
     media = {part: _media(part, given, channels) if ids[part] else () for part in PARTS}
     boundary, ior, roughness, max_depth = (
@@ -108,7 +110,8 @@ def read_properties(given: Mapping[str, Any], channels: int) -> ToothProperties:
         raise InputError(f"ior = {ior} must be at least 1; give the index of refraction of enamel, 1.631.")
     if roughness is not None and not (isinstance(roughness, int | float) and ROUGHNESS[0] <= roughness <= ROUGHNESS[1]):
         raise InputError(
-            f"roughness = {roughness} must lie in {ROUGHNESS[0]:g} to {ROUGHNESS[1]:g}; correct it, or leave it out for no mirror image."
+            f"roughness = {roughness} must lie in {ROUGHNESS[0]:g} to {ROUGHNESS[1]:g}; correct it, or leave it out for"
+            " no mirror image."
         )
     if roughness is not None and boundary == "matched":
         raise InputError(
@@ -137,7 +140,8 @@ def _media(part: str, given: Mapping[str, Any], channels: int) -> tuple[Medium, 
             ) from problem
         if len(numbers) not in {1, channels}:
             raise InputError(
-                f"{name} has {len(numbers)} values in a variant of {channels} channel; give one number, or set an RGB variant."
+                f"{name} has {len(numbers)} values in a variant of {channels} channel; give one number, or set an RGB"
+                " variant."
             )
         columns.append(np.broadcast_to(numbers, channels).tolist())
     media = tuple(Medium(*values) for values in zip(*columns, strict=True))

@@ -1,8 +1,9 @@
 """Paths through somebody else's scene: stock surfaces and lights around teeth, and the walk's own physics inside them.
 
-Flights, phase functions, nested media and thin faces are those of the walk (``walk.py``); what differs is that any Mitsuba
-surface and emitter may surround a tooth. Every vertex is joined to one sampled emitter along a straight line with analytic
-transmittance, and weighed against the chance that the path finds that emitter by itself (Veach 1997, power heuristic).
+Flights, phase functions, nested media and thin faces are those of the walk (``walk.py``); what differs is that any
+Mitsuba surface and emitter may surround a tooth. Every vertex is joined to one sampled emitter along a straight line
+with analytic transmittance, and weighed against the chance that the path finds that emitter by itself (Veach 1997,
+power heuristic).
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from services.fit.transport.scene.geometry import ENAMEL
 
 CONNECTION_GAIN = 3.0
 CONNECTION_FLOOR = 0.02
-"""A scattering vertex is joined to its emitter with probability clip(gain x expected contribution, floor, 1), as in the walk."""
+"""A scattering vertex is joined to its emitter with probability clip(gain x expected contribution, floor, 1), as in the
+walk."""
 SCALE_SAMPLES = 4096
 DARK_DEPTH = 40.0
 """Optical depth past which a straight line is dark in single precision."""
@@ -224,7 +226,10 @@ class ScenePaths:
         path.radiance += dr.select(active, carried * emitter.eval(flight.si, active) * share, 0)
 
     def _reflect(self, path: Path, flight: Flight, ior: mi.Float) -> None:
-        """What a thin outer face turns back. Without gloss, light from elsewhere shows no mirror image: its loss is a weight."""
+        """What a thin outer face turns back.
+
+        Without gloss, light from elsewhere shows no mirror image: its loss is a weight.
+        """
         face, enters = flight.meets & (flight.part == ENAMEL), flight.cosine < 0
         flight.reflected = fresnel.reflectance(dr.abs(flight.cosine), ior)
         turned = face & (path.sampler.next_1d(face) < flight.reflected)

@@ -30,14 +30,16 @@ class ToothShapes:
 class SceneTeeth:
     """The teeth of one scene at their present places.
 
-    A lane's *place* holds bit ENAMEL inside an enamel surface and bit DENTIN inside a dentin surface, so teeth may not overlap.
+    A lane's *place* holds bit ENAMEL inside an enamel surface and bit DENTIN inside a dentin surface, so teeth may not
+    overlap.
     """
 
     def __init__(self, scene: Any, shapes: ToothShapes) -> None:
         """Find and check the surfaces.
 
         Raises:
-            InputError: no shape of such an id, or one that cannot be a tooth's surface. MeshError: a surface cannot bound a medium.
+            InputError: no shape of such an id, or one that cannot be a tooth's surface. MeshError: a surface cannot
+                bound a medium.
         """
         self._shapes = shapes
         self._state = _state(scene, shapes)
@@ -69,7 +71,9 @@ class SceneTeeth:
         return dr.select((place & DENTIN) != 0, DENTIN, place & ENAMEL)
 
     def beyond(self, place: mi.UInt32, part: mi.UInt32, cosine: mi.Float) -> mi.UInt32:
-        """Place after crossing a surface at ``cosine`` between direction and outward normal; a missed hit heals at the next."""
+        """Place after crossing a surface at ``cosine`` between direction and outward normal; a missed hit heals at the
+        next.
+        """
         return dr.select(cosine < 0, place | part, place & ~part)
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
@@ -87,7 +91,8 @@ def _state(scene: Any, shapes: ToothShapes) -> list[NDArray[Any]]:
         if name not in by_id:
             known = ", ".join(sorted(filter(None, by_id))) or "no shape with an id"
             raise InputError(
-                f"The scene has no shape '{name}' but {known}; correct the id, and load the scene with optimize=False so that ids survive."
+                f"The scene has no shape '{name}' but {known}; correct the id, and load the scene with optimize=False"
+                " so that ids survive."
             )
         if not by_id[name].is_mesh():
             raise InputError(f"Shape '{name}' is no triangle mesh; give the tooth's surface as a mesh file.")

@@ -44,12 +44,14 @@ def main(
     write_results(fits, out)
     for fit in fits:
         print(
-            f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error {100 * fit.errors.fit_error:.2f} %"
+            f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error"
+            f" {100 * fit.errors.fit_error:.2f} %"
         )
         quantities = {name: getattr(fit.parameters, name) for name in type(fit.parameters).model_fields}
         for name, told in (quantities | {name: atom for name, atom in fit.atoms.items() if atom.value > 0}).items():
             print(
-                f"  {name:22} {told.value:9.5f} ± {told.se:.5f} {told.unit}{'' if told.determined else '  not determined'}"
+                f"  {name:22} {told.value:9.5f} ± {told.se:.5f}"
+                f" {told.unit}{'' if told.determined else '  not determined'}"
             )
         for note in fit.notes:
             print(f"  {note}")

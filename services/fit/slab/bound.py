@@ -1,7 +1,7 @@
 """What images of a cell can tell at best: the Cramér-Rao bound of a material under a rig, before anything is measured.
 
-The curvature of the misfit comes from the forward model at a known material, and the smoothness prior adds its own. The bound
-of a number is the root of its posterior variance and the square of what the prior moves it by at that material.
+The curvature of the misfit comes from the forward model at a known material, and the smoothness prior adds its own. The
+bound of a number is the root of its posterior variance and the square of what the prior moves it by at that material.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from services.fit.slab.solve.weights import independent_weights
 Array = NDArray[np.float64]
 
 BATCHES, PATHS, PATHS_THICK = 8, 8000, 60_000
-"""Of the render that gives the curvature: as many as a step of the search takes, and more where a cell ``is_thick``. There
-noise passes for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s was bounded by 0.36 % with 8,000 paths, 1.4 % with 40,000, 0.85 % with 250,000."""
+"""Of the render that gives the curvature: as many as a step of the search takes, and more where a cell ``is_thick``.
+There noise passes for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s was bounded by 0.36 % with 8,000 paths, 1.4
+% with 40,000, 0.85 % with 250,000."""
 FIRST_STEP = 2**33
 """Numbers its random streams apart from a fit's."""
 

@@ -1,7 +1,7 @@
 """Whether a cell's images can tell its phase function, and what to measure instead.
 
-Images are looked at one by one before the fit. How thick and how absorbing the sample is comes from the fit itself: the HG
-medium that it starts from takes a thin sample and an absorbing one for each other.
+Images are looked at one by one before the fit. How thick and how absorbing the sample is comes from the fit itself: the
+HG medium that it starts from takes a thin sample and an absorbing one for each other.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from services.fit.slab.model.dictionary import Material
 Array = NDArray[np.float64]
 
 THINNEST, THICKEST = 0.1, 10.0
-"""Range of sigma_t w in which images tell a phase function (Gkioulekas et al. 2013, figure 6): below, they hold little but
-noise, above, light has forgotten each single deflection."""
+"""Range of sigma_t w in which images tell a phase function (Gkioulekas et al. 2013, figure 6): below, they hold little
+but noise, above, light has forgotten each single deflection."""
 BEST = 2.0
 """sigma_t w to aim at: many photons scatter, and most of those that do only a few times."""
 MIN_ALBEDO = 0.2
@@ -27,7 +27,8 @@ MIN_ALBEDO = 0.2
 MAX_AT_MAXIMUM = 4
 """Pixels that may share an image's largest value: as many as are alike by symmetry in an image without noise."""
 MAX_MISFIT_SIGMAS = 5.0
-"""Standard errors by which squared residuals may exceed the noise before a dictionary is doubted: the chance is 3e-7 a fit."""
+"""Standard errors by which squared residuals may exceed the noise before a dictionary is doubted: the chance is 3e-7 a
+fit."""
 MIN_LIT = 0.5
 """Share of an image's maximum from which pixels count for where the beam is."""
 MAX_OFF = 1.0
@@ -60,7 +61,10 @@ def _off_axis(name: str, image: Array, largest: float, pixels: PixelGrid, beam: 
     if abs(centre_mm) <= MAX_OFF * max(pitch_mm, beam.size_mm):
         return ()
     return (
-        f"In image {name} the light lies {abs(centre_mm):.2g} mm off the plane y = 0; centre the beam or correct pixels.y_mm.",
+        (
+            f"In image {name} the light lies {abs(centre_mm):.2g} mm off the plane y = 0; centre the beam or correct"
+            " pixels.y_mm."
+        ),
     )
 
 
@@ -73,7 +77,9 @@ def grid_faults(pixels: PixelGrid) -> tuple[str, ...]:
 
 
 def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
-    """Whether the sample is too thin, too thick or too absorbing to tell its phase function, and what to measure instead."""
+    """Whether the sample is too thin, too thick or too absorbing to tell its phase function, and what to measure
+    instead.
+    """
     thickness = material.extinction_per_mm * width_mm
     albedo = material.scattering_per_mm / material.extinction_per_mm
     known = f"σt·w is about {thickness:.2g}, and images tell a phase function from {THINNEST:g} to {THICKEST:g}"
@@ -86,8 +92,9 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
         told.append(f"The sample is too thick: {known}; {what}.")
     if albedo < MIN_ALBEDO:
         told.append(
-            f"The sample absorbs too much: about {100 * (1 - albedo):.0f} % of what meets a particle is absorbed, and little but "
-            "single scattering leaves the cell; measure at a wavelength that is absorbed less, or take a thinner cell."
+            f"The sample absorbs too much: about {100 * (1 - albedo):.0f} % of what meets a particle is absorbed, and"
+            " little but single scattering leaves the cell; measure at a wavelength that is absorbed less, or take a"
+            " thinner cell."
         )
     return tuple(told)
 
@@ -102,7 +109,10 @@ def similarity_faults(material: Material, width_mm: float, *, scattering: bool, 
     if scattering or not reduced or thickness <= BEST:
         return ()
     remedy = f"dilute it {thickness / BEST:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
-    what = f"The images fix σs′, but not σs and g by themselves: at a σt·w of {thickness:.2g} light has forgotten its single deflections"
+    what = (
+        f"The images fix σs′, but not σs and g by themselves: at a σt·w of {thickness:.2g} light has forgotten its"
+        " single deflections"
+    )
     return (f"{what}. Take σs, g and the phase function with their ± alone; to tell them apart, {remedy}.",)
 
 
@@ -116,5 +126,8 @@ def mixture_faults(dictionary: str, misfit: float, misfit_se: float, values: int
     squares, error = 2 * misfit / values, math.hypot(math.sqrt(2 / values), 2 * misfit_se / values)
     if dictionary == DEFAULT_DICTIONARY or squares <= 1 + MAX_MISFIT_SIGMAS * error:
         return ()
-    what = f"The images differ from the nearest mix of dictionary {dictionary} by {math.sqrt(squares):.2g} times their noise"
+    what = (
+        f"The images differ from the nearest mix of dictionary {dictionary} by {math.sqrt(squares):.2g} times their"
+        " noise"
+    )
     return (f"{what}: the material may be no such mix, and then ± say too little; compare with {DEFAULT_DICTIONARY}.",)

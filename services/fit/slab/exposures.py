@@ -1,7 +1,8 @@
 """Exposures of one wavelength to linear images with their variances, merged as those of all raw cameras are.
 
-A camera's noise is measured from its own frames: read noise from black frames of one exposure, counts per electron from pairs of
-frames of one light. Light and camera stand still, so two different exposures are a pair as well as two alike are.
+A camera's noise is measured from its own frames: read noise from black frames of one exposure, counts per electron from
+pairs of frames of one light. Light and camera stand still, so two different exposures are a pair as well as two alike
+are.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.float32]
 
 ASSUMED = NoiseModel(read_counts=2.0, counts_per_electron=1.0)
-"""By which exposures are weighed where no frames tell the noise; variances are then assumed as for images that come without."""
+"""By which exposures are weighed where no frames tell the noise; variances are then assumed as for images that come
+without."""
 ABOVE_BLACK = 5.0
 """Standard errors of its mean by which a frame must be brighter than black, or it was taken with the beam off."""
 SIGMA_OF_MEDIAN = 1.4826
@@ -115,8 +117,8 @@ class _Stack:
             exposure = self.exposure(frame, noise)
             if float(np.mean(exposure.signal)) <= ABOVE_BLACK * _error_of_mean(exposure.signal):
                 raise CaptureInputError(
-                    f"Frame {self.root / frame.file} (camera {frame.camera}, light {frame.light}) is no brighter than the camera's black "
-                    "frames; expose it for longer, or leave it out."
+                    f"Frame {self.root / frame.file} (camera {frame.camera}, light {frame.light}) is no brighter than"
+                    " the camera's black frames; expose it for longer, or leave it out."
                 )
             found.append(exposure)
         return found

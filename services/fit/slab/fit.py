@@ -29,7 +29,8 @@ from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
 
 STEPS_OF_ATOMS = 20
-"""Most steps of a search by the weights of atoms: narrow lobes are noisy and their steps damped, and a start that was 30 % off took 11."""
+"""Most steps of a search by the weights of atoms: narrow lobes are noisy and their steps damped, and a start that was
+30 % off took 11."""
 LAST_LOOK = 2**30
 """Number of the render, counted apart from the solver's, that errors are taken from."""
 

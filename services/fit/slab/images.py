@@ -66,8 +66,8 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
     if held_out.all():
         raise CaptureInputError(f"All images at {wavelength_nm:g} nm are held out; leave some to be fitted.")
     return Measurements(
-        np.stack(values), np.stack(variances), held_out, tuple(f"{entry.camera} under {entry.light}" for entry in entries),
-        assumed, tuple(faults),
+        np.stack(values), np.stack(variances), held_out,
+        tuple(f"{entry.camera} under {entry.light}" for entry in entries), assumed, tuple(faults),
     )  # fmt: skip
 
 
@@ -120,7 +120,8 @@ def _folded(value: Array, variance: Array, grid: Grid) -> tuple[Array, Array]:
     halves = np.stack([value[: grid.rows][::-1], value[grid.rows :]])
     weights = 1 / np.stack([variance[: grid.rows][::-1], variance[grid.rows :]])
     total = weights.sum(axis=0)
-    # Both halves have the same expectation, so they are weighed alike where both are usable: weights by noisy values are biased.
+    # Both halves have the same expectation, so they are weighed alike where both are usable: weights by noisy values
+    # are biased.
     usable = weights > 0
     count = usable.sum(axis=0)
     mean = (halves * usable).sum(axis=0) / np.maximum(count, 1)

@@ -1,7 +1,8 @@
-"""Which further measurement would help most: the bound of the fit's images and those of another cell, dilution or camera together.
+"""Which further measurement would help most: the bound of the fit's images and those of another cell, dilution or
+camera together.
 
-The material is taken to be what the fit found. Diluting it by a known factor divides f and sigma_a by that factor and leaves the shape
-of ln f, so what two dilutions tell of ln f adds up, as what two cells of different width tell does.
+The material is taken to be what the fit found. Diluting it by a known factor divides f and sigma_a by that factor and
+leaves the shape of ln f, so what two dilutions tell of ln f adds up, as what two cells of different width tell does.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ def next_measurement(
     seed: int,
     blocks: Blocks = map,
 ) -> str:
-    """One sentence on what to measure next and what it would buy; empty where nothing tried would cut the largest error much.
+    """One sentence on what to measure next and what it would buy; empty where nothing tried would cut the largest error
+    much.
 
     Args:
         index: of the sample.
@@ -66,7 +68,8 @@ def next_measurement(
     """
     variances = np.where(measured.held_out[:, None], np.inf, measured.variances)
     prior = precision(scale)
-    # Where images tell nothing at all, ln f may be off by ten at each knot, and the absorption by all of the extinction.
+    # Where images tell nothing at all, ln f may be off by ten at each knot, and the absorption by all of the
+    # extinction.
     prior[np.diag_indices(KNOTS)] += UNKNOWN_LN_F**-2
     prior[-1, -1] += material.extinction_per_mm**-2
     rig = rig_of(folder, wavelength_nm, index)
@@ -105,7 +108,8 @@ def _percent(share: float) -> str:
 
 
 def candidates(folder: SlabFolder, wavelength_nm: float, material: Material) -> Iterator[Candidate]:
-    """Dilutions and cells within the range in which a fit comes near its bound, and a camera beside a beam where none is.
+    """Dilutions and cells within the range in which a fit comes near its bound, and a camera beside a beam where none
+    is.
 
     Beyond ``THICK`` fits stay ten times above the bound, so that what it promises there would not come true.
     """
@@ -159,12 +163,17 @@ def _beside_a_beam(folder: SlabFolder, wavelength_nm: float) -> Candidate | None
         for one in dict.fromkeys(image.light for image in entries)
     )
     other = folder.model_copy(update={"cameras": (*folder.cameras, more), "images": images, "exposures": ()})
-    words = f"add a camera at the {side} at {angle_deg:g} degrees, {BESIDE_DEG:g} degrees beside the beam of light {first.name}"
+    words = (
+        f"add a camera at the {side} at {angle_deg:g} degrees, {BESIDE_DEG:g} degrees beside the beam of light"
+        f" {first.name}"
+    )
     return Candidate(words, other)
 
 
 def _noise_share(measured: Measurements, averaged: int) -> float:
-    """Standard deviation of a pixel that has its image's mean, as a share of it, over all images; a value averages so many pixels."""
+    """Standard deviation of a pixel that has its image's mean, as a share of it, over all images; a value averages so
+    many pixels.
+    """
     usable = np.isfinite(measured.variances) & ~measured.held_out[:, None]
     shares = [
         variances[use].sum() / max(float(values[use].mean() * values[use].sum()), 1e-300)

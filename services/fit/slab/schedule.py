@@ -1,4 +1,6 @@
-"""Where a slab's work runs: whole wavelengths on a worker each, or the blocks of paths of one wavelength on all workers."""
+"""Where a slab's work runs: whole wavelengths on a worker each, or the blocks of paths of one wavelength on all
+workers.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from services.fit.slab.results.kept import fingerprint, keep, read_kept
 from services.fit.slab.solve.standing import Standing, StandingFile
 
 MAX_TRAVELLING_BYTES = 32 * 2**20
-"""Of a block's sums: its paths take seconds, in which any network between workers carries ten times that. Larger ones stay where they are."""
+"""Of a block's sums: its paths take seconds, in which any network between workers carries ten times that. Larger ones
+stay where they are."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,9 @@ def run_wavelengths(
 ) -> Iterator[Path]:
     """Fit wavelengths, unless an earlier attempt has; gives the folder of each as soon as it is done.
 
-    With as many wavelengths as workers or more, each runs whole on one of them. With fewer, one runs after the other here, and
-    its blocks on all workers. A block's sums depend on what names it alone and are added in the order of the blocks, so the
-    answer is the same to the last digit.
+    With as many wavelengths as workers or more, each runs whole on one of them. With fewer, one runs after the other
+    here, and its blocks on all workers. A block's sums depend on what names it alone and are added in the order of the
+    blocks, so the answer is the same to the last digit.
 
     Args:
         workers: that the job asked for; some may still be starting.
@@ -83,7 +86,9 @@ def block_task(_host: Any, trace: Callable[[Block], BlockSums], block: Block, fl
 
 
 def fit_wavelength(task: WavelengthTask, blocks: Blocks, told: Callable[[Standing], None] = lambda _: None) -> Path:
-    """Fit one wavelength into its folder, unless an earlier attempt has; one that was cut short goes on before its last step."""
+    """Fit one wavelength into its folder, unless an earlier attempt has; one that was cut short goes on before its last
+    step.
+    """
     mark = fingerprint(task.root, task.wavelength_nm, task.options)
     kept = read_kept(task.place)
     if kept is None or kept.of != mark:

@@ -1,7 +1,7 @@
 """Total reflectance and transmittance of flat layers, with derivatives, to a requested error.
 
-Runs the fit's own walk (``services.fit.transport.paths.walk``) between planes instead of meshes; light that leaves either face is
-counted instead of connected to lamps.
+Runs the fit's own walk (``services.fit.transport.paths.walk``) between planes instead of meshes; light that leaves
+either face is counted instead of connected to lamps.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ GRADIENT_ERROR = 0.003
 """Standard error of a derivative, as a fraction of its value or of ``GRADIENT_FLOOR`` of the largest beside it."""
 GRADIENT_FLOOR = 1e-3
 EXIT_FLOOR = 0.1
-"""Standard errors of radiances and of rings are relative to the value, or to this fraction of the largest of its kind."""
+"""Standard errors of radiances and of rings are relative to the value, or to this fraction of the largest of its
+kind."""
 MAX_SAMPLES = 4096
 MAX_PATHS = 2**37
 
@@ -49,7 +50,9 @@ class Layer(Record):
 
 
 class FaceValues(Record):
-    """Values of scattered light that leaves the lit face (R) and the far face (T), one per exit cosine or per ring, with standard errors."""
+    """Values of scattered light that leaves the lit face (R) and the far face (T), one per exit cosine or per ring,
+    with standard errors.
+    """
 
     R: tuple[float, ...]
     T: tuple[float, ...]
@@ -84,7 +87,9 @@ class SlabResult(Record):
 
 @dataclass
 class Sums:
-    """Float64 sums over lanes; rows are the totals, then each derivative, each exit cosine and each ring, columns R and T."""
+    """Float64 sums over lanes; rows are the totals, then each derivative, each exit cosine and each ring, columns R and
+    T.
+    """
 
     rows: int
     specular: float
@@ -102,7 +107,8 @@ class Sums:
         """Add a pass: sums (lanes, rows, 2) over ``samples`` paths per lane."""
         if not np.isfinite(table).all():
             raise NonFiniteError(
-                f"{np.count_nonzero(~np.isfinite(table))} of {table.size} slab sums are not finite; report the parameters."
+                f"{np.count_nonzero(~np.isfinite(table))} of {table.size} slab sums are not finite; report the"
+                " parameters."
             )
         self.first += table.sum(axis=0)
         self.second += (table**2).sum(axis=0) / samples
@@ -137,23 +143,27 @@ def simulate_slab(
     max_seconds: float = 600.0,
     numbered: bool = False,
 ) -> SlabResult:
-    """Simulate until max(R_se / R, T_se / max(T, 1e-3)) <= ``rel_error`` and, with ``gradient``, every derivative is as sure as asked.
+    """Simulate until max(R_se / R, T_se / max(T, 1e-3)) <= ``rel_error`` and, with ``gradient``, every derivative is as
+    sure as asked.
 
-    Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer; ``sigma1, alpha1, beta1,
-    g1a, g1b, sigma2, ..., c`` for layers or where ``numbered``, c the depth of the first inner border at fixed total depth. A derivative's standard
-    error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the same source, whichever is larger; that of a radiance or
-    ring to ``rel_error`` of its value or of a tenth of the largest. After ``max_seconds`` the result is given as it stands, with
-    ``complete`` false and its true standard errors.
+    Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer;
+    ``sigma1, alpha1, beta1, g1a, g1b, sigma2, ..., c`` for layers or where ``numbered``, c the depth of the first inner
+    border at fixed total depth. A derivative's standard error is held to 0.3 % of its value or of 1e-3 of the largest
+    derivative of the same source, whichever is larger; that of a radiance or ring to ``rel_error`` of its value or of a
+    tenth of the largest. After ``max_seconds`` the result is given as it stands, with ``complete`` false and its true
+    standard errors.
 
     Args:
         layers: the first one is lit.
         mu_incident: cosine to the normal of the collimated beam of source ``normal``.
-        exit_cosines: cosines to the normal, in air, at which the radiance that leaves each face is wanted; scattered light only.
-        ring_edges_mm: radii about the point of entry between which, and beyond the last of which, the light that leaves is wanted;
-            scattered light only.
+        exit_cosines: cosines to the normal, in air, at which the radiance that leaves each face is wanted; scattered
+            light only.
+        ring_edges_mm: radii about the point of entry between which, and beyond the last of which, the light that leaves
+            is wanted; scattered light only.
 
     Raises:
-        InputError: a parameter is outside its range. PlatformError: no usable libLLVM. NonFiniteError: a total is not finite.
+        InputError: a parameter is outside its range. PlatformError: no usable libLLVM. NonFiniteError: a total is not
+            finite.
     """
     ring_count = len(ring_edges_mm) + 1 if ring_edges_mm else 0
 
@@ -176,8 +186,8 @@ def simulate_slab(
     if not 0 < rel_error < 1:
         raise InputError(f"rel-error = {rel_error:g} must lie between 0 and 1; 1e-3 is usual.")
     names, sums = accumulate(
-        layers, shortfall, ior=ior, boundary=boundary, source=source, mu_incident=mu_incident, exit_cosines=exit_cosines,
-        ring_edges_mm=ring_edges_mm, gradient=gradient, seed=seed, max_seconds=max_seconds,
+        layers, shortfall, ior=ior, boundary=boundary, source=source, mu_incident=mu_incident,
+        exit_cosines=exit_cosines, ring_edges_mm=ring_edges_mm, gradient=gradient, seed=seed, max_seconds=max_seconds,
     )  # fmt: skip
     if numbered:
         names = tuple({"sigma": "sigma1", "alpha": "alpha1", "g": "g1a"}.get(name, name) for name in names)
@@ -215,9 +225,9 @@ def accumulate(
 ) -> tuple[tuple[str, ...], Sums]:
     """Trace until ``shortfall``, the largest ratio of a standard error to what is asked of it, is at most 1.
 
-    The derivative to the border's depth c comes from the border terms, or from the extinction scores of both layers, to which
-    it is equal in a slab because R and T depend on sigma_i d_i alone: dR/dc = (sigma1/d1) dR/dsigma1 - (sigma2/d2) dR/dsigma2.
-    The first pass tells which is less noisy; ``border_terms_only`` keeps the first.
+    The derivative to the border's depth c comes from the border terms, or from the extinction scores of both layers, to
+    which it is equal in a slab because R and T depend on sigma_i d_i alone: dR/dc = (sigma1/d1) dR/dsigma1 -
+    (sigma2/d2) dR/dsigma2. The first pass tells which is less noisy; ``border_terms_only`` keeps the first.
 
     Returns:
         Names of the derivatives, and the sums.
@@ -236,8 +246,8 @@ def accumulate(
     geometry = SlabGeometry(tuple(layer.thickness_mm for layer in layers), moving_border=border)
     media = Media([_medium(layer) for layer in layers])
     plan = Plan(
-        scores=tuple(Score(*score) for score in scores), shape=0 if border else None, faces=True, bend=boundary == "smooth", exit_cosines=exit_cosines,
-        ring_edges_mm=ring_edges_mm,
+        scores=tuple(Score(*score) for score in scores), shape=0 if border else None, faces=True,
+        bend=boundary == "smooth", exit_cosines=exit_cosines, ring_edges_mm=ring_edges_mm,
     )  # fmt: skip
     sums = Sums(
         1 + len(scores) + border + len(exit_cosines) + plan.rings, float(specular_share(ior, source, mu_incident))
@@ -289,7 +299,8 @@ def _checked(layers: tuple[Layer, ...], ior: float, boundary: str, source: str) 
         last = number == len(layers)
         if not layer.thickness_mm > 0 or (math.isinf(layer.thickness_mm) and not last):
             raise InputError(
-                f"layer {number}.thickness_mm = {layer.thickness_mm:g} must be positive, and only the last layer may be infinite."
+                f"layer {number}.thickness_mm = {layer.thickness_mm:g} must be positive, and only the last layer may be"
+                " infinite."
             )
     if math.isinf(layers[-1].thickness_mm) and layers[-1].alpha == 1 and sum(layer.alpha < 1 for layer in layers) == 0:
         raise InputError(
@@ -312,7 +323,8 @@ def _check_directions(
             raise InputError(f"exit-cosines has {cosine:g}; give cosines to the normal in 0 to 1, 0 excluded.")
     if not all(low < high < math.inf for low, high in pairwise((0.0, *ring_edges_mm))):
         raise InputError(
-            f"ring-edges = {', '.join(f'{edge:g}' for edge in ring_edges_mm)} must be positive, finite and increasing, in mm."
+            f"ring-edges = {', '.join(f'{edge:g}' for edge in ring_edges_mm)} must be positive, finite and increasing,"
+            " in mm."
         )
 
 
@@ -346,7 +358,9 @@ def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> floa
 
 
 def specular_share(ior: ArrayLike, source: str, mu_incident: float = 1.0) -> NDArray[np.float64]:
-    """Share of the incident flux that the lit face reflects, for each ``ior``; Lambertian light by Gauss-Legendre in float64."""
+    """Share of the incident flux that the lit face reflects, for each ``ior``; Lambertian light by Gauss-Legendre in
+    float64.
+    """
     eta = np.asarray(ior, dtype=np.float64)
     if source == "normal":
         return _fresnel(eta, mu_incident)

@@ -1,4 +1,6 @@
-"""Doors of the job kind ``slab``: ``run`` fits a folder's wavelengths on the workers, ``export`` writes what came out."""
+"""Doors of the job kind ``slab``: ``run`` fits a folder's wavelengths on the workers, ``export`` writes what came
+out.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ if TYPE_CHECKING:
     from services.fit.slab.solve.standing import Standing
 
 CHECKPOINT = "fit-checkpoint"
-"""Below the job's folder, one folder a wavelength: its result once it is done, until then where its fit stands, so that a new attempt goes on there."""
+"""Below the job's folder, one folder a wavelength: its result once it is done, until then where its fit stands, so that
+a new attempt goes on there."""
 
 
 def run(spec: JobSpec, context: StageContext) -> SlabReport:
@@ -79,7 +82,8 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
 
 
 def export(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Write parameters.json, phase.json and its pictures, errors.json and report.html, and tables and scenes for Mitsuba as the asset.
+    """Write parameters.json, phase.json and its pictures, errors.json and report.html, and tables and scenes for
+    Mitsuba as the asset.
 
     Raises:
         StoreError: the fit is missing or damaged. CaptureInputError: the folder is gone.
@@ -142,4 +146,7 @@ def _told(fit: Any) -> str:
         f"{label} {value.value:.4g} ± {value.se:.1g}"
         for label, value in (("σs", told.sigma_s), ("σs′", told.sigma_s_reduced))
     )
-    return f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images {100 * fit.errors.fit_error:.2f} %."
+    return (
+        f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images"
+        f" {100 * fit.errors.fit_error:.2f} %."
+    )

@@ -45,8 +45,9 @@ def index_of(folder: SlabFolder, wavelength_nm: float) -> Index:
     for light, one in found.items():
         if abs(one.value - mean) > MAX_APART * one.se:
             raise CaptureInputError(
-                f"The through-beam of light {light} at {wavelength_nm:g} nm gives an index of {one.value:.3f} ± {one.se:.1g} and all "
-                f"together {mean:.3f}; measure its peak_x_mm again, or correct the light's angle_deg or the cell's width_mm."
+                f"The through-beam of light {light} at {wavelength_nm:g} nm gives an index of {one.value:.3f} ±"
+                f" {one.se:.1g} and all together {mean:.3f}; measure its peak_x_mm again, or correct the light's"
+                " angle_deg or the cell's width_mm."
             )
     return Index(mean, total**-0.5)
 

@@ -1,10 +1,12 @@
-"""Adam on stochastic gradients, the solver of teeth 2018 (section 6): init, step, terminate, finish; the outcome is a value.
+"""Adam on stochastic gradients, the solver of teeth 2018 (section 6): init, step, terminate, finish; the outcome is a
+value.
 
-Each step takes one gradient J'W r in the unbounded domain, J and r from two independently seeded passes of the same number of paths per pixel (64 in the
-paper), and moves by Kingma and Ba's rule with their decay rates. Priors join the gradient; bounds are met by projection. The paper states neither its
-learning rate nor when it stops: here the rate is in units of the domain's step scale, constant, and a fit ends after ``max_steps``, or when two running
-means of x, over the last ``window`` steps and over three times as many, differ by less than ``still`` rates. Nothing here knows an error, so
-the standard errors that are reported come from normal equations rendered at the end.
+Each step takes one gradient J'W r in the unbounded domain, J and r from two independently seeded passes of the same
+number of paths per pixel (64 in the paper), and moves by Kingma and Ba's rule with their decay rates. Priors join the
+gradient; bounds are met by projection. The paper states neither its learning rate nor when it stops: here the rate is
+in units of the domain's step scale, constant, and a fit ends after ``max_steps``, or when two running means of x, over
+the last ``window`` steps and over three times as many, differ by less than ``still`` rates. Nothing here knows an
+error, so the standard errors that are reported come from normal equations rendered at the end.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ ADVICE_MORE_STEPS = "Adam still moved at its last step; raise adam_steps, or cho
 
 @dataclass(frozen=True)
 class Gradient:
-    """A stochastic gradient (F,) of the data's F = 1/2 sum w r^2, and F, both without the residual's Monte Carlo noise on average."""
+    """A stochastic gradient (F,) of the data's F = 1/2 sum w r^2, and F, both without the residual's Monte Carlo noise
+    on average.
+    """
 
     gradient: Array
     loss: float
@@ -136,7 +140,8 @@ class Adam:
         low, high = self.domain.bounds
         new = np.clip(x - scale * move, low, high)
 
-        # Single iterates wander by about the rate for ever; running means tell drift from wandering, once both have left the start behind.
+        # Single iterates wander by about the rate for ever; running means tell drift from wandering, once both have
+        # left the start behind.
         lately, before = (
             old + (new - old) / span
             for old, span in ((state.lately, options.window), (state.before, 3 * options.window))

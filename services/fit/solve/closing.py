@@ -1,12 +1,14 @@
 """What is measured once, where a fit ends: how its answer really responds, and what holding g cost it.
 
-A fit with Jacobians J~ of similar media solves J~'W r(x) + Lambda (x - m) = 0, an estimating equation whose instruments J~ are not the derivatives J of
-its images. Its answer moves with the data by M^-1 J~'W, M = J~'W J + Lambda, and not by the inverse of J~'W J~ + Lambda (generalised method of moments,
-Hansen 1982). And with another mean cosine of the media, at equal reduced scattering and absorption, images change by dC and the answer by M^-1 J~'W dC.
+A fit with Jacobians J~ of similar media solves J~'W r(x) + Lambda (x - m) = 0, an estimating equation whose instruments
+J~ are not the derivatives J of its images. Its answer moves with the data by M^-1 J~'W, M = J~'W J + Lambda, and not by
+the inverse of J~'W J~ + Lambda (generalised method of moments, Hansen 1982). And with another mean cosine of the media,
+at equal reduced scattering and absorption, images change by dC and the answer by M^-1 J~'W dC.
 
-All sums are in coordinates y, x = T y, in which the curvature that is believed is the identity. There M = 1 + E. Exact derivatives are noisy, and the
-inverse of a noisy matrix is worthless long before the matrix is, so E is shrunk to what stands out of its noise: with entries of variance tau^2 about 0,
-and noise v, E tau^2 / (tau^2 + v) (Efron and Morris 1973), tau^2 such that sum E^2 / (tau^2 + v) is its expectation (Paule and Mandel 1982).
+All sums are in coordinates y, x = T y, in which the curvature that is believed is the identity. There M = 1 + E. Exact
+derivatives are noisy, and the inverse of a noisy matrix is worthless long before the matrix is, so E is shrunk to what
+stands out of its noise: with entries of variance tau^2 about 0, and noise v, E tau^2 / (tau^2 + v) (Efron and Morris
+1973), tau^2 such that sum E^2 / (tau^2 + v) is its expectation (Paule and Mandel 1982).
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ class ClosingSums:
 
     @property
     def shift_covariance(self) -> Array:
-        """Covariance (F, F) of the gradient by the changes, sum of b b', each shortened to the length that it has without noise."""
+        """Covariance (F, F) of the gradient by the changes, sum of b b', each shortened to the length that it has
+        without noise.
+        """
         return self.shifts_of(range(len(self.shifts)))
 
     def shifts_of(self, chosen: Iterable[int]) -> Array:
@@ -91,7 +95,8 @@ def closing_sums(
         residuals: render minus reference (M,) from two more.
         moved: changes of the render (K, 2, M), by change and seed.
         weight: (M,)
-        errors: so many of the last derivatives are those to the instrument's errors, of the renders of the residuals, as in ``normal_equations``.
+        errors: so many of the last derivatives are those to the instrument's errors, of the renders of the residuals,
+            as in ``normal_equations``.
     """
     mean, spread = 0.5 * (similar[0] + similar[1]), 0.5 * (similar[0] - similar[1])
     true, true_spread = 0.5 * (exact[0] + exact[1]), 0.5 * (exact[0] - exact[1])
@@ -115,7 +120,8 @@ def closing_sums(
     gradient, gradient_noise = with_noise(residuals, is_residual=True)
     shifts = [with_noise((change[0], change[1])) for change in moved]
 
-    # Response; where J is borrowed both sides share their noise, which is taken off the value and makes their errors go together.
+    # Response; where J is borrowed both sides share their noise, which is taken off the value and makes their errors go
+    # together.
     response = (weight * m) @ e.T - (weight * d) @ o.T
     variance = np.zeros_like(response)
     rendered = f - o
@@ -145,8 +151,8 @@ class Response:
 def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
     """Shrink the measured response towards the believed curvature.
 
-    Derivatives J~ of the tissue have no part along those of the instrument's errors, from which y is freed, so M = [1 + E, 0; G, 1]: errors follow the
-    tissue by G, and the tissue's answer is what it would be without them.
+    Derivatives J~ of the tissue have no part along those of the instrument's errors, from which y is freed, so M = [1 +
+    E, 0; G, 1]: errors follow the tissue by G, and the tissue's answer is what it would be without them.
 
     Args:
         prior: whitened precision T' Lambda T, which joins the measured data.

@@ -1,35 +1,32 @@
-"""What the data fix, and how well: sandwich covariance, undetermined directions, derived quantities by the delta method.
+"""What data fix, and how well: sandwich covariance, undetermined directions, derived quantities by the delta method.
 
 In coordinates y, x = T y, in which the believed curvature J~'WJ~ + Lambda is the identity,
 
     Cov(y) = M^-1 (s D + C + Lambda + S + N) M^-T + r r'
 
-=======  ==========================================================================================================================
-D        J~'W Sigma W J~, the noise of the measurements; s >= 1 is the factor by which residuals exceed it (model misfit)
+=======  ===============================================================================================================
+D        J~'W Sigma W J~, the noise of the measurements; s >= 1 is the factor by which residuals exceed it
 C        Monte Carlo covariance of the final gradient, by pixels (``normal_equations``)
 Lambda   the weak prior's precision, which alone speaks where the data are silent
-M        the response of the answer, 1 where Jacobians are the images' own; S, shifts by a held mean cosine (``solve.closing``)
+M        the response of the answer, 1 where Jacobians are the images' own (``solve.closing``)
+S        what held mean cosines shift (``solve.closing``)
 N        what noise in M does to steps p that were taken by it, diag(sum_b var(M_ab) p_b^2)
 r        what is left of the step to the minimum, where the fit ended short of it: M^-1 (gradient + Lambda (x - mean))
-=======  ==========================================================================================================================
+=======  ===============================================================================================================
 
 Where the instrument's errors are coordinates their prior is then used in full (``solve.recombination``), which moves x.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.results import Estimate
 from services.fit.instrument.errors import kind_of_error
-from services.fit.optics.domain import UNITS, Domain, kind_of, natural_derivative
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
+from services.fit.optics.domain import Domain
 from services.fit.solve.closing import ClosingSums, Response, response
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import NormalEquations
@@ -41,15 +38,6 @@ NOISE_FACTOR = 3.0
 """An eigenvalue below so many of its own standard deviations is not told from zero."""
 MIN_DATA_SHARE = 0.5
 """A parameter is determined where data, not prior, give at least this part of the information."""
-DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
-    {
-        "sigma_s_reduced": ("1/mm", lambda m: m.sigma_s_reduced),
-        "sigma_a": ("1/mm", lambda m: (1 - m.alpha) * m.sigma),
-        "alpha_reduced": ("1", lambda m: m.alpha_reduced),
-        "mean_cosine": ("1", lambda m: m.mean_cosine),
-    }
-)
-"""Quantities of a medium that are reported beside its parameters: unit and formula."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +67,9 @@ class Uncertainty:
         return {name: se for name, se in sorted(found.items(), key=lambda one: -one[1]) if se > 0}
 
     def is_determined(self, slope: Array) -> bool:
-        """Whether the data fix a quantity with gradient ``slope``: it avoids open directions and bounds, and the prior knows less than half."""
+        """Whether the data fix a quantity with gradient ``slope``: it avoids open directions and bounds, and the prior
+        knows less than half.
+        """
         _, precision = self.domain.prior
         scaled = slope * self.domain.scale
         size = float(scaled @ scaled)
@@ -101,14 +91,19 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Whitening:
-    """Coordinates y, x = T y, of unit curvature, each the nearest to one of x, and the scaled directions (F, K) whose curvature drowns in its own noise."""
+    """Coordinates y, x = T y, of unit curvature, each the nearest to one of x, and the scaled directions (F, K) whose
+    curvature drowns in its own noise.
+    """
 
     transform: Array
     open_directions: Array
 
 
 def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
-    """Judge the curvature by its noise. Open directions keep only their noise level, so that they show a large error instead of a negative variance."""
+    """Judge the curvature by its noise.
+
+    Open directions keep only their noise level, so that they show a large error instead of a negative variance.
+    """
     count, errors = domain.tissue_count, len(domain.errors.names)
     precision, scale = domain.prior[1][:count], domain.scale[:count]
     left = eliminate(equations, _of_errors(domain), np.zeros(count + errors), count)
@@ -120,7 +115,8 @@ def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
     curvature, axes = np.linalg.eigh((vectors * believed) @ vectors.T + np.diag(precision * scale**2))
     tissue = scale[:, None] * ((axes / np.sqrt(np.maximum(curvature, tiny))) @ axes.T)
 
-    # Errors follow the tissue, and have a unit of their own besides; no direction of theirs is open, as their prior is proper.
+    # Errors follow the tissue, and have a unit of their own besides; no direction of theirs is open, as their prior is
+    # proper.
     own = np.concatenate([np.zeros((count, errors)), left.root])
     open_directions = np.concatenate([vectors[:, is_open], np.zeros((errors, int(is_open.sum())))])
     return Whitening(np.concatenate([left.lift @ tissue, own], axis=1), open_directions)
@@ -135,7 +131,9 @@ def _of_errors(domain: Domain) -> Array:
 
 @dataclass(frozen=True)
 class Pooled:
-    """Gradient of the data in whitened coordinates (F,), its Monte Carlo covariance (F, F), and how far (F,) it was carried by an assumed response."""
+    """Gradient of the data in whitened coordinates (F,), its Monte Carlo covariance (F, F), and how far (F,) it was
+    carried by an assumed response.
+    """
 
     gradient: Array
     noise: Array
@@ -143,8 +141,9 @@ class Pooled:
 
 
 def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
-    # What the solver knew, carried on by the measured response instead of its own curvature, and the closing measurement, weighted by their noise. The
-    # difference of the two ways of carrying is as uncertain as it is large: images are linear over short distances only.
+    # What the solver knew, carried on by the measured response instead of its own curvature, and the closing
+    # measurement, weighted by their noise. The difference of the two ways of carrying is as uncertain as it is large:
+    # images are linear over short distances only.
     carried = np.asarray(np.linalg.solve(t, equations.carried + np.zeros(len(t))), dtype=np.float64)
     correction = solved.excess @ carried
     known, known_noise = (
@@ -162,7 +161,9 @@ def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Res
 
 @dataclass(frozen=True)
 class ClosingModel:
-    """What is known about a solution once its response was measured: M, and the gradient (F,) with its noise (F, F), in whitened coordinates."""
+    """What is known about a solution once its response was measured: M, and the gradient (F,) with its noise (F, F), in
+    whitened coordinates.
+    """
 
     domain: Domain
     x: Array
@@ -172,9 +173,11 @@ class ClosingModel:
     noise: Array
 
     def step(self, part_count: int = 1) -> Array:
-        """The last Newton step (F,): along what is not open, no longer than one scale for each of so many things, inside the bounds.
+        """The last Newton step (F,): along what is not open, no longer than one scale for each of so many things,
+        inside the bounds.
 
-        The instrument's errors go where they are best for the tissue as the step leaves it, which is not where a whole one would.
+        The instrument's errors go where they are best for the tissue as the step leaves it, which is not where a whole
+        one would.
         """
         domain, open_directions, count = self.domain, self.known.open_directions, self.domain.tissue_count
         scaled = -self.known.transform @ self.inverse @ self.gradient / domain.scale
@@ -185,7 +188,8 @@ class ClosingModel:
         return np.asarray(np.concatenate([step[:count], self._errors_after(step[:count])]))
 
     def _errors_after(self, tissue: Array) -> Array:
-        # Change of the errors (K,) at which F = g'z + z'z / 2, z = M y, is least after a step of the tissue, which alone moves its part of y.
+        # Change of the errors (K,) at which F = g'z + z'z / 2, z = M y, is least after a step of the tissue, which
+        # alone moves its part of y.
         count = len(tissue)
         if count == len(self.x):
             return np.zeros(0)
@@ -197,7 +201,9 @@ class ClosingModel:
         return np.asarray(np.clip(self.x[count:] + change, low, high) - self.x[count:])
 
     def slope(self, step: Array) -> float:
-        """Slope of F at x along a step, per length of the step; of a step that follows noise it is steeper by what noise alone would give."""
+        """Slope of F at x along a step, per length of the step; of a step that follows noise it is steeper by what
+        noise alone would give.
+        """
         return float(self.gradient @ self._moved(step))
 
     def promise(self, step: Array) -> tuple[float, float]:
@@ -232,12 +238,16 @@ def uncertainty(
     step: Array | None = None,
     moved: Sequence[str] = (),
 ) -> Uncertainty:
-    """Uncertainty at a solution from the normal equations there. Its x is the solution, moved where errors of an instrument use their prior in full.
+    """Uncertainty at a solution from the normal equations there.
+
+    Its x is the solution, moved where errors of an instrument use their prior in full.
 
     Args:
-        sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where Jacobians are the images' own.
+        sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where
+            Jacobians are the images' own.
         step: what the fit moved after it.
-        moved: what the last of the closing measurement's changes are of, ``teeth`` or ``dome`` each; the others are of held mean cosines.
+        moved: what the last of the closing measurement's changes are of, ``teeth`` or ``dome`` each; the others are of
+            held mean cosines.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
     known = whitening(domain, equations)
@@ -276,8 +286,9 @@ def uncertainty(
 
 
 def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
-    # The whitened prior by what it is of: the tissue, and each kind of the instrument's errors. Columns of a Cholesky factor are parts that
-    # add up and of which none is negative; what kinds that go together have in common counts for the first of them.
+    # The whitened prior by what it is of: the tissue, and each kind of the instrument's errors. Columns of a Cholesky
+    # factor are parts that add up and of which none is negative; what kinds that go together have in common counts for
+    # the first of them.
     count, precision = domain.tissue_count, domain.precision
     parts = {"prior": t[:count].T @ precision[:count, :count] @ t[:count]}
     kinds = np.array([kind_of_error(name) for name in domain.errors.names])
@@ -288,100 +299,9 @@ def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
     return parts
 
 
-def estimates(
-    tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None
-) -> dict[str, Estimate]:
-    """Every parameter of the named parts with unit, standard error and whether the data fix it, and the derived quantities.
-
-    Args:
-        tissue: the solution.
-        parts: ``enamel``, ``dentin``, ``shape``, of a mouth ``3.enamel``, ``3.shape``, ``gums`` or ``cavity``.
-        known: uncertainty of the coordinates that were fitted; None where nothing was.
-        shape_known: uncertainty of the blend weights where another channel's fit gave them.
-    """
-    fitted = set(known.domain.parameters) if known is not None else set()
-    out: dict[str, Estimate] = {}
-    for part in parts:
-        if part == "cavity":
-            out["cavity.reflectance"] = _raw(
-                tissue, "cavity.reflectance", known if "cavity.reflectance" in fitted else None
-            )
-            continue
-        if part.rpartition(".")[2] == "shape":
-            names = [f"{part}.{k}" for k in range(len(_weights(tissue, part)))]
-            out |= {name: _raw(tissue, name, known if name in fitted else shape_known) for name in names}
-            continue
-        for leaf in MEDIUM_FIELDS:
-            name = f"{part}.{leaf}"
-            if f"{part}.cosine" in fitted and leaf in {"sigma", "alpha", "g1"}:
-                out[name] = _derived(tissue, known, part, attrgetter(leaf), UNITS[leaf])
-            else:
-                out[name] = _raw(tissue, name, known if name in fitted else None)
-        for leaf, (unit, quantity) in DERIVED.items():
-            out[f"{part}.{leaf}"] = _derived(tissue, known, part, quantity, unit)
-    return out
-
-
-def _weights(tissue: Optics, part: str) -> tuple[float, ...]:
-    # Blend weights of a tooth, ``shape`` or ``3.shape``.
-    return tissue.shape if isinstance(tissue, Tissue) else tissue.teeth[int(part.partition(".")[0])].shape
-
-
-def _raw(tissue: Optics, name: str, known: Uncertainty | None) -> Estimate:
-    unit = UNITS[kind_of(name)]
-    if known is None:
-        return Estimate(value=tissue.value(name), se=None, unit=unit, determined=False)
-    slope = np.zeros(len(known.x))
-    for k, coordinate in enumerate(known.domain.coordinates):
-        if name in coordinate.targets:
-            slope[k] = natural_derivative(coordinate.kind, float(known.x[k]))
-    return _estimate(tissue.value(name), unit, known, slope)
-
-
-def _estimate(value: float, unit: str, known: Uncertainty, slope: Array) -> Estimate:
-    se, determined = known.standard_error(slope), known.is_determined(slope)
-    return Estimate(value=value, se=se, unit=unit, determined=determined, se_parts=known.se_parts(slope))
-
-
-def _derived(
-    tissue: Optics, known: Uncertainty | None, part: str, quantity: Callable[[Medium], float], unit: str
-) -> Estimate:
-    value = quantity(tissue.medium(part))
-    if known is None:
-        return Estimate(value=value, se=None, unit=unit, determined=False)
-    # Central differences in the unbounded domain; the step is far below every scale and far above rounding.
-    slope, step = np.zeros(len(known.x)), 1e-5
-    for k, coordinate in enumerate(known.domain.coordinates):
-        if any(target.startswith(f"{part}.") for target in coordinate.targets):
-            shift = np.zeros(len(known.x))
-            shift[k] = step
-            high, low = (
-                quantity(known.domain.tissue_at(known.x + sign * shift, tissue).medium(part)) for sign in (1, -1)
-            )
-            slope[k] = (high - low) / (2 * step)
-    if not slope.any():
-        return Estimate(value=value, se=None, unit=unit, determined=False)
-    return _estimate(value, unit, known, slope)
-
-
-def instrument_estimates(known: Uncertainty) -> dict[str, Estimate]:
-    """The instrument's errors by name; one is determined where the images tell it better than the calibration did."""
-    first, found = known.domain.tissue_count, {}
-    for k, (name, before) in enumerate(zip(known.domain.errors.names, known.domain.errors.se.tolist(), strict=True)):
-        slope = np.zeros(len(known.x))
-        slope[first + k] = 1.0
-        se = known.standard_error(slope)
-        found[name] = Estimate(
-            value=float(known.x[first + k]),
-            se=se,
-            unit="1",
-            determined=se < MIN_DATA_SHARE**0.5 * before,
-            se_parts=known.se_parts(slope),
-        )
-    return found
-
-
 def positive_part(matrix: Array) -> Array:
-    """The matrix without its negative eigenvalues, which a covariance estimated from products of two seeds may have, and a variance has not."""
+    """The matrix without its negative eigenvalues, which a covariance estimated from products of two seeds may have,
+    and a variance has not.
+    """
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

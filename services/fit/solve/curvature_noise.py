@@ -1,7 +1,9 @@
-"""How noisy a curvature from Monte Carlo Jacobians is, kept where it matters: among coordinates that act on the same measurements.
+"""How noisy a curvature from Monte Carlo Jacobians is, kept where it matters: among coordinates that act on the same
+measurements.
 
-The covariance of all entries of a curvature H (F, F) has F^4 numbers, gigabytes for the coordinates of a jaw. But a measurement near one tooth knows of few
-coordinates. So noise is a sum of parts, each the covariance of the entries of H among some coordinates, from measurements of its own.
+The covariance of all entries of a curvature H (F, F) has F^4 numbers, gigabytes for the coordinates of a jaw. But a
+measurement near one tooth knows of few coordinates. So noise is a sum of parts, each the covariance of the entries of H
+among some coordinates, from measurements of its own.
 """
 
 from __future__ import annotations
@@ -18,11 +20,13 @@ Array = NDArray[np.float64]
 
 
 def pairs_of(count: int, exact: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Which entries H_ab are noisy, as indices a and b (P,): pairs of the noisy coordinates, then each of them with every exact one.
+    """Which entries H_ab are noisy, as indices a and b (P,): pairs of the noisy coordinates, then each of them with
+    every exact one.
 
     Args:
         count: coordinates whose derivatives are noisy; they come first.
-        exact: coordinates whose derivatives are known exactly, such as a gain's; entries between two of them have no noise.
+        exact: coordinates whose derivatives are known exactly, such as a gain's; entries between two of them have no
+            noise.
     """
     first, second = np.triu_indices(count)
     noisy, known = np.divmod(np.arange(count * exact), max(exact, 1))
@@ -98,7 +102,8 @@ class CurvatureNoise:
         return total
 
     def of_eliminated(self, inverse: Array) -> Array:
-        """The bias (F, F) that noise gives A S^-1 A', for the last K coordinates, all exact: sum_kl S^-1_kl Cov(A_ak, A_bl).
+        """The bias (F, F) that noise gives A S^-1 A', for the last K coordinates, all exact: sum_kl S^-1_kl Cov(A_ak,
+        A_bl).
 
         Args:
             inverse: S^-1 (K, K).
@@ -136,7 +141,9 @@ class CurvatureNoise:
 
 
 def per_pixel(terms: Array, lights: int) -> Array:
-    """Sums (F, N) over the lights of a pixel of terms (F, lights x N): what is of one pixel is of the same walks, what is of two is independent."""
+    """Sums (F, N) over the lights of a pixel of terms (F, lights x N): what is of one pixel is of the same walks, what
+    is of two is independent.
+    """
     return np.asarray(terms.reshape(len(terms), lights, -1).sum(axis=1))
 
 
@@ -148,7 +155,8 @@ def curvature_noise(
     lights: int = 1,
     exact: Sequence[int] = (),
 ) -> NoisePart:
-    """Noise of sum w j j' among some coordinates, from the mean and difference (F, M) of two independently seeded estimates of j.
+    """Noise of sum w j j' among some coordinates, from the mean and difference (F, M) of two independently seeded
+    estimates of j.
 
     Args:
         exact: further coordinates whose derivatives have no noise.

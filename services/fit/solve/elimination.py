@@ -1,11 +1,14 @@
 """Normal equations of the tissue alone, where the instrument's errors follow it.
 
-Images are exactly linear in the errors e, and their columns B have no Monte Carlo noise. So for any tissue x the best errors are known in closed form, and
-a step p of the tissue takes them along by -R p. What is left are equations of the tissue (variable projection, Golub and Pereyra 1973):
+Images are exactly linear in the errors e, and their columns B have no Monte Carlo noise. So for any tissue x the best
+errors are known in closed form, and a step p of the tissue takes them along by -R p. What is left are equations of the
+tissue (variable projection, Golub and Pereyra 1973):
 
-    S = B'WB + P,   R = S^-1 B'WJ,   H = J'WJ - J'WB R,   g = J'Wr - R'(B'Wr + P e),   P the precision of the errors' prior
+    S = B'WB + P,   R = S^-1 B'WJ,   H = J'WJ - J'WB R,   g = J'Wr - R'(B'Wr + P e),   P the precision of the errors'
+    prior
 
-J'WB comes from noisy derivatives, so J'WB S^-1 B'WJ is too large by what its noise squares to, which its own covariance tells and which is taken off.
+J'WB comes from noisy derivatives, so J'WB S^-1 B'WJ is too large by what its noise squares to, which its own covariance
+tells and which is taken off.
 """
 
 from __future__ import annotations
@@ -59,7 +62,8 @@ class Eliminated:
 
 
 def eliminate(equations: NormalEquations, precision: Array, slope: Array, count: int) -> Eliminated:
-    """Leave the first ``count`` coordinates; without errors these are the equations themselves, the tissue's prior included.
+    """Leave the first ``count`` coordinates; without errors these are the equations themselves, the tissue's prior
+    included.
 
     Args:
         precision: of the prior of all coordinates, (F + K, F + K).

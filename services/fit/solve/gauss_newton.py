@@ -1,20 +1,23 @@
 """Gauss-Newton with Monte Carlo Jacobians: init, step, terminate, finish; the outcome is a value.
 
-The objective is F(x) = 1/2 sum w r(x)^2 + 1/2 sum precision (x - prior)^2 in the unbounded domain. Each step asks the problem for normal equations
-(curvature from two independent seeds, residual from a third), pools them with those of earlier steps carried to the present point, solves a
-trust-region subproblem that damps past the most negative curvature, and judges the proposal.
+The objective is F(x) = 1/2 sum w r(x)^2 + 1/2 sum precision (x - prior)^2 in the unbounded domain. Each step asks the
+problem for normal equations (curvature from two independent seeds, residual from a third), pools them with those of
+earlier steps carried to the present point, solves a trust-region subproblem that damps past the most negative
+curvature, and judges the proposal.
 
-Two independent witnesses judge: the loss compared at both ends with common random numbers, from seeds that saw neither gradient nor curvature; and the
-change that the quadratic model promises, with the noise of its gradient and curvature and an allowance for its error that grows with the step. Far from
-the optimum the comparison decides, close to it, where losses hardly differ, the gradient knows more. With z = 3 standard errors:
+Two independent witnesses judge: the loss compared at both ends with common random numbers, from seeds that saw neither
+gradient nor curvature; and the change that the quadratic model promises, with the noise of its gradient and curvature
+and an allowance for its error that grows with the step. Far from the optimum the comparison decides, close to it, where
+losses hardly differ, the gradient knows more. With z = 3 standard errors:
 
 * both together surely better, and not contradicting each other: taken;
 * surely worse, or less than promised: the model's curvature is at fault, the trust radius shrinks;
 * otherwise noise stops progress: samples double; at their limit the fit is as good as its noise and ends.
 
-A fit that ends so has stopped somewhere within a few standard errors, on the side it came from. A last step therefore settles it on the minimum of all
-that is known, along the directions whose curvature stands out of its noise, unless the comparison is surely against it, or, where derivatives are not the
-images' own, unless both witnesses together are not for it by one standard error; its error is then that of the pooled gradient, and unbiased.
+A fit that ends so has stopped somewhere within a few standard errors, on the side it came from. A last step therefore
+settles it on the minimum of all that is known, along the directions whose curvature stands out of its noise, unless the
+comparison is surely against it, or, where derivatives are not the images' own, unless both witnesses together are not
+for it by one standard error; its error is then that of the pooled gradient, and unbiased.
 """
 
 from __future__ import annotations
@@ -56,14 +59,18 @@ ADVICE = {
     Result.CONVERGED: "",
     Result.NOISE_LIMITED: "Monte Carlo noise ended the fit; raise max_samples_per_pixel for smaller standard errors.",
     Result.MAX_STEPS: "The fit still improved at its last step; raise max_steps.",
-    Result.STALLED: "No step along the gradient lowers the error; check that the mesh, the lights and the boundary model match the capture.",
+    Result.STALLED: (
+        "No step along the gradient lowers the error; check that the mesh, the lights and the boundary model match the"
+        " capture."
+    ),
 }
 
 
 DETERMINED = 3.0
 """A direction counts as determined when its curvature exceeds so many of its own standard deviations."""
 LAST_STEP_Z = 1.0
-"""Standard errors by which both witnesses have to be for a fit's last step: nothing comes after it that a wrong one could mislead."""
+"""Standard errors by which both witnesses have to be for a fit's last step: nothing comes after it that a wrong one
+could mislead."""
 
 
 class Problem(Protocol):
@@ -91,10 +98,12 @@ class Options:
     slope_error: float = 0.0
     """The same at any length, where derivatives are not those of the images: the comparison then always has a say."""
     tolerance: float = 0.0
-    """Converged when a further step promises no more than noise does, and noise is worth no more than this change of F."""
+    """Converged when a further step promises no more than noise does, and noise is worth no more than this change of
+    F."""
     least_radius: float = 1e-3
     parts: int = 1
-    """Lengths of steps are root mean squares over so many things that images tell apart, such as teeth: each may go as far as one alone would."""
+    """Lengths of steps are root mean squares over so many things that images tell apart, such as teeth: each may go as
+    far as one alone would."""
 
 
 @dataclass(frozen=True)
@@ -189,12 +198,14 @@ class GaussNewton:
             fresh, known = pool(state.memory, state.memory_samples, fresh, known), state.memory_samples + known
         state = replace(state, step=state.step + 1, memory=fresh, memory_samples=known)
 
-        # The weak prior is exact: it joins curvature and gradient, never their noise. The instrument's errors follow the tissue.
+        # The weak prior is exact: it joins curvature and gradient, never their noise. The instrument's errors follow
+        # the tissue.
         equations = eliminate(fresh, self.domain.precision, self.domain.prior_slope(x), self.domain.tissue_count)
         best, settling = x + equations.settling, equations.settling
         noise_gain = gain_by_noise(equations)
 
-        # Nothing to gain beyond noise, and noise itself small: done. Asked at full radius, so that a small radius never looks like convergence.
+        # Nothing to gain beyond noise, and noise itself small: done. Asked at full radius, so that a small radius never
+        # looks like convergence.
         _, promised = self._propose(equations, x, max(state.radius, 1.0))
         if promised <= noise_gain <= options.tolerance and not self._drowns(equations, state):
             return self._settled(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
@@ -212,7 +223,8 @@ class GaussNewton:
                     f"The loss is not finite at step {state.step}; check the capture for invalid radiance."
                 )
 
-            # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken off.
+            # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken
+            # off.
             model_se = math.hypot(
                 equations.step_noise(step), (options.slope_error + options.model_error * length) * promised
             )
@@ -247,7 +259,8 @@ class GaussNewton:
         )
 
     def _settled(self, problem: Problem, state: State, equations: Eliminated) -> State:
-        # Newton step in the directions that the data determine: curvature beyond its noise, and a noise of the step below one scale.
+        # Newton step in the directions that the data determine: curvature beyond its noise, and a noise of the step
+        # below one scale.
         count = self.domain.tissue_count
         scale, x, settling = self.domain.scale[:count], state.x[:count], equations.settling
         if state.memory is not None and settling.any():
@@ -289,8 +302,9 @@ class GaussNewton:
         return replace(state, x=new, memory=state.memory.moved(whole), verdict=f"{state.verdict}, settled")
 
     def _drowns(self, equations: Eliminated, state: State) -> bool:
-        # Whether more samples are to tell a direction whose step noise is above one scale. What the instrument's errors leave to the tissue is small beside
-        # what images tell of both, and so are such directions beside the tolerance, which is one of images.
+        # Whether more samples are to tell a direction whose step noise is above one scale. What the instrument's errors
+        # leave to the tissue is small beside what images tell of both, and so are such directions beside the tolerance,
+        # which is one of images.
         if not self.domain.errors.names or state.samples >= self.options.max_samples:
             return False
         scale = self.domain.scale[: self.domain.tissue_count]
@@ -318,7 +332,8 @@ class GaussNewton:
         return step, -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
 
     def _carry(self, state: State, step: Array, length: float) -> State:
-        # What was known before a long step is worth less after it: the model's error grows with the step, its noise does not.
+        # What was known before a long step is worth less after it: the model's error grows with the step, its noise
+        # does not.
         assert state.memory is not None
         return replace(
             state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (length / 0.3) ** 2)
@@ -336,7 +351,9 @@ def _spread(equations: Eliminated, scale: Array) -> tuple[Array, Array, Array]:
 
 
 def gain_by_noise(equations: NormalEquations | Eliminated) -> float:
-    """What a Newton step at the true optimum promises on average because the gradient is noisy: tr(H^-1 C) / 2, over directions that curve upwards."""
+    """What a Newton step at the true optimum promises on average because the gradient is noisy: tr(H^-1 C) / 2, over
+    directions that curve upwards.
+    """
     eigenvalues, vectors = np.linalg.eigh(equations.hessian)
     floor = np.maximum(equations.eigenvalue_noise(vectors), 1e-13 * max(float(np.abs(eigenvalues).max()), 1e-300))
     spread = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise, vectors)
@@ -345,7 +362,9 @@ def gain_by_noise(equations: NormalEquations | Eliminated) -> float:
 
 @dataclass(frozen=True)
 class Judged:
-    """A step as two witnesses see it: the change of F by comparison and by a model, with their standard errors, and from how many of them on one is sure."""
+    """A step as two witnesses see it: the change of F by comparison and by a model, with their standard errors, and
+    from how many of them on one is sure.
+    """
 
     change: float
     change_se: float
@@ -364,7 +383,9 @@ class Judged:
         return abs(self.change - self.model) > self.sure_z * math.hypot(self.change_se, self.model_se)
 
     def is_better(self, z: float) -> bool:
-        """Whether both together are for it by z standard errors; a comparison that is surely against it, or contradicts, has the last word."""
+        """Whether both together are for it by z standard errors; a comparison that is surely against it, or
+        contradicts, has the last word.
+        """
         total, total_se = _combine(self.change, self.change_se, self.model, self.model_se)
         return total + z * total_se < 0 and not self.is_worse and not (self.contradicted and self.change > 0)
 

@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 class Addition:
     """What further measurements add in whitened coordinates y (F,), each (F, F); blocks add.
 
-    Where these measurements have errors of their own in common, such as a new light's gain, K of them in units of their ± are the
-    last coordinates (F + K,), and ``left`` is what remains for y.
+    Where these measurements have errors of their own in common, such as a new light's gain, K of them in units of their
+    ± are the last coordinates (F + K,), and ``left`` is what remains for y.
     """
 
     information: Array
@@ -36,7 +36,9 @@ class Addition:
         return Addition(factor * self.information, factor * self.meat, self.errors)
 
     def left(self) -> Addition:
-        """Of y alone, its own errors at their best for any y; noise in J makes them explain a little more than they can."""
+        """Of y alone, its own errors at their best for any y; noise in J makes them explain a little more than they
+        can.
+        """
         if not self.errors:
             return self
         count = len(self.information) - self.errors
@@ -77,7 +79,9 @@ def addition(
 
 
 def covariance_with(known: Sandwich, added: Addition) -> Array:
-    """Covariance (F, F) of x in a fit with the further measurements; negative information, which noise alone makes, counts as none."""
+    """Covariance (F, F) of x in a fit with the further measurements; negative information, which noise alone makes,
+    counts as none.
+    """
     own = added.left()
     information, meat = (positive_part(matrix) for matrix in (own.information, own.meat))
     inverse = np.asarray(np.linalg.inv(np.linalg.inv(known.inverse) + information), dtype=np.float64)
@@ -85,6 +89,8 @@ def covariance_with(known: Sandwich, added: Addition) -> Array:
 
 
 def covariance_after(known: Uncertainty, added: Addition) -> Array:
-    """Covariance (F, F) of x as the fit states it, had it the further measurements; the step that was left stays left."""
+    """Covariance (F, F) of x as the fit states it, had it the further measurements; the step that was left stays
+    left.
+    """
     assert known.sandwich is not None
     return covariance_with(known.sandwich, added) + known.parts.get("unfinished", np.zeros_like(known.covariance))

@@ -1,4 +1,5 @@
-"""Losses as weights of a least-squares fit (teeth 2018, section 7): F = 1/2 sum w r^2, scaled so that sum w var_ref is the number of measurements.
+"""Losses as weights of a least-squares fit (teeth 2018, section 7): F = 1/2 sum w r^2, scaled so that sum w var_ref is
+the number of measurements.
 
 ============  ==========================================  ==================================
 loss          sum over measurements                       w, up to the common scale
@@ -10,10 +11,10 @@ relative_l1   abs r / (ref + floor)                       1 / ((ref + floor) abs
 robust        Cauchy, ln(1 + (u / c)^2)                   1 / (1 + (u / c)^2)
 ============  ==========================================  ==================================
 
-floor is a share of the mean reference; u = r over its standard deviation (sensor and Monte Carlo), in units of the median size of all u. The last three
-depend on the residual: iteratively reweighted least squares (Beaton and Tukey 1974), weights from a render that no other pass sees, so that for given
-weights the fit is as unbiased as l2. What stays is that noise of that render enlarges small residuals: l1 becomes least squares where the fit is
-closer than the noise.
+floor is a share of the mean reference; u = r over its standard deviation (sensor and Monte Carlo), in units of the
+median size of all u. The last three depend on the residual: iteratively reweighted least squares (Beaton and Tukey
+1974), weights from a render that no other pass sees, so that for given weights the fit is as unbiased as l2. What stays
+is that noise of that render enlarges small residuals: l1 becomes least squares where the fit is closer than the noise.
 """
 
 from __future__ import annotations
@@ -78,6 +79,7 @@ def _floored(reference: Array) -> Array:
 
 
 def _scaled(weight: Array, variance: Array) -> Array:
-    # So that F is in units of the measurements' noise, and priors keep their meaning; sensor noise of nothing leaves weights of mean one.
+    # So that F is in units of the measurements' noise, and priors keep their meaning; sensor noise of nothing leaves
+    # weights of mean one.
     total = float(weight @ variance)
     return np.asarray(weight * (len(weight) / total if total > 0 else 1 / weight.mean()))

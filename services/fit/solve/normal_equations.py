@@ -1,8 +1,9 @@
 """Unbiased sums over measurements from noisy Jacobians and images, and how noisy each sum is.
 
-Two independently seeded estimates j1, j2 of a derivative have the mean m = (j1 + j2) / 2 and the difference d = j1 - j2. Then m m' - d d' / 4 is the
-symmetrised product of the two, unbiased for j j', and for any direction u the product (u'j1)(u'j2) has the variance E[(u'm)^2 (u'd)^2]
-(m and d are uncorrelated; exact for Gaussian noise). So one pair of estimates gives every sum here together with its own error.
+Two independently seeded estimates j1, j2 of a derivative have the mean m = (j1 + j2) / 2 and the difference d = j1 -
+j2. Then m m' - d d' / 4 is the symmetrised product of the two, unbiased for j j', and for any direction u the product
+(u'j1)(u'j2) has the variance E[(u'm)^2 (u'd)^2] (m and d are uncorrelated; exact for Gaussian noise). So one pair of
+estimates gives every sum here together with its own error.
 """
 
 from __future__ import annotations
@@ -100,9 +101,10 @@ def normal_equations(
 ) -> NormalEquations:
     """Sum one block of measurements.
 
-    Images of a pixel under all lights, and their derivatives, are of the same walks: their errors are correlated. So noise is that of sums over the
-    lights of a pixel, pixels being independent. With halves of differences d of J and s of r, the sum of w m r over a pixel's lights has the covariance
-    [sum w m s][..]' + [sum w r d][..]' - [sum w d s][..]': the last term is what the first two both count.
+    Images of a pixel under all lights, and their derivatives, are of the same walks: their errors are correlated. So
+    noise is that of sums over the lights of a pixel, pixels being independent. With halves of differences d of J and s
+    of r, the sum of w m r over a pixel's lights has the covariance [sum w m s][..]' + [sum w r d][..]' - [sum w d
+    s][..]': the last term is what the first two both count.
 
     Args:
         j1, j2: derivatives (F, M) from two independent seeds.
@@ -111,8 +113,9 @@ def normal_equations(
         weight: (M,), 0 where a measurement does not count.
         lights: M = lights x pixels, light by light.
         regions: which together hold all measurements; None for one of all coordinates.
-        exact: so many of the last derivatives, such as those to a gain, are of the very renders of r1 and r2. So each is multiplied with the residual of
-            the other, and what their own noise does to the curvature, far less than that of the other derivatives, counts as nothing.
+        exact: so many of the last derivatives, such as those to a gain, are of the very renders of r1 and r2. So each
+            is multiplied with the residual of the other, and what their own noise does to the curvature, far less than
+            that of the other derivatives, counts as nothing.
     """
     mean, difference = 0.5 * (j1 + j2), j1 - j2
     residual, spread = 0.5 * (r1 + r2), 0.5 * (r1 - r2)
@@ -151,7 +154,10 @@ def normal_equations(
 
 
 def pool(old: NormalEquations, old_samples: float, new: NormalEquations, new_samples: float) -> NormalEquations:
-    """Mean of two independent estimates of the same sums, weighted by their samples. The measurements are the same ones: their own noise does not average."""
+    """Mean of two independent estimates of the same sums, weighted by their samples.
+
+    The measurements are the same ones: their own noise does not average.
+    """
     share = new_samples / (old_samples + new_samples)
     pooled = old.scaled(1 - share) + new.scaled(share)
     return replace(pooled, data_noise=(1 - share) * old.data_noise + share * new.data_noise)
@@ -159,7 +165,9 @@ def pool(old: NormalEquations, old_samples: float, new: NormalEquations, new_sam
 
 @dataclass(frozen=True)
 class LossChange:
-    """Change of F = 1/2 sum w r^2 between two points, both rendered with the same two seeds, and its Monte Carlo variance."""
+    """Change of F = 1/2 sum w r^2 between two points, both rendered with the same two seeds, and its Monte Carlo
+    variance.
+    """
 
     change: float
     variance: float
@@ -182,13 +190,16 @@ def loss_change(
     lights: int,
     cell: NDArray[np.int32] | None = None,
 ) -> LossChange:
-    """Compare residuals (M,), M = lights x pixels, at two points; index 1 and 2 are independent seeds, each shared by both points (common random numbers).
+    """Compare residuals (M,), M = lights x pixels, at two points; index 1 and 2 are independent seeds, each shared by
+    both points (common random numbers).
 
-    The loss is the product of two independent residuals, so Monte Carlo noise does not bias it. Its variance follows from the same identity as above,
-    applied to the bilinear form n1 n2 - o1 o2, and is summed by pixels, whose lights share their walks.
+    The loss is the product of two independent residuals, so Monte Carlo noise does not bias it. Its variance follows
+    from the same identity as above, applied to the bilinear form n1 n2 - o1 o2, and is summed by pixels, whose lights
+    share their walks.
 
-    Few paths make the product of both seeds' noise its largest part. Sums over cells instead of pixels, of the cells' mean residuals, keep what changes
-    slowly from pixel to pixel, as what parameters do, and have a share of that noise that falls with the root of a cell's pixels.
+    Few paths make the product of both seeds' noise its largest part. Sums over cells instead of pixels, of the cells'
+    mean residuals, keep what changes slowly from pixel to pixel, as what parameters do, and have a share of that noise
+    that falls with the root of a cell's pixels.
 
     Args:
         cell: number (N,) of each pixel's cell; None where pixels stand alone.

@@ -1,14 +1,17 @@
-"""The instrument's errors and their prior once more, by how far either is off: the best unbiased combination of the two.
+"""The instrument's errors and their prior once more, by how far either is off: the best unbiased combination of the
+two.
 
-A fit weighs the errors' prior against photographs whose noise alone it knows, by derivatives that are not the images' own. Held mean cosines, moves of
-scan and dome, and those derivatives leave an answer x (F,) with more error than that, so its errors e, the last K of x, may be worse than their prior was.
-The prior says e = m + n, n of covariance V. With B = dx / dm, the answer's response to the prior, and d = e - m,
+A fit weighs the errors' prior against photographs whose noise alone it knows, by derivatives that are not the images'
+own. Held mean cosines, moves of scan and dome, and those derivatives leave an answer x (F,) with more error than that,
+so its errors e, the last K of x, may be worse than their prior was. The prior says e = m + n, n of covariance V. With B
+= dx / dm, the answer's response to the prior, and d = e - m,
 
-    c = Cov(x, d) = C[:, e] - B V,   D = Cov(d) = C[e, e] - B[e] V - V B[e]' + V,   x <- x - G d,   C <- C - c D^-1 c',   G = c D^-1
+    c = Cov(x, d) = C[:, e] - B V,   D = Cov(d) = C[e, e] - B[e] V - V B[e]' + V,   x <- x - G d,   C <- C - c D^-1 c',
+    G = c D^-1
 
-is the linear unbiased combination of least variance (Gauss and Markov). Where the fit used its prior in full, c = 0 and nothing changes; after it no ± of
-an error is larger than the prior's. The tissue goes along as far as its error goes with the instrument's. An error that lies too far from its prior is
-freed of it.
+is the linear unbiased combination of least variance (Gauss and Markov). Where the fit used its prior in full, c = 0 and
+nothing changes; after it no ± of an error is larger than the prior's. The tissue goes along as far as its error goes
+with the instrument's. An error that lies too far from its prior is freed of it.
 """
 
 from __future__ import annotations
@@ -59,7 +62,8 @@ class Recombination:
         """Q (F, K) of the best combination x + Q d, which is -G where every prior is believed.
 
         Args:
-            wrong: places of errors whose prior is not. The answer is freed of these: their prior's means go where the answer puts the errors.
+            wrong: places of errors whose prior is not. The answer is freed of these: their prior's means go where the
+                answer puts the errors.
         """
         used = [k for k in range(len(self.prior)) if k not in wrong]
         freed = np.zeros_like(self.response)
@@ -89,7 +93,8 @@ def _inverse(spread: Array, unit: Array) -> Array:
 
 
 FAULT_Z = 3.0
-"""An error that lies more than so many standard errors from its prior is a fault of the calibration: 1 good one in 370 does."""
+"""An error that lies more than so many standard errors from its prior is a fault of the calibration: 1 good one in 370
+does."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +112,9 @@ class Fault:
 def faults(off: Array, found: Recombination) -> tuple[Fault, ...]:
     """Errors that lie more than ``FAULT_Z`` standard errors from their prior, the clearest first.
 
-    A prior that is off by f moves d by f h, h = (1 - B[e])'s own column, so f = h'D^-1 d / h'D^-1 h is what all errors together say of it. One by one: each
-    fault is taken out before the others are judged, as a wrong one draws others along (Baarda 1968).
+    A prior that is off by f moves d by f h, h = (1 - B[e])'s own column, so f = h'D^-1 d / h'D^-1 h is what all errors
+    together say of it. One by one: each fault is taken out before the others are judged, as a wrong one draws others
+    along (Baarda 1968).
 
     Args:
         off: d (K,), errors of the first answer less their prior's mean.

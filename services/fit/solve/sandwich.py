@@ -1,4 +1,6 @@
-"""Cov(x) = T M^-1 meat M^-T T' of a fit's answer, and the same after the prior of the instrument's errors was used in full (``recombination``)."""
+"""Cov(x) = T M^-1 meat M^-T T' of a fit's answer, and the same after the prior of the instrument's errors was used in
+full (``recombination``).
+"""
 
 from __future__ import annotations
 
@@ -91,14 +93,16 @@ def settle(domain: Domain, x: Array, sandwich: Sandwich, meats: Mapping[str, Arr
 
 
 def _moved(domain: Domain, x: Array, step: Array) -> Array:
-    # By the step, or as much of it as moves the tissue by one scale: what frees an error is not linear farther than that.
+    # By the step, or as much of it as moves the tissue by one scale: what frees an error is not linear farther than
+    # that.
     count, (low, high) = domain.tissue_count, domain.bounds
     length = float(np.linalg.norm((step / domain.scale)[:count]))
     return np.asarray(np.clip(x + step / max(1.0, length), low, high))
 
 
 def _of_prior(domain: Domain, found: Recombination) -> dict[str, Array]:
-    # What the prior's error, of covariance V = L L', makes of the answer by kind; what kinds that go together have in common counts for the first of them.
+    # What the prior's error, of covariance V = L L', makes of the answer by kind; what kinds that go together have in
+    # common counts for the first of them.
     kinds = np.array([kind_of_error(name) for name in domain.errors.names])
     halves = found.response @ np.linalg.cholesky(found.prior)
     return {kind: halves[:, kinds == kind] @ halves[:, kinds == kind].T for kind in dict.fromkeys(kinds.tolist())}

@@ -1,16 +1,21 @@
-"""One step of a stain texture: optical depths d of its texels, a_t = exp(-d), under priors, from sums over all measurements (teeth 2018 Eq. 1, 10).
+"""One step of a stain texture: optical depths d of its texels, a_t = exp(-d), under priors, from sums over all
+measurements (teeth 2018 Eq. 1, 10).
 
-A path's light is a product of factors exp(-d), one per face crossed, so with shares S_t = -(1/C) dC/dd_t of a pixel's light in the texels it crossed,
+A path's light is a product of factors exp(-d), one per face crossed, so with shares S_t = -(1/C) dC/dd_t of a pixel's
+light in the texels it crossed,
 
     carried_t = sum w C1 C2 S_t,   explained_t = sum w ref C S_t,   dF/dd_t = explained_t - carried_t.
 
-A ratio step sets d to d - ln(explained / carried) / 2: photograph over render, averaged over all lights and views by the light that a texel passes. With two
-crossings per path sum_t S_t = 2, so 2 diag(carried) bounds the curvature from above (Lange 2013, separable majorisation) and a ratio step lowers F
-however uneven the texture. It is slow where neighbours differ, because that bound counts the way in, which all texels share. Momentum steps (Polyak 1964) with
-diag(carried) finish; their factors are optimal for curvatures between a quarter of it, seen on the way out only, and twice it.
+A ratio step sets d to d - ln(explained / carried) / 2: photograph over render, averaged over all lights and views by
+the light that a texel passes. With two crossings per path sum_t S_t = 2, so 2 diag(carried) bounds the curvature from
+above (Lange 2013, separable majorisation) and a ratio step lowers F however uneven the texture. It is slow where
+neighbours differ, because that bound counts the way in, which all texels share. Momentum steps (Polyak 1964) with
+diag(carried) finish; their factors are optimal for curvatures between a quarter of it, seen on the way out only, and
+twice it.
 
-A common factor of all images is nearly what the media's absorption does, and d cannot fall below 0. So the first steps find the pattern at a free factor, with
-the cleanest part of the surface at d = 0; media then take the factor, and the last steps leave it to the images.
+A common factor of all images is nearly what the media's absorption does, and d cannot fall below 0. So the first steps
+find the pattern at a free factor, with the cleanest part of the surface at d = 0; media then take the factor, and the
+last steps leave it to the images.
 """
 
 from __future__ import annotations
@@ -111,7 +116,8 @@ class StainSolver:
         )
 
     def exact_step(self, state: StainState, sums: StainSums, number: int) -> StainState:
-        """A step with momentum along the exact gradient; later ones are shorter, so that noise averages out (Robbins and Monro 1951).
+        """A step with momentum along the exact gradient; later ones are shorter, so that noise averages out (Robbins
+        and Monro 1951).
 
         Args:
             number: of exact steps before this one.
@@ -144,7 +150,8 @@ class StainSolver:
         from scipy import sparse
         from scipy.sparse.linalg import spsolve
 
-        # Data by the diagonal bound, priors exactly; texels of which noise says nothing have the prior's curvature alone.
+        # Data by the diagonal bound, priors exactly; texels of which noise says nothing have the prior's curvature
+        # alone.
         prior, carried = self._prior(), np.maximum(sums.carried, 0.0)
         gradient = slope + prior @ state.depth
         step = -spsolve((sparse.diags(bound * carried) + prior).tocsc(), gradient) + momentum * state.moved

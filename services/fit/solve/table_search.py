@@ -1,7 +1,8 @@
 """Start of a fit: the best homogeneous tooth in a table over albedo x density x anisotropy (teeth 2018, section 7).
 
-An image is a polynomial in the albedo when its paths are kept by scattering order, I(alpha) = sum_n alpha^n I_n. So a render at alpha = 1, split into
-bins of orders, gives every albedo at once, and tens of renders over density x anisotropy carry tens of thousands of table points.
+An image is a polynomial in the albedo when its paths are kept by scattering order, I(alpha) = sum_n alpha^n I_n. So a
+render at alpha = 1, split into bins of orders, gives every albedo at once, and tens of renders over density x
+anisotropy carry tens of thousands of table points.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from services.fit.optics.domain import to_natural
 Array = NDArray[np.float64]
 
 REDUCED_DENSITIES = (0.2, 0.4, 0.7, 1.1, 1.6, 2.3, 3.3, 4.8)
-"""Reduced scattering sigma (1 - g), per mm: the literature's span for enamel and dentin. A grid in it, not in sigma, keeps every render as costly as needed."""
+"""Reduced scattering sigma (1 - g), per mm: the literature's span for enamel and dentin. A grid in it, not in sigma,
+keeps every render as costly as needed."""
 ANISOTROPIES = (0.0, 0.7)
 KAPPA = (1.0, 3.0)
 """Range of -log10(1 - alpha). Not beyond: where absorption is invisible the fit would start on a plateau."""
 SCALE_TRUST = 0.35
-"""Log-scale misfit that costs as much as a relative image error of 1: lights are calibrated, but one medium stands for two."""
+"""Log-scale misfit that costs as much as a relative image error of 1: lights are calibrated, but one medium stands for
+two."""
 
 
 def order_edges(last: int = 2048) -> NDArray[np.int64]:
@@ -106,7 +109,8 @@ def search_node(
     alpha = np.array([to_natural("alpha", x) for x in np.linspace(*KAPPA, albedos)])
     powers = bin_powers(alpha, edges)
 
-    # <C,R> and <C,C> are polynomials in the same powers, so no image is formed per albedo; two seeds keep noise out of <C,C>.
+    # <C,R> and <C,C> are polynomials in the same powers, so no image is formed per albedo; two seeds keep noise out of
+    # <C,C>.
     bins = len(edges) - 1
     cross, gram, total = np.zeros(bins), np.zeros((bins, bins)), 0.0
     for (first, second), seen in zip(orders, observed, strict=True):

@@ -1,4 +1,6 @@
-"""The trust-region subproblem with a curvature that Monte Carlo noise may have made indefinite (Moré and Sorensen 1983)."""
+"""The trust-region subproblem with a curvature that Monte Carlo noise may have made indefinite (Moré and Sorensen
+1983).
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,16 @@ def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: 
         hessian: symmetric (F, F), may be indefinite.
         gradient: (F,)
         radius: largest length of the step, positive.
-        curvature_floor: least curvature (F,) that is believed in each eigendirection, ascending order of H's eigenvalues; noise level of the eigenvalue.
+        curvature_floor: least curvature (F,) that is believed in each eigendirection, ascending order of H's
+            eigenvalues; noise level of the eigenvalue.
 
     Raises:
         NonFiniteError: NaN or infinity in the input.
     """
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         raise NonFiniteError(
-            f"The normal equations hold {np.count_nonzero(~np.isfinite(hessian))} non-finite entries; lower the sample noise or mask the pixels that cause it."
+            f"The normal equations hold {np.count_nonzero(~np.isfinite(hessian))} non-finite entries; lower the sample"
+            " noise or mask the pixels that cause it."
         )
     size = float(np.linalg.norm(gradient))
     if size == 0.0 or radius <= 0.0:
@@ -73,7 +77,8 @@ def solve_box(
     radius: float,
     hessian_noise: Noise | None = None,
 ) -> Array:
-    """Step p from x with norm(p / scale) <= radius and x + p within bounds; coordinates that would leave are set on their bound and the rest solved again.
+    """Step p from x with norm(p / scale) <= radius and x + p within bounds; coordinates that would leave are set on
+    their bound and the rest solved again.
 
     Args:
         hessian_noise: as in NormalEquations, for the least believed curvature; None for exact curvature.

@@ -39,7 +39,8 @@ from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_m
 from services.fit.instrument.capture import instrument_of
 from services.fit.instrument.found import instrument_report
 from services.fit.optics.parameters import Tissue
-from services.fit.solve.covariance import Uncertainty, estimates
+from services.fit.solve.covariance import Uncertainty
+from services.fit.solve.estimates import estimates
 from services.fit.tooth.schedule import ChannelSchedule
 
 
@@ -191,7 +192,8 @@ class FitDriver:
 def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> DentinShape | None:
     """The dentin surface the job asks for: the given one, a blend shape made from the enamel, or none.
 
-    The blend modes' axes follow from the mesh, from its FDI number, and where these leave them open from where the cameras stand.
+    The blend modes' axes follow from the mesh, from its FDI number, and where these leave them open from where the
+    cameras stand.
     """
     if spec.dentin == "known":
         assert tooth.dentin is not None
@@ -243,7 +245,8 @@ def fitted_thickness(
     shape: tuple[float, ...],
     covariance: tuple[tuple[float, ...], ...],
 ) -> ThicknessMap | None:
-    """Enamel's thickness as the first camera sees it, of the fitted dentin; None without dentin, or where it does not see the tooth.
+    """Enamel's thickness as the first camera sees it, of the fitted dentin; None without dentin, or where it does not
+    see the tooth.
 
     Args:
         tooth: with its dentin where the job says that it is known.

@@ -1,26 +1,28 @@
 """One channel's fit, from nothing to parameters: table search, homogeneous tooth, starts for two media, exact fit.
 
-============  ===============================================  ========  =======================================================
+============  ===============================================  ========  ===============================================
 stage         free                                             media     ends
-============  ===============================================  ========  =======================================================
+============  ===============================================  ========  ===============================================
 search        table over albedo x density x anisotropy         exact     best point
 homogeneous   sigma, alpha shared by both media                similar   converged, or a few steps
 start.k       sigma, alpha of both media, from several ratios  similar   two steps each; the least loss goes on
 layered       the same                                         similar   converged, or max_steps
-shape         the same and the dentin's blend weights          exact     converged, or max_steps; only where they are fitted
+shape         the same and the dentin's blend weights          exact     converged, or max_steps; where they are fitted
 exact         the same                                         exact     converged, or max_steps
 phase         g1, beta, g2 too                                 exact     converged, or max_steps; only with two lobes
-stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; only where stains are fitted
-============  ===============================================  ========  =======================================================
+stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; where fitted
+============  ===============================================  ========  ===============================================
 
-Similar media have the same reduced scattering and absorption at mean cosine 0 (similarity theory). They cost several times less for equal noise, and
-their derivatives to sigma are several times less noisy, at an image error of 1 to 15 %. So they carry the fit to its neighbourhood. In the last stage
-residuals come from the exact media and only the Jacobian from similar ones: where J'W r = 0 the exact image fits, whatever approximates J.
+Similar media have the same reduced scattering and absorption at mean cosine 0 (similarity theory). They cost several
+times less for equal noise, and their derivatives to sigma are several times less noisy, at an image error of 1 to 15 %.
+So they carry the fit to its neighbourhood. In the last stage residuals come from the exact media and only the Jacobian
+from similar ones: where J'W r = 0 the exact image fits, whatever approximates J.
 
-sigma and g are nearly one parameter in a thick medium. With one lobe the enamel's mean cosine is a coordinate at constant reduced scattering and
-absorption, from the first exact stage on, under a weak prior: it decides how much light turns back after few scatterings. With two lobes g1, beta and g2
-are free under weak Gaussian priors. The instrument's errors join with the first exact stage: in similar media they would only hide what
-these have wrong. Absorption of a thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
+sigma and g are nearly one parameter in a thick medium. With one lobe the enamel's mean cosine is a coordinate at
+constant reduced scattering and absorption, from the first exact stage on, under a weak prior: it decides how much light
+turns back after few scatterings. With two lobes g1, beta and g2 are free under weak Gaussian priors. The instrument's
+errors join with the first exact stage: in similar media they would only hide what these have wrong. Absorption of a
+thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
 """
 
 from __future__ import annotations
@@ -47,12 +49,15 @@ from services.fit.solve.losses import is_reweighted
 ALL_LEAVES = ("sigma", "alpha", "g1", "beta", "g2")
 SIMILAR_G = 0.0
 START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
-"""Density of enamel and dentin over the homogeneous tooth's: dentin scatters more in every source of the literature table."""
+"""Density of enamel and dentin over the homogeneous tooth's: dentin scatters more in every source of the literature
+table."""
 HOMOGENEOUS_STEPS = 4
 EXACT_SAMPLES = 4
-"""Paths per pixel at which the exact stages begin, over those of the start, for three views; they double as noise asks."""
+"""Paths per pixel at which the exact stages begin, over those of the start, for three views; they double as noise
+asks."""
 MIN_EXACT_SAMPLES = 32
-"""With fewer, where the limit allows them, comparisons of full images decide little: a large stack takes longer from 11 to its 21 than at 21 alone."""
+"""With fewer, where the limit allows them, comparisons of full images decide little: a large stack takes longer from 11
+to its 21 than at 21 alone."""
 SEARCH_SAMPLES = 64
 """Least paths per pixel of the search, which looks at a few hundred pixels only."""
 REWEIGHTINGS = 2
@@ -232,7 +237,8 @@ class ChannelSchedule(Stages[Tissue]):
         return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
 
     def _with_cosines(self, domain: Domain) -> Domain:
-        # Of the enamel where nothing of it is given, which another cosine would change: what lies below it is lit by light that has scattered often.
+        # Of the enamel where nothing of it is given, which another cosine would change: what lies below it is lit by
+        # light that has scattered often.
         fitted = [part for part in self.media[:1] if not any(name.startswith(f"{part}.") for name in self.spec.held)]
         return Domain(domain.coordinates + tuple(Coordinate((f"{part}.cosine",), *COSINE) for part in fitted))
 
@@ -249,7 +255,8 @@ class ChannelSchedule(Stages[Tissue]):
         return self._uniform(similar_medium(Medium(start.sigma, start.alpha, g1=start.g), HELD_G))
 
     def _search(self) -> table_search.Candidate:
-        # One render per node and view with two seeds each, so that <C,C> is free of noise; every albedo follows from it.
+        # One render per node and view with two seeds each, so that <C,C> is free of noise; every albedo follows from
+        # it.
         nodes, edges = table_search.nodes(), table_search.order_edges()
         passes = replace(self.passes, blocks=self.files.search_blocks)
 
@@ -280,8 +287,8 @@ class ChannelSchedule(Stages[Tissue]):
         return table_search.Candidate(**best[0])
 
     def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
-        # Several density ratios, each improved a little, then compared by loss with the same seeds: with few samples a single start may end with enamel
-        # and dentin exchanged.
+        # Several density ratios, each improved a little, then compared by loss with the same seeds: with few samples a
+        # single start may end with enamel and dentin exchanged.
         domain, ends = self._domain(("sigma", "alpha")), list[Tissue]()
         for k, (thin, dense) in enumerate(START_RATIOS):
             start = tissue.with_values(
@@ -327,7 +334,7 @@ def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...], priors: Priors
 
 def _coordinate(targets: tuple[str, ...], priors: Priors) -> Coordinate:
     # What both media share has a prior only where theirs are one.
-    (prior, *others) = (priors.get(target) for target in targets)
+    prior, *others = (priors.get(target) for target in targets)
     return (
         Coordinate(targets) if prior is None or any(other != prior for other in others) else Coordinate(targets, *prior)
     )

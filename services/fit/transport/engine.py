@@ -61,7 +61,8 @@ class Engine:
                 raise InputError(f"{name} = {ior:g} must be at least 1; give the index of refraction of {usual}.")
         if not 0 <= recipe.border_width_mm <= WIDEST_BORDER_MM:
             raise InputError(
-                f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g}; correct it."
+                f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g};"
+                " correct it."
             )
         prepare_device(threads, recipe.device)
         from services.fit.transport.lighting.light_maps import LightMaps
@@ -97,14 +98,20 @@ class Engine:
 
         Args:
             seed: with pixel and sample number it fixes every random number.
-            samples: paths per pixel, rounded up to a multiple of ``batches``; fewer than ``batches`` make as many batches.
-            rel_error: instead of ``samples``, sqrt(sum of variances) / norm to reach over all pixels and lights of the view.
-            max_seconds: with ``rel_error``, give the result as it stands after this time, with ``complete`` false and its true error.
-            max_samples: the same after so many paths per pixel. A result that was not cut short by time repeats bit for bit.
-            batches: independent batches whose spread gives the variance; one value's error follows Student's t with ``batches - 1``.
+            samples: paths per pixel, rounded up to a multiple of ``batches``; fewer than ``batches`` make as many
+                batches.
+            rel_error: instead of ``samples``, sqrt(sum of variances) / norm to reach over all pixels and lights of the
+                view.
+            max_seconds: with ``rel_error``, give the result as it stands after this time, with ``complete`` false and
+                its true error.
+            max_samples: the same after so many paths per pixel. A result that was not cut short by time repeats bit for
+                bit.
+            batches: independent batches whose spread gives the variance; one value's error follows Student's t with
+                ``batches - 1``.
 
         Raises:
-            InputError: a parameter is outside its physical range, the view lists no pixel, or not exactly one of ``samples`` and ``rel_error`` is given.
+            InputError: a parameter is outside its physical range, the view lists no pixel, or not exactly one of
+                ``samples`` and ``rel_error`` is given.
             NonFiniteError: a result is NaN or infinite.
         """
         from services.fit.transport.paths.scores import Plan
@@ -133,9 +140,9 @@ class Engine:
     ) -> JacobianEstimate:
         """Images and their derivatives to the natural parameters ``names`` (see ``Tissue``).
 
-        Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` has both border terms. Arguments are those of
-        ``images``; ``rel_error`` is to be reached by the images and by each derivative, relative to its own norm. A derivative of
-        which only noise is seen never gets there: give a limit.
+        Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` has both border terms.
+        Arguments are those of ``images``; ``rel_error`` is to be reached by the images and by each derivative, relative
+        to its own norm. A derivative of which only noise is seen never gets there: give a limit.
 
         Raises:
             As ``images``; InputError also for a name the scene does not have.
@@ -181,20 +188,23 @@ class Engine:
         order: int = 5,
         tooth: int = 0,
     ) -> ShapeGradient:
-        """Derivatives of sum(cotangent x images) to all weights of a tooth's dentin shape, with far less noise than the Jacobian's.
+        """Derivatives of sum(cotangent x images) to all weights of a tooth's dentin shape, with far less noise than the
+        Jacobian's.
 
-        Light and importance on the border (``border_series``) instead of single paths. It has a bias: the series ends at ``order``, and light
-        is averaged over patches of the border.
+        Light and importance on the border (``border_series``) instead of single paths. It has a bias: the series ends
+        at ``order``, and light is averaged over patches of the border.
 
         Args:
-            cotangent: (L, N) weight of every light's pixel, such as an L2 loss's residual; rows of lights that the view does not list do not count.
+            cotangent: (L, N) weight of every light's pixel, such as an L2 loss's residual; rows of lights that the view
+                does not list do not count.
             samples: walks per pixel, rounded up to whole batches.
             photons: per light, likewise; by default as many in all as there are walks.
             order: of the spherical harmonics, 1 to 9.
             tooth: whose dentin moves.
 
         Raises:
-            InputError: as ``images``; also for a scene without shape modes, and a cotangent of another shape or not finite.
+            InputError: as ``images``; also for a scene without shape modes, and a cotangent of another shape or not
+                finite.
             NonFiniteError: the result is NaN or infinite.
         """
         from services.fit.transport.gradients.shape_gradient import ShapeGradients
@@ -202,22 +212,26 @@ class Engine:
         cotangent = np.asarray(cotangent, dtype=np.float64)
         if not 0 <= tooth < len(self.recipe.teeth) or self._geometry.modes_of[tooth] == 0:
             raise InputError(
-                f"Tooth {tooth} has no dentin with shape modes, so there is no gradient to its shape; build it from a blend shape."
+                f"Tooth {tooth} has no dentin with shape modes, so there is no gradient to its shape; build it from a"
+                " blend shape."
             )
         if self.recipe.border_width_mm > 0:
             raise InputError(
-                f"border_width_mm = {self.recipe.border_width_mm:g}, and only a sharp border has this gradient; take the Jacobian's."
+                f"border_width_mm = {self.recipe.border_width_mm:g}, and only a sharp border has this gradient; take"
+                " the Jacobian's."
             )
         if not 1 <= order <= 9 or samples < 1 or (photons is not None and photons < 1):
             raise InputError(
-                f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the order 1 to 9; correct them."
+                f"samples = {samples}, photons = {photons} and order = {order}: counts must be at least 1, and the"
+                " order 1 to 9; correct them."
             )
         media, _ = self._prepare(tissue, view)
         require_cotangent(cotangent, view, self.recipe)
         moved = tissue if isinstance(tissue, Tissue) else tissue.teeth[tooth]
         if moved.enamel.table is not None or moved.dentin.table is not None:
             raise InputError(
-                f"Tooth {tooth} has a phase table, and this gradient needs lobes; give it lobes, or take the Jacobian's."
+                f"Tooth {tooth} has a phase table, and this gradient needs lobes; give it lobes, or take the"
+                " Jacobian's."
             )
         if tooth not in self._shape_gradients:
             self._shape_gradients[tooth] = ShapeGradients(self._geometry, tooth, self._ior, self._radius_mm)
@@ -239,7 +253,8 @@ class Engine:
         seed: int,
         batches: int = 1,
     ) -> NDArray[np.float64]:
-        """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters < bin_edges[k + 1].
+        """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters <
+        bin_edges[k + 1].
 
         An image is a polynomial in a common albedo with these as coefficients; paths end at the last edge.
         """
@@ -262,10 +277,12 @@ class Engine:
         samples: int,
         batches: int = 16,
     ) -> StainGradient:
-        """Derivatives of sum(cotangent x images) to every texel of the stains, in one pass, both of a path's crossings included (teeth 2018 Eq. 10).
+        """Derivatives of sum(cotangent x images) to every texel of the stains, in one pass, both of a path's crossings
+        included (teeth 2018 Eq. 10).
 
         Args:
-            cotangent: (L, N), such as the residual of an L2 loss; independent of this pass where the result is to be unbiased.
+            cotangent: (L, N), such as the residual of an L2 loss; independent of this pass where the result is to be
+                unbiased.
 
         Raises:
             As ``images``; InputError also for a cotangent of another shape, or a scene without stains.
@@ -284,7 +301,7 @@ class Engine:
         batches, count = Effort(samples=samples, batches=batches).shares(samples)
         tally = StainTally(textures, seen / (largest or 1.0), batches)
         start = CameraStart(view, batches, seed, self._radius_mm)
-        (sums, _) = self._walk(media, lights, start, Plan(stains=True)).run(count, tally).arrays()
+        sums, _ = self._walk(media, lights, start, Plan(stains=True)).run(count, tally).arrays()
         require_finite_gradient("the stains", view, sums)
         means = sums * (largest / count)
         gradient, variance = (

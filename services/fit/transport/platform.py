@@ -1,7 +1,7 @@
 """Choose the Dr.Jit back end once per process, after checking that it cannot abort the process.
 
-Whoever renders calls ``prepare_device`` before it imports a kernel, so that whatever the machine lacks is told here, as one sentence.
-``python -m services.fit.transport.platform`` tells it too, and exits with status 4.
+Whoever renders calls ``prepare_device`` before it imports a kernel, so that whatever the machine lacks is told here, as
+one sentence. ``python -m services.fit.transport.platform`` tells it too, and exits with status 4.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from services.core.errors import PlatformError
 from services.core.records import Device
 
 OLDEST_LLVM = 17
-"""libLLVM 13 and 14 are refused by Dr.Jit with a misleading sentence; 15 and 16 abort the process in the first kernel."""
+"""libLLVM 13 and 14 are refused by Dr.Jit with a misleading sentence; 15 and 16 abort the process in the first
+kernel."""
 LLVM_REMEDY = "install libllvm19 (or 18, 17), or set DRJIT_LIBLLVM_PATH to such a libLLVM.so"
 PACKAGES = {"libatomic.so.1": "libatomic1", "libstdc++.so.6": "libstdc++6"}
-"""Debian's and Ubuntu's package of each library that Dr.Jit's wheel takes from the system; a bare system lacks the first."""
+"""Debian's and Ubuntu's package of each library that Dr.Jit's wheel takes from the system; a bare system lacks the
+first."""
 _MISSING_LIBRARY = re.compile(r"(lib\S+?\.so[.\d]*): cannot open shared object file")
 
 
@@ -54,7 +56,8 @@ def require_llvm(version: tuple[int, int, int]) -> None:
         raise PlatformError(f"No libLLVM was found, which the CPU renderer needs; {LLVM_REMEDY}.")
     if version[0] < OLDEST_LLVM:
         raise PlatformError(
-            f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed; {LLVM_REMEDY}."
+            f"libLLVM {version[0]}.{version[1]} would crash the renderer, version {OLDEST_LLVM} or later is needed;"
+            f" {LLVM_REMEDY}."
         )
 
 

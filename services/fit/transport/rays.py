@@ -47,7 +47,9 @@ class RayScene:
         self._scene = mi.load_dict({"type": "scene", "surface": surface})
 
     def first_hits(self, origins_mm: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
-        """Nearest hits of rays from ``origins_mm`` (N, 3) or (3,) along unit ``directions`` (N, 3); there may be none."""
+        """Nearest hits of rays from ``origins_mm`` (N, 3) or (3,) along unit ``directions`` (N, 3); there may be
+        none.
+        """
         if len(directions) == 0:  # Dr.Jit ends the process that evaluates nothing
             none = np.zeros(0, dtype=np.int64)
             return Hits(none.astype(bool), np.zeros((0, 3)), np.zeros((0, 3)), none, none)
@@ -55,7 +57,8 @@ class RayScene:
         import mitsuba as mi
 
         origins = np.broadcast_to(origins_mm, directions.shape)
-        # Rays start near the meshes, because single precision at a metre's distance would cost a tenth of a micrometre per millimetre.
+        # Rays start near the meshes, because single precision at a metre's distance would cost a tenth of a micrometre
+        # per millimetre.
         centre = self._vertices.mean(axis=0)
         radius = float(np.linalg.norm(self._vertices - centre, axis=1).max()) + 1.0
         skip = np.maximum(0.0, ((centre - origins) * directions).sum(axis=1) - radius)

@@ -1,4 +1,6 @@
-"""The capture of a virtual laboratory's mouth: lights in turn, some frames with all of them, while the subject sways a little."""
+"""The capture of a virtual laboratory's mouth: lights in turn, some frames with all of them, while the subject sways a
+little.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +111,9 @@ def write_capture(
 
 
 def _seen_move(camera: CalibratedCamera, moved_mm: Floats) -> Floats:
-    """By how many pixels (2,) the middle of the teeth moves in a pinhole's image; at half a metre all of them move alike."""
+    """By how many pixels (2,) the middle of the teeth moves in a pinhole's image; at half a metre all of them move
+    alike.
+    """
     start, end = camera.project(np.stack([np.zeros(3), moved_mm]))[0]
     return np.asarray(end - start)
 

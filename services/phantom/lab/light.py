@@ -1,7 +1,8 @@
 """What light comes from the mouth of a virtual laboratory to a camera, under each of its lights.
 
-The tooth that is measured is walked through by the engine, path by path. What stands around it only has to look like teeth, gums
-and lips, so it is shaded: no light passes between it and that tooth, which is what a fit of one tooth takes for granted.
+The tooth that is measured is walked through by the engine, path by path. What stands around it only has to look like
+teeth, gums and lips, so it is shaded: no light passes between it and that tooth, which is what a fit of one tooth takes
+for granted.
 """
 
 from __future__ import annotations
@@ -70,7 +71,9 @@ class MouthLight:
     def _around(
         self, camera: CalibratedCamera
     ) -> tuple[tuple[Floats, Floats], Floats, NDArray[np.int64], NDArray[np.int64]]:
-        """Shaded neighbours and all else, the fitted tooth as if it were shaded (L, H, W, 3), and how many subpixels see it and could."""
+        """Shaded neighbours and all else, the fitted tooth as if it were shaded (L, H, W, 3), and how many subpixels
+        see it and could.
+        """
         width, height = camera.size
         neighbours, others, fitted = (np.zeros((len(self._lights), height * width, 3)) for _ in range(3))
         visible, met = (np.zeros(height * width, dtype=np.int64) for _ in range(2))
@@ -99,7 +102,8 @@ class MouthLight:
 
 
 def _smoothed(images: Floats, seen: NDArray[np.bool_], share: Floats) -> Floats:
-    """Images (L, H, W) of a tooth, as much of each pixel as shows it, with the noise of single paths spread over neighbours.
+    """Images (L, H, W) of a tooth, as much of each pixel as shows it, with the noise of single paths spread over
+    neighbours.
 
     A few hundred paths leave some pixels several times too bright, which would clip in a sensor as no light does.
     """

@@ -1,4 +1,6 @@
-"""The mouth of a virtual laboratory: the six upper front teeth of a subject, their gums, lips and a retractor, and a scan of them."""
+"""The mouth of a virtual laboratory: the six upper front teeth of a subject, their gums, lips and a retractor, and a
+scan of them.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,9 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
 
 
 def landmarks_mm(mouth: LabMouth) -> dict[tuple[int, str], Floats]:
-    """Points (3,) of the scan that an operator clicks on, by tooth and name: each tooth's lowest point, and the height of its neck."""
+    """Points (3,) of the scan that an operator clicks on, by tooth and name: each tooth's lowest point, and the height
+    of its neck.
+    """
     found = {}
     world = mouth.scan.mesh.vertices_mm @ mouth.world_from_scan[:3, :3].T + mouth.world_from_scan[:3, 3]
     for tooth in mouth.teeth:

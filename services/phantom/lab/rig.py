@@ -1,4 +1,6 @@
-"""The true rig of a virtual laboratory: cameras with their lenses, lights with their brightness, all a little off what was planned."""
+"""The true rig of a virtual laboratory: cameras with their lenses, lights with their brightness, all a little off what
+was planned.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,16 @@ CHANNELS = ("red", "green", "blue")
 CAMERA_MM = 500.0
 """From the teeth to each camera: near enough that boards tell focal length from distance."""
 LENS = (-0.35, 0.3, 0.001, -0.0006)
-"""Radial and tangential distortion as OpenCV has it: one or two pixels in the corners of an image of half a megapixel."""
+"""Radial and tangential distortion as OpenCV has it: one or two pixels in the corners of an image of half a
+megapixel."""
 OFF_CAMERA_MM, OFF_CAMERA_DEG, OFF_FOCAL, OFF_CENTRE_PX = 4.0, 0.5, 0.02, 6.0
-"""Standard deviations of a mounted camera from the plan: its place, its direction, its focal length and its principal point."""
+"""Standard deviations of a mounted camera from the plan: its place, its direction, its focal length and its principal
+point."""
 OFF_LIGHT_MM, LIGHT_SPREAD = 8.0, 0.2
 """Of a light's place, and of its brightness in each channel, relative."""
 WHITE_COUNTS_PER_S = 1.3e5
-"""Of a white diffuser at a metre from a light of intensity 1, in a camera's green: 2600 counts in a fiftieth of a second."""
+"""Of a white diffuser at a metre from a light of intensity 1, in a camera's green: 2600 counts in a fiftieth of a
+second."""
 RESPONSE = (0.8, 1.0, 0.7)
 """Of a sensor in red, green and blue."""
 OFF_RESPONSE = 0.05
@@ -124,7 +129,9 @@ def _aimed(rotation: Floats, forward: Floats) -> Floats:
 
 
 class Lens:
-    """Where a camera's pixels look, and where they lie in the image of a pinhole in its place; by OpenCV's own formulas."""
+    """Where a camera's pixels look, and where they lie in the image of a pinhole in its place; by OpenCV's own
+    formulas.
+    """
 
     def __init__(self, camera: CalibratedCamera) -> None:
         self.camera = camera

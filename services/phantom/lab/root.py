@@ -1,7 +1,8 @@
 """The whole root of a virtual laboratory's tooth: a phantom has a stub of it, as its gums hide the rest.
 
-The engine renders the measured tooth alone, so light reaches what gums would cover. Through the end of a stub 4 mm above the neck, lights from
-above brightened or darkened the lower crown by 5 to 20 % against a root of its kind's length, which is what a registered scan's tooth has.
+The engine renders the measured tooth alone, so light reaches what gums would cover. Through the end of a stub 4 mm
+above the neck, lights from above brightened or darkened the lower crown by 5 to 20 % against a root of its kind's
+length, which is what a registered scan's tooth has.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ TAPER = 0.4
 
 
 def with_whole_root(tooth: JawTooth) -> Tooth:
-    """An upper tooth of a phantom, its stub stretched to the average length of its kind's root, enamel and dentin by the same map."""
+    """An upper tooth of a phantom, its stub stretched to the average length of its kind's root, enamel and dentin by
+    the same map.
+    """
     outer, dentin = (Mesh(_stretched(tooth, mesh.vertices_mm), mesh.faces) for mesh in (tooth.outer, tooth.dentin))
     return Tooth(tooth.fdi, outer, dentin)
 

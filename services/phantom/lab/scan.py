@@ -1,4 +1,6 @@
-"""A scan of a phantom jaw as a scanner gives it: one open labelled surface, cut off above the gums' base, with noise."""
+"""A scan of a phantom jaw as a scanner gives it: one open labelled surface, cut off above the gums' base, with
+noise.
+"""
 
 from __future__ import annotations
 

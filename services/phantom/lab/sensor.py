@@ -49,7 +49,8 @@ class Sensor:
         assert camera.radiance_per_count is not None
         through = self.filtered(radiance / np.array(camera.radiance_per_count))
         electrons = np.maximum(through, 0) * (exposure_s / self.counts_per_electron)
-        # Thousands of electrons scatter as a normal distribution does; in the dark the read noise is larger than the difference.
+        # Thousands of electrons scatter as a normal distribution does; in the dark the read noise is larger than the
+        # difference.
         noise = random.normal(size=electrons.shape) * np.sqrt(electrons + self.read_electrons**2)
         counts = self.black + (electrons + noise) * self.counts_per_electron
         return np.clip(np.rint(counts), 0, self.full).astype(np.uint16)

@@ -1,7 +1,8 @@
 """The calibration session of a virtual laboratory: boards, mirror and white spheres, an even source and a chart.
 
-Everything is drawn ray by ray from its geometry: planes and spheres are met by the rays of the distorted lens, and a mirror's
-highlight lies where the law of reflection puts it. Nothing of the calibration's own code draws what it is to find.
+Everything is drawn ray by ray from its geometry: planes and spheres are met by the rays of the distorted lens, and a
+mirror's highlight lies where the law of reflection puts it. Nothing of the calibration's own code draws what it is to
+find.
 """
 
 from __future__ import annotations
@@ -167,7 +168,9 @@ class Session:
 def write_session(
     root: Path, rig: Calibration, sensor: Sensor, seed: int, *, n_boards: int, n_mirror: int, n_white: int
 ) -> Floats:
-    """Write a raw folder with all frames of a session; returns world_from_board (4, 4) of the first board, the calibration's frame."""
+    """Write a raw folder with all frames of a session; returns world_from_board (4, 4) of the first board, the
+    calibration's frame.
+    """
     random = np.random.default_rng([seed, 0x5E5])
     writer = RawWriter(root, rig, sensor, random)
     session = Session(writer, random, n_boards)

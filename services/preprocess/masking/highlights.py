@@ -1,8 +1,8 @@
 """Which pixels show a surface reflection instead of light that was inside the tooth.
 
-Mallick et al. 2005 rotate RGB so that one axis, S, is the light's colour; a reflection adds to S alone. Teeth are nearly
-light-coloured, so ‖UV‖ is small and noisy: here S against UV becomes one linear functional per pixel with its variance, and is
-joined by what the scan knows, how far each normal is from the mirror direction.
+Mallick et al. 2005 rotate RGB so that one axis, S, is the light's colour; a reflection adds to S alone. Teeth are
+nearly light-coloured, so ‖UV‖ is small and noisy: here S against UV becomes one linear functional per pixel with its
+variance, and is joined by what the scan knows, how far each normal is from the mirror direction.
 """
 
 from __future__ import annotations
@@ -40,14 +40,16 @@ class HighlightOptions:
 
 
 def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
-    """Cosine (H, W) of the angle between the surface normal and the half vector of light and view; -1 where no surface is.
+    """Cosine (H, W) of the angle between the surface normal and the half vector of light and view; -1 where no surface
+    is.
 
-    A pixel's ray is a + b x + c y from the camera's eye, so all that is needed are products of the normal with a few fixed vectors and
-    polynomials of the pixel's place.
+    A pixel's ray is a + b x + c y from the camera's eye, so all that is needed are products of the normal with a few
+    fixed vectors and polynomials of the pixel's place.
     """
     pose, inverse_K = np.asarray(camera.camera_from_world), np.linalg.inv(np.asarray(camera.K))
     eye = -pose[:3, :3].T @ pose[:3, 3]
-    # Directions in the world of the camera's pixel (0, 0), of a step in x and of a step in y; the depth is along the camera's axis
+    # Directions in the world of the camera's pixel (0, 0), of a step in x and of a step in y; the depth is along the
+    # camera's axis
     start, step_x, step_y = (
         pose[:3, :3].T @ inverse_K @ vector
         for vector in (np.array([0.5, 0.5, 1]), np.array([1, 0, 0]), np.array([0, 1, 0]))
@@ -112,7 +114,8 @@ def highlight_mask(
     Args:
         radiance, variance: (H, W, C), linear, and its variance.
         usable: (H, W), pixels whose whole footprint is tooth and whose value is good.
-        saturated: (H, W), tooth pixels without a value because too bright; near the mirror direction they are a highlight's core.
+        saturated: (H, W), tooth pixels without a value because too bright; near the mirror direction they are a
+            highlight's core.
         cosines: (H, W) from ``half_cosines``.
         normal: (H, W, 3), outward.
         light_colour: the light's intensity per channel.
@@ -134,7 +137,8 @@ def highlight_mask(
     shading = _fit_shading(brightness, far, normal, o)
     colour = _fit_colour(radiance, brightness, usable, far, axis) if radiance.shape[-1] >= 3 else None
 
-    # A few rows at a time: both estimates of the reflected part joined by their inverse variances, and what they say of each pixel
+    # A few rows at a time: both estimates of the reflected part joined by their inverse variances, and what they say of
+    # each pixel
     weak, strong = burnt.astype(np.uint8), burnt
     profile = LobeProfile()
     for rows in bands(usable.shape):
@@ -198,7 +202,9 @@ class _Shading:
 
 @dataclass(frozen=True)
 class _Colour:
-    """Diffuse chroma: its direction (C,), and the inverse (H, W) of its ratio to the brightness in the neighbourhood."""
+    """Diffuse chroma: its direction (C,), and the inverse (H, W) of its ratio to the brightness in the
+    neighbourhood.
+    """
 
     direction: NDArray[np.float64]
     inverse_ratio: Image
@@ -215,9 +221,11 @@ def _reflected(
     colour: _Colour | None,
     o: HighlightOptions,
 ) -> tuple[Image, Image]:
-    """Reflected part and inverse variance (h, w) by shading and by colour together; weight 0 where neither says anything.
+    """Reflected part and inverse variance (h, w) by shading and by colour together; weight 0 where neither says
+    anything.
 
-    With v = UV·d along the tooth's own chroma d and ρ = v/S of diffuse light, S − v/ρ is the reflection; its variance grows as 1/ρ².
+    With v = UV·d along the tooth's own chroma d and ρ = v/S of diffuse light, S − v/ρ is the reflection; its variance
+    grows as 1/ρ².
     """
     tiny = np.float32(1e-30)
     flat = variance.reshape(-1, variance.shape[-1])
@@ -287,7 +295,9 @@ def _quadratic(normal: NDArray[Any]) -> Iterator[NDArray[Any]]:
 def _fit_colour(
     radiance: Image, brightness: Image, usable: BoolArray, far: BoolArray, axis: NDArray[np.float64]
 ) -> _Colour | None:
-    """Chroma of diffuse light, and its ratio to the brightness around each pixel; None where there is none to learn from."""
+    """Chroma of diffuse light, and its ratio to the brightness around each pixel; None where there is none to learn
+    from.
+    """
     import cv2
 
     if np.count_nonzero(far) < 20:

@@ -30,7 +30,8 @@ class HandMasks:
         for camera, light in self._masks:
             if camera not in cameras or light not in lights:
                 raise CaptureInputError(
-                    f"Mask {mask_path(root, camera, light)} is of no camera and light of the capture; remove it or correct its name."
+                    f"Mask {mask_path(root, camera, light)} is of no camera and light of the capture; remove it or"
+                    " correct its name."
                 )
 
     def bits(self, camera: str, light: str, size: tuple[int, int]) -> NDArray[np.uint16]:

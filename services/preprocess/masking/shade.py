@@ -20,7 +20,8 @@ from services.preprocess.subject import Subject
 from services.preprocess.tasks.workshop import Workshop
 
 PIXEL_MM = 0.25
-"""Shadows are looked for in images averaged to about this pixel: finer than their edges, which light inside a tooth makes soft."""
+"""Shadows are looked for in images averaged to about this pixel: finer than their edges, which light inside a tooth
+makes soft."""
 MIN_LIGHTS = 6
 """With fewer lights most of a pixel's images may lie in shadow, and nothing says how bright it would be."""
 SHADOWED = 0.5
@@ -49,8 +50,8 @@ class _Coarse:
 def shade(workshop: Workshop, source: Source, subject: Subject, view: View, context: StageContext) -> None:
     """Flag SHADOW in all images of a camera and store how sure that is, in per cent.
 
-    Surfaces that the fit renders throw their shadows there; gums and teeth that it does not render shade here by their geometry, and
-    what no scan shows by comparing the camera's lights.
+    Surfaces that the fit renders throw their shadows there; gums and teeth that it does not render shade here by their
+    geometry, and what no scan shows by comparing the camera's lights.
 
     Raises:
         JobCancelledError. FencedError: another attempt has begun.
@@ -118,7 +119,8 @@ def _light_on(coarse: _Coarse, lamp: Light, rendered: Sequence[Any]) -> tuple[Im
 
 def _flag(workshop: Workshop, subject: Subject, view: View, camera: int, light: int, confidence: Image) -> None:
     """Write one image's flags, confidence and picture, and say that it is done."""
-    # Where a worker died between the flags and the record, the files no longer have the record's sizes; all but flags is as it was
+    # Where a worker died between the flags and the record, the files no longer have the record's sizes; all but flags
+    # is as it was
     done = workshop.record(camera, light)
     assert done is not None, "images are stored before shadows are looked for"
     bits = _read(workshop, view, "valid", light)

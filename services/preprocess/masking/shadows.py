@@ -1,9 +1,10 @@
 """Shadows of what no scan shows, lips and retractor, found by comparing a light with the camera's other lights.
 
-A pixel lies in a light's shadow where less than half of the direct light that would reach it unoccluded does. What reaches a
-pixel of known normal is known but for the shadow, and a tooth's brightness is about proportional to it once the light has
-spread inside. So a pixel's images under all lights share one factor, its brightness under unit irradiance, and a shadow is
-an image that falls short of it. Known surfaces' shadows are in the expected irradiance, as the fit renders them.
+A pixel lies in a light's shadow where less than half of the direct light that would reach it unoccluded does. What
+reaches a pixel of known normal is known but for the shadow, and a tooth's brightness is about proportional to it once
+the light has spread inside. So a pixel's images under all lights share one factor, its brightness under unit
+irradiance, and a shadow is an image that falls short of it. Known surfaces' shadows are in the expected irradiance, as
+the fit renders them.
 """
 
 from __future__ import annotations
@@ -21,39 +22,50 @@ Image = NDArray[np.float32]
 SHADOW_PIXEL_MM = 0.25
 """Pixel of what a light sees: a shadow's edge is known to so much, a quarter of what light spreads inside a tooth."""
 DEPTH_BIAS_MM = 0.3
-"""A surface this much nearer to a light shades what lies behind it; less may be the surface itself: scans are rough by so much."""
+"""A surface this much nearer to a light shades what lies behind it; less may be the surface itself: scans are rough by
+so much."""
 MIN_COSINE = 0.05
 """Of the angle between light and normal below which a surface's slant is taken for this one's, 87 degrees."""
 
 
 @dataclass(frozen=True)
 class ShadowRule:
-    """When a pixel counts as shadowed. Lengths are millimetres on the tooth, ratios are of the brightness that other lights let expect."""
+    """When a pixel counts as shadowed.
+
+    Lengths are millimetres on the tooth, ratios are of the brightness that other lights let expect.
+    """
 
     spread_mm: float = 1.6
     """Light enters enamel and leaves again about so far away (standard deviation); a shadow's edge is as soft."""
     spread_share: float = 0.75
     """Of a tooth's light that has spread so; the rest leaves where it entered."""
     smooth_mm: float = 0.5
-    """Brightness is compared over about so much (standard deviation), finer than light spreads, so that one pixel's noise decides nothing."""
+    """Brightness is compared over about so much (standard deviation), finer than light spreads, so that one pixel's
+    noise decides nothing."""
     telling: float = 0.4
-    """A light tells of a pixel's brightness if it gives this much of the irradiance of the pixel's best light; grazing ones are known worst."""
+    """A light tells of a pixel's brightness if it gives this much of the irradiance of the pixel's best light; grazing
+    ones are known worst."""
     facing: float = 0.03
     """Cosine of the light's angle below which a pixel glows mainly by light from beside it and says nothing."""
     bright_quantile: float = 0.65
-    """Of a pixel's ratios under all lights, taken for unshadowed: most lights are not shadowed, and noise must not choose."""
+    """Of a pixel's ratios under all lights, taken for unshadowed: most lights are not shadowed, and noise must not
+    choose."""
     certain: float = 0.47
     """A ratio below it is a shadow by definition."""
     possible: float = 0.57
-    """A ratio below it is a shadow where it touches a certain one: light that has spread inside brightens a shadow's rim."""
+    """A ratio below it is a shadow where it touches a certain one: light that has spread inside brightens a shadow's
+    rim."""
     model_error: float = 0.12
-    """Relative error of the expected brightness: view-dependent reflection and light that leaves far from where it entered."""
+    """Relative error of the expected brightness: view-dependent reflection and light that leaves far from where it
+    entered."""
 
 
 def expected_irradiance(
     points_mm: Image, normal: Image, position_mm: tuple[float, float, float], unoccluded: NDArray[np.bool_] | None
 ) -> Image:
-    """Irradiance (H, W) of a unit point light, 1/mm²; 0 where the surface turns away, where known surfaces shade it, or nothing is seen."""
+    """Irradiance (H, W) of a unit point light, 1/mm²; 0 where the surface turns away, where known surfaces shade it, or
+    nothing is seen.
+    """
     way = np.asarray(position_mm, dtype=np.float32) - points_mm
     squared = (way * way).sum(axis=-1)
     facing = (way * normal).sum(axis=-1)
@@ -66,7 +78,9 @@ def expected_irradiance(
 def reached_by(
     points_mm: Image, normal: Image, position_mm: tuple[float, float, float], meshes: Sequence[Mesh]
 ) -> NDArray[np.bool_]:
-    """Whether known surfaces let a point light through to each point (H, W), by what the light itself would see of them."""
+    """Whether known surfaces let a point light through to each point (H, W), by what the light itself would see of
+    them.
+    """
     eye = _camera_at(position_mm, meshes)
     nearest = project(eye, meshes)
     height, width = points_mm.shape[:2]

@@ -22,8 +22,9 @@ def valid_bits(
 ) -> NDArray[np.uint16]:
     """Mask bits (H, W); 0 is a pixel to fit.
 
-    Shading is no reason to mask: a tooth glows where its surface turns from the light. OUTSIDE keeps pixels whose whole footprint is
-    to be fitted, and one pixel less along the outline where the image was resampled, which mixes it with its surroundings.
+    Shading is no reason to mask: a tooth glows where its surface turns from the light. OUTSIDE keeps pixels whose whole
+    footprint is to be fitted, and one pixel less along the outline where the image was resampled, which mixes it with
+    its surroundings.
 
     Args:
         glossy: masks (H, W) of surfaces that reflect, each of its own colour; None for one that is everything.
@@ -78,20 +79,21 @@ def require_plausible_scale(cameras: tuple[Camera, ...], lights: tuple[Light, ..
         distance = float(np.linalg.norm(pose[:3, :3] @ centre + pose[:3, 3]))
         if distance <= radius:
             raise CaptureInputError(
-                f"Camera {camera.name} stands {distance:.3g} mm from the teeth's centre, inside their {radius:.3g} mm radius; "
-                "its pose must be in millimetres like the meshes."
+                f"Camera {camera.name} stands {distance:.3g} mm from the teeth's centre, inside their {radius:.3g} mm"
+                " radius; its pose must be in millimetres like the meshes."
             )
         size_px = 2 * radius / distance * camera.K[0][0]
         if size_px < 4:
             raise CaptureInputError(
-                f"The teeth span {size_px:.2g} px in camera {camera.name}, {distance:.3g} mm away; its pose must be in millimetres like the meshes."
+                f"The teeth span {size_px:.2g} px in camera {camera.name}, {distance:.3g} mm away; its pose must be in"
+                " millimetres like the meshes."
             )
     for light in lights:
         distance = float(np.linalg.norm(np.asarray(light.position_mm) - centre))
         if distance <= radius:
             raise CaptureInputError(
-                f"Light {light.name} stands {distance:.3g} mm from the teeth's centre, inside their {radius:.3g} mm radius; "
-                "its position must be in millimetres like the meshes."
+                f"Light {light.name} stands {distance:.3g} mm from the teeth's centre, inside their {radius:.3g} mm"
+                " radius; its position must be in millimetres like the meshes."
             )
 
 
@@ -103,5 +105,6 @@ def require_seen(footprint: Footprint, teeth: int, camera: Camera) -> None:
     """
     if not (footprint.covered & (footprint.mesh < teeth)).any():
         raise CaptureInputError(
-            f"No tooth projects into the image of camera {camera.name}; check its pose, its K and that all lengths are in millimetres."
+            f"No tooth projects into the image of camera {camera.name}; check its pose, its K and that all lengths are"
+            " in millimetres."
         )

@@ -71,11 +71,13 @@ class CameraFrames:
 
         Args:
             camera: as calibrated.
-            assumed_noise: fraction of the value, and of full scale, where neither frames nor calibration tell the noise.
+            assumed_noise: fraction of the value, and of full scale, where neither frames nor calibration tell the
+                noise.
             scratch: folder in which what was measured is kept and looked for; None to measure it anew.
 
         Raises:
-            CaptureInputError: a frame cannot be read, no black is known, or frames contradict each other; names the frame.
+            CaptureInputError: a frame cannot be read, no black is known, or frames contradict each other; names the
+                frame.
         """
         self._root, self._folder, self.calibrated, self._scratch = root, folder, camera, scratch
         self.raw = folder.camera_named(camera.name)
@@ -184,8 +186,8 @@ class CameraFrames:
         counts = read_counts(self._root, self._folder, frame).astype(np.float32)
         if (median := float(np.median(counts))) > BRIGHT_BLACK * self._full:
             raise CaptureInputError(
-                f"Frame {self._root / frame.file} ({frame.label}) has a median of {median:g} counts, so it is no black frame; "
-                "take it with the lens covered, or correct its kind."
+                f"Frame {self._root / frame.file} ({frame.label}) has a median of {median:g} counts, so it is no black"
+                " frame; take it with the lens covered, or correct its kind."
             )
         return counts
 
@@ -194,8 +196,8 @@ class CameraFrames:
         if self.calibrated.black_counts is None:
             lit = next((one for one in self._folder.frame if one.camera == name), self._folder.frame[0])
             raise CaptureInputError(
-                f"Camera {name} has no black frame, so the zero of {lit.file} and its other frames is unknown; add one with "
-                'the lens covered (kind = "black"), or give black_counts in the calibration.'
+                f"Camera {name} has no black frame, so the zero of {lit.file} and its other frames is unknown; add one"
+                ' with the lens covered (kind = "black"), or give black_counts in the calibration.'
             )
         told = f"{self.calibrated.black_counts:g}"
         self.notes.append(
@@ -203,7 +205,9 @@ class CameraFrames:
         )
 
     def _measured_noise(self, relative: float, floor: float) -> NoiseModel:
-        """Of its own frames; what they do not tell is the calibration's, and what that does not is assumed and noted."""
+        """Of its own frames; what they do not tell is the calibration's, and what that does not is assumed and
+        noted.
+        """
         name, calibrated = self.raw.name, self.calibrated
         # The black's own noise is asked for while it is measured, and counts for nothing there.
         self.noise = NoiseModel(0.0, 0.0)
@@ -212,7 +216,8 @@ class CameraFrames:
         if measured is not None:
             slope, read = measured
             self.notes.append(
-                f"Camera {name}: measured of its own frames are a read noise of {read:.3g} counts and {slope:.3g} counts per electron."
+                f"Camera {name}: measured of its own frames are a read noise of {read:.3g} counts and {slope:.3g}"
+                " counts per electron."
             )
             return NoiseModel(read, slope)
         read = calibrated.read_noise_counts if read is None else read
@@ -220,8 +225,9 @@ class CameraFrames:
             return NoiseModel(read, calibrated.counts_per_electron)
         scale = float(self._full) if np.isfinite(self._full) else 1.0
         self.notes.append(
-            f"Camera {name}: no two frames of one thing and no calibration tell its noise; {relative:.1%} of the signal and "
-            f"{floor:.2%} of full scale are assumed. Two flat frames of one exposure, and two black ones, would tell it."
+            f"Camera {name}: no two frames of one thing and no calibration tell its noise; {relative:.1%} of the signal"
+            f" and {floor:.2%} of full scale are assumed. Two flat frames of one exposure, and two black ones, would"
+            " tell it."
         )
         return NoiseModel(floor * scale if read is None else read, 0.0, relative)
 
@@ -235,7 +241,9 @@ class CameraFrames:
         return float(np.sqrt(np.average([v**2 for _, v in known], weights=[w for w, _ in known]))) if known else None
 
     def _lit_pairs(self) -> Iterator[LitPair]:
-        """Pairs of one exposure and one thing; flat ones where there are some, else those of lights and of all lights."""
+        """Pairs of one exposure and one thing; flat ones where there are some, else those of lights and of all
+        lights.
+        """
         flats = self._folder.frames_of(self.raw.name, "flat")
         groups = [own for own in _alike(flats) if len(own) > 1]
         if not groups:
@@ -253,7 +261,10 @@ class CameraFrames:
         found = measure_linearity(list(self._series()), float(self._full)) if is_known else self.linearity
         if found.ratios.size:
             low, middle, high = np.percentile(found.ratios, (5, 50, 95))
-            told = f"Camera {name}: longer exposures are {middle:.3f} times as bright as their times say (5 to 95 %: {low:.3f} to {high:.3f})"
+            told = (
+                f"Camera {name}: longer exposures are {middle:.3f} times as bright as their times say (5 to 95 %:"
+                f" {low:.3f} to {high:.3f})"
+            )
             self.notes.append(
                 f"{told}{'' if found.is_linear else '; its counts are linearised by a curve fitted to that'}."
             )
@@ -287,8 +298,8 @@ class CameraFrames:
             rate, _, lost = merge([self.exposure(frame) for frame in flats], self.noise)
             if lost.any():
                 raise CaptureInputError(
-                    f"Frame {self._root / flats[0].file} ({flats[0].label}) and all other flat ones are full at {int(lost.sum())} "
-                    "pixels; take one with a shorter exposure."
+                    f"Frame {self._root / flats[0].file} ({flats[0].label}) and all other flat ones are full at"
+                    f" {int(lost.sum())} pixels; take one with a shorter exposure."
                 )
             seen = np.atleast_3d(rate) if self.raw.mosaic == "none" else demosaic(rate, self.raw.mosaic)
             vignetting = fitted_vignetting(self.calibrated, seen)

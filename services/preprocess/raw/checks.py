@@ -42,13 +42,15 @@ def missing_exposures(folder: RawFolder) -> Iterator[str]:
             if lacking:
                 files = ", ".join(one.file for one in folder.frames_of(camera.name, "light") if one.light == light)
                 yield (
-                    f"Camera {camera.name}, light {light} lacks the exposure of {lacking[0]:g} s that most lights have; its frames "
-                    f"are {files}."
+                    f"Camera {camera.name}, light {light} lacks the exposure of {lacking[0]:g} s that most lights have;"
+                    f" its frames are {files}."
                 )
 
 
 def colour_of(frame: RawFrame, channels: tuple[str, ...], radiance: NDArray[np.float32]) -> FrameColour | None:
-    """How red a frame's pixels (N, C), in the order of ``channels``, are against their blue; None where that cannot be told."""
+    """How red a frame's pixels (N, C), in the order of ``channels``, are against their blue; None where that cannot be
+    told.
+    """
     if not {"red", "blue"} <= set(channels) or not radiance.size:
         return None
     red, blue = (float(np.abs(radiance[..., channels.index(one)]).mean(dtype=np.float64)) for one in ("red", "blue"))
@@ -77,7 +79,8 @@ def require_like_exposures(
         if np.abs(off).max() < np.log(EXPOSURE_OFF):
             if not _shows_the_same(first, second):
                 raise CaptureInputError(
-                    f"{what} shows another picture than {shorter.file}; exchange its bytes, or correct its light or place."
+                    f"{what} shows another picture than {shorter.file}; exchange its bytes, or correct its light or"
+                    " place."
                 )
             continue
         if first.signal.ndim == 3 and {"red", "blue"} <= set(channels):
@@ -87,17 +90,19 @@ def require_like_exposures(
             against = _brighter(first, second.signal[..., swap], second.headroom[..., swap], second.factor)
             if against is not None and np.abs(against).max() < np.log(EXPOSURE_OFF) / 2:
                 raise CaptureInputError(
-                    f"{what} has red and blue exchanged against {shorter.file}; export both with the same order of channels."
+                    f"{what} has red and blue exchanged against {shorter.file}; export both with the same order of"
+                    " channels."
                 )
         found = "brighter" if off[np.argmax(np.abs(off))] > 0 else "darker"
         raise CaptureInputError(
-            f"{what} is clearly {found} than {shorter.file} lets expect from exposure_s, gain and level; correct these, "
-            "or the order of its bytes, bits or channels."
+            f"{what} is clearly {found} than {shorter.file} lets expect from exposure_s, gain and level; correct these,"
+            " or the order of its bytes, bits or channels."
         )
 
 
 def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
-    """Logarithm of how much brighter than expected a longer exposure is, per channel; None where too little is seen to tell.
+    """Logarithm of how much brighter than expected a longer exposure is, per channel; None where too little is seen to
+    tell.
 
     Both are cut off below full, so that pixels which are full in the longer one, or would be, agree.
     """
@@ -113,7 +118,9 @@ def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) ->
 
 
 def _shows_the_same(first: Exposure, second: Exposure) -> bool:
-    """Whether two exposures go up and down together, channels apart; pictures without contrast do not tell otherwise."""
+    """Whether two exposures go up and down together, channels apart; pictures without contrast do not tell
+    otherwise.
+    """
     seen = (first.headroom > 0) & (second.headroom > 0)
     planes = [np.moveaxis(np.atleast_3d(image), -1, 0) for image in (first.signal, second.signal, seen)]
     for a, b, usable in zip(*planes, strict=True):

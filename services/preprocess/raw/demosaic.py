@@ -13,7 +13,8 @@ BoolArray = NDArray[np.bool_]
 
 SUPPORT = 5
 """Pixels along the edge of a filter: what is full spoils as many around it."""
-# Malvar, He and Cutler 2004, figure 2, in units of 1/8: bilinear interpolation with the other channels' curvature added.
+# Malvar, He and Cutler 2004, figure 2, in units of 1/8: bilinear interpolation with the other channels' curvature
+# added.
 _GREEN = np.array([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]])
 _BESIDE = np.array([[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]])
 _ACROSS = np.array([[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]])
@@ -31,8 +32,8 @@ def demosaic(values: Image, mosaic: Mosaic, means: NDArray[np.float32] | None = 
     """Image (H, W, 3) of a mosaic (H, W).
 
     Args:
-        means: of the channels of the whole photograph that this is a part of; None where it is the whole. They are brought
-            to one mean before and back after, since the filters take edges of one channel for those of another.
+        means: of the channels of the whole photograph that this is a part of; None where it is the whole. They are
+            brought to one mean before and back after, since the filters take edges of one channel for those of another.
     """
     means = channel_means(values, mosaic) if means is None else means
     scale = np.where(means > 0, means / max(float(means.max()), 1e-30), 1).astype(np.float32)
@@ -46,7 +47,8 @@ def demosaic(values: Image, mosaic: Mosaic, means: NDArray[np.float32] | None = 
         for x in range(2):
             own, place = channels[y, x], (slice(y, None, 2), slice(x, None, 2))
             for wanted in {0, 1, 2} - {own}:
-                # A green pixel has the wanted colour beside it in its row or in its column; others have it at the corners.
+                # A green pixel has the wanted colour beside it in its row or in its column; others have it at the
+                # corners.
                 beside = "row" if channels[y, 1 - x] == wanted else "column"
                 name = "green" if wanted == 1 else beside if own == 1 else "across"
                 image[*place, wanted] = filtered[name][place]
@@ -57,8 +59,8 @@ def demosaic(values: Image, mosaic: Mosaic, means: NDArray[np.float32] | None = 
 def demosaic_variance(variance: Image, mosaic: Mosaic) -> Image:
     """Variance (H, W, 3) per pixel with which a sum over many pixels has its right error.
 
-    Interpolated pixels share noise with their neighbours. A channel that one pixel in four sees has four times the variance of such
-    a pixel, as if its pixels were independent.
+    Interpolated pixels share noise with their neighbours. A channel that one pixel in four sees has four times the
+    variance of such a pixel, as if its pixels were independent.
     """
     import cv2
 

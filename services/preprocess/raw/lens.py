@@ -20,7 +20,8 @@ EVEN = 2
 REACH_PX = 4
 """Pixels around what is sampled that demosaicing and interpolation look at."""
 BEYOND_PX = 1e-3
-"""A sample that lies farther beyond the outermost pixels' centres is dimmed by the black around the image, by as much."""
+"""A sample that lies farther beyond the outermost pixels' centres is dimmed by the black around the image, by as
+much."""
 FLAT_BLOCK = 16
 """Pixels along a block of a flat field, whose mean is fitted: the fall of light is smooth."""
 MIN_BLOCKS = 16
@@ -39,7 +40,8 @@ class Lens:
     vignetting: tuple[float, float, float]
 
     def source(self, window: Window) -> Image | None:
-        """Where a window of the pinhole's image lies in the photograph: x, y (H, W, 2) as indices, centres at whole numbers.
+        """Where a window of the pinhole's image lies in the photograph: x, y (H, W, 2) as indices, centres at whole
+        numbers.
 
         None for a lens without distortion.
         """
@@ -103,7 +105,9 @@ class Sampler:
         return np.ascontiguousarray(np.moveaxis(found, -1, 0))
 
     def source(self, places: Sequence[Image]) -> Window:
-        """The rows of ``region`` that places (2, h, W) sample, with what demosaicing and interpolation look at around them."""
+        """The rows of ``region`` that places (2, h, W) sample, with what demosaicing and interpolation look at around
+        them.
+        """
         low, high = min(float(one[1].min()) for one in places), max(float(one[1].max()) for one in places)
         region = self.region
         top = int(np.clip(np.floor(low) - REACH_PX, region.top, max(region.bottom - EVEN, region.top)))

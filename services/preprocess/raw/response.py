@@ -24,7 +24,8 @@ MUST_EXPLAIN = 0.3
 BLOCK = 16
 """Pixels along a block's edge whose mean is compared."""
 MAX_CONTRAST = 0.2
-"""Standard deviation of a block by its mean: beyond it, an edge lies in it, which pixels full in part are brightest at."""
+"""Standard deviation of a block by its mean: beyond it, an edge lies in it, which pixels full in part are brightest
+at."""
 MIN_BLOCKS = 8
 
 
@@ -84,9 +85,11 @@ def measure_linearity(series: Sequence[Series], full: float) -> Linearity:
 
 
 def _curve(x: FloatArray, y: FloatArray, observed: FloatArray) -> tuple[float, float]:
-    """a, b such that log(f(y) / f(x)) equals the ratio of exposures, by Gauss-Newton; zeros unless clearly other than that.
+    """a, b such that log(f(y) / f(x)) equals the ratio of exposures, by Gauss-Newton; zeros unless clearly other than
+    that.
 
-    A black that is off by a part of a count bends the dark end in its own way, so such an offset is fitted along and left out.
+    A black that is off by a part of a count bends the dark end in its own way, so such an offset is fitted along and
+    left out.
     """
     a, b, offset = 0.0, 0.0, 0.0
     for _ in range(12):

@@ -62,7 +62,10 @@ class RawSource:
         self.notes: tuple[str, ...] = tuple(missing_exposures(self._folder))
         fewest = min(sum(frame.kind == "tracking" for frame in self._of(camera.name)) for camera in self._folder.camera)
         if fewest < MIN_TRACKING:
-            told = f"A camera has {fewest} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to 0.2 px"
+            told = (
+                f"A camera has {fewest} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to"
+                " 0.2 px"
+            )
             self.notes += (f"{told}; take one with all lights on after every few lights.",)
 
     def lights_of(self, camera: int) -> tuple[int, ...]:

@@ -77,7 +77,9 @@ class RawView:
         )
 
     def brightness(self, frames: Sequence[RawFrame]) -> Image:
-        """Mean of the channels of one frame, or of one light's exposures, in ``motion.window`` (H, W), undistorted; its unit does not matter."""
+        """Mean of the channels of one frame, or of one light's exposures, in ``motion.window`` (H, W), undistorted; its
+        unit does not matter.
+        """
         taken = [self._frames.counts(frame, self._sampler.region) for frame in frames]
         means = self._means([self._sparse(frame, counts) for frame, counts in zip(frames, taken, strict=True)])
         height, width = self.motion.window.shape
@@ -94,7 +96,9 @@ class RawView:
         return image
 
     def _light(self, exposures: Sequence[Exposure]) -> Image:
-        """What was seen above black, in one unit; where every exposure is full, as bright as the shortest says, not dark."""
+        """What was seen above black, in one unit; where every exposure is full, as bright as the shortest says, not
+        dark.
+        """
         if len(exposures) == 1:
             return exposures[0].signal
         rate, _, lost = merge(exposures, self._frames.noise)
@@ -102,7 +106,8 @@ class RawView:
         return np.where(lost, shortest.signal / np.float32(shortest.factor), rate)
 
     def image(self, frames: Sequence[RawFrame], moves: Sequence[Displacement]) -> LightImage:
-        """The exposures of one light, merged before they are interpolated where the subject was still between them, and after otherwise.
+        """The exposures of one light, merged before they are interpolated where the subject was still between them, and
+        after otherwise.
 
         Raises:
             CaptureInputError: they contradict each other; names the frame. SettingsError: there is too little memory.
@@ -168,7 +173,9 @@ class RawView:
         return self._frames.exposure_of(frame, counts[held.within(self._sampler.region)], (held.rows, held.columns))
 
     def _colours(self, shots: Sequence[Shot], held: Window, means: NDArray[np.float32] | None) -> Image:
-        """Counts a second, their variances (C of each) and 1 where they are lost (H, W, 2 C + 1), of a part of the region."""
+        """Counts a second, their variances (C of each) and 1 where they are lost (H, W, 2 C + 1), of a part of the
+        region.
+        """
         exposures = [self._exposure(shot.frame, shot.counts, held) for shot in shots]
         rate, variance, lost = merge(exposures, self._frames.noise)
         del exposures

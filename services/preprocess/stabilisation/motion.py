@@ -38,10 +38,11 @@ def jaws(fdi: Sequence[int]) -> list[list[int]]:
 
 
 def frames_to_match(frames: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
-    """Tracking frames, which share one light; with fewer than two of them every light is matched to the first by its edges.
+    """Tracking frames, which share one light; with fewer than two of them every light is matched to the first by its
+    edges.
 
-    Of a light's exposures that follow one another the first stands for all: a short one may be all noise and a long one full, so that
-    neither shows an edge, and between them edges tell no motion that a subject makes in that time.
+    Of a light's exposures that follow one another the first stands for all: a short one may be all noise and a long one
+    full, so that neither shows an edge, and between them edges tell no motion that a subject makes in that time.
     """
     tracking = tuple(frame for frame in frames if frame.kind == "tracking")
     if len(tracking) >= 2:
@@ -77,8 +78,8 @@ class Displacement:
 class ViewMotion:
     """Measures motion against the first frame and gives it for every light frame.
 
-    Between tracking frames it is measured and then interpolated over the frame number: frames are triggered evenly, and the number is free of
-    the host's clock.
+    Between tracking frames it is measured and then interpolated over the frame number: frames are triggered evenly, and
+    the number is free of the host's clock.
     """
 
     def __init__(self, view: View, bodies: Sequence[Sequence[int]], frames: Sequence[FrameRecord]) -> None:
@@ -113,7 +114,8 @@ class ViewMotion:
 
         Args:
             frames: numbers of some of ``frames_to_match``.
-            picture: values (H, W) or (H, W, C) in ``window``, linear in light above ``level``, of a frame, and of those that it stands for.
+            picture: values (H, W) or (H, W, C) in ``window``, linear in light above ``level``, of a frame, and of those
+                that it stands for.
 
         Raises:
             CaptureInputError: moved too far to be aligned; names the frame and the camera.

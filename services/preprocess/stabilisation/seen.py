@@ -1,6 +1,7 @@
 """What dense optical flow sees between two tracking frames, before and after the measured motion is taken out.
 
-Flow knows neither the scan nor the motion that was measured, so what it still sees afterwards is an independent judgement.
+Flow knows neither the scan nor the motion that was measured, so what it still sees afterwards is an independent
+judgement.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """How the subject moved between two frames of a camera, and the frame as if it had not.
 
-Only tooth pixels are kept, and teeth of one jaw are one rigid body of known shape. Its image moves by a smooth field: a shift, a
-linear and a quadratic part, and a parallax in proportion to the scan's relief. Direct alignment (Lucas & Kanade 1981, with the
-parametric warps of Baker & Matthews 2004, section 2, and Irani & Anandan's plane plus parallax, 1996) finds those few
-coefficients from all pixels at once. Dense flow, which has two unknowns per pixel, follows shading and reflections instead of the
-tooth; README.md has the comparison.
+Only tooth pixels are kept, and teeth of one jaw are one rigid body of known shape. Its image moves by a smooth field: a
+shift, a linear and a quadratic part, and a parallax in proportion to the scan's relief. Direct alignment (Lucas &
+Kanade 1981, with the parametric warps of Baker & Matthews 2004, section 2, and Irani & Anandan's plane plus parallax,
+1996) finds those few coefficients from all pixels at once. Dense flow, which has two unknowns per pixel, follows
+shading and reflections instead of the tooth; README.md has the comparison.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ FloatArray = NDArray[np.float64]
 # 1, x, y, relief, x², xy, y²
 TERMS = 7
 Feature = Literal["texture", "edges"]
-# Same light: the terms' standard deviations before anything is seen, as shares of the body's shorter side; the shift is free.
-# A nod or turn by a few degrees moves a tooth's outline by this much.
+# Same light: the terms' standard deviations before anything is seen, as shares of the body's shorter side; the shift is
+# free. A nod or turn by a few degrees moves a tooth's outline by this much.
 LIKELY_SHARE = (0.02, 0.02, 0.02, 0.007, 0.007, 0.007)
 # Features are made with Gaussians of 2 px, so that residuals of about 4π 2² pixels are one observation
 CORRELATED_PX = 50.0
-# Another light: edges of the lit side alone are left, so all but the shift is held; relative to the mean curvature of the cost
+# Another light: edges of the lit side alone are left, so all but the shift is held; relative to the mean curvature of
+# the cost
 EDGE_RIDGE = (0, 10, 10, 100, 100, 100, 100)
 # Matching runs near the fit's 1/5 of 20 megapixels, and on evenly strided pixels: a few coefficients need no more
 SOLVE_PIXELS = 800_000
@@ -84,7 +85,8 @@ class SurfaceFlow:
         return self._planes(coefficients, rows, columns, moved=1)
 
     def _planes(self, coefficients: FloatArray, rows: slice, columns: slice, moved: int) -> Image:
-        # Displacements, plus ``moved`` times the pixel's own place. The polynomial is a product of (rows, 3) and (3, columns).
+        # Displacements, plus ``moved`` times the pixel's own place. The polynomial is a product of (rows, 3) and (3,
+        # columns).
         relief = self._relief[rows, columns]
         y_px, x_px = (np.arange(n)[cut] for n, cut in zip(self._relief.shape, (rows, columns), strict=True))
         x, y = ((v - c) / self._scale_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
@@ -185,8 +187,8 @@ class Aligner:
     def _damping(self, scale: float, hessian: FloatArray) -> FloatArray:
         """What is added to the cost's curvature (2 TERMS,), 1/px² of ``scale``², and pulls each term towards no motion.
 
-        Between frames of one light the estimate is the most likely one: contrast speaks with its residuals' standard deviation ``scale``, and
-        what it does not tell stays near no motion.
+        Between frames of one light the estimate is the most likely one: contrast speaks with its residuals' standard
+        deviation ``scale``, and what it does not tell stays near no motion.
         """
         if self._feature == "edges":
             return np.asarray(np.tile(EDGE_RIDGE, 2) * np.trace(hessian) / (2 * TERMS) + 1e-12)
@@ -197,8 +199,8 @@ class Aligner:
 def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
     """Values at ``time`` by the cubic through the four nearest knots, and an error estimate.
 
-    The estimate is the difference to the parabola through the three nearest, larger than the cubic's own error where motion is smooth; with
-    fewer than three knots it is zero, since nothing is known.
+    The estimate is the difference to the parabola through the three nearest, larger than the cubic's own error where
+    motion is smooth; with fewer than three knots it is zero, since nothing is known.
 
     Args:
         times: (K,) distinct. values: (K, ...).
@@ -234,8 +236,9 @@ def warp(image: NDArray[np.generic], displacement: Image) -> Image:
 def _features(image: Image, feature: Feature) -> Image:
     """What of an image survives the change of light between the frames compared.
 
-    ``texture``: local mean and contrast removed, so that slow shading counts little and outlines and stains count alike.
-    ``edges``: gradient magnitude relative to its neighbourhood, so that neither the sign nor the size of an edge matters.
+    ``texture``: local mean and contrast removed, so that slow shading counts little and outlines and stains count
+    alike. ``edges``: gradient magnitude relative to its neighbourhood, so that neither the sign nor the size of an edge
+    matters.
     """
     import cv2
 
@@ -249,7 +252,9 @@ def _features(image: Image, feature: Feature) -> Image:
 
 
 def reduce_grey(image: NDArray[np.generic], factor: int, level: float = 0.0) -> Image:
-    """Mean over the channels of (H, W) or (H, W, C) and over squares of ``factor`` pixels, above ``level``; what is left of a square is dropped."""
+    """Mean over the channels of (H, W) or (H, W, C) and over squares of ``factor`` pixels, above ``level``; what is
+    left of a square is dropped.
+    """
     import cv2
 
     height, width = (max(1, n // factor) for n in image.shape[:2])

@@ -1,8 +1,9 @@
-"""The blocks that a preparation is made of. Each is one Dask task; it skips what is done already, so any of them may run again.
+"""The blocks that a preparation is made of.
 
-::
+Each is one Dask task; it skips what is done already, so any of them may run again. ::
 
-    look (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows are asked for
+    look (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows
+    are asked for
                                                  └──> compare (camera), where motion is measured
 
 One block writes an image's shards and no other does.
@@ -59,7 +60,8 @@ class Block:
         """Do what is not done yet.
 
         Raises:
-            CaptureInputError, StoreError: as ``Source`` and ``require_seen`` say. JobCancelledError. FencedError: another attempt has begun.
+            CaptureInputError, StoreError: as ``Source`` and ``require_seen`` say. JobCancelledError. FencedError:
+                another attempt has begun.
         """
         context = LocalContext(self.workshop.writer.root, self.workshop.writer.attempt)
         context.raise_if_cancelled()

@@ -13,13 +13,16 @@ from services.preprocess.source import Source
 from services.preprocess.stabilisation.motion import stored_step
 
 FORMAT = 9
-"""Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels become."""
+"""Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels
+become."""
 INDIFFERENT = frozenset({"workers", "priority", "memory_gib"})
 """Options that change no pixel."""
 
 
 def create_arrays(store: Path, source: Source, *, with_shadows: bool) -> None:
-    """Radiance, variance, valid, surface and, where they are asked for or measured, shadow and motion; one shard per image, so that each has one writer."""
+    """Radiance, variance, valid, surface and, where they are asked for or measured, shadow and motion; one shard per
+    image, so that each has one writer.
+    """
     description = source.description
     height, width = (max(camera.size[axis] for camera in description.cameras) for axis in (1, 0))
     planes = (len(description.cameras), len(description.lights), height, width)

@@ -58,7 +58,9 @@ class Progress:
         self._context.report(StageEvent(stage="prepare", kind="finished", message=message, done=1.0))
 
     def _left_s(self) -> tuple[float, float] | None:
-        """Between how many seconds the rest will take: as if all images took as long as a fast and as a slow one so far."""
+        """Between how many seconds the rest will take: as if all images took as long as a fast and as a slow one so
+        far.
+        """
         if len(self._seconds) < ENOUGH or not self._left:
             return None
         rounds = -(-self._left // self._threads)

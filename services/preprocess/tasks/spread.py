@@ -1,4 +1,6 @@
-"""Where the blocks of a preparation run: on the workers of the Dask cluster that this code is a task of, else here, one after the other."""
+"""Where the blocks of a preparation run: on the workers of the Dask cluster that this code is a task of, else here, one
+after the other.
+"""
 
 from __future__ import annotations
 

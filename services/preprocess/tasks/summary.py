@@ -40,7 +40,8 @@ def summarise(
         masks: digest of the masks by hand.
 
     Raises:
-        CaptureInputError: no pixel is valid, no tooth is as bright as these, or channels look exchanged. FencedError: another attempt has begun.
+        CaptureInputError: no pixel is valid, no tooth is as bright as these, or channels look exchanged. FencedError:
+            another attempt has begun.
     """
     workshop.writer.require_lease()
     images = _images(workshop, source)
@@ -60,7 +61,10 @@ def summarise(
             )
         elif all(max(report.masked, key=report.masked.__getitem__, default="") == "motion" for report in reports):
             what = "lacks a valid tooth pixel, mostly as motion is not known there"
-            remedy = "see that its frames are listed in the order taken, or have time_s, and that tracking frames stand between the lights"
+            remedy = (
+                "see that its frames are listed in the order taken, or have time_s, and that tracking frames stand"
+                " between the lights"
+            )
         else:
             what, remedy = "lacks a valid tooth pixel", "check exposure, lights, noise and masks, then capture again"
         raise CaptureInputError(f"Every image of {source.root} {what}; {remedy}.")

@@ -85,7 +85,8 @@ def test_noise_is_as_specified(tmp_path: Path, job: Callable[..., JobSpec]) -> N
     truth = frames_of(tmp_path / "clean")[0, lit].astype(np.float64)
     deviation = np.hypot(0.02 * (truth - clean.black_level), 0.004 * (2**16 - 1))
     z = (frames_of(tmp_path / "noisy")[0, lit] - truth) / deviation
-    # n samples of N(0, 1): mean within 4/√n, variance within 4·√(2/n); together a false alarm in 8,000 seeds, and the seed is fixed.
+    # n samples of N(0, 1): mean within 4/√n, variance within 4·√(2/n); together a false alarm in 8,000 seeds, and the
+    # seed is fixed.
     assert abs(z.mean()) < 4 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 4 * np.sqrt(2 / z.size)
 

@@ -72,13 +72,16 @@ def test_a_cancelled_capture_is_dark_and_resumes(
 
 
 LONG_S = 58.0
-"""An exposure that outlasts every wait of a test: whoever waits for its end has failed. At a level of 0.1 it is within the dose of a light."""
+"""An exposure that outlasts every wait of a test: whoever waits for its end has failed. At a level of 0.1 it is within
+the dose of a light."""
 WAIT_S = 30.0
 
 
 @pytest.fixture
 def long_job(job: Callable[..., JobSpec], monkeypatch: pytest.MonkeyPatch) -> Callable[..., JobSpec]:
-    """A job that exposes for so long as soon as a light is on; without the preflight's glimpses, and with short black frames."""
+    """A job that exposes for so long as soon as a light is on; without the preflight's glimpses, and with short black
+    frames.
+    """
 
     def plan(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
         frames = plan_capture(rig, lights)

@@ -139,11 +139,17 @@ BAD: dict[str, tuple[Damage, str]] = {
     "whole numbers of 32 bits": (values(lambda v: v.astype(np.int32)), rf"{HERE} holds numbers of type int32"),
     "channels exchanged": (
         image("x.png", lambda v: v[..., ::-1]),
-        r"x\.png \(camera c0, light l2\) has red and blue exchanged against c0_l2_0\.025\.npy; export both with the same order",
+        (
+            r"x\.png \(camera c0, light l2\) has red and blue exchanged against c0_l2_0\.025\.npy; export both with the"
+            r" same order"
+        ),
     ),
     "channels of both exposures exchanged": (
         exchanged,
-        r"Frame c0_l2_0\.025\.npy \(camera c0, light l2\) has 0\.\d+ times as much red as blue where c0_l0_0\.025\.npy has \d",
+        (
+            r"Frame c0_l2_0\.025\.npy \(camera c0, light l2\) has 0\.\d+ times as much red as blue where"
+            r" c0_l0_0\.025\.npy has \d"
+        ),
     ),
     "another size": (values(lambda v: v[:, 1:]), rf"{HERE} has 39 x 32 pixels, but its camera has 40 x 32"),
     "turned": (values(lambda v: v.swapaxes(0, 1)), rf"{HERE} has 32 x 40 pixels \(turned by 90 degrees\?\)"),

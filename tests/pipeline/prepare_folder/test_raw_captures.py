@@ -59,9 +59,11 @@ def smooth_truth(manifest: PreparedManifest, shape: tuple[int, ...]) -> np.ndarr
 
 
 def test_colour_counts_of_three_exposures_become_radiance_with_its_variance(textured: Path, tmp_path: Path) -> None:
-    """z of all pixels that are not full: mean square within 5 standard errors, 4 %, and 3 % for the noise model's own error.
+    """z of all pixels that are not full: mean square within 5 standard errors, 4 %, and 3 % for the noise model's own
+    error.
 
-    The mean may be off by 0.05, as the black frames' and the flat frames' noise is shared by all pixels of a place or a camera.
+    The mean may be off by 0.05, as the black frames' and the flat frames' noise is shared by all pixels of a place or a
+    camera.
     """
     write_raw_capture(tmp_path / "raw", textured, Sensor(), (0.0125, 0.05, 0.2), flats=6)
     source = RawSource(tmp_path / "raw", None, 0.01, 0.002)
@@ -85,7 +87,8 @@ def test_colour_counts_of_three_exposures_become_radiance_with_its_variance(text
 def test_exposures_that_show_nothing_move_no_subject(
     textured: Path, tmp_path: Path, others_s: tuple[float, ...]
 ) -> None:
-    """Without tracking frames edges are matched, and an exposure that is all noise or full has none: lights are found where one good exposure shows them.
+    """Without tracking frames edges are matched, and an exposure that is all noise or full has none: lights are found
+    where one good exposure shows them.
 
     Edges are good to about a pixel; the same edges with a little more or less noise to a tenth of that.
     """

@@ -62,7 +62,9 @@ def site_means(image: np.ndarray, labels: np.ndarray, reduce: str = "mean") -> n
 
 
 def test_exposures_of_a_real_sensor_are_linear_above_their_black(chart: tuple[Path, CameraFrames]) -> None:
-    """The source's own figures over its 430 pairs: median 1.001, 5 % 0.973, 95 % 1.040; within 0.002, 0.005 and 0.005 of them."""
+    """The source's own figures over its 430 pairs: median 1.001, 5 % 0.973, 95 % 1.040; within 0.002, 0.005 and 0.005
+    of them.
+    """
     root, camera = chart
     assert camera.linearity.is_linear
     folder, labels, ratios = read_raw_folder(root), patches(), []

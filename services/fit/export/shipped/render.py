@@ -1,6 +1,7 @@
 """Render the measured tooth with Mitsuba 3: ``python render.py --camera c0 --light l0 --spp 256 --out tooth.exr``.
 
-Each colour channel is its own scene, because scattering differs per channel and Mitsuba's phase functions hold one number.
+Each colour channel is its own scene, because scattering differs per channel and Mitsuba's phase functions hold one
+number.
 """
 
 import argparse

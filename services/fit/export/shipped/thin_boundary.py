@@ -1,4 +1,5 @@
-"""A thin dielectric boundary for Mitsuba 3: transmitted light does not bend; F is air-to-ior Fresnel at |cos| from both sides (teeth 2018, Eq. 1 and 2).
+"""A thin dielectric boundary for Mitsuba 3: transmitted light does not bend; F is air-to-ior Fresnel at |cos| from both
+sides (teeth 2018, Eq. 1 and 2).
 
 A texture ``stain`` takes its share of what passes, and nothing of what is reflected.
 

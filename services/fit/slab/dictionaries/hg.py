@@ -9,7 +9,8 @@ from services.fit.slab.model.dictionary import hg_values
 from services.fit.slab.solve.mixture import Mixtures, unit_atoms
 
 COSINES = (-0.9, -0.75, -0.6, -0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95)
-"""Mean cosines, closer to each other where lobes are narrow: a lobe between two neighbours is their mix within 2 % of its norm."""
+"""Mean cosines, closer to each other where lobes are narrow: a lobe between two neighbours is their mix within 2 % of
+its norm."""
 
 
 def lobes(sample: Sample) -> ChosenDictionary:  # noqa: ARG001 - the same for every sample

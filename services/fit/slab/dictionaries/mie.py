@@ -1,7 +1,7 @@
 """Dictionary ``mie``: homogeneous spheres of many radii in the sample's medium (Lorenz-Mie theory).
 
-The coefficients a_n and b_n come from miepython; the sums over orders are those of Bohren and Huffman (1983), section 4.4, so
-that no normalisation of a library's version enters.
+The coefficients a_n and b_n come from miepython; the sums over orders are those of Bohren and Huffman (1983), section
+4.4, so that no normalisation of a library's version enters.
 """
 
 from __future__ import annotations
@@ -21,11 +21,14 @@ Array = NDArray[np.float64]
 Amplitudes = NDArray[np.complex128]
 
 SMALLEST_SIZE, LARGEST_SIZE = 0.5, 30.0
-"""Size parameters 2 pi n r / wavelength. Below, spheres scatter alike whatever their size; above, the forward peak is as narrow as a tent."""
+"""Size parameters 2 pi n r / wavelength. Below, spheres scatter alike whatever their size; above, the forward peak is
+as narrow as a tent."""
 ATOMS = 84
-"""A factor of 1.05 in radius from one to the next. With 1.10 spheres of one size came out 4 % wrong in reduced scattering."""
+"""A factor of 1.05 in radius from one to the next. With 1.10 spheres of one size came out 4 % wrong in reduced
+scattering."""
 RADII_PER_ATOM = 3
-"""Radii over which an atom is averaged, evenly in their logarithm: the rings of a single large sphere belong to no real sample."""
+"""Radii over which an atom is averaged, evenly in their logarithm: the rings of a single large sphere belong to no real
+sample."""
 
 
 def spheres(sample: Sample) -> ChosenDictionary:
@@ -74,7 +77,8 @@ def _coefficients(relative_index: complex, size: float) -> tuple[Amplitudes, Amp
         from miepython import an_bn
     except ImportError as problem:
         raise PlatformError(
-            "dictionary = mie needs the package miepython; install dentine with its extra mie, or choose another dictionary."
+            "dictionary = mie needs the package miepython; install dentine with its extra mie, or choose another"
+            " dictionary."
         ) from problem
     # There an absorbing sphere has a negative imaginary part.
     a, b = an_bn(relative_index.conjugate(), size)

@@ -1,8 +1,9 @@
 """The dictionary of Gkioulekas et al. (2013), section 4.3: 200 tent phase functions, a pure absorber and vacuum.
 
-A mixture of the atoms is a medium whose scattering per angle, f(theta) = sigma_s p(theta), is linear between 200 knots, and
-whose absorption is free. So a fit knows f at the knots (per mm and sr) and sigma_a (per mm); weights are made from them on
-request. Tents at 0 and 180 degrees weigh 1e-4 of the others, which makes the first one almost the same atom as vacuum.
+A mixture of the atoms is a medium whose scattering per angle, f(theta) = sigma_s p(theta), is linear between 200 knots,
+and whose absorption is free. So a fit knows f at the knots (per mm and sr) and sigma_a (per mm); weights are made from
+them on request. Tents at 0 and 180 degrees weigh 1e-4 of the others, which makes the first one almost the same atom as
+vacuum.
 """
 
 from __future__ import annotations

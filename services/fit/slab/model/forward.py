@@ -1,4 +1,5 @@
-"""Images of a slab and their derivatives by blocks of paths: pure functions of what names them, so they may run anywhere.
+"""Images of a slab and their derivatives by blocks of paths: pure functions of what names them, so they may run
+anywhere.
 
 A block is one light's paths of one batch. Its sums depend on the seed and the numbers that name it alone, and sums are
 always taken in the order of the blocks, so the answer is the same on any number of workers.
@@ -48,7 +49,8 @@ class BlockSums:
     rows: Array
     """(cameras, pixels, KNOTS + 1), empty without scores."""
     totals: Array
-    """Scattered light that leaves by the light's face, by the other, and what was cut off; per unit of the beam's power."""
+    """Scattered light that leaves by the light's face, by the other, and what was cut off; per unit of the beam's
+    power."""
 
 
 class Blocks(Protocol):

@@ -1,7 +1,7 @@
 """The faces of a cell: Snell's and Fresnel's laws at medium, glass and air, for smooth plane-parallel layers.
 
-Light that is reflected between the two sides of a glass is summed without interference. What a glass's outer side reflects
-comes back displaced by twice its thickness times the tangent; that is kept, as it exceeds a pixel.
+Light that is reflected between the two sides of a glass is summed without interference. What a glass's outer side
+reflects comes back displaced by twice its thickness times the tangent; that is kept, as it exceeds a pixel.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ class Interface:
     def reflections(self, inside_sine: float) -> tuple[Reflection, ...]:
         """Ways back into the medium for light that arrives from inside: at the glass, then at the glass's outer side.
 
-        The light that goes to and fro in the glass more than once, some 1e-4 of what arrives, is counted with its first return.
+        The light that goes to and fro in the glass more than once, some 1e-4 of what arrives, is counted with its first
+        return.
         """
         cosine = math.sqrt(1 - inside_sine**2)
         if self.index_glass is None:

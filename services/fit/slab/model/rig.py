@@ -1,7 +1,8 @@
 """What the forward model needs of a folder: each light with the cameras that see it, as plain arrays.
 
-Every light is turned into a front light: for a back light the cell is mirrored, so that its cameras change sides and lateral
-directions stay. The beam meets the outer face of the cell at x = y = 0, and a pixel is where light leaves the outer face.
+Every light is turned into a front light: for a back light the cell is mirrored, so that its cameras change sides and
+lateral directions stay. The beam meets the outer face of the cell at x = y = 0, and a pixel is where light leaves the
+outer face.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grid:
-    """Pixels, folded at y = 0 where the grid is symmetric: beams and cameras lie in the plane y = 0, so both halves are equal."""
+    """Pixels, folded at y = 0 where the grid is symmetric: beams and cameras lie in the plane y = 0, so both halves are
+    equal.
+    """
 
     x_from_mm: float
     y_from_mm: float
@@ -67,7 +70,8 @@ class Views:
     """Whether the camera looks at the face that the light does not meet."""
     sines: Array
     scales: Array
-    """Radiance outside, averaged over a pixel, of one unit of power per sr in the medium that reaches the face there, per mm2."""
+    """Radiance outside, averaged over a pixel, of one unit of power per sr in the medium that reaches the face there,
+    per mm2."""
     shifts_mm: Array
 
 
@@ -126,7 +130,8 @@ def _views(
 ) -> Views:
     sine = interface.inside_sine(light.angle_deg)
     sines = np.array([interface.inside_sine(camera.angle_deg) for _, camera in seen])
-    # A solid angle shrinks on its way in by (n0/n)^2 cos b / cos b_in; radiance is power per sr outside and projected area.
+    # A solid angle shrinks on its way in by (n0/n)^2 cos b / cos b_in; radiance is power per sr outside and projected
+    # area.
     solid = (interface.index_outside / interface.index) ** 2 / np.sqrt(1 - sines**2)
     passed = np.array([interface.transmittance(s) for s in sines])
     size = folder.beam.size_mm

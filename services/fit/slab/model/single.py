@@ -1,7 +1,9 @@
-"""Single scattering by quadrature along the beam, with its scores: exact but for the light of three and more reflections.
+"""Single scattering by quadrature along the beam, with its scores: exact but for the light of three and more
+reflections.
 
-A view has one scattering angle per number of reflections of the beam before, and of the light after, the scatter. The depth
-is cut into cells; within a cell the exit point moves evenly, so that the beam's cross-section is averaged in closed form.
+A view has one scattering angle per number of reflections of the beam before, and of the light after, the scatter. The
+depth is cut into cells; within a cell the exit point moves evenly, so that the beam's cross-section is averaged in
+closed form.
 """
 
 from __future__ import annotations
@@ -103,7 +105,9 @@ def _langevin(x: Array) -> Array:
 
 
 def _spread(grid: Grid, beam: Beam, starts: Array, ends: Array) -> Array:
-    """Share of a cell's light that reaches each pixel (cells, pixels), exit points between ``starts`` and ``ends`` on y = 0."""
+    """Share of a cell's light that reaches each pixel (cells, pixels), exit points between ``starts`` and ``ends`` on y
+    = 0.
+    """
     edges_x = grid.x_from_mm + grid.pitch_x_mm * np.arange(grid.columns + 1)
     edges_y = grid.y_from_mm + grid.pitch_y_mm * np.arange(grid.rows + 1)
     halves = 2 if grid.folded else 1

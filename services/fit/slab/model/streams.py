@@ -1,4 +1,6 @@
-"""Random numbers by counter: a stream is a 64-bit state that any (seed, place in the job, path) leads to (SplitMix64)."""
+"""Random numbers by counter: a stream is a 64-bit state that any (seed, place in the job, path) leads to
+(SplitMix64).
+"""
 
 from __future__ import annotations
 

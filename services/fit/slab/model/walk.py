@@ -1,9 +1,9 @@
 """The walk of one light: orders two and up, with the scores of all knots, compiled by Numba.
 
-A path is the beam's; at each of its vertices from the second on it is connected to every camera through the flat face. A
-contribution's derivative by ln f_n is itself times (sum over its scatters of the share of knot n in f(theta)) less
-f_n Omega_n times its way, by Eq. 18 of Gkioulekas et al. (2013) as ``optics.md`` corrects it: so each image carries a row
-of KNOTS sums of shares, and one sum of ways.
+A path is the beam's; at each of its vertices from the second on it is connected to every camera through the flat face.
+A contribution's derivative by ln f_n is itself times (sum over its scatters of the share of knot n in f(theta)) less
+f_n Omega_n times its way, by Eq. 18 of Gkioulekas et al. (2013) as ``optics.md`` corrects it: so each image carries a
+row of KNOTS sums of shares, and one sum of ways.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def reflectance(cosine, eta):  # type: ignore[no-untyped-def]  # compiled
 
 @njit(cache=True)
 def meet_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
-    """Whether light comes back from a face, and how far it went sideways in the glass, in units of its lateral direction.
+    """Whether light comes back from a face, and how far it went sideways in the glass, in units of its lateral
+    direction.
 
     glass: (n_outside / n, n_glass / n or 0, thickness).
     """
@@ -145,10 +146,11 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
     rows,
     totals,
 ):
-    """Add ``paths`` paths to images (C, P), rows (C, P, KNOTS + 1) and totals (light out of the front, the back, cut off).
+    """Add ``paths`` paths to images (C, P), rows (C, P, KNOTS + 1) and totals (light out of the front, the back, cut
+    off).
 
-    light: (sine, transmittance, shift, total reflectance along the beam). mirrors: reflectance of a face along each camera.
-    grid: (x from, y from, pitch x, pitch y, columns, rows, folded). Without ``scores`` rows stay as they are.
+    light: (sine, transmittance, shift, total reflectance along the beam). mirrors: reflectance of a face along each
+    camera. grid: (x from, y from, pitch x, pitch y, columns, rows, folded). Without ``scores`` rows stay as they are.
     """
     scattering, sigma_t, albedo, cumulative, cosines, densities, guide = medium
     x_from, y_from, pitch_x, pitch_y, columns, row_count, folded = grid
@@ -163,7 +165,8 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
 
     for path in range(paths):
         state = path_state(key, path)
-        # The first scatter is forced: the beam's passes between the faces form a geometric series that is drawn from exactly.
+        # The first scatter is forced: the beam's passes between the faces form a geometric series that is drawn from
+        # exactly.
         weight = light[1] * albedo * collided / (1 - repeat)
         x, y, way = light[2], 0.0, 0.0
         dx, dy, dz = light[0], 0.0, beam_cosine

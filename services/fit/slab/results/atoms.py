@@ -1,4 +1,6 @@
-"""What a fit by a dictionary of few atoms tells of them: parts of the scattering, and sizes where the atoms are spheres."""
+"""What a fit by a dictionary of few atoms tells of them: parts of the scattering, and sizes where the atoms are
+spheres.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,11 @@ LARGEST_SIZE_SHARE = 0.1
 
 
 def atoms_of(dictionary: ChosenDictionary, material: Material, uncertainty: Uncertainty) -> dict[str, Quantity]:
-    """By the names of ``parameters.json``: ``atoms.<name>`` is an atom's part of sigma_s; nothing where there are no atoms.
+    """By the names of ``parameters.json``: ``atoms.<name>`` is an atom's part of sigma_s; nothing where there are no
+    atoms.
 
-    Of spheres also ``volumes.<name>``, their share of the sample's volume, ``volume_fraction``, which is the sum of these, and
-    ``mean_radius``, the mean by volume.
+    Of spheres also ``volumes.<name>``, their share of the sample's volume, ``volume_fraction``, which is the sum of
+    these, and ``mean_radius``, the mean by volume.
     """
     if not isinstance(material, Mixture):
         return {}

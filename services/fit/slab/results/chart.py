@@ -10,7 +10,8 @@ from services.fit.slab.results.result import PhaseFunction
 WIDTH, HEIGHT = 640, 300
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 40
 PICTURE_STYLE = (
-    "text{fill:#595e68;font:12px system-ui,sans-serif}.grid{stroke:#d9d6d0}.series{fill:none;stroke:#0b63a5;stroke-width:2}"
+    "text{fill:#595e68;font:12px"
+    " system-ui,sans-serif}.grid{stroke:#d9d6d0}.series{fill:none;stroke:#0b63a5;stroke-width:2}"
     ".band{fill:#0b63a5;opacity:.25}.prior{fill:#d9d6d0;opacity:.6}"
     "@media(prefers-color-scheme:dark){text{fill:#a9b4b7}.grid{stroke:#3a4549}.series{stroke:#6db5ea}.band{fill:#6db5ea}.prior{fill:#3a4549}}"
     "@media(max-width:450px){text{font-size:17px}}"
@@ -21,7 +22,9 @@ DECADES_BELOW = 4
 
 
 def phase_chart(title: str, phase: PhaseFunction) -> str:
-    """Value per sr against the angle, logarithmic, with a band of one standard error; grey where the images do not tell."""
+    """Value per sr against the angle, logarithmic, with a band of one standard error; grey where the images do not
+    tell.
+    """
     low, high = _limits(phase)
 
     def x(theta_deg: float) -> float:

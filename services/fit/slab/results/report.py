@@ -1,4 +1,6 @@
-"""A slab's report: one HTML file with errors, coefficients, phase functions and images, without any outside reference."""
+"""A slab's report: one HTML file with errors, coefficients, phase functions and images, without any outside
+reference.
+"""
 
 from __future__ import annotations
 

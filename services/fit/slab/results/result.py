@@ -84,7 +84,10 @@ class SlabFit(Record):
 
 
 def parameters_of(material: Material, uncertainty: Uncertainty, index: Index) -> Parameters:
-    """The coefficients with their standard errors. One of a small value is judged by the extinction that it is part of."""
+    """The coefficients with their standard errors.
+
+    One of a small value is judged by the extinction that it is part of.
+    """
     values = {
         "sigma_t": material.extinction_per_mm,
         "sigma_s": material.scattering_per_mm,
@@ -136,9 +139,11 @@ class SlabReport(Record):
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
         judged = FitReport(
             converged=not stopped,
-            advice=f"The search at {', '.join(stopped)} spent its steps before they stopped to help; raise option effort."
-            if stopped
-            else "",
+            advice=(
+                f"The search at {', '.join(stopped)} spent its steps before they stopped to help; raise option effort."
+                if stopped
+                else ""
+            ),
             parameters={},
             fit_error={f"{fit.wavelength_nm:g}": fit.errors.fit_error for fit in self.fits},
             held_out_error={name: error for name, error in held_out.items() if error is not None},

@@ -1,4 +1,6 @@
-"""A measured phase function as Mitsuba's ``tabphase`` takes it, and a small scene around it that stock Mitsuba renders."""
+"""A measured phase function as Mitsuba's ``tabphase`` takes it, and a small scene around it that stock Mitsuba
+renders.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,10 @@ def scene_xml(fit: SlabFit, cell: Cell) -> str:
     told = fit.parameters
     bsdf = '<bsdf type="null"/>'
     if cell.boundary == "smooth":
-        bsdf = f'<bsdf type="dielectric"><float name="int_ior" value="{told.index.value:g}"/><float name="ext_ior" value="{cell.index_outside:g}"/></bsdf>'
+        bsdf = (
+            f'<bsdf type="dielectric"><float name="int_ior" value="{told.index.value:g}"/><float name="ext_ior"'
+            f' value="{cell.index_outside:g}"/></bsdf>'
+        )
     edge_mm = EDGE_TO_WIDTH * cell.width_mm / 2
     return SCENE.format(
         width_mm=cell.width_mm,

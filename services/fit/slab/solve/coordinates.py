@@ -1,7 +1,8 @@
 """The unknowns by which a solver moves a medium, and what is held of them beforehand.
 
-``Knots`` are ln f at the 200 knots under a smoothness prior; ``mixture.Mixtures`` are the weights of a dictionary's atoms. Both
-end with sigma_a. The forward model tells derivatives by ln f and sigma_a, and each kind of unknowns takes them on by the chain rule.
+``Knots`` are ln f at the 200 knots under a smoothness prior; ``mixture.Mixtures`` are the weights of a dictionary's
+atoms. Both end with sigma_a. The forward model tells derivatives by ln f and sigma_a, and each kind of unknowns takes
+them on by the chain rule.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ LARGEST_CHANGE = 1.0
 LONGEST = 0.3
 """Of ln sigma_s in one step of a thick cell."""
 BROAD = 9
-"""Multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells tell of none that is smaller."""
+"""Multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells tell of none that is
+smaller."""
 
 
 class Coordinates(Protocol):
@@ -41,7 +43,9 @@ class Coordinates(Protocol):
         """The medium with these unknowns."""
 
     def chain(self, material: Material) -> Array | None:
-        """Derivatives of ln f and sigma_a by the unknowns (UNKNOWNS, U); None where they are the unknowns themselves."""
+        """Derivatives of ln f and sigma_a by the unknowns (UNKNOWNS, U); None where they are the unknowns
+        themselves.
+        """
 
     def scale(self, material: Material, quadratic: Quadratic) -> float:
         """Scale of the prior, near a medium and as its images suggest."""
@@ -53,7 +57,9 @@ class Coordinates(Protocol):
         """The same of a prior so weak that what it tells is not taken for a measurement."""
 
     def broad(self) -> Array:
-        """Few directions (U, K) that matter in any sample, in which a noisy matrix is judged by itself; none where unknowns are few."""
+        """Few directions (U, K) that matter in any sample, in which a noisy matrix is judged by itself; none where
+        unknowns are few.
+        """
 
     def reach(self, material: Material) -> Array:
         """Standard deviations (K,) of how far off a medium may be along these directions."""
@@ -65,7 +71,9 @@ class Coordinates(Protocol):
         """A step of which no unknown moves further than a linearisation is good for."""
 
     def similar(self, change: Array, material: Material) -> Array:
-        """A step in a thick cell, whose images hardly change with sigma_s at a constant sigma_s' but much with sigma_s'."""
+        """A step in a thick cell, whose images hardly change with sigma_s at a constant sigma_s' but much with
+        sigma_s'.
+        """
 
     def is_bound(self, x: Array) -> NDArray[np.bool_]:
         """Which unknowns lie at a bound that they may not pass."""
@@ -103,14 +111,18 @@ class Knots:
         return precision(flag_scales())
 
     def broad(self) -> Array:
-        """Cosines of multiples of the angle, of which the first is sigma_s and the second about g, and the absorption."""
+        """Cosines of multiples of the angle, of which the first is sigma_s and the second about g, and the
+        absorption.
+        """
         directions = np.zeros((UNKNOWNS, BROAD + 1))
         directions[:KNOTS, :BROAD] = np.cos(np.outer(ANGLES_RAD, np.arange(BROAD)))
         directions[KNOTS, BROAD] = 1
         return directions
 
     def reach(self, material: Material) -> Array:
-        """As a Henyey-Greenstein start may be: by a factor of e in sigma_s, and less in what turns faster with the angle."""
+        """As a Henyey-Greenstein start may be: by a factor of e in sigma_s, and less in what turns faster with the
+        angle.
+        """
         return np.append(1 / np.maximum(np.arange(BROAD), 1.0) ** 2, 0.1 * material.extinction_per_mm)
 
     def minimum(self, matrix: Array, right: Array) -> Array:
@@ -141,8 +153,8 @@ class Knots:
     def log_evidence(self, quadratic: Quadratic, scale: float) -> float:
         """Of a scale of the prior, but for a constant that all scales share.
 
-        The mean derivatives are taken as if they were exact: the matrix is then positive, and a scale cannot win by following
-        directions of negative curvature, which the unbiased matrix has.
+        The mean derivatives are taken as if they were exact: the matrix is then positive, and a scale cannot win by
+        following directions of negative curvature, which the unbiased matrix has.
         """
         prior = precision(scale)
         linear, total = quadratic.linear + quadratic.noise_linear, quadratic.matrix + quadratic.noise + prior

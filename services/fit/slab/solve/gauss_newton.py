@@ -32,20 +32,24 @@ Array = NDArray[np.float64]
 TOLERATED_RISE = 2.0
 """Standard errors by which the objective may rise: fewer would refuse good steps whose comparison is noisy."""
 WEIGHTS_DIFFER = 0.5
-"""Of the misfit, which may rise by that in a thick cell: weights there are mostly those of the paths and are estimated anew for each render,
-and misfits of one medium were seen to differ by a third. A low one would else refuse all steps after it."""
+"""Of the misfit, which may rise by that in a thick cell: weights there are mostly those of the paths and are estimated
+anew for each render, and misfits of one medium were seen to differ by a third. A low one would else refuse all steps
+after it."""
 MAX_HALVINGS = 4
 WORTHWHILE = 2.0
 """A step that promises less than so many times what noise alone does waits for more paths."""
 UNFINISHED, UNFINISHED_THICK = 5.0, 1.0
-"""At the end, a step that promised more than so many times what noise does is followed by another. Where sigma_t w exceeds ``prior.THICK``,
-what is left along sigma_s at a constant sigma_s' promises little beside the noise of all directions and is still a tenth of sigma_s."""
+"""At the end, a step that promised more than so many times what noise does is followed by another. Where sigma_t w
+exceeds ``prior.THICK``, what is left along sigma_s at a constant sigma_s' promises little beside the noise of all
+directions and is still a tenth of sigma_s."""
 NEAR = 0.05
 """Of ln sigma_s, within which residuals of several media join: what is not linear is then below a thousandth."""
 ENOUGH_PATHS = 0.5
-"""At the end of a fit of a thick cell the variance by its paths is to be at most so many times that by the measurements."""
+"""At the end of a fit of a thick cell the variance by its paths is to be at most so many times that by the
+measurements."""
 DAMPING = 1.0
-"""Levenberg term in units of the noise of J: at 0.3 and at 3 the end was the same within its noise, at 0.05 it strayed."""
+"""Levenberg term in units of the noise of J: at 0.3 and at 3 the end was the same within its noise, at 0.05 it
+strayed."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +134,8 @@ class GaussNewton:
     joined: Joined | None = None
     """Renders of this stage that later ones join, in a thick cell."""
     is_searching: bool = False
-    """Whether the fit may still be far off: then steps go by smooth derivatives and along broad directions in any cell."""
+    """Whether the fit may still be far off: then steps go by smooth derivatives and along broad directions in any
+    cell."""
     kept: StandingFile | None = None
     """Where to go on from, and where to keep how far the fit has come; None for neither."""
 
@@ -228,7 +233,8 @@ class GaussNewton:
 
         Args:
             worth: what the last step promised, in units of what noise alone does.
-            rest: noise of the paths in units of that of the measurements, where more of them help: renders of a stage join.
+            rest: noise of the paths in units of that of the measurements, where more of them help: renders of a stage
+                join.
         """
         thick = self.is_thick(moved)
         enough, most = (UNFINISHED_THICK, self.budget.most_last_thick) if thick else (UNFINISHED, self.budget.most_last)
@@ -259,8 +265,8 @@ class GaussNewton:
     ) -> Array:
         """The step to the damped minimum, no unknown further than is good.
 
-        The Levenberg term is about the present point: what noise may have bent is held there. It moves no fixed point, so that
-        repeated steps from fresh paths end where an undamped one would.
+        The Levenberg term is about the present point: what noise may have bent is held there. It moves no fixed point,
+        so that repeated steps from fresh paths end where an undamped one would.
         """
         x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
         noise = equations.gradient_noise + equations.data_noise
@@ -287,7 +293,8 @@ class GaussNewton:
         """Normal equations of fresh batches.
 
         Args:
-            join: whether derivatives of the stage's renders before join. Weights then stay as the first of them had them.
+            join: whether derivatives of the stage's renders before join. Weights then stay as the first of them had
+                them.
         """
         self.renders += 1
         self.paths += paths * batches * len(self.rig.lights)
@@ -303,8 +310,8 @@ class GaussNewton:
         )
         shape, seen = (self.rig.grid.rows, self.rig.grid.columns), [views.images for views in self.rig.lights]
         own = tuple(smoothed_covariance(estimates.images[:, some], shape) * batches * paths for some in seen)
-        # Weights come from earlier renders alone: rare bright paths raise a pixel and its variance together, and weights that
-        # share them with the residuals bent sigma_s' up by several per cent.
+        # Weights come from earlier renders alone: rare bright paths raise a pixel and its variance together, and
+        # weights that share them with the residuals bent sigma_s' up by several per cent.
         recent = own if self.path_noise is None else self.path_noise
         earlier = self.joined if join else None
         known = recent if earlier is None else earlier.path_noise
@@ -316,7 +323,8 @@ class GaussNewton:
         self.multiple = (multiple + before) / 2
         noise = [one / (batches * paths) for one in known]
         if not self.is_thick(material):
-            # In a thin cell each camera sees scatters of its own: what they share is little, and its estimate would only add noise.
+            # In a thin cell each camera sees scatters of its own: what they share is little, and its estimate would
+            # only add noise.
             noise = [one * np.eye(one.shape[1]) for one in noise]
         weights = weights_of(seen, variances, noise)
         self.path_noise = tuple((first + second) / 2 for first, second in zip(own, recent, strict=True))
@@ -336,11 +344,15 @@ class GaussNewton:
         return self.is_thick(material) or (self.is_searching and self.joins(material))
 
     def joins(self, material: Material) -> bool:
-        """Whether the unknowns are ln f and sigma_a themselves, in which residuals of several media are told at their mean."""
+        """Whether the unknowns are ln f and sigma_a themselves, in which residuals of several media are told at their
+        mean.
+        """
         return self.coordinates.chain(material) is None
 
     def near(self, earlier: Joined | None, material: Material) -> ResidualSums | None:
-        """Residuals of renders before, where these are of media so near that derivatives tell how they would be here."""
+        """Residuals of renders before, where these are of media so near that derivatives tell how they would be
+        here.
+        """
         if earlier is None or not self.joins(material):
             return None
         place = self.coordinates.material_at(earlier.residuals.place)

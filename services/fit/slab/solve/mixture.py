@@ -1,7 +1,7 @@
 """Unknowns of a dictionary with few atoms: f = D w with weights w >= 0, and sigma_a >= 0.
 
-Each atom is a phase function p_m at the knots, so that w_m is the part of sigma_s that is its own. Atoms next to each other are
-much alike: the bounds choose few of them, and a wide ridge keeps the others' ± finite.
+Each atom is a phase function p_m at the knots, so that w_m is the part of sigma_s that is its own. Atoms next to each
+other are much alike: the bounds choose few of them, and a wide ridge keeps the others' ± finite.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from services.fit.slab.solve.prior import Quadratic
 Array = NDArray[np.float64]
 
 SHARE = 1.0
-"""Standard deviation of a weight's prior, as a share of sigma_s: an atom may be all there is. With 0.1, which the evidence took more
-often than not, one lobe was spread over its neighbours, and its weight came out at half with a ± of a tenth."""
+"""Standard deviation of a weight's prior, as a share of sigma_s: an atom may be all there is. With 0.1, which the
+evidence took more often than not, one lobe was spread over its neighbours, and its weight came out at half with a ± of
+a tenth."""
 WEAK_SHARE = 10.0
 """The same of the prior by which values are flagged."""
 FIRST_SPREAD = 0.1

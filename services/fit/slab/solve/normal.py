@@ -1,18 +1,19 @@
 """Normal equations from independent batches, so that no product is taken of an estimate with itself.
 
-With C_b and J_b the images and derivatives of batch b of B, y the measurements and W their weights (``weights``), the pairs of
-different batches give unbiased
+With C_b and J_b the images and derivatives of batch b of B, y the measurements and W their weights (``weights``), the
+pairs of different batches give unbiased
 
     misfit   sum_ab (C_a - y) W (C_b - y),   gradient   sum_ab J_a^T W (C_b - y),   normal matrix   sum_ab J_a^T W J_b
 
 each over a != b and divided by B (B - 1). One batch alone would add the power of its own noise to all three.
 
-Derivatives of E batches rendered before, with the same weights, may join: then J_a and J_b of the matrix run over all, and J_a of the
-gradient does, with the divisor B (B + E - 1). Their noise is independent of the present images whatever medium they were taken at, so
-the gradient is still zero where images fit. In a thick cell most of its noise is that of J times the residuals, and falls with E.
+Derivatives of E batches rendered before, with the same weights, may join: then J_a and J_b of the matrix run over all,
+and J_a of the gradient does, with the divisor B (B + E - 1). Their noise is independent of the present images whatever
+medium they were taken at, so the gradient is still zero where images fit. In a thick cell most of its noise is that of
+J times the residuals, and falls with E.
 
-Residuals of media near by may join as well, as J tells how they would be here: then the gradient is that at the mean of all their
-media, with the divisor R (B + E - 1) for residuals of R batches.
+Residuals of media near by may join as well, as J tells how they would be here: then the gradient is that at the mean of
+all their media, with the divisor R (B + E - 1) for residuals of R batches.
 """
 
 from __future__ import annotations
@@ -103,7 +104,8 @@ class NormalEquations:
     noise_gradient: Array
     """What the gradient would have too much if each batch met itself."""
     matrix_error: Array
-    """Half the difference of the matrices of either half of the batches (U, U): about as far as ``matrix`` may be off by chance."""
+    """Half the difference of the matrices of either half of the batches (U, U): about as far as ``matrix`` may be off
+    by chance."""
     data_noise: Array
     """Covariance of the gradient's noise by the measurements (U, U)."""
     used: int
@@ -184,7 +186,8 @@ def normal_equations(
     # The gradient is a U-statistic of batches: its variance is that of a batch's part, twice the mean over its pairs.
     parts = terms - terms.mean(axis=0)
     gradient_noise = parts.T @ parts / pairs * (count / seen.count)
-    # The noise of earlier derivatives meets that of the measurements alike in all batches, where no spread shows it: so it counts here.
+    # The noise of earlier derivatives meets that of the measurements alike in all batches, where no spread shows it: so
+    # it counts here.
     scattered = weights.of_measurements(whole.reshape(jacobians[0].shape)[None])[0].reshape(-1, UNKNOWNS)
     mean = whole / every.count
 
@@ -193,6 +196,7 @@ def normal_equations(
     misfit_se = float(np.sqrt((variance * (np.maximum(products, 0) + variance / 2)).sum()))
     return NormalEquations(
         misfit, misfit_se, gradient, matrix, gradient_noise, noise=mean.T @ mean - matrix,
-        noise_gradient=mean.T @ seen.total / seen.count - gradient, used=int(weights.used.sum()), matrix_error=every.matrix_error(),
-        data_noise=(scattered.T @ scattered - own_data) / (every.count**2 - count), derivatives=every, residuals=seen,
+        noise_gradient=mean.T @ seen.total / seen.count - gradient, used=int(weights.used.sum()),
+        matrix_error=every.matrix_error(), data_noise=(scattered.T @ scattered - own_data) / (every.count**2 - count),
+        derivatives=every, residuals=seen,
     )  # fmt: skip

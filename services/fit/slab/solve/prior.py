@@ -1,7 +1,8 @@
 """Smoothness of ln f: its second derivative by angle is Gaussian, with a scale that the evidence chooses.
 
-A phase function is even at both poles, so the second difference there takes the mirrored neighbour: it pulls the slope to
-zero where no camera looks. The prior is not centred on an HG function, which would put a forward peak where none is seen.
+A phase function is even at both poles, so the second difference there takes the mirrored neighbour: it pulls the slope
+to zero where no camera looks. The prior is not centred on an HG function, which would put a forward peak where none is
+seen.
 """
 
 from __future__ import annotations
@@ -18,17 +19,19 @@ from services.fit.slab.solve.normal import UNKNOWNS
 Array = NDArray[np.float64]
 
 SCALES = (3.0, 10.0, 30.0)
-"""Standard deviations of d2 ln f / d theta2, per rad2, among which the evidence chooses; HG 0.8 has 60 at its peak, 3 beyond 20 degrees.
-Thick cells have the same: there 1 per rad2 drew the fit towards a constant ln f along what images hardly tell, sigma_s at a constant
-sigma_s' (200 nm spheres at sigma_t w = 5.4: sigma_s by -11 % at 640,000 paths, where 3 does by -2.6 % and 10 by -0.2 %)."""
+"""Standard deviations of d2 ln f / d theta2, per rad2, among which the evidence chooses; HG 0.8 has 60 at its peak, 3
+beyond 20 degrees. Thick cells have the same: there 1 per rad2 drew the fit towards a constant ln f along what images
+hardly tell, sigma_s at a constant sigma_s' (200 nm spheres at sigma_t w = 5.4: sigma_s by -11 % at 640,000 paths, where
+3 does by -2.6 % and 10 by -0.2 %)."""
 SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
-"""Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has halved.
-HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
+"""Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has
+halved. HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
 RIDGE = 1e-12
 """Of the largest curvature, so that a direction that nothing tells of can be solved for."""
 THICK, THICK_REDUCED = 4.0, 2.5
-"""Of sigma_t w, and of sigma_s' w, from which cameras of one side see nearly the same of every path. A fit may begin half off in sigma_t
-and knows sigma_s' at once: 200 nm spheres at sigma_t w = 5.4 were taken for a thin sample at 3.9, and the search stopped there."""
+"""Of sigma_t w, and of sigma_s' w, from which cameras of one side see nearly the same of every path. A fit may begin
+half off in sigma_t and knows sigma_s' at once: 200 nm spheres at sigma_t w = 5.4 were taken for a thin sample at 3.9,
+and the search stopped there."""
 
 
 def is_thick(material: Material, width_mm: float) -> bool:
@@ -49,7 +52,9 @@ def second_differences() -> Array:
 
 
 def precision(scale: float | Array) -> Array:
-    """Inverse covariance of all unknowns (UNKNOWNS, UNKNOWNS) for one scale or one per knot; nothing is assumed of the absorption."""
+    """Inverse covariance of all unknowns (UNKNOWNS, UNKNOWNS) for one scale or one per knot; nothing is assumed of the
+    absorption.
+    """
     bends = second_differences() / np.broadcast_to(scale, KNOTS)[:, None]
     matrix = np.zeros((UNKNOWNS, UNKNOWNS))
     matrix[:KNOTS, :KNOTS] = bends.T @ bends
@@ -64,7 +69,9 @@ def flag_scales() -> Array:
 
 @dataclass(frozen=True)
 class Quadratic:
-    """Half the misfit near a material: linear^T x + x^T matrix x / 2 + a constant, in the unknowns x (U,) and not in steps."""
+    """Half the misfit near a material: linear^T x + x^T matrix x / 2 + a constant, in the unknowns x (U,) and not in
+    steps.
+    """
 
     matrix: Array
     linear: Array

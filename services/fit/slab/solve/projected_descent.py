@@ -1,9 +1,9 @@
 """The solver of Gkioulekas et al. (2013): projected stochastic gradient descent on simplex weights, Algorithms 1 and 2.
 
-Kept as a named baseline. As ``optics.md`` corrects it: the image and the derivative of line 9 come from independent streams,
-the average is over as many iterates as are summed, weights are clamped before they are raised to a power, and the common
-offset of all atoms, 99 % of Eq. 19, goes with the vacuum atom. The particle caches of Algorithms 3 and 4 with their step h
-are replaced by what they estimate, the path's scores, which have no step.
+Kept as a named baseline. As ``optics.md`` corrects it: the image and the derivative of line 9 come from independent
+streams, the average is over as many iterates as are summed, weights are clamped before they are raised to a power, and
+the common offset of all atoms, 99 % of Eq. 19, goes with the vacuum atom. The particle caches of Algorithms 3 and 4
+with their step h are replaced by what they estimate, the path's scores, which have no step.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def projected(point: Array) -> Array:
 def weight_gradient(rows: Array, material: Material, pulls: Array) -> Array:
     """Derivative by the weights (KNOTS + 2,) of sum of pulls times images; ``pulls`` (images, pixels).
 
-    ``rows`` are sums of shares and ways (images, pixels, KNOTS + 1). Weight n adds sigma_max / Omega_n to f at knot n and
-    sigma_max to the extinction; vacuum adds nothing.
+    ``rows`` are sums of shares and ways (images, pixels, KNOTS + 1). Weight n adds sigma_max / Omega_n to f at knot n
+    and sigma_max to the extinction; vacuum adds nothing.
     """
     shares = np.einsum("ip,ipn->n", pulls, rows)
     solid = tent_solid_angles()

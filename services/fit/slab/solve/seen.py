@@ -1,8 +1,10 @@
-"""What a noisy normal matrix is believed of, and the two steps that are made with it: one of all unknowns, and one in broad directions.
+"""What a noisy normal matrix is believed of, and the two steps that are made with it: one of all unknowns, and one in
+broad directions.
 
-Among two hundred unknowns that are mostly noise some direction always looks measured: eigenvalues of the noise alone reach far beyond
-what any single direction's noise is. So a step of all unknowns is held by all of the noise. Ten broad directions, chosen before any
-image, have only their own to fear. In a thick cell one of these is sigma_s at a constant sigma_s'.
+Among two hundred unknowns that are mostly noise some direction always looks measured: eigenvalues of the noise alone
+reach far beyond what any single direction's noise is. So a step of all unknowns is held by all of the noise. Ten broad
+directions, chosen before any image, have only their own to fear. In a thick cell one of these is sigma_s at a constant
+sigma_s'.
 """
 
 from __future__ import annotations
@@ -50,7 +52,9 @@ class Seen:
         return np.asarray(self.dual @ (self.vectors.T @ gradient))
 
     def noise(self, covariance: Array) -> Array:
-        """That of a gradient's covariance (U, U); one estimated without bias may have slightly negative eigenvalues, a variance has none."""
+        """That of a gradient's covariance (U, U); one estimated without bias may have slightly negative eigenvalues, a
+        variance has none.
+        """
         values, axes = np.linalg.eigh(self.vectors.T @ covariance @ self.vectors)
         half = self.dual @ axes * np.sqrt(np.maximum(values, 0))
         return np.asarray(half @ half.T)
@@ -75,14 +79,16 @@ def broad_step(
 ) -> Array:
     """A second step (U,) from x, along broad directions alone and not held by the noise of J.
 
-    That noise adds up over all pixels, but the unbiased matrix is off by its fluctuation alone, which many pixels average. In a thick
-    cell the direction of sigma_s at a constant sigma_s' has less signal than noise: held by all of it, steps went a tenth of their
-    way there, and fits ended where their budget did. Both steps in turn are a cycle of two grids.
+    That noise adds up over all pixels, but the unbiased matrix is off by its fluctuation alone, which many pixels
+    average. In a thick cell the direction of sigma_s at a constant sigma_s' has less signal than noise: held by all of
+    it, steps went a tenth of their way there, and fits ended where their budget did. Both steps in turn are a cycle of
+    two grids.
 
-    The gradient is taken for a measurement g = -M d + noise of the way d. In directions of signal s and unit noise of J an element
-    of M is off by about h sqrt(1 + s_i + s_j), so an element of g has a variance of h^2 sum_j (1 + s_i + s_j) d_j^2 beside its own.
-    With R the covariance of both, and T what d may be beforehand, the most probable way has (M R^-1 M + T^-1 + prior) d =
-    -M R^-1 g - prior x: all of it where signals stand out, none of it where they do not. As R depends on d, it is found in turns.
+    The gradient is taken for a measurement g = -M d + noise of the way d. In directions of signal s and unit noise of J
+    an element of M is off by about h sqrt(1 + s_i + s_j), so an element of g has a variance of h^2 sum_j (1 + s_i +
+    s_j) d_j^2 beside its own. With R the covariance of both, and T what d may be beforehand, the most probable way has
+    (M R^-1 M + T^-1 + prior) d = -M R^-1 g - prior x: all of it where signals stand out, none of it where they do not.
+    As R depends on d, it is found in turns.
 
     Args:
         broad: directions (U, K).
@@ -112,7 +118,9 @@ def broad_step(
 
 
 def noise_ratio(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:
-    """By how many times the gradient's noise exceeds that of images that fit, which is the normal matrix with its noise."""
+    """By how many times the gradient's noise exceeds that of images that fit, which is the normal matrix with its
+    noise.
+    """
     whole = quadratic.matrix + quadratic.noise
     total = whole + prior + _ridge(quadratic)
     both = np.linalg.solve(total, np.stack([gradient_noise, whole]))

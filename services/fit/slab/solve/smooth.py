@@ -1,13 +1,14 @@
 """Derivatives of a thick cell's images, made smooth over pixels.
 
-In a thick cell a path scatters tens of times, and the sum of its scores is many times what sigma_s at a constant sigma_s' changes an
-image by. But light that has scattered twice and more is smeared out: its relative derivatives vary slowly over an image, as six
-functions of the place do. So each image's derivatives are replaced by their weighted least-squares fit with these functions times the
-image, single scattering apart, which has no noise. In 200 nm spheres at sigma_t w = 9.1 the noise of the normal matrix fell 16-fold in
-that direction, and the matrix itself stayed the same within its error.
+In a thick cell a path scatters tens of times, and the sum of its scores is many times what sigma_s at a constant
+sigma_s' changes an image by. But light that has scattered twice and more is smeared out: its relative derivatives vary
+slowly over an image, as six functions of the place do. So each image's derivatives are replaced by their weighted
+least-squares fit with these functions times the image, single scattering apart, which has no noise. In 200 nm spheres
+at sigma_t w = 9.1 the noise of the normal matrix fell 16-fold in that direction, and the matrix itself stayed the same
+within its error.
 
-The fit is linear in the derivatives, and what it is made from is independent of the present paths, so the gradient's mean is still zero
-where images fit. Nothing is assumed of the images themselves.
+The fit is linear in the derivatives, and what it is made from is independent of the present paths, so the gradient's
+mean is still zero where images fit. Nothing is assumed of the images themselves.
 """
 
 from __future__ import annotations

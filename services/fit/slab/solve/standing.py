@@ -1,4 +1,6 @@
-"""Where a fit stands before each step of its last stages, kept so that a new attempt goes on there to the same digits."""
+"""Where a fit stands before each step of its last stages, kept so that a new attempt goes on there to the same
+digits.
+"""
 
 from __future__ import annotations
 

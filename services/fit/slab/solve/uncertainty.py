@@ -40,7 +40,9 @@ class Uncertainty:
         return float(np.sqrt(slope @ self.images_alone @ slope))
 
     def whole_error(self, slope: Array) -> float:
-        """The larger of both, by which a quantity is judged: a fit that ended short of its minimum may say more under the weak prior."""
+        """The larger of both, by which a quantity is judged: a fit that ended short of its minimum may say more under
+        the weak prior.
+        """
         return max(self.standard_error(slope), self.undetermined_error(slope))
 
 
@@ -48,9 +50,9 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     """Covariances at a solution.
 
     The unbiased matrix is indefinite where it is noise, and its mean with the noise in would promise too much: so only
-    directions whose curvature stands out count. In thin cells the images' Monte Carlo noise is in the weights, as the shot noise
-    is. In thick ones, where it is the larger part, the gradient's noise is taken as it was seen between batches, and what is left
-    of the way to the minimum counts as error.
+    directions whose curvature stands out count. In thin cells the images' Monte Carlo noise is in the weights, as the
+    shot noise is. In thick ones, where it is the larger part, the gradient's noise is taken as it was seen between
+    batches, and what is left of the way to the minimum counts as error.
     """
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
@@ -73,7 +75,9 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
 
 
 def _left(solution: Solution, x: Array, prior: Array, known: Array) -> Array:
-    """Square (U, U) of what is left of the way to the minimum within bounds, less what noise alone leaves of it on average."""
+    """Square (U, U) of what is left of the way to the minimum within bounds, less what noise alone leaves of it on
+    average.
+    """
     coordinates, quadratic = solution.coordinates, solution.quadratic
     seen = seen_of(quadratic, prior)
     slope = seen.projected(quadratic.linear + quadratic.matrix @ x)
@@ -85,15 +89,17 @@ def _left(solution: Solution, x: Array, prior: Array, known: Array) -> Array:
 
 
 def covariance_of(quadratic: Quadratic, prior: Array) -> Array:
-    """Posterior covariance of the unknowns under a prior's precision (U, U), where the weights hold all noise there is."""
+    """Posterior covariance of the unknowns under a prior's precision (U, U), where the weights hold all noise there
+    is.
+    """
     return np.asarray(np.linalg.inv(seen_of(quadratic, prior).total))
 
 
 def _half_lines(quadratic: Quadratic, prior: Array, x: Array, bound: NDArray[np.bool_]) -> Array:
     """Precision (U,) that a bound adds to the unknowns that lie at it.
 
-    On the half line that is left to it, an unknown of slope s has exp(-s x - a x^2 / 2): a second moment of 1/a where s is
-    small, as without the bound, and of 2/s^2 where it is large.
+    On the half line that is left to it, an unknown of slope s has exp(-s x - a x^2 / 2): a second moment of 1/a where s
+    is small, as without the bound, and of 2/s^2 where it is large.
     """
     slope = quadratic.linear + quadratic.noise_linear + (quadratic.matrix + quadratic.noise + prior) @ x
     return np.where(bound, np.maximum(slope, 0) ** 2 / 2, 0.0)

@@ -1,8 +1,8 @@
 """Weights of images: the inverse of their covariance, by the measurements' noise and by the paths that rendered them.
 
-A path is connected to every camera, and in a thick cell cameras of one side see nearly the same of it: at sigma_t w = 5 the noise of a
-pixel correlates by 0.95 between them. Weighed as independent, three cameras told each path three times, and what they tell by their
-differences, which that noise hardly touches, was lost in it.
+A path is connected to every camera, and in a thick cell cameras of one side see nearly the same of it: at sigma_t w = 5
+the noise of a pixel correlates by 0.95 between them. Weighed as independent, three cameras told each path three times,
+and what they tell by their differences, which that noise hardly touches, was lost in it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ class Weights:
         return out
 
     def of_measurements(self, whitened: Array) -> Array:
-        """S^1/2 R x of what was whitened before, with S the variances of the measurements: x^T R^T S R x is their part in W."""
+        """S^1/2 R x of what was whitened before, with S the variances of the measurements: x^T R^T S R x is their part
+        in W.
+        """
         out = np.zeros_like(whitened)
         for own, root in zip(self.images, self.roots, strict=True):
             out[:, own] = np.einsum("pij,bjp...->bip...", root, whitened[:, own], optimize=True)
@@ -71,13 +73,16 @@ def weights_of(images: Sequence[NDArray[np.int64]], variances: Array, covariance
 
 
 def independent_weights(variances: Array, noise: Array) -> Weights:
-    """Weights of values whose measurements and renders all have noise of their own, with these variances (images, pixels)."""
+    """Weights of values whose measurements and renders all have noise of their own, with these variances (images,
+    pixels).
+    """
     each = [np.array([image]) for image in range(len(variances))]
     return weights_of(each, variances, [one[:, None, None] for one in noise])
 
 
 def smoothed_covariance(images: Array, shape: tuple[int, int]) -> Array:
-    """Monte Carlo covariance (pixels, C, C) of the mean of batches (B, C, pixels), smoothed over neighbours of one image.
+    """Monte Carlo covariance (pixels, C, C) of the mean of batches (B, C, pixels), smoothed over neighbours of one
+    image.
 
     A pixel's own estimate is small where its value happens to be small, and weights that follow it pull the fit down.
     """

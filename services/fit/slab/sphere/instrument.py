@@ -1,7 +1,9 @@
-"""What a sphere reads of a slab whose totals are known: theory of Pickering et al. (Appl. Opt. 32, 399, 1993) with baffles.
+"""What a sphere reads of a slab whose totals are known: theory of Pickering et al. (Appl. Opt. 32, 399, 1993) with
+baffles.
 
-Light in a sphere goes to and fro until the detector, an open port or the sample takes it; its gain depends on the sample,
-which lies in the wall. Substituting the standard for the sample changes that gain, and the reading is off by the ratio.
+Light in a sphere goes to and fro until the detector, an open port or the sample takes it; its gain depends on the
+sample, which lies in the wall. Substituting the standard for the sample changes that gain, and the reading is off by
+the ratio.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ def _reflection(file: SphereFile, reading: TotalsReading, scattered: float, mirr
     """A reading against the standard; both are lit first, and the third port is the open entrance."""
     if (sphere := _with_wall(file.reflection_sphere, reading.reflection_wall)) is None:
         return scattered + mirror
-    # Behind a baffle light meets the wall first. A mirror's light meets it whole, scattered light loses the entrance's share.
+    # Behind a baffle light meets the wall first. A mirror's light meets it whole, scattered light loses the entrance's
+    # share.
     spared = 1 - _area(sphere, sphere.third_port_mm) if sphere.baffle else 1.0
     return (scattered + mirror / spared) * _gain(sphere, sample) / _gain(sphere, file.standard_reflectance)
 

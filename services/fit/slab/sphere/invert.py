@@ -1,7 +1,7 @@
 """From readings to absorption and reduced scattering, each with its standard error.
 
-Two totals fix two coefficients. The collimated transmittance, where it was measured, gives the extinction by itself, so g
-follows as well; otherwise g is what the file says, on which the reduced coefficient hardly depends.
+Two totals fix two coefficients. The collimated transmittance, where it was measured, gives the extinction by itself, so
+g follows as well; otherwise g is what the file says, on which the reduced coefficient hardly depends.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from services.fit.slab.sphere.totals import NODES, Optics, slab_totals
 Array = NDArray[np.float64]
 
 ASSUMED_SE = 0.005
-"""Of R and T where the file gives none, as a share of the incident power: a laboratory's sphere repeats to about this."""
+"""Of R and T where the file gives none, as a share of the incident power: a laboratory's sphere repeats to about
+this."""
 ASSUMED_UNSCATTERED_SHARE = 0.05
 """Standard error of the collimated transmittance where the file gives none, as a share of its value."""
 SEARCH_NODES = 8
@@ -205,7 +206,8 @@ class _Problem:
             told = f"R = {reading.R:g}, T = {reading.T:g}"
             nearest = f"the nearest one reads {fitted[0]:.4f}, {fitted[1]:.4f}"
             notes.append(
-                f"No slab of this width and index reads {told}; {nearest}: check index, glass, standard and what R includes."
+                f"No slab of this width and index reads {told}; {nearest}: check index, glass, standard and what R"
+                " includes."
             )
         if absorption < least:
             notes.append("The readings tell no absorption: what is lost is below what they resolve.")
@@ -217,13 +219,15 @@ class _Problem:
             )
         elif not MIN_G < 1 - reduced / max(extinction - absorption, 1e-12) < MAX_G:
             notes.append(
-                "The collimated transmittance contradicts R and T, as no g fits all three; check it for scattered light."
+                "The collimated transmittance contradicts R and T, as no g fits all three; check it for scattered"
+                " light."
             )
         if reading.R_se is None or reading.T_se is None:
             notes.append(f"R and T without a standard error are taken to have {ASSUMED_SE:g}.")
         if reading.T_unscattered is not None and reading.T_unscattered_se is None:
             notes.append(
-                f"T_unscattered without a standard error is taken to have {100 * ASSUMED_UNSCATTERED_SHARE:g} % of its value."
+                f"T_unscattered without a standard error is taken to have {100 * ASSUMED_UNSCATTERED_SHARE:g} % of its"
+                " value."
             )
         return tuple(notes)
 

@@ -86,7 +86,8 @@ class SphereFile(Record):
             raise ValueError("cell.index is null, and totals do not tell it; give the sample's index")
         if self.cell.boundary == "smooth" and (self.cell.index or 0) < self.cell.index_outside:
             raise ValueError(
-                f"cell.index is below index_outside, {self.cell.index_outside:g}; only a sample that is denser is understood"
+                f"cell.index is below index_outside, {self.cell.index_outside:g}; only a sample that is denser is"
+                " understood"
             )
         names = [reading.wavelength_nm for reading in self.totals]
         if twice := {nm for nm in names if nm is not None and names.count(nm) > 1}:
@@ -133,7 +134,8 @@ def _read_rxt(path: Path) -> SphereFile:
         )
     if not 2 <= columns <= MAX_RXT_COLUMNS:
         raise CaptureInputError(
-            f"{path}: {columns} readings a line are not understood; give M_R and M_T, then M_U and the wall of either sphere."
+            f"{path}: {columns} readings a line are not understood; give M_R and M_T, then M_U and the wall of either"
+            " sphere."
         )
     reflection, transmission = (_sphere(header[first : first + 5]) if spheres else None for first in (7, 12))
     slide = {"index": slide_index, "thickness_mm": slide_mm} if slide_mm > 0 and slide_index > 1 else None

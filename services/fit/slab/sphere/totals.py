@@ -9,8 +9,9 @@ so a slab that is lit alike from both sides (even), or with opposite signs (odd)
 
     G even = L^-T V k tanh(k tau/2) V^T L^-1,   G odd the same with coth,   B = L L^T,   L^T A L = V k^2 V^T,
 
-and half the sum and half the difference of both answers are R and T for light from one side. Nothing is stepped, so a slab
-may be as thick as it likes. The forward peak of the phase function is taken out of the scattering (delta-M, Wiscombe 1977).
+and half the sum and half the difference of both answers are R and T for light from one side. Nothing is stepped, so a
+slab may be as thick as it likes. The forward peak of the phase function is taken out of the scattering (delta-M,
+Wiscombe 1977).
 """
 
 from __future__ import annotations
@@ -27,12 +28,14 @@ from services.fit.slab.model.interface import Interface
 Array = NDArray[np.float64]
 
 NODES = 32
-"""Nodes a range of cosines. With 32 no tabulated slab up to g = 0.9 is off by more than 4e-5; with 96 by more than 1e-7."""
+"""Nodes a range of cosines. With 32 no tabulated slab up to g = 0.9 is off by more than 4e-5; with 96 by more than
+1e-7."""
 BEAM_WEIGHT = 1e-10
-"""Weight of the node that carries the beam: so small that what is scattered into it changes no total, and far above rounding."""
+"""Weight of the node that carries the beam: so small that what is scattered into it changes no total, and far above
+rounding."""
 WHITE_RATE = 1e-22
-"""Least squared decay rate in units of the largest: the slowest mode of a white slab does not decay, and rounding may make
-its square negative."""
+"""Least squared decay rate in units of the largest: the slowest mode of a white slab does not decay, and rounding may
+make its square negative."""
 MIN_DEPTH = 1e-12
 """Half the optical thickness below which a slab is as good as clear."""
 
@@ -103,7 +106,8 @@ def slab_totals(optics: Optics, width_mm: float, interface: Interface, nodes: in
 def _quadrature(interface: Interface, nodes: int) -> _Quadrature:
     """Gauss-Legendre in the cosine in the medium where all light is reflected, and in the cosine outside elsewhere.
 
-    Fresnel's laws are smooth in the outer cosine, and have a square root in the inner one at the edge of total reflection.
+    Fresnel's laws are smooth in the outer cosine, and have a square root in the inner one at the edge of total
+    reflection.
     """
     index = interface.index / interface.index_outside
     edge = math.sqrt(1 - 1 / index**2)

@@ -1,7 +1,7 @@
 """How translucent a slab looks, as dental laboratories state it: the same slab over a black and over a white backing.
 
-The translucency parameter TP is the CIELAB difference of both (Johnston et al. 1995), the contrast ratio the quotient of
-their luminances Y over black and white. Both are told under daylight D65 for the observer of CIE 1931.
+The translucency parameter TP is the CIELAB difference of both (Johnston et al. 1995), the contrast ratio the quotient
+of their luminances Y over black and white. Both are told under daylight D65 for the observer of CIE 1931.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from services.fit.transport.scene.geometry import Geometry, Hit
 from services.fit.transport.scene.media import Media, PhaseFunction
 
 COSINE_CLAMP = 1e-3
-"""1/|omega . n| has a logarithmically divergent second moment. Crossings at cosine mu come with density ~ mu, so clamping
-below this value removes about half of it, 5e-4, of a one-sided term that its partner nearly cancels."""
+"""1/|omega . n| has a logarithmically divergent second moment. Crossings at cosine mu come with density ~ mu, so
+clamping below this value removes about half of it, 5e-4, of a one-sided term that its partner nearly cancels."""
 
 
 def inverse_cosine(cosine: mi.Float) -> mi.Float:

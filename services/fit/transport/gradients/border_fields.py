@@ -1,7 +1,8 @@
 """Light on the dentin's border, gathered by photons, and the camera's walks that meet it.
 
-Both count where they cross the border, by 1 / |n . w|, and expand directions in spherical harmonics (``border_series``). Light that has not collided keeps
-its one direction instead. No path connects to a light or to another path, so both walks are cheap, and a product of their sums stands for all pairs.
+Both count where they cross the border, by 1 / |n . w|, and expand directions in spherical harmonics
+(``border_series``). Light that has not collided keeps its one direction instead. No path connects to a light or to
+another path, so both walks are cheap, and a product of their sums stands for all pairs.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from services.fit.transport.scene.media import Media
 from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
 GRAZING_COSINE = 0.2
-"""A crossing with less |n . w| counts with the mean of 1 / |n . w| below it, 2 / this, exact where radiance is constant there: 1 / |n . w| itself has a
-logarithmically divergent second moment."""
+"""A crossing with less |n . w| counts with the mean of 1 / |n . w| below it, 2 / this, exact where radiance is constant
+there: 1 / |n . w| itself has a logarithmically divergent second moment."""
 FIXED_POINT = 2.0**36
 """Units of the table of light per unit of weight: fine against single precision, and 1e8 before it overflows."""
 
@@ -98,7 +99,9 @@ class BorderWalk(Walk, ABC):
     def _count(
         self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
     ) -> None:
-        """Count crossings of a lane's path at ``strength``, its weight over the cosine; ``fresh`` ones have not collided."""
+        """Count crossings of a lane's path at ``strength``, its weight over the cosine; ``fresh`` ones have not
+        collided.
+        """
 
     def _texel(self, hit: Hit, active: mi.Bool) -> mi.UInt32:
         return dr.gather(
@@ -119,7 +122,9 @@ class LightWalk(BorderWalk):
         dr.make_opaque(self.table)
 
     def gather(self, samples: int) -> NDArray[np.float32]:
-        """Mean radiance on texels, in spherical harmonics what has collided, integrated over directions what has not: (L, batches, texels, columns)."""
+        """Mean radiance on texels, in spherical harmonics what has collided, integrated over directions what has not:
+        (L, batches, texels, columns).
+        """
         self.trace(samples, Tally(1, 1, 0))
         dr.eval(self.table)
         dr.sync_thread()
@@ -143,7 +148,9 @@ class LightWalk(BorderWalk):
 
 
 class CameraWalk(BorderWalk):
-    """Walks from the camera's pixels; at each crossing they meet the light that counts for their pixel, and sum up what each shape mode changes."""
+    """Walks from the camera's pixels; at each crossing they meet the light that counts for their pixel, and sum up what
+    each shape mode changes.
+    """
 
     def __init__(
         self,
@@ -155,7 +162,9 @@ class CameraWalk(BorderWalk):
         coefficients: Array,
         light: NDArray[np.float32],
     ) -> None:
-        """Take c_j (order + 1,), and light as (N, batches, texels, columns): harmonics to meet crossings, and what uncollided ones, of one direction, meet."""
+        """Take c_j (order + 1,), and light as (N, batches, texels, columns): harmonics to meet crossings, and what
+        uncollided ones, of one direction, meet.
+        """
         super().__init__(geometry, media, start, texels, len(coefficients) - 1, ior)
         self.pixels, self.light_batches = light.shape[:2]
         self.shape_modes = geometry.modes_of[texels.tooth]

@@ -1,12 +1,16 @@
-"""What moving the dentin's border does to images, order by order in spherical harmonics; and the patches on which light is averaged.
+"""What moving the dentin's border does to images, order by order in spherical harmonics; and the patches on which light
+is averaged.
 
-With L(x, w) the radiance of a light in propagation direction w, and L+(x, w) what the cameras count of light that travels so, a change of the media changes
-an image by dI = -int dV int dw L+ [dsigma L - dsigma_s (f * L)]. A border that moves by v along the dentin's outward normal n exchanges enamel for dentin
-in the volume it sweeps. In real spherical harmonics, in which f is diagonal with its Legendre moments f_j,
+With L(x, w) the radiance of a light in propagation direction w, and L+(x, w) what the cameras count of light that
+travels so, a change of the media changes an image by dI = -int dV int dw L+ [dsigma L - dsigma_s (f * L)]. A border
+that moves by v along the dentin's outward normal n exchanges enamel for dentin in the volume it sweeps. In real
+spherical harmonics, in which f is diagonal with its Legendre moments f_j,
 
-    dI/dc = -int dA (n . v) sum_j c_j sum_k L_jk L+_jk,        c_j = [sigma - sigma_s f_j] dentin - [sigma - sigma_s f_j] enamel.
+    dI/dc = -int dA (n . v) sum_j c_j sum_k L_jk L+_jk,        c_j = [sigma - sigma_s f_j] dentin - [sigma - sigma_s
+    f_j] enamel.
 
-What extinction takes and scattering returns cancels in c_0 before anything is sampled: c_0 is the difference of absorption.
+What extinction takes and scattering returns cancels in c_0 before anything is sampled: c_0 is the difference of
+absorption.
 """
 
 from __future__ import annotations
@@ -32,14 +36,17 @@ class BorderSeries:
     dentin: Medium
 
     def coefficients(self, order: int) -> Array:
-        """c_j for j = 0 ... order, per mm, the last one halved: the mean of the last two partial sums, as terms alternate where light is sent back."""
+        """c_j for j = 0 ... order, per mm, the last one halved: the mean of the last two partial sums, as terms
+        alternate where light is sent back.
+        """
         j = np.arange(order + 1)
         terms = _attenuation(self.dentin, j) - _attenuation(self.enamel, j)
         terms[-1] *= 0.5 if order else 1.0
         return terms
 
     def uncollided(self, cosine: Array) -> Array:
-        """sum_jk c_j Y_jk Y_jk between light that arrives and light that is seen in one direction each, per mm and sr, at the cosine between the two.
+        """sum_jk c_j Y_jk Y_jk between light that arrives and light that is seen in one direction each, per mm and sr,
+        at the cosine between the two.
 
         Unless both are one line, extinction takes nothing, and what scatters is the phase function's own value.
         """
@@ -63,7 +70,8 @@ def _scattered(medium: Medium, cosine: Array) -> Array:
 def patches(surface: Mesh, count: int) -> NDArray[np.int64]:
     """Divide a surface into at most so many patches of like size that bend little: each triangle's patch, (T,).
 
-    Lloyd's algorithm on middles and unit normals of triangles (a turn by one radian counts as one millimetre), from farthest points.
+    Lloyd's algorithm on middles and unit normals of triangles (a turn by one radian counts as one millimetre), from
+    farthest points.
     """
     corners = surface.vertices_mm[surface.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,4 +1,6 @@
-"""The gradient of a weighted sum of images to the dentin's shape: light on the border times importance, summed over the border."""
+"""The gradient of a weighted sum of images to the dentin's shape: light on the border times importance, summed over the
+border.
+"""
 
 from __future__ import annotations
 
@@ -90,12 +92,14 @@ class ShapeGradients:
     ) -> NDArray[np.float32]:
         """Light weighted by the cotangent (L, N), as a ``CameraWalk`` meets it: (N, batches, texels, columns).
 
-        ``arriving`` are directions of uncollided light, (L, 3). These and the pixels' own are taken as from the tooth's middle.
+        ``arriving`` are directions of uncollided light, (L, 3). These and the pixels' own are taken as from the tooth's
+        middle.
         """
         seen, weighting, uncollided = -_along(view), weights.T.astype(np.float32), table[..., -1]
         light = np.tensordot(weighting, table, axes=1)
 
-        # What meets a pixel's own uncollided line: collided light by the series, uncollided light by the phase function.
+        # What meets a pixel's own uncollided line: collided light by the series, uncollided light by the phase
+        # function.
         factors = np.repeat(series.coefficients(order), 2 * np.arange(order + 1) + 1)
         exact = weights * series.uncollided(arriving @ seen.T)
         light[..., -1] = np.einsum("nbtk,nk->nbt", light[..., :-1], harmonics(seen, order) * factors)
@@ -118,8 +122,9 @@ def _along(view: View) -> Array:
 def crossed_mean(crossed: Array) -> tuple[Array, Array]:
     """Mean of A x B crossed batches (A, B, M), and the variance of that mean.
 
-    Each number has the noise of its row, of its column and of the two together. Of the mean squares of rows, columns and the rest, (rows + columns - rest)
-    / (A B) is the mean's variance without bias; here rows and columns count at least as much as the rest.
+    Each number has the noise of its row, of its column and of the two together. Of the mean squares of rows, columns
+    and the rest, (rows + columns - rest) / (A B) is the mean's variance without bias; here rows and columns count at
+    least as much as the rest.
     """
     a, b = crossed.shape[:2]
     mean, of_rows, of_columns = crossed.mean(axis=(0, 1)), crossed.mean(axis=1), crossed.mean(axis=0)

@@ -1,7 +1,8 @@
-"""Stains: a texture a_t on a tooth's outer surface that dims what passes through it, in and out (teeth 2018 Eq. 1, 10), and the derivative to its texels.
+"""Stains: a texture a_t on a tooth's outer surface that dims what passes through it, in and out (teeth 2018 Eq. 1, 10),
+and the derivative to its texels.
 
-A path that crosses stained faces k carries the factor prod a_t(k), so its derivative to a texel is its contribution times the texel's bilinear weight over
-a_t at each of these faces, that of the connection to the light included.
+A path that crosses stained faces k carries the factor prod a_t(k), so its derivative to a texel is its contribution
+times the texel's bilinear weight over a_t at each of these faces, that of the connection to the light included.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ class StainTextures:
     """The textures of all teeth that have one, and where each face lies in them."""
 
     def __init__(self, corners_uv: list[NDArray[np.float64]], stains: tuple[Stain | None, ...]) -> None:
-        """Take texture coordinates (F, 3, 2) of every tooth's outer faces, in the order of the scene's faces, and every tooth's texture."""
+        """Take texture coordinates (F, 3, 2) of every tooth's outer faces, in the order of the scene's faces, and every
+        tooth's texture.
+        """
         sizes = [(1, 1) if stain is None else stain.transmittance.shape for stain in stains]
         first = np.cumsum([0] + [height * width for height, width in sizes])
         self.ranges = tuple(
@@ -115,7 +118,10 @@ class StainTextures:
 
 
 class StainTally(Tally):
-    """Derivatives of sum(cotangent x images) to all texels, (batches, texels). Lanes add to common slots, so bits depend on the order of threads."""
+    """Derivatives of sum(cotangent x images) to all texels, (batches, texels).
+
+    Lanes add to common slots, so bits depend on the order of threads.
+    """
 
     def __init__(self, textures: StainTextures, cotangent: NDArray[np.float64], batches: int) -> None:
         """Take the cotangent (L, N)."""

@@ -1,8 +1,8 @@
 """Groups of lights, of each of which a connection looks up one: under many lights, few of them matter to one vertex.
 
-A vertex scatters most of its light into a lobe, so that most lights hardly show through it. Each group holds lights from all
-around the tooth, and its one light is chosen in proportion to what it would bring through clear space, which costs a fraction
-of a look-up for each.
+A vertex scatters most of its light into a lobe, so that most lights hardly show through it. Each group holds lights
+from all around the tooth, and its one light is chosen in proportion to what it would bring through clear space, which
+costs a fraction of a look-up for each.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class LightGroups:
         """Choose one light of a group in proportion to importance(direction) x intensity / distance^2.
 
         Returns:
-            Its index, and the sum of those products over the group: the value over the probability of whichever is chosen.
+            Its index, and the sum of those products over the group: the value over the probability of whichever is
+            chosen.
         """
         first, total, sums = group * self.size, mi.Float(0), []
         for member in range(self.size):
@@ -58,7 +59,9 @@ class LightGroups:
 
 
 def neighbours_in_a_row(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of points, ordered so that points near each other come near each other, by halving along the widest axis."""
+    """Indices of points, ordered so that points near each other come near each other, by halving along the widest
+    axis.
+    """
 
     def halve(chosen: NDArray[np.int64]) -> list[int]:
         if len(chosen) == 1:

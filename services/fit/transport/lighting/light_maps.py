@@ -1,10 +1,11 @@
-"""Depth maps seen from every light: what lies between a scattering vertex and the light, looked up instead of ray traced.
+"""Depth maps seen from every light: what lies between a scattering vertex and the light, looked up instead of ray
+traced.
 
-One map per light holds, on a grid of directions, where the light's ray enters the outer surface and where it enters and leaves
-the dentin. Between grid points depths are interpolated, so that the optical depth from any vertex to any light costs one look-up.
-It is an estimate; the walk corrects it by exact shadow rays, few where the map is smooth and more where it cannot know:
-at silhouettes, and where a ray meets a surface more often than once in and once out (translucent shadow maps, Dachsbacher and
-Stamminger 2003, here as a control variate).
+One map per light holds, on a grid of directions, where the light's ray enters the outer surface and where it enters and
+leaves the dentin. Between grid points depths are interpolated, so that the optical depth from any vertex to any light
+costs one look-up. It is an estimate; the walk corrects it by exact shadow rays, few where the map is smooth and more
+where it cannot know: at silhouettes, and where a ray meets a surface more often than once in and once out (translucent
+shadow maps, Dachsbacher and Stamminger 2003, here as a control variate).
 """
 
 from __future__ import annotations
@@ -133,7 +134,8 @@ class LightMaps:
         relative = positions_mm - centre
         distance = np.linalg.norm(relative, axis=1)
 
-        # A sphere of this radius seen from so far away fills this half-angle; what a very near light sees beyond the map is not certain.
+        # A sphere of this radius seen from so far away fills this half-angle; what a very near light sees beyond the
+        # map is not certain.
         half_mm = float((radius / np.sqrt(np.maximum(1 - (radius / distance) ** 2, WIDEST**-2))).max())
         self.count = len(positions_mm)
         self.texel_mm = max(TEXEL_MM, 2 * half_mm / math.sqrt(self.MAX_BYTES / (4 * self.WORDS * self.count)))
@@ -195,8 +197,9 @@ class LightMaps:
             return (ray,)
 
         ray = MapRay(
-            start, direction, dr.full(mi.Float, -self._near, lanes), dr.zeros(mi.UInt32, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes),
-            dr.zeros(mi.Float, lanes), dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, -self._near, lanes),
+            start, direction, dr.full(mi.Float, -self._near, lanes), dr.zeros(mi.UInt32, lanes),
+            dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes),
+            dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, -self._near, lanes),
             dr.full(mi.Bool, True, lanes),
         )  # fmt: skip
         (ray,) = dr.while_loop((ray,), lambda ray: ray.alive, step, label="light map")
@@ -205,7 +208,10 @@ class LightMaps:
         self._store(ray)
 
     def _meet(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:  # noqa: ARG002 - scenes of several surfaces need it
-        """Note a surface. Bits: outer entered, dentin entered, dentin left, outer left; the last bit: anything out of that order."""
+        """Note a surface.
+
+        Bits: outer entered, dentin entered, dentin left, outer left; the last bit: anything out of that order.
+        """
         entering, met = dr.dot(ray.direction, hit.normal) < 0, hit.valid
         event = dr.select(
             hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4))
@@ -231,7 +237,8 @@ class LightMaps:
         certain_kinds: tuple[int, ...],
         more: tuple[mi.UInt32, ...] = (),
     ) -> None:
-        """Four numbers of 16 bits, so that all maps stay in the cache: three depths, and the surface with the cell's certainty in the lowest bit.
+        """Four numbers of 16 bits, so that all maps stay in the cache: three depths, and the surface with the cell's
+        certainty in the lowest bit.
 
         A cell is certain where all its corners met the same, of a kind that the map can tell.
         """
@@ -332,7 +339,8 @@ class LightMaps:
 def aligned(values: Any) -> Any:
     """A copy in Dr.Jit's own memory: what NumPy lends may lack the alignment that a gather of four at once needs.
 
-    A kernel that reads one number per lane is compiled for the alignment it meets, and so again at random for memory that NumPy lends.
+    A kernel that reads one number per lane is compiled for the alignment it meets, and so again at random for memory
+    that NumPy lends.
     """
     copy = values + dr.opaque(type(values), 0)
     dr.eval(copy)

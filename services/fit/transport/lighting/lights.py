@@ -22,8 +22,9 @@ from services.fit.transport.scene.media import Media
 CANDIDATES = 8
 """Stratified candidate lights per connection; 18 or 54 cost more than they gave."""
 STEPS_PER_ROOT = 0.4
-"""Steps of the walk per connection, over the root of the number of lights. A connection looks up about as many lights as that root, so the
-look-ups per step do not grow with the lights. Measured best at 54 and at 155 lights, and within 3 % of it at 6."""
+"""Steps of the walk per connection, over the root of the number of lights. A connection looks up about as many lights
+as that root, so the look-ups per step do not grow with the lights. Measured best at 54 and at 155 lights, and within 3
+% of it at 6."""
 ROULETTE_GAIN = 3.0
 DARKEST_CHANCE = 0.02
 """A shadow ray is cast with probability clip(gain x expected contribution, floor, 1)."""
@@ -47,7 +48,9 @@ class PointLights:
     def choose(
         self, point: mi.Point3f, importance: Callable[[mi.Vector3f], mi.Float], rng: mi.PCG32, active: mi.Bool
     ) -> ChosenLight:
-        """Pick one light of stratified candidates in proportion to importance(direction) x intensity / distance^2 (resampled importance sampling)."""
+        """Pick one light of stratified candidates in proportion to importance(direction) x intensity / distance^2
+        (resampled importance sampling).
+        """
         total, chosen = mi.Float(0), ChosenLight(mi.UInt32(0), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
         for first, last in self.strata:
             size = last - first

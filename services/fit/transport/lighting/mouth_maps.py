@@ -1,7 +1,9 @@
-"""Light maps of scenes of several surfaces: each knows the first thing that a light's ray enters, and how far into it the ray may be followed.
+"""Light maps of scenes of several surfaces: each knows the first thing that a light's ray enters, and how far into it
+the ray may be followed.
 
-A thing is a tooth with its dentin, the gums, or the wall. Behind anything else a map says nothing, and the shadow ray is all. Where a ray has met
-nothing yet the map knows that too: what lies on a wall in front of all surfaces sees the light.
+A thing is a tooth with its dentin, the gums, or the wall. Behind anything else a map says nothing, and the shadow ray
+is all. Where a ray has met nothing yet the map knows that too: what lies on a wall in front of all surfaces sees the
+light.
 """
 
 from __future__ import annotations

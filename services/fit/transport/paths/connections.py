@@ -1,8 +1,9 @@
 """Connections from scattering vertices to all lights, with their derivatives.
 
-Looking up every light costs as much as dozens of steps of the walk. So a lane keeps one of its last few vertices, chosen in
-proportion to the most that it could contribute, and connects that one, to one light of every group (``light_groups``). All lanes
-connect in the same turn, which keeps the vector units full where each vertex deciding for itself would not.
+Looking up every light costs as much as dozens of steps of the walk. So a lane keeps one of its last few vertices,
+chosen in proportion to the most that it could contribute, and connects that one, to one light of every group
+(``light_groups``). All lanes connect in the same turn, which keeps the vector units full where each vertex deciding for
+itself would not.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from services.fit.transport.scene.geometry import Geometry
 from services.fit.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 
 MAP_DOUBT = 0.1
-"""Relative error that a light map is trusted not to exceed where it is certain: the share of a connection that shadow rays check."""
+"""Relative error that a light map is trusted not to exceed where it is certain: the share of a connection that shadow
+rays check."""
 MAP_FAILURE = 0.003
 """The same, relative to the brightest that the vertex could be: no connection goes unchecked."""
 
@@ -93,8 +95,8 @@ class Connections:
 
         return Vertex(
             mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.book.unscattered(),
-            zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque,
-            [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
+            zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes),
+            [mi.Bool(False)] * self.geometry.opaque, [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
         )  # fmt: skip
 
     def offer(self, kept: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:
@@ -111,7 +113,8 @@ class Connections:
         def to_lights(vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool) -> mi.PCG32:
             kept, rng = self._look_around(vertex, lane, rng, active, tally)
 
-            # Correct what the maps said about one light by a shadow ray, cast with a probability in proportion to the doubt.
+            # Correct what the maps said about one light by a shadow ray, cast with a probability in proportion to the
+            # doubt.
             chance = dr.clip(ROULETTE_GAIN * kept.total * self.lights.inverse_irradiance, DARKEST_CHANCE, 1)
             casts = active & (kept.total > 0) & (rng.next_float32() < chance)
             weight = kept.weight * kept.total / (kept.importance * chance)
@@ -178,7 +181,9 @@ class Connections:
     def _look_around(
         self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally
     ) -> tuple[Doubt, mi.PCG32]:
-        """Count what the light maps expect from one light of every group, and keep one of these in proportion to the doubt about it."""
+        """Count what the light maps expect from one light of every group, and keep one of these in proportion to the
+        doubt about it.
+        """
         maps, groups = self.lights.maps, self.lights.groups
         doubt = MAP_DOUBT if self.plan.shape is None and not self.plan.stains else 1.0
 
@@ -211,8 +216,8 @@ class Connections:
 
         zero = mi.Float(0)
         kept = Doubt(
-            mi.UInt32(0), mi.Vector3f(0, 0, 1), zero, zero, [mi.Float(0) for _ in self.book.sigma_media], mi.Float(0), mi.Float(0),
-            [mi.Float(0)] * self.plan.stains,
+            mi.UInt32(0), mi.Vector3f(0, 0, 1), zero, zero, [mi.Float(0) for _ in self.book.sigma_media], mi.Float(0),
+            mi.Float(0), [mi.Float(0)] * self.plan.stains,
         )  # fmt: skip
         state = dr.while_loop(
             (mi.UInt32(0), rng, kept, vertex, lane, active),
@@ -264,8 +269,8 @@ class Connections:
         if vertex.wall:
             (on_wall,) = vertex.wall
             mixed = Mixed(
-                dr.select(on_wall, wall, mixed.first), dr.select(on_wall, wall, mixed.second), dr.select(on_wall, 1, mixed.share),
-                dr.select(on_wall, 0, mixed.slope),
+                dr.select(on_wall, wall, mixed.first), dr.select(on_wall, wall, mixed.second),
+                dr.select(on_wall, 1, mixed.share), dr.select(on_wall, 0, mixed.slope),
             )  # fmt: skip
         return mixed
 

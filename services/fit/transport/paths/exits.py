@@ -1,8 +1,10 @@
-"""Where and in which directions scattered light leaves a slab: rings about the point of entry, radiance at chosen cosines.
+"""Where and in which directions scattered light leaves a slab: rings about the point of entry, radiance at chosen
+cosines.
 
-Every flight is connected to every exit cosine by the mean over its possible collisions, along one random azimuth, the same for all cosines:
-on a straight flight in one layer the phase function towards an exit is constant and the transmittance an integral of exponentials, so
-neither where the collision happens nor how grazing the exit is adds noise. Between partly reflecting faces the way out goes on as a geometric series.
+Every flight is connected to every exit cosine by the mean over its possible collisions, along one random azimuth, the
+same for all cosines: on a straight flight in one layer the phase function towards an exit is constant and the
+transmittance an integral of exponentials, so neither where the collision happens nor how grazing the exit is adds
+noise. Between partly reflecting faces the way out goes on as a geometric series.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from services.fit.transport.scene.geometry import Hit, SlabGeometry
 from services.fit.transport.scene.media import Media, PhaseFunction
 
 MIN_RATE = 1e-6
-"""Attenuation along flight and way out per optical depth flown; nearer to 0 than this the two cancel, and the integrand is constant."""
+"""Attenuation along flight and way out per optical depth flown; nearer to 0 than this the two cancel, and the integrand
+is constant."""
 
 
 class Exits:
@@ -51,7 +54,9 @@ class Exits:
         tally.add(walker.lane, self._first_ring + 2 * ring + face, value, scattered)
 
     def connect(self, walker: Walker, hit: Hit, sigma: mi.Float, scattered: mi.Float, tally: Tally) -> None:
-        """Add to the radiance at every cosine what the flight ahead sends there; a collision leaves ``scattered`` of it."""
+        """Add to the radiance at every cosine what the flight ahead sends there; a collision leaves ``scattered`` of
+        it.
+        """
         if not self.plan.exit_cosines:
             return
         phase = PhaseFunction(self.media, self.geometry.medium(walker.place))
@@ -62,14 +67,16 @@ class Exits:
         flown, active = sigma * hit.distance, walker.active & ~walker.secondary
 
         def step(
-            which: mi.UInt32, omega: mi.Vector3f, across: mi.Vector2f, begin: mi.Vector2f, end: mi.Vector2f, flown: mi.Float, scattered: mi.Float,
-            lane: mi.UInt32, active: mi.Bool,
-        ) -> tuple[mi.UInt32, mi.Vector3f, mi.Vector2f, mi.Vector2f, mi.Vector2f, mi.Float, mi.Float, mi.UInt32, mi.Bool]:  # fmt: skip
+            which: mi.UInt32, omega: mi.Vector3f, across: mi.Vector2f, begin: mi.Vector2f, end: mi.Vector2f,
+            flown: mi.Float, scattered: mi.Float, lane: mi.UInt32, active: mi.Bool,
+        ) -> tuple[mi.UInt32, mi.Vector3f, mi.Vector2f, mi.Vector2f, mi.Vector2f, mi.Float, mi.Float, mi.UInt32,
+                   mi.Bool]:  # fmt: skip
             inside, narrowing, mirrored = self._face(dr.gather(mi.Float, self.cosines, which, active))
             sine = dr.sqrt(dr.maximum(1 - dr.square(inside), 0))
             sent = []
             for side, sign in enumerate((-1, 1)):
-                # Collisions come at rate exp(-depth flown), and their light gets out by exp(-depth to the face / cosine).
+                # Collisions come at rate exp(-depth flown), and their light gets out by exp(-depth to the face /
+                # cosine).
                 rate = 1 + (-sign / inside) * omega.z
                 size = dr.maximum(dr.abs(rate), MIN_RATE)
                 brightest = dr.select(rate > 0, begin[side] / inside, end[side] / inside + flown)

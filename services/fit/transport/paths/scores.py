@@ -30,13 +30,15 @@ class Plan:
     exit_cosines: tuple[float, ...] = ()
     """With ``faces``: also the radiance that leaves at these cosines."""
     ring_edges_mm: tuple[float, ...] = ()
-    """With ``faces``: also what leaves within rings about the point of entry, between these radii and beyond the last."""
+    """With ``faces``: also what leaves within rings about the point of entry, between these radii and beyond the
+    last."""
     order_edges: tuple[int, ...] = ()
     """Split images by scattering order at these edges."""
     stains: bool = False
     """Instead of images, the derivative of their sum, weighted by a cotangent, to the texels of stains."""
     most_steps: int | None = None
-    """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is counted as a third slot."""
+    """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is
+    counted as a third slot."""
 
     @property
     def rings(self) -> int:
@@ -46,7 +48,10 @@ class Plan:
 
 @dataclass
 class Scatterings:
-    """What a path has scattered so far. The albedos sit in an exponent, exact also where 1 - alpha is below float32 resolution."""
+    """What a path has scattered so far.
+
+    The albedos sit in an exponent, exact also where 1 - alpha is below float32 resolution.
+    """
 
     counts: list[mi.UInt32]
     """In each medium that is counted on its own."""
@@ -65,7 +70,8 @@ class Scores:
         for s in plan.scores:
             if s.field in self.phase_fields and media.tabulated[s.medium - 1]:
                 raise InputError(
-                    f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other derivatives."
+                    f"Medium {s.medium} has a phase table in place of lobes, and so no {s.field}; ask for other"
+                    " derivatives."
                 )
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
         # Of few media all are counted; of many, those whose albedo is free; where media mix, none.
@@ -123,13 +129,15 @@ class Scores:
     def flight(self, sums: list[mi.Float], medium: mi.UInt32, length: mi.Float, scatter: mi.Bool) -> list[mi.Float]:
         """Sigma at fixed albedo: -t per segment, 1/sigma per scatter (teeth 2018 Eq. 23, corrected)."""
         return [
-            dr.select(
-                medium == s.medium,
-                total + dr.select(scatter, dr.rcp(self.media.sigma[s.medium - 1]), 0) - length,
-                total,
+            (
+                dr.select(
+                    medium == s.medium,
+                    total + dr.select(scatter, dr.rcp(self.media.sigma[s.medium - 1]), 0) - length,
+                    total,
+                )
+                if s.field == "sigma"
+                else total
             )
-            if s.field == "sigma"
-            else total
             for s, total in zip(self.plan.scores, sums, strict=True)
         ]
 
@@ -142,7 +150,9 @@ class Scores:
         ]
 
     def mixed_motion(self, medium: Mixed, terms: dict[str, mi.Float]) -> mi.Float:
-        """Change of ln(phase function) with q, per mm: differences of the two media times ``terms``, all fields of the lobes (Eq. 19, corrected)."""
+        """Change of ln(phase function) with q, per mm: differences of the two media times ``terms``, all fields of the
+        lobes (Eq. 19, corrected).
+        """
         total = mi.Float(0)
         for field, term in terms.items():
             column = {"beta": self.media.beta, "g1": self.media.g1, "g2": self.media.g2}[field]
@@ -177,7 +187,9 @@ class Scores:
         terms: dict[str, mi.Float],
         lengths: dict[int, mi.Float],
     ) -> list[mi.Float]:
-        """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and segments."""
+        """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and
+        segments.
+        """
         whole = []
         for s, total in zip(self.plan.scores, sums, strict=True):
             value = total

@@ -1,7 +1,7 @@
 """Where walks begin, and with which random numbers.
 
-Streams depend on (seed, pixel, sample) alone, never on block, batch or worker, so a result does not depend on how the work
-was cut.
+Streams depend on (seed, pixel, sample) alone, never on block, batch or worker, so a result does not depend on how the
+work was cut.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ class PathStart:
 
 
 class CameraStart:
-    """Walks from a view's pixels, box filter; every batch leaves out its first ``skipped`` samples. Every camera has streams of its own, by its name."""
+    """Walks from a view's pixels, box filter; every batch leaves out its first ``skipped`` samples.
+
+    Every camera has streams of its own, by its name.
+    """
 
     def __init__(self, view: View, batches: int, seed: int, radius_mm: float, skipped: int = 0) -> None:
         camera = view.camera
@@ -65,7 +68,9 @@ class CameraStart:
         self._near = dr.opaque(mi.Float, max(float(np.linalg.norm(eye)) - radius_mm - NEAR_MARGIN_MM, 0.0))
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
-        """A path through a random point of the lane's pixel; ``sample`` counts within the batch, from the first that is not skipped."""
+        """A path through a random point of the lane's pixel; ``sample`` counts within the batch, from the first that is
+        not skipped.
+        """
         pixel = dr.gather(mi.UInt32, self.pixel, lane, active)
         batch = dr.gather(mi.UInt32, self.batch, lane, active)
         rng = stream(self.seed, pixel, sample * self.batches + batch)
@@ -76,7 +81,8 @@ class CameraStart:
 
 
 class LightStart:
-    """Photons from every light, uniformly over a rectangle that holds the tooth as that light sees it, in batches of their own.
+    """Photons from every light, uniformly over a rectangle that holds the tooth as that light sees it, in batches of
+    their own.
 
     Weights are near 1; ``power`` says what 1 stands for. Lanes are ordered by light, then by batch: groups.
     """

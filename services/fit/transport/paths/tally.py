@@ -1,6 +1,7 @@
 """Where a walk's contributions land: private slots per lane, so that sums never depend on the order of threads.
 
-Sums are double: a lane that adds ten thousand nearly equal float32 numbers is off by 1e-5, and the rounding is the same way each time.
+Sums are double: a lane that adds ten thousand nearly equal float32 numbers is off by 1e-5, and the rounding is the same
+way each time.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 
 class Tally:
-    """Sums of contributions and of contributions times scores, per (lane, slot); a slot is a light, or a light's order bin."""
+    """Sums of contributions and of contributions times scores, per (lane, slot); a slot is a light, or a light's order
+    bin.
+    """
 
     def __init__(self, lanes: int, slots: int, derivatives: int) -> None:
         self.lanes, self.slots = lanes, slots

@@ -17,7 +17,8 @@ from services.fit.transport.scene.recipe import JacobianEstimate, StackEstimate
 FIRST_ROUND = 4
 """Paths per batch in the first round."""
 GROWTH = 4.0
-"""A round makes all paths so far at most this many times more: an early estimate of the error is not trusted further."""
+"""A round makes all paths so far at most this many times more: an early estimate of the error is not trusted
+further."""
 MIN_GROWTH = 1.25
 """And at least this: every look at the error is a chance to stop on one that is too small by luck."""
 SAFETY = 1.05
@@ -47,11 +48,13 @@ class Effort:
     def __post_init__(self) -> None:
         if (self.samples is None) == (self.rel_error is None):
             raise InputError(
-                f"samples = {self.samples} and rel_error = {self.rel_error}: give exactly one, a number of paths per pixel or an error to reach."
+                f"samples = {self.samples} and rel_error = {self.rel_error}: give exactly one, a number of paths per"
+                " pixel or an error to reach."
             )
         if self.samples is not None and (self.samples < 1 or self.batches < 1):
             raise InputError(
-                f"samples = {self.samples} and batches = {self.batches} must be at least 1; ask for one path per pixel or more."
+                f"samples = {self.samples} and batches = {self.batches} must be at least 1; ask for one path per pixel"
+                " or more."
             )
         if self.rel_error is None:
             return
@@ -59,12 +62,13 @@ class Effort:
             raise InputError(f"rel_error = {self.rel_error:g} must lie between 0 and 1; 0.01 is usual.")
         if self.batches < 2:
             raise InputError(
-                f"batches = {self.batches} must be at least 2 with rel_error, as the error is the spread between batches."
+                f"batches = {self.batches} must be at least 2 with rel_error, as the error is the spread between"
+                " batches."
             )
         if not self.max_seconds >= 0 or not self.batches <= self.max_samples <= MAX_SAMPLES:
             raise InputError(
-                f"max_seconds = {self.max_seconds:g} must not be negative, and max_samples = {self.max_samples} must lie in "
-                f"batches = {self.batches} to {MAX_SAMPLES}; correct the limits."
+                f"max_seconds = {self.max_seconds:g} must not be negative, and max_samples = {self.max_samples} must"
+                f" lie in batches = {self.batches} to {MAX_SAMPLES}; correct the limits."
             )
 
     def shares(self, samples: int) -> tuple[int, int]:
@@ -76,8 +80,8 @@ class Effort:
 def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums], Estimate], effort: Effort) -> Estimate:
     """Trace rounds with sample numbers that follow on, and summarise all of them together.
 
-    Every batch has an equal share of every round, so that however many rounds were needed, errors have one degree of freedom less than
-    there are batches.
+    Every batch has an equal share of every round, so that however many rounds were needed, errors have one degree of
+    freedom less than there are batches.
 
     Args:
         trace: sums over the sample numbers in a range, in every one of so many batches.

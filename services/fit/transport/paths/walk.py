@@ -1,7 +1,7 @@
-"""The nested-media walk: free flights, crossings, scattering, connections to all lights, and the scores that make derivatives.
+"""The nested-media walk: free flights, crossings, scattering, connections to all lights, and scores for derivatives.
 
-One loop serves everything the project computes: camera walks in a tooth that connect to point lights, and walks in a flat
-slab that count what leaves either face. What a scene lacks is absent from its kernel.
+One loop serves everything the project computes: camera walks in a tooth that connect to point lights, and walks in a
+flat slab that count what leaves either face. What a scene lacks is absent from its kernel.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Walk:
             self.slots += self.exits.slots
 
     def run(self, samples: int, tally: Tally | None = None) -> Tally:
-        """Trace ``samples`` paths in every lane; returns their sums, evaluated. A plan for stains brings its own tally."""
+        """Sums of ``samples`` paths in every lane, evaluated; a plan for stains brings its own tally."""
         tally = tally or Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
         self.trace(samples, tally)
         tally.evaluate()
@@ -128,7 +128,8 @@ class Walk:
         meets = walker.active & ~scatters & hit.valid
         reflects = mi.Bool(False)
         if self.ior is not None:
-            # A thin face lets the camera's own ray in where its mirror image would be of empty space, and reflects others by chance.
+            # A thin face lets the camera's own ray in where its mirror image would be of empty space, and reflects
+            # others by chance.
             contrast = self.geometry.contrast(
                 self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit)
             )
@@ -272,8 +273,8 @@ class Walk:
         if self.geometry.opaque:
             omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
         found = Vertex(
-            walker.origin, omega, walker.place, self._carried(walker), clear, walker.so_far, walker.sums, walker.border_sums, walker.secondary,
-            walker.shape_factor, wall, walker.stains, mi.Float(0),
+            walker.origin, omega, walker.place, self._carried(walker), clear, walker.so_far, walker.sums,
+            walker.border_sums, walker.secondary, walker.shape_factor, wall, walker.stains, mi.Float(0),
         )  # fmt: skip
         walker.vertex = self.connections.offer(
             walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces

@@ -1,4 +1,7 @@
-"""What the engine refuses, each with the name and the value of what is wrong. Media check themselves (``media.require_medium``), meshes too."""
+"""What the engine refuses, each with the name and the value of what is wrong.
+
+Media check themselves (``media.require_medium``), meshes too.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +30,14 @@ def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.fl
     for number, (position, intensity) in enumerate(zip(positions_mm, intensities, strict=True)):
         if not np.isfinite(position).all():
             raise InputError(
-                f"Light {number} has position_mm = {position.tolist()}, which is not finite; correct the rig's calibration."
+                f"Light {number} has position_mm = {position.tolist()}, which is not finite; correct the rig's"
+                " calibration."
             )
         if not INTENSITIES[0] <= intensity <= INTENSITIES[1]:
             low, high = INTENSITIES
             raise InputError(
-                f"Light {number} has intensity = {intensity:g}, which must lie in {low:g} to {high:g}; correct the rig's calibration."
+                f"Light {number} has intensity = {intensity:g}, which must lie in {low:g} to {high:g}; correct the"
+                " rig's calibration."
             )
         if np.linalg.norm(position) > FARTHEST_MM:
             raise InputError(
@@ -41,8 +46,8 @@ def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.fl
             )
         if np.linalg.norm(position) <= reach_mm:
             raise InputError(
-                f"Light {number} at position_mm = {position.tolist()} is within {reach_mm:.0f} mm of the origin, where the tooth is; "
-                "lights must be outside it, in millimetres."
+                f"Light {number} at position_mm = {position.tolist()} is within {reach_mm:.0f} mm of the origin, where"
+                " the tooth is; lights must be outside it, in millimetres."
             )
 
 
@@ -80,7 +85,8 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
     ):
         where = ", ".join(f"{c:.4g}" for c in eye_mm)
         raise InputError(
-            f"Camera {name} stands at ({where}) mm, where the tooth is; camera_from_world must be in millimetres, as the meshes are."
+            f"Camera {name} stands at ({where}) mm, where the tooth is; camera_from_world must be in millimetres, as"
+            " the meshes are."
         )
     if len(view) == 0:
         raise InputError(f"Camera {name} lists no pixel; its valid mask is empty.")
@@ -88,7 +94,8 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
     if outside.any():
         x, y = view.pixels[outside][0]
         raise InputError(
-            f"Camera {name} lists pixel ({x}, {y}), outside its {view.camera.size[0]} x {view.camera.size[1]}; correct the list."
+            f"Camera {name} lists pixel ({x}, {y}), outside its {view.camera.size[0]} x {view.camera.size[1]}; correct"
+            " the list."
         )
     if view.lights is not None and not (
         view.lights and set(view.lights) <= set(range(lights)) and len(set(view.lights)) == len(view.lights)
@@ -107,12 +114,14 @@ def require_cotangent(cotangent: NDArray[np.float64], view: View, recipe: SceneR
     expected = len(recipe.light_positions_mm), len(view)
     if np.shape(cotangent) != expected:
         raise InputError(
-            f"The cotangent has shape {np.shape(cotangent)}; give a weight for each of {expected[0]} lights and {expected[1]} pixels, {expected}."
+            f"The cotangent has shape {np.shape(cotangent)}; give a weight for each of {expected[0]} lights and"
+            f" {expected[1]} pixels, {expected}."
         )
     bad = np.argwhere(~np.isfinite(cotangent))
     if len(bad):
         raise InputError(
-            f"The cotangent is {cotangent[tuple(bad[0])]} at light {bad[0][0]} and pixel {bad[0][1]}; give finite weights, 0 for what does not count."
+            f"The cotangent is {cotangent[tuple(bad[0])]} at light {bad[0][0]} and pixel {bad[0][1]}; give finite"
+            " weights, 0 for what does not count."
         )
 
 
@@ -125,7 +134,8 @@ def require_finite_gradient(what: str, view: View, *arrays: NDArray[np.float64])
     bad = sum(int((~np.isfinite(array)).sum()) for array in arrays)
     if bad:
         raise NonFiniteError(
-            f"{bad} numbers of the gradient to {what} by camera {view.camera.name} came out non-finite; report the parameters."
+            f"{bad} numbers of the gradient to {what} by camera {view.camera.name} came out non-finite; report the"
+            " parameters."
         )
 
 
@@ -141,5 +151,6 @@ def require_finite(arrays: list[NDArray[np.float64]], view: View) -> None:
     if bad.any():
         where = ", ".join(f"({x}, {y})" for x, y in view.pixels[bad][:3])
         raise NonFiniteError(
-            f"{int(bad.sum())} of {len(view)} pixels of camera {view.camera.name} came out non-finite, first at {where}; report the parameters."
+            f"{int(bad.sum())} of {len(view)} pixels of camera {view.camera.name} came out non-finite, first at"
+            f" {where}; report the parameters."
         )

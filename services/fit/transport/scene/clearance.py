@@ -25,7 +25,8 @@ SPACING_PER_CELL = 0.3
 REBUILD_MM = 0.1
 """A border that moved less than this only lowers the bound; one that moved more is measured again."""
 MARGIN_MM = 1.5
-"""Of several inner surfaces each is measured so far around its box, and taken to be just as far from all other places."""
+"""Of several inner surfaces each is measured so far around its box, and taken to be just as far from all other
+places."""
 
 
 def surface_samples(

@@ -1,7 +1,7 @@
 """Where media lie. The walk asks two questions of a geometry: what do I hit next, and which medium is behind it.
 
-A geometry's *place* is a small integer per lane that says where the lane is: for meshes (``mesh_geometry.py``) the set of surfaces it is
-inside of, for slabs the number of the layer.
+A geometry's *place* is a small integer per lane that says where the lane is: for meshes (``mesh_geometry.py``) the set
+of surfaces it is inside of, for slabs the number of the layer.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from services.fit.transport.scene.media import Mixed
 ENAMEL, DENTIN = 1, 2
 """Numbers of the media of a single tooth."""
 RAY_EPSILON = 1e-5
-"""Offset of a ray that starts on a surface, over 1 + the largest coordinate: 170 roundings. What it skips is neither absorbed nor scattered, so it is nine
-times less than Mitsuba's own; of two million rays none met its surface again at thirty times less."""
+"""Offset of a ray that starts on a surface, over 1 + the largest coordinate: 170 roundings. What it skips is neither
+absorbed nor scattered, so it is nine times less than Mitsuba's own; of two million rays none met its surface again at
+thirty times less."""
 
 
 @dataclass

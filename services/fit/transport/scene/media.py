@@ -21,7 +21,8 @@ MAX_SELECTED = 3
 
 
 def require_medium(name: str, medium: Medium) -> None:
-    """Refuse parameters outside their physical range, before any kernel; kernels compute in single precision, where they must lie inside it too.
+    """Refuse parameters outside their physical range, before any kernel; kernels compute in single precision, where
+    they must lie inside it too.
 
     Raises:
         InputError: names parameter and value.

@@ -1,7 +1,8 @@
 """Teeth, gums and the wall of the mouth as triangles, and the media between them.
 
-All surfaces are one mesh. A surface's number is k for the outer surface of tooth k of T, T + k for its dentin, 2T for gums and 2T + 1 for the wall.
-A lane's *place* holds bit n while it is inside the solid that surface n bounds, so solids may overlap. What a scene lacks is absent from its kernels.
+All surfaces are one mesh. A surface's number is k for the outer surface of tooth k of T, T + k for its dentin, 2T for
+gums and 2T + 1 for the wall. A lane's *place* holds bit n while it is inside the solid that surface n bounds, so solids
+may overlap. What a scene lacks is absent from its kernels.
 """
 
 from __future__ import annotations
@@ -111,7 +112,9 @@ class MeshGeometry:
         return changed
 
     def _dentin_now(self, moved: list[NDArray[np.float64]]) -> tuple[Mesh, NDArray[np.float64]]:
-        """All dentin as one mesh, and the displacements (M, V, 3) of its vertices; a tooth's modes move its own alone."""
+        """All dentin as one mesh, and the displacements (M, V, 3) of its vertices; a tooth's modes move its own
+        alone.
+        """
         first = np.cumsum([0] + [len(vertices) for vertices in moved])
         dentins = list(self._dentins.values())
         faces = np.concatenate(
@@ -213,7 +216,9 @@ class MeshGeometry:
         return self._clearance(point, active)
 
     def inside(self, place: mi.UInt32) -> mi.UInt32:
-        """Number of the tooth that counts at a place, the number of teeth where that is gums, and above that outside of all."""
+        """Number of the tooth that counts at a place, the number of teeth where that is gums, and above that outside of
+        all.
+        """
         within = place & (2**self.teeth - 1)
         if self._dentins:
             dentin = (place >> self.teeth) & (2**self.teeth - 1)
@@ -260,7 +265,10 @@ class MeshGeometry:
         return dr.fma(direction, hit.distance, origin) + hit.normal * offset
 
     def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:
-        """Normal speed n . (B_m - B0) at the hit, interpolated over its triangle; zero but on the dentin of one tooth."""
+        """Normal speed n .
+
+        (B_m - B0) at the hit, interpolated over its triangle; zero but on the dentin of one tooth.
+        """
         active = active & ~hit.outer & hit.valid
         if not self.single:
             active &= hit.surface == self.teeth + tooth

@@ -1,7 +1,8 @@
-"""A border between enamel and dentin across which albedo and phase function change gradually (teeth 2018 Eq. 15 to 18, corrected in optics.md).
+"""A border between enamel and dentin across which albedo and phase function change gradually (teeth 2018 Eq. 15 to 18,
+corrected in optics.md).
 
-The share of enamel is l = logistic(q / s), q the signed distance to the dentin's surface, positive in enamel. Extinction stays sharp, so free flights and
-light maps are those of the sharp border.
+The share of enamel is l = logistic(q / s), q the signed distance to the dentin's surface, positive in enamel.
+Extinction stays sharp, so free flights and light maps are those of the sharp border.
 """
 
 from __future__ import annotations

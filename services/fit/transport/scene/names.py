@@ -13,7 +13,9 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
 @dataclass(frozen=True)
 class MediaNumbers:
-    """Numbers of the media of a scene: enamel and dentin of each tooth in turn, gums, and the wall's reflectance as an albedo. 0 is empty space."""
+    """Numbers of the media of a scene: enamel and dentin of each tooth in turn, gums, and the wall's reflectance as an
+    albedo. 0 is empty space.
+    """
 
     teeth: int
     dentin: bool
@@ -98,19 +100,22 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         # A solver's step that ends on a bound may be off by a rounding.
         if len(tissue.shape) != modes or not all(-1e-9 <= c <= 1 + 1e-9 for c in tissue.shape):
             raise InputError(
-                f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode; correct it."
+                f"{prefix}shape = {tissue.shape} must be {modes} blend weights between 0 and 1, one per dentin mode;"
+                " correct it."
             )
         require_stain(f"{prefix}stain", tissue.stain, tooth)
     if (mouth.gums is None) == numbers.gums:
         raise InputError(
-            f"The scene has {'' if numbers.gums else 'no '}gums and its media have {'none' if numbers.gums else 'some'}; give both or neither."
+            f"The scene has {'' if numbers.gums else 'no '}gums and its media have"
+            f" {'none' if numbers.gums else 'some'}; give both or neither."
         )
     if mouth.gums is not None:
         require_medium("gums", mouth.gums)
         media.append(mouth.gums)
     if (mouth.reflectance is None) == numbers.cavity:
         raise InputError(
-            f"The scene has {'a' if numbers.cavity else 'no'} cavity and its media {'no' if numbers.cavity else 'a'} reflectance; give both or neither."
+            f"The scene has {'a' if numbers.cavity else 'no'} cavity and its media {'no' if numbers.cavity else 'a'}"
+            " reflectance; give both or neither."
         )
     if mouth.reflectance is not None:
         if not 0 <= mouth.reflectance <= 1:
@@ -118,7 +123,8 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         media.append(Medium(1.0, mouth.reflectance))
     if recipe.border_width_mm > 0 and any(medium.table is not None for medium in media):
         raise InputError(
-            f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border sharp, or give it lobes."
+            f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border"
+            " sharp, or give it lobes."
         )
     return media
 
@@ -134,11 +140,13 @@ def require_stain(name: str, stain: Stain | None, tooth: ToothSurfaces) -> None:
     texels = stain.transmittance
     if tooth.stain_uv is None:
         raise InputError(
-            f"{name} is given for a tooth without texture coordinates; give its surface stain_uv, or leave the texture out."
+            f"{name} is given for a tooth without texture coordinates; give its surface stain_uv, or leave the texture"
+            " out."
         )
     if tooth.stain_uv.shape != (len(tooth.outer.faces), 3, 2) or not np.isfinite(tooth.stain_uv).all():
         raise InputError(
-            f"{name}'s coordinates have shape {tooth.stain_uv.shape}; they must be finite and ({len(tooth.outer.faces)}, 3, 2), one per corner."
+            f"{name}'s coordinates have shape {tooth.stain_uv.shape}; they must be finite and"
+            f" ({len(tooth.outer.faces)}, 3, 2), one per corner."
         )
     if texels.ndim != 2 or texels.size == 0:
         raise InputError(f"{name} has shape {texels.shape}; it must be one channel, (H, W).")
@@ -146,7 +154,8 @@ def require_stain(name: str, stain: Stain | None, tooth: ToothSurfaces) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise InputError(
-            f"{name}[{row}, {column}] = {texels[row, column]:.10g} must be above 0 and at most 1; correct {int(bad.sum())} texels."
+            f"{name}[{row}, {column}] = {texels[row, column]:.10g} must be above 0 and at most 1; correct"
+            f" {int(bad.sum())} texels."
         )
 
 

@@ -1,6 +1,7 @@
 """Whether dentin lies inside enamel with room for a ray's offset between the two surfaces.
 
-Surfaces nearer to each other than the offset hide one another: a ray that crosses the first starts anew beyond the second.
+Surfaces nearer to each other than the offset hide one another: a ray that crosses the first starts anew beyond the
+second.
 """
 
 from __future__ import annotations
@@ -31,13 +32,14 @@ def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
     outside = suspects[winding_number(outer, points[suspects]) < 0.5]
     if len(outside):
         raise MeshError(
-            f"The dentin surface passes through the outer surface, at its worst {distance[outside].max():.3g} mm beyond it; "
-            f"move it at least {gap_mm:.2g} mm inside."
+            f"The dentin surface passes through the outer surface, at its worst {distance[outside].max():.3g} mm beyond"
+            f" it; move it at least {gap_mm:.2g} mm inside."
         )
     touching = int(np.count_nonzero(distance < gap_mm))
     if touching:
         raise MeshError(
-            f"The dentin surface touches the outer surface at {touching} of {len(points)} vertices; move it at least {gap_mm:.2g} mm inside."
+            f"The dentin surface touches the outer surface at {touching} of {len(points)} vertices; move it at least"
+            f" {gap_mm:.2g} mm inside."
         )
 
 

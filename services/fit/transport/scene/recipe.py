@@ -44,7 +44,8 @@ class SceneRecipe:
     cavity: Mesh | None = None
     """The wall of the mouth behind the teeth, an opaque diffuse surface; it need not be closed."""
     border_width_mm: float = 0.0
-    """Over which albedo and phase function change from enamel's to dentin's, half of it on either side; 0 for a sharp border."""
+    """Over which albedo and phase function change from enamel's to dentin's, half of it on either side; 0 for a sharp
+    border."""
 
     def vertices_mm(self) -> NDArray[np.float64]:
         """Vertices of all outer surfaces, (V, 3)."""
@@ -76,7 +77,8 @@ class View:
     pixels: NDArray[np.int32]
     """(N, 2) integer x, y of the valid pixels."""
     lights: tuple[int, ...] | None = None
-    """Indices of the lights that count in some of these pixels; None for all. The others are not sampled: their images are 0 with variance 0."""
+    """Indices of the lights that count in some of these pixels; None for all. The others are not sampled: their images
+    are 0 with variance 0."""
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -109,7 +111,9 @@ class StackEstimate:
 
 @dataclass(frozen=True)
 class StainGradient:
-    """Derivatives of sum(cotangent x images) to the texels of each tooth's stain, (H, W) each, None where it has none; variances are of the means."""
+    """Derivatives of sum(cotangent x images) to the texels of each tooth's stain, (H, W) each, None where it has none;
+    variances are of the means.
+    """
 
     gradient: tuple[NDArray[np.float64] | None, ...]
     variance: tuple[NDArray[np.float64] | None, ...]
@@ -118,7 +122,9 @@ class StainGradient:
 
 @dataclass(frozen=True)
 class JacobianEstimate:
-    """Images (L, N) and their derivatives (F, L, N) in the order of ``names``, from one seed; variances are of the means."""
+    """Images (L, N) and their derivatives (F, L, N) in the order of ``names``, from one seed; variances are of the
+    means.
+    """
 
     names: tuple[str, ...]
     mean: NDArray[np.float64]
@@ -131,7 +137,9 @@ class JacobianEstimate:
 
     @property
     def rel_error(self) -> float:
-        """The worst of the images and of each derivative, each relative to its own norm: units of parameters do not matter."""
+        """The worst of the images and of each derivative, each relative to its own norm: units of parameters do not
+        matter.
+        """
         pairs = [(self.mean, self.variance), *zip(self.jacobian, self.jacobian_variance, strict=True)]
         return float(np.max([relative_error(*pair) for pair in pairs]))
 

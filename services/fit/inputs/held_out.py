@@ -1,0 +1,52 @@
+"""Which images a fit does not see, to be judged by them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.errors import CaptureInputError, SettingsError
+from services.core.records import JobSpec, PreparedManifest
+
+
+def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:
+    """Which images (camera, light) stay out of the fit: the job's choice, else the capture's, else every fourth light,
+    at least one.
+
+    Raises:
+        SettingsError: a light or camera is unknown or none is left to fit. CaptureInputError: fewer than two lights.
+    """
+    cameras, lights = [c.name for c in manifest.cameras], [light.name for light in manifest.lights]
+    if len(lights) < 2:
+        raise CaptureInputError(
+            f"The capture has {len(lights)} light; a fit needs at least two, one of them to test with, so capture more"
+            " lights."
+        )
+    chosen = np.zeros((len(cameras), len(lights)), dtype=bool)
+    if spec.held_out_lights is not None:
+        for name in spec.held_out_lights:
+            if name not in lights:
+                raise SettingsError(
+                    f"Option held_out_lights names '{name}', which the capture does not have; it has"
+                    f" {', '.join(lights)}."
+                )
+            chosen[:, lights.index(name)] = True
+    elif spec.held_out_cameras:
+        pass
+    elif manifest.held_out:
+        for camera, light in manifest.held_out:
+            chosen[cameras.index(camera), lights.index(light)] = True
+    else:
+        chosen[:, 3::4] = True
+        chosen[:, -1] |= not chosen.any()
+    for name in spec.held_out_cameras:
+        if name not in cameras:
+            raise SettingsError(
+                f"Option held_out_cameras names '{name}', which the capture does not have; it has {', '.join(cameras)}."
+            )
+        chosen[cameras.index(name)] = True
+    if chosen.all():
+        raise SettingsError(
+            "Every image is held out and none is left to fit; name fewer in held_out_lights or held_out_cameras."
+        )
+    return chosen
