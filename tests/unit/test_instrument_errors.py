@@ -193,7 +193,7 @@ def test_the_prior_of_the_errors_joins_slope_and_change() -> None:
 def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     spec = JobSpec.model_validate({"capture": "c"})
     errors = {"green": errors_of("green", ("a", "b"), ("c0",), None)}
-    kinds = assumed_names(errors, None, {"teeth", "dome"})
+    kinds = assumed_names(errors, ("teeth", "dome"))
     assert kinds == (*errors["green"].names, "teeth", "dome")
     (assumed,) = instrument_sentences(spec, errors, {}, kinds)
     assert assumed.startswith("Assumed, as the calibration does not state")
@@ -213,7 +213,7 @@ def test_an_error_that_the_calibration_states_is_not_told_as_assumed() -> None:
     stated = CalibrationUncertainty(names=("gain.green", "light_gain.b"), covariance=((1e-4, 0.0), (0.0, 1e-4)))
     errors = {"green": errors_of("green", ("a", "b"), ("c0",), stated)}
     # No move was measured, so what was assumed of moves is in no ±.
-    names = assumed_names(errors, stated, ())
+    names = assumed_names(errors, ())
     assert names == ("light_gain.a", "flare.c0.green")
     (told,) = instrument_sentences(JobSpec.model_validate({"capture": "c"}), errors, {}, names, stated)
     assert "may be: 1 % for light_gain.a and 0.3 % for flare. The ±" in told
@@ -222,7 +222,7 @@ def test_an_error_that_the_calibration_states_is_not_told_as_assumed() -> None:
 def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path: Path) -> None:
     ball, lights = sphere(4.0), np.array([[100.0, 300.0, -700.0], [-200.0, 100.0, -600.0]])
     recipe = single_tooth(ball, None, lights, np.array([1.0, 2.0]))
-    covariance, assumed = move_covariance(None)
+    covariance, assumed = move_covariance(None, ())
     assert assumed == ("teeth", "dome")
     moves = write_moves(tmp_path, recipe, covariance, lights.mean(axis=0))
     assert sorted(move.body for move in moves) == ["dome"] * 6 + ["teeth"] * 6
@@ -248,7 +248,7 @@ def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path
         np.allclose(move.camera_move, rigid(sign * twist, np.zeros(3)), atol=1e-6) for move in moves for sign in (1, -1)
     )
     stated = CalibrationUncertainty(names=("dome.tx",), covariance=((0.25,),))
-    assert move_covariance(stated)[0][9, 9] == 0.25
+    assert move_covariance(stated, ())[0][9, 9] == 0.25
 
 
 def test_knowing_an_error_better_beforehand_is_worth_what_a_fit_with_that_prior_would_say() -> None:
@@ -309,6 +309,7 @@ def test_an_uncertainty_that_no_fit_uses_is_told() -> None:
     assert told == (
         (
             "The calibration states how wrong camera.c0.rx and 1 more may be. No fit moves single cameras and lights: "
-            "of these errors the ± know at most the lights' distances, which count in their gains."
+            "of these errors the ± know at most the lights' distances, which count in their gains, and what moves all "
+            "lights as one."
         ),
     )

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.geometry import Light
 from services.core.records import JobSpec, PreparedManifest
 from services.fit.execution.blocks import BlockInstrument
 from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names
 from services.fit.instrument.irradiance import at_the_teeth
-from services.fit.instrument.moves import Move, move_covariance, write_moves
+from services.fit.instrument.moves import Move, is_dome_placed, move_covariance, write_moves
 from services.fit.transport.scene.recipe import SceneRecipe
 
 MAX_JAW_LIGHTS = 12
@@ -27,17 +28,20 @@ square. And where there are many, their errors average out."""
 class Instrument:
     """What a calibration says of the instrument that took a capture."""
 
-    lights: tuple[str, ...]
-    """Names, in the order of the views' images."""
+    lights: tuple[Light, ...]
+    """In the order of the views' images."""
     stated: CalibrationUncertainty | None
-    dome_centre_mm: tuple[float, ...]
-    """Mean position of all lights."""
+    knows_distances: bool = False
+    """Whether gains of single lights are of their irradiance at the teeth."""
     max_light_gains: int | None = None
     """Under more fitted lights than this, gains of single lights are no coordinates; None for any number."""
 
     def moves(self, folder: Path, recipe: SceneRecipe) -> tuple[Move, ...]:
         """Moves of scan and dome under the lights of a recipe, with their scenes."""
-        return write_moves(folder, recipe, move_covariance(self.stated)[0], np.array(self.dome_centre_mm))
+        covariance, _ = move_covariance(self.stated, self.lights)
+        centre_mm = np.mean([light.position_mm for light in self.lights], axis=0)
+        known = self.knows_distances and is_dome_placed(self.stated, self.lights)
+        return write_moves(folder, recipe, covariance, centre_mm, keep_irradiance=known)
 
     def errors(self, channel: str, cameras: Sequence[str], used: NDArray[np.bool_]) -> InstrumentErrors:
         """Those of a channel that act on the fitted photographs of some cameras under the lights (L,) that are used."""
@@ -56,7 +60,7 @@ class Instrument:
         return BlockInstrument(gain_name(channel), names, flare_name(camera, channel), brightest)
 
     def _chosen(self, lights: NDArray[np.bool_]) -> list[str]:
-        return [name for name, is_chosen in zip(self.lights, lights, strict=True) if is_chosen]
+        return [light.name for light, is_chosen in zip(self.lights, lights, strict=True) if is_chosen]
 
 
 def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[np.float64]) -> Instrument | None:
@@ -70,8 +74,6 @@ def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[n
     """
     if spec.instrument == "off" or spec.solver == "adam":
         return None
-    positions = np.array([light.position_mm for light in manifest.lights])
-    names = tuple(light.name for light in manifest.lights)
     max_gains = MAX_JAW_LIGHTS if spec.kind == "jaw" else None
     stated = at_the_teeth(manifest.uncertainty, manifest.lights, manifest.channels, teeth_mm)
-    return Instrument(names, stated, tuple(positions.mean(axis=0).tolist()), max_gains)
+    return Instrument(manifest.lights, stated, stated is not manifest.uncertainty, max_gains)

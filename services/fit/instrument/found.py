@@ -5,32 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from services.core.calibration.uncertainty import CalibrationUncertainty
-from services.core.records import JobSpec
-from services.fit.instrument.moves import MOVED
+from services.core.records import JobSpec, PreparedManifest
+from services.fit.instrument.moves import move_covariance
 from services.fit.instrument.sentences import assumed_names, instrument_sentences
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import instrument_estimates
 
 
-def instrument_report(
-    spec: JobSpec, known: Mapping[str, Uncertainty], stated: CalibrationUncertainty | None
-) -> dict[str, Any]:
+def instrument_report(spec: JobSpec, known: Mapping[str, Uncertainty], manifest: PreparedManifest) -> dict[str, Any]:
     """The fields of a ``FitReport`` that are about the instrument.
 
     Args:
         known: by channel, the uncertainty at the solution.
-        stated: by the calibration.
+        manifest: of what was prepared, with what its calibration states.
     """
     errors = {channel: one.domain.errors for channel, one in known.items()}
     found = {channel: own for channel, one in known.items() if (own := instrument_estimates(one))}
-    moved = {body for body in MOVED if any(body in one.parts for one in known.values())}
-    assumed = assumed_names(errors, stated, moved)
+    _, moves = move_covariance(manifest.uncertainty, manifest.lights)
+    assumed = assumed_names(errors, [body for body in moves if any(body in one.parts for one in known.values())])
     faults = {channel: one.faults for channel, one in known.items() if one.faults}
     return {
         "instrument": found,
         "instrument_prior": {c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in found},
         "assumed": assumed,
         "instrument_faults": {c: tuple(errors[c].names[fault.place] for fault in own) for c, own in faults.items()},
-        "instrument_told": instrument_sentences(spec, errors, faults, assumed, stated),
+        "instrument_told": instrument_sentences(spec, errors, faults, assumed, manifest.uncertainty),
     }

@@ -4,6 +4,11 @@ Images of a moved tooth need many paths: 0.05 mm move an image by 2 %, and two i
 chance. As coordinates such moves would follow that noise. So they are considered and not estimated (Schmidt 1966): each
 changes the photographs by one standard deviation of its own, and the answer with them.
 
+A dome of which the calibration states every light's place has no error of its own: it moves by what the lights' errors
+have in common. The 2 mm that are assumed otherwise would count those errors twice. Where some light's place is not
+stated the assumed move stays, and is of all lights: nothing else speaks for that light, a dome moves as one, and the
+other lights' distances are then in no gain (``irradiance``).
+
 A tooth that moves by T under cameras and lights that stay is a tooth that stays under cameras and lights that move by
 T^-1, so no surface is built again.
 """
@@ -18,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
-from services.core.geometry import Camera
+from services.core.geometry import Camera, Light
 from services.fit.execution.blocks import BlockTask, StoredFile, read_block, write_recipe
 from services.fit.execution.engine_host import EngineHost
 from services.fit.instrument.errors import DEFAULT_MOVE_SE
@@ -67,40 +72,84 @@ def rigid(twist: Array, centre_mm: Array) -> Array:
     return move
 
 
-def move_covariance(stated: CalibrationUncertainty | None) -> tuple[Array, tuple[str, ...]]:
-    """Covariance (12, 12) of the moves of teeth and dome, and those of them of which some part took its default."""
+def is_dome_placed(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> bool:
+    """Whether every light's place is stated, which says how wrong the dome's may be, and no dome's move is named."""
+    if stated is None or any(f"dome.{axis}" in stated.names for axis in TWIST):
+        return False
+    return all(name in stated.names for name in _places(lights))
+
+
+def move_covariance(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> tuple[Array, tuple[str, ...]]:
+    """Covariance (12, 12) of the moves of teeth and dome, and those of them of which some part took its default.
+
+    Args:
+        stated: by the calibration.
+        lights: all of the capture.
+    """
     names = [f"{body}.{axis}" for body in MOVED for axis in TWIST]
     covariance = np.diag([se**2 for body in MOVED for se in DEFAULT_MOVE_SE[body]])
     own = [name for name in names if stated is not None and name in stated.names]
     if stated is not None:
-        here, there = [names.index(name) for name in own], [stated.names.index(name) for name in own]
-        covariance[np.ix_(here, here)] = stated.matrix[np.ix_(there, there)]
+        covariance[np.ix_(*2 * [[names.index(name) for name in own]])] = _stated(stated, own)
+    if stated is not None and is_dome_placed(stated, lights):
+        nearest = np.linalg.pinv(_twist_derivative(np.array([light.position_mm for light in lights])))
+        covariance[len(TWIST) :, len(TWIST) :] = nearest @ _stated(stated, _places(lights)) @ nearest.T
+        own += [name for name in names if name.startswith("dome.")]
     assumed = {name.partition(".")[0] for name in names if name not in own}
     return covariance, tuple(body for body in MOVED if body in assumed)
 
 
-def write_moves(folder: Path, recipe: SceneRecipe, covariance: Array, dome_centre_mm: Array) -> tuple[Move, ...]:
-    """Independent moves whose covariances add up to the whole, with their scenes."""
+def _places(lights: Sequence[Light]) -> list[str]:
+    return [f"light.{light.name}.{axis}" for light in lights for axis in "xyz"]
+
+
+def _stated(stated: CalibrationUncertainty, names: Sequence[str]) -> Array:
+    places = [stated.names.index(name) for name in names]
+    return np.asarray(stated.matrix[np.ix_(places, places)])
+
+
+def _twist_derivative(places_mm: Array) -> Array:
+    # Of places (L, 3) to a turn w and a shift t about their mean, w x r + t: (3 L, 6). Its pseudo-inverse gives the
+    # move nearest to any errors of places.
+    arms_mm = places_mm - places_mm.mean(axis=0)
+    turned = np.cross(np.eye(3)[:, None], arms_mm).transpose(1, 2, 0)
+    return np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2).reshape(-1, 6)
+
+
+def write_moves(
+    folder: Path, recipe: SceneRecipe, covariance: Array, dome_centre_mm: Array, *, keep_irradiance: bool = False
+) -> tuple[Move, ...]:
+    """Independent moves whose covariances add up to the whole, with their scenes.
+
+    Args:
+        keep_irradiance: lights that the dome moves stay as bright at the teeth, as their gains know the distances.
+    """
     teeth_centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in recipe.teeth]).mean(axis=0)
-    lights, moves = recipe.light_positions_mm, list[tuple[str, Array, Array]]()
+    lights, moves = recipe.light_positions_mm, list[tuple[str, Array, Array, Array]]()
     values, vectors = np.linalg.eigh(covariance)
     for value, vector in zip(values, vectors.T, strict=True):
         twist = REACH * np.sqrt(max(value, 0.0)) * vector
         body = MOVED[int(np.abs(vector[6:]).max() > np.abs(vector[:6]).max())]
-        back = np.linalg.inv(rigid(twist[:6], teeth_centre_mm))
-        both = back @ rigid(twist[6:], dome_centre_mm)
-        moves.append((body, lights @ both[:3, :3].T + both[:3, 3], np.linalg.inv(back)))
+        forth = rigid(twist[:6], teeth_centre_mm)
+        back, moved = np.linalg.inv(forth), _moved(rigid(twist[6:], dome_centre_mm), lights)
+        farther = ((moved - teeth_centre_mm) ** 2).sum(axis=1) / ((lights - teeth_centre_mm) ** 2).sum(axis=1)
+        bright = recipe.light_intensities * (farther if keep_irradiance else 1.0)
+        moves.append((body, _moved(np.asarray(back, dtype=np.float64), moved), bright, forth))
     found, count = list[Move](), max(MAX_LIGHTS // len(lights) - 1, 1)
     for start in range(0, len(moves), count):
         part = moves[start : start + count]
-        positions = np.concatenate([lights, *(moved for _, moved, _ in part)])
-        intensities = np.tile(recipe.light_intensities, len(part) + 1)
+        positions = np.concatenate([lights, *(moved for _, moved, _, _ in part)])
+        intensities = np.concatenate([recipe.light_intensities, *(bright for _, _, bright, _ in part)])
         stored = write_recipe(folder, replace(recipe, light_positions_mm=positions, light_intensities=intensities))
         found += [
             Move(body, stored, (k + 1) * len(lights), tuple(map(tuple, camera.tolist())))
-            for k, (body, _, camera) in enumerate(part)
+            for k, (body, _, _, camera) in enumerate(part)
         ]
     return tuple(found)
+
+
+def _moved(move: Array, points_mm: Array) -> Array:
+    return np.asarray(points_mm @ move[:3, :3].T + move[:3, 3])
 
 
 def by_scene(moves: Sequence[Move]) -> tuple[tuple[Move, ...], ...]:

@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec
 from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, kind_of_error
-from services.fit.instrument.moves import move_covariance
 from services.fit.solve.recombination import Fault
 
 SIZES = {
@@ -26,16 +25,14 @@ REMEDY = {
 }
 
 
-def assumed_names(
-    errors: Mapping[str, InstrumentErrors], stated: CalibrationUncertainty | None, moved: Collection[str]
-) -> tuple[str, ...]:
-    """Errors that took their default, over all channels, and ``teeth`` or ``dome`` where some part of their move did.
+def assumed_names(errors: Mapping[str, InstrumentErrors], moves: Sequence[str]) -> tuple[str, ...]:
+    """Errors that took their default, over all channels.
 
     Args:
-        moved: those of the moves that some channel's ± know.
+        moves: ``teeth`` or ``dome``, where some part of their move did and some channel's ± know it.
     """
     names = dict.fromkeys(name for own in errors.values() for name in own.names if name in own.assumed)
-    return (*names, *(body for body in move_covariance(stated)[1] if body in moved))
+    return (*names, *moves)
 
 
 def instrument_sentences(
@@ -98,7 +95,8 @@ def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
         rest = f" and {len(unused) - 1} more" if unused[1:] else ""
         yield (
             f"The calibration states how wrong {unused[0]}{rest} may be. No fit moves single cameras and lights: "
-            "of these errors the ± know at most the lights' distances, which count in their gains."
+            "of these errors the ± know at most the lights' distances, which count in their gains, and what moves all "
+            "lights as one."
         )
 
 

@@ -84,7 +84,7 @@ def report(
         steps=sum(jaw.fit.steps for jaw in fits.values()),
         seconds=seconds,
         teeth=teeth,
-        **instrument_report(spec, {c: jaw.fit.known for c, jaw in fits.items()}, observations.manifest.uncertainty),
+        **instrument_report(spec, {c: jaw.fit.known for c, jaw in fits.items()}, observations.manifest),
     )
 
 

@@ -180,7 +180,7 @@ class FitDriver:
             correlations=correlations,
             told=told(tables, correlations) if converged else NOTHING,
             seconds=seconds,
-            **instrument_report(self.attempt.spec, known, observations.manifest.uncertainty),
+            **instrument_report(self.attempt.spec, known, observations.manifest),
         )
 
     def _table(self, fit: ChannelFit[Tissue], known: Uncertainty, shape_known: Uncertainty) -> dict[str, Any]:
