@@ -7,7 +7,8 @@ import type { OptionSchema } from "./optionField";
 /** A dome that has not told its state by then has not told it. */
 const DOME_PATIENCE_MS = 3000;
 
-export type JobState = "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
+export type JobState =
+  "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
 
 /** A relative image error, 0.05 for 5 %, and one standard error. */
 export interface Figure {
@@ -170,7 +171,9 @@ export interface Session {
   name: string;
   scopes: string[];
   is_open: boolean;
-  /** Opens ALL OFF and nothing else; null where the server asks nobody for a token, or the token may not work the dome. */
+  /**
+   * Opens ALL OFF and nothing else; null where the server asks nobody for a token, or the token may not work the dome.
+   */
   dark_key: string | null;
 }
 
@@ -227,7 +230,9 @@ export class Unauthenticated extends Refusal {}
 
 /** Whether the same may be answered later: nobody answers, too much was asked, or the server is in trouble. */
 export function mayPass(problem: unknown): boolean {
-  return problem instanceof TypeError || (problem instanceof Refusal && (problem.status === 429 || problem.status >= 500));
+  return (
+    problem instanceof TypeError || (problem instanceof Refusal && (problem.status === 429 || problem.status >= 500))
+  );
 }
 
 export function sentenceOf(problem: unknown): string {
@@ -236,8 +241,15 @@ export function sentenceOf(problem: unknown): string {
   return problem instanceof Error ? problem.message : String(problem);
 }
 
-export async function ask<T>(path: string, method = "GET", headers: Record<string, string> = {}, body?: object): Promise<T> {
-  const sent = body ? { method, headers: { ...headers, "Content-Type": "application/json" }, body: JSON.stringify(body) } : { method, headers };
+export async function ask<T>(
+  path: string,
+  method = "GET",
+  headers: Record<string, string> = {},
+  body?: object,
+): Promise<T> {
+  const sent = body
+    ? { method, headers: { ...headers, "Content-Type": "application/json" }, body: JSON.stringify(body) }
+    : { method, headers };
   return inLane(() => request<T>(path, sent));
 }
 
@@ -245,17 +257,22 @@ async function request<T>(path: string, sent: RequestInit): Promise<T> {
   const answer = await fetch(`/v1${path}`, sent);
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
-    throw new (answer.status === 401 ? Unauthenticated : Refusal)(problem?.detail ?? `The server answered ${answer.status}.`, answer.status);
+    throw new (answer.status === 401 ? Unauthenticated : Refusal)(
+      problem?.detail ?? `The server answered ${answer.status}.`,
+      answer.status,
+    );
   }
   return (answer.status === 204 ? undefined : answer.json()) as Promise<T>;
 }
 
 export const getSession = (): Promise<Session> => ask("/session");
-export const signIn = (token: string): Promise<Session> => ask("/session", "POST", { Authorization: `Bearer ${token}` });
+export const signIn = (token: string): Promise<Session> =>
+  ask("/session", "POST", { Authorization: `Bearer ${token}` });
 export const setUp = (secret: string): Promise<IssuedToken> => ask("/setup", "POST", {}, { secret });
 export const signOut = (): Promise<void> => ask("/session", "DELETE");
 
-export const listJobs = (limit: number, before?: number): Promise<JobPage> => ask(`/jobs?limit=${limit}${before === undefined ? "" : `&before=${before}`}`);
+export const listJobs = (limit: number, before?: number): Promise<JobPage> =>
+  ask(`/jobs?limit=${limit}${before === undefined ? "" : `&before=${before}`}`);
 export const listWorkers = (): Promise<Workers> => ask("/workers");
 export const getJob = (id: string): Promise<JobDetail> => ask(`/jobs/${id}`);
 export const getOptions = (): Promise<OptionsSchema> => ask("/options");
@@ -264,18 +281,22 @@ export const getPreset = (name: string): Promise<Preset> => ask(`/presets/${name
 export const listCaptures = (): Promise<{ captures: Capture[] }> => ask("/captures?limit=500");
 export const listCalibrations = (): Promise<NamedCalibration[]> => ask("/calibrations");
 /** Puts what a calibration job made under a name. */
-export const keepCalibration = (job: string, name: string): Promise<NamedCalibration> => ask(`/jobs/${job}/calibration/${encodeURIComponent(name)}`, "PUT");
+export const keepCalibration = (job: string, name: string): Promise<NamedCalibration> =>
+  ask(`/jobs/${job}/calibration/${encodeURIComponent(name)}`, "PUT");
 export const submitJob = (wanted: object): Promise<Job> => ask("/jobs", "POST", {}, wanted);
 export const renameJob = (id: string, name: string | null): Promise<Job> => ask(`/jobs/${id}`, "PATCH", {}, { name });
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
 export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "POST");
-export const getDome = (): Promise<DomeState> => inLane(() => request("/dome", { signal: AbortSignal.timeout(DOME_PATIENCE_MS) }));
+export const getDome = (): Promise<DomeState> =>
+  inLane(() => request("/dome", { signal: AbortSignal.timeout(DOME_PATIENCE_MS) }));
 
 /**
- * ALL OFF waits for no lane, and the stream of events makes room for it. It is sent without the cookie, by the session's
+ * ALL OFF waits for no lane, and the stream of events makes room for it. It is sent without the cookie, by the
+ * session's
  * dark key where the server asks for tokens: browsers keep connections with and without cookies apart, so that this one
- * is free whatever else is under way, downloads too. Where the key does not do, the cookie is tried: darkening twice is harmless.
+ * is free whatever else is under way, downloads too. Where the key does not do, the cookie is tried: darkening twice is
+ * harmless.
  */
 export async function allOff(session: Session | null): Promise<AllOff> {
   clearTheWay();
@@ -289,9 +310,11 @@ export async function allOff(session: Session | null): Promise<AllOff> {
   }
 }
 
-export const lightUp = (light: number, level: number, on_s: number): Promise<DomeStatus> => ask("/dome/light", "PUT", {}, { light, level, on_s });
+export const lightUp = (light: number, level: number, on_s: number): Promise<DomeStatus> =>
+  ask("/dome/light", "PUT", {}, { light, level, on_s });
 export const darken = (): Promise<DomeStatus> => ask("/dome/light", "DELETE");
-export const preflight = (mouth: string): Promise<{ findings: string[] }> => ask("/dome/preflight", "POST", {}, { mouth });
+export const preflight = (mouth: string): Promise<{ findings: string[] }> =>
+  ask("/dome/preflight", "POST", {}, { mouth });
 export const listArtifacts = (id: string): Promise<Artifact[]> => ask(`/jobs/${id}/artifacts`);
 export const getParameters = (id: string): Promise<Parameters> => ask(`/jobs/${id}/artifacts/parameters.json`);
 

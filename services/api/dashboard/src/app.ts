@@ -1,4 +1,7 @@
-/** The page: a list of jobs and the job that the address names, or the dome; a form for a token where the server asks for one. */
+/**
+ * The page: a list of jobs and the job that the address names, or the dome; a form for a token where the server asks
+ * for one.
+ */
 
 import { getSession, mayPass, type Session, sentenceOf, signOut, Unauthenticated } from "./api";
 import { DomeView } from "./domeView";
@@ -119,9 +122,14 @@ function may(scope: string): boolean {
 
 /** Why nothing of an address is shown, as its every button would be refused; empty if some may be pressed. */
 function lackingFor(hash: string): string {
-  if (hash === DOME && !may("operate-dome")) return "This token may not work the dome; sign in with one that has the scope operate-dome.";
+  if (hash === DOME && !may("operate-dome"))
+    return "This token may not work the dome; sign in with one that has the scope operate-dome.";
   const submits = hash === NEW || hash === RIG || hash.startsWith(`${SUBMIT}/`) || hash === SUBMIT;
-  if (submits && !may("submit")) return "This token may look at jobs and submit none; choose a job from the list, or sign in with one that has the scope submit.";
+  if (submits && !may("submit"))
+    return (
+      "This token may look at jobs and submit none; choose a job from the list, or sign in with one that " +
+      "has the scope submit."
+    );
   return "";
 }
 
@@ -132,7 +140,15 @@ function viewOf(hash: string, id: string): View | null {
   if (hash === RIG) return new RigView();
   const source = hash.match(/^#\/submit(?:\/(\w+))?$/);
   if (source) return new SubmitView(source[1] ?? "");
-  return id ? new JobView(id, () => void refreshList(), () => void showNewest(), showViewConnection, may("submit")) : null;
+  return id
+    ? new JobView(
+        id,
+        () => void refreshList(),
+        () => void showNewest(),
+        showViewConnection,
+        may("submit"),
+      )
+    : null;
 }
 
 function mark(link: HTMLAnchorElement, isHere: boolean): void {

@@ -47,8 +47,24 @@ export class Comparison {
   }
 
   add(event: JobEvent): void {
-    const { camera, light, channel, step, render, photo, residual, held_out: heldOut, residual_of_white: ofWhite, residual_limit: limit } = event.data;
-    const share = typeof ofWhite === "number" ? `${100 * ofWhite} % of white` : typeof limit === "number" ? `${significant(limit)} of radiance` : "";
+    const {
+      camera,
+      light,
+      channel,
+      step,
+      render,
+      photo,
+      residual,
+      held_out: heldOut,
+      residual_of_white: ofWhite,
+      residual_limit: limit,
+    } = event.data;
+    const share =
+      typeof ofWhite === "number"
+        ? `${100 * ofWhite} % of white`
+        : typeof limit === "number"
+          ? `${significant(limit)} of radiance`
+          : "";
     const preview: Preview = {
       camera: text(camera),
       light: text(light),
@@ -64,7 +80,8 @@ export class Comparison {
     const key = [preview.channel, preview.camera, preview.light].filter(Boolean).join(" · ");
     if (!this.views.size) this.build();
     const steps = this.views.get(key) ?? new Map<number, Preview>();
-    if (!this.views.has(key)) this.choice.append(element("option", { value: key }, preview.heldOut ? `${key} (held out)` : key));
+    if (!this.views.has(key))
+      this.choice.append(element("option", { value: key }, preview.heldOut ? `${key} (held out)` : key));
     this.views.set(key, steps.set(preview.step, preview));
     if (this.choice.value === key) this.show(this.followsLatest);
   }
@@ -82,12 +99,28 @@ export class Comparison {
       this.split,
     );
     const stack = element("div", { class: "stack" }, this.photo, this.render, this.line);
-    const scale = element("p", { class: "scale" }, this.least, element("i", { role: "img", "aria-label": "Colours of the residual, from blue over white to orange" }), this.most);
+    const scale = element(
+      "p",
+      { class: "scale" },
+      this.least,
+      element("i", { role: "img", "aria-label": "Colours of the residual, from blue over white to orange" }),
+      this.most,
+    );
     const pictures = element(
       "div",
       { class: "pictures" },
       element("figure", {}, stack, element("figcaption", {}, "left of the line: render; right: photograph")),
-      element("figure", {}, this.residual, scale, element("figcaption", {}, "residual: render less photograph; blue where the render is darker, orange where it is brighter")),
+      element(
+        "figure",
+        {},
+        this.residual,
+        scale,
+        element(
+          "figcaption",
+          {},
+          "residual: render less photograph; blue where the render is darker, orange where it is brighter",
+        ),
+      ),
     );
     this.root.replaceChildren(controls, pictures);
     this.place();

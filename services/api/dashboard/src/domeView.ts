@@ -1,6 +1,20 @@
-/** The dome by hand: ALL OFF, what the controller says, one light for alignment, preflight. Asks the controller again every second. */
+/**
+ * The dome by hand: ALL OFF, what the controller says, one light for alignment, preflight. Asks the controller again
+ * every second.
+ */
 
-import { allOff, darken, type DomeState, type DomeStatus, getDome, lightUp, preflight, sentenceOf, type Session, Unauthenticated } from "./api";
+import {
+  allOff,
+  darken,
+  type DomeState,
+  type DomeStatus,
+  getDome,
+  lightUp,
+  preflight,
+  sentenceOf,
+  type Session,
+  Unauthenticated,
+} from "./api";
 import { element } from "./element";
 import { LightGrid } from "./lightGrid";
 
@@ -28,7 +42,13 @@ export class DomeView {
   private readonly seconds = numberInput("seconds", 10, 1, LONGEST_LIGHT_S);
   private readonly dark = element("button", { type: "button" }, "Switch it off");
   private readonly grid = new LightGrid((light) => void this.light(light));
-  private readonly mouth = element("input", { id: "mouth", type: "text", required: "", spellcheck: "false", autocomplete: "off" });
+  private readonly mouth = element("input", {
+    id: "mouth",
+    type: "text",
+    required: "",
+    spellcheck: "false",
+    autocomplete: "off",
+  });
   private readonly look = element("button", {}, "Run the preflight");
   private readonly findings = element("ul", { class: "findings", role: "status" });
   private capturers = "";
@@ -54,7 +74,12 @@ export class DomeView {
 
   /** Fill the view, ALL OFF first of all, and follow the dome until `stop`. */
   start(): void {
-    const rig = element("form", { class: "fields" }, labelled("Folder of the rig on the server", this.mouth), this.look);
+    const rig = element(
+      "form",
+      { class: "fields" },
+      labelled("Folder of the rig on the server", this.mouth),
+      this.look,
+    );
     rig.addEventListener("submit", (event) => {
       event.preventDefault();
       void this.preflight();
@@ -63,12 +88,21 @@ export class DomeView {
       element("header", {}, element("h2", {}, "Dome"), this.state, this.heard, this.address),
       this.off,
       this.offTrouble,
-      element("p", { class: "soft" }, "Every light goes dark at once and every capture is stopped. It is no emergency stop: that one is a switch."),
+      element(
+        "p",
+        { class: "soft" },
+        "Every light goes dark at once and every capture is stopped. It is no emergency stop: that one is a switch.",
+      ),
       this.done,
       this.refusal,
       this.silence,
       section("One light, for alignment", this.capturing, this.fields(), this.grid.root),
-      section("Preflight", element("p", { class: "soft" }, "Every light for a moment, black level and clipping; takes seconds."), rig, this.findings),
+      section(
+        "Preflight",
+        element("p", { class: "soft" }, "Every light for a moment, black level and clipping; takes seconds."),
+        rig,
+        this.findings,
+      ),
       section("Controller", this.facts),
     );
     this.clock = window.setInterval(() => this.showAge(), 500);
@@ -82,13 +116,20 @@ export class DomeView {
   }
 
   private fields(): HTMLElement {
-    return element("div", { class: "fields" }, labelled("Level, %", this.level), labelled(`Seconds, ${LONGEST_LIGHT_S} at most`, this.seconds), this.dark);
+    return element(
+      "div",
+      { class: "fields" },
+      labelled("Level, %", this.level),
+      labelled(`Seconds, ${LONGEST_LIGHT_S} at most`, this.seconds),
+      this.dark,
+    );
   }
 
   private async allOff(): Promise<void> {
     this.offTrouble.hidden = true;
     const late = window.setTimeout(() => {
-      this.offTrouble.textContent = `ALL OFF has had no answer for ${OFF_PATIENCE_MS / 1000} s; it is still being sent. ${EMERGENCY}`;
+      this.offTrouble.textContent =
+        `ALL OFF has had no answer for ${OFF_PATIENCE_MS / 1000} s; it is still being sent. ` + EMERGENCY;
       this.offTrouble.hidden = false;
     }, OFF_PATIENCE_MS);
     try {
@@ -96,9 +137,11 @@ export class DomeView {
         const { status, stopped, others_stopped: others } = await allOff(this.session());
         this.hear(status);
         const names = [...stopped, ...(others ? [ofOthers(others)] : [])];
-        this.done.textContent = `All is dark. ${names.length ? `Stopped: ${names.join(", ")}.` : "No job was capturing."}`;
+        const ended = names.length ? `Stopped: ${names.join(", ")}.` : "No job was capturing.";
+        this.done.textContent = `All is dark. ${ended}`;
       });
-      if (!this.refusal.hidden) this.refusal.textContent = `ALL OFF was not carried out: ${this.refusal.textContent} ${EMERGENCY}`;
+      if (!this.refusal.hidden)
+        this.refusal.textContent = `ALL OFF was not carried out: ${this.refusal.textContent} ${EMERGENCY}`;
     } finally {
       window.clearTimeout(late);
       this.offTrouble.hidden = true;
@@ -107,7 +150,9 @@ export class DomeView {
 
   private async light(light: number): Promise<void> {
     for (const input of [this.level, this.seconds]) if (!input.reportValidity()) return;
-    await this.act(async () => this.hear(await lightUp(light, this.level.valueAsNumber / 100, this.seconds.valueAsNumber)));
+    await this.act(async () =>
+      this.hear(await lightUp(light, this.level.valueAsNumber / 100, this.seconds.valueAsNumber)),
+    );
   }
 
   private async preflight(): Promise<void> {
@@ -153,7 +198,8 @@ export class DomeView {
       if (this.isStopped) return;
       const isLost = problem instanceof TypeError;
       this.onConnection(!isLost);
-      if (!(problem instanceof DOMException)) this.forget(); // who does not answer in time is forgotten once what he said is old
+      // Who does not answer in time is forgotten once what he said is old.
+      if (!(problem instanceof DOMException)) this.forget();
       tell(this.silence, problem);
       this.silence.hidden = isLost || problem instanceof DOMException;
     }
@@ -177,7 +223,8 @@ export class DomeView {
     }
     const ageMs = performance.now() - this.heardMs;
     const isStale = ageMs > STALE_MS;
-    this.heard.textContent = `last heard ${Math.floor(ageMs / 1000)} s ago${isStale && this.lastState ? `: ${this.lastState}` : ""}`;
+    const state = isStale && this.lastState ? `: ${this.lastState}` : "";
+    this.heard.textContent = `last heard ${Math.floor(ageMs / 1000)} s ago${state}`;
     this.heard.classList.toggle("stale", isStale);
     if (isStale && this.state.textContent !== "unknown") this.forget();
   }
@@ -199,12 +246,24 @@ export class DomeView {
     this.capturers = capturers;
     const links = dome.capturing.flatMap((id) => [" ", element("a", { href: `#/${id}` }, id)]);
     const others = dome.others_capturing ? [links.length ? " and " : " ", ofOthers(dome.others_capturing)] : [];
-    this.capturing.replaceChildren("The dome captures, so no light goes on by hand.", ...(links.length ? [" Job", ...links] : []), ...others, ".");
+    this.capturing.replaceChildren(
+      "The dome captures, so no light goes on by hand.",
+      ...(links.length ? [" Job", ...links] : []),
+      ...others,
+      ".",
+    );
   }
 
   private show(status: DomeStatus): void {
     const [first] = status.lit;
-    this.state.textContent = first === undefined ? (status.stopped ? "dark, ALL OFF" : "dark") : status.lit.length === 1 ? `light ${first} is on` : `${status.lit.length} lights are on`;
+    this.state.textContent =
+      first === undefined
+        ? status.stopped
+          ? "dark, ALL OFF"
+          : "dark"
+        : status.lit.length === 1
+          ? `light ${first} is on`
+          : `${status.lit.length} lights are on`;
     this.state.dataset["state"] = first === undefined ? "SUCCEEDED" : "RUNNING";
     if (first !== undefined) this.done.textContent = "";
     this.grid.show(status.light_count, status.lit);
@@ -215,7 +274,12 @@ export class DomeView {
       ["LED supply", status.supply_on ? "on" : "off"],
       ["ALL OFF", status.stopped ? "holds until somebody starts anew" : "does not hold"],
       ["Faults", status.faults.join(", ") || "none"],
-      ["Banks", status.temperature_degc.map((degc, bank) => `${degc.toFixed(1)} °C, ${status.current_ma[bank] ?? 0} mA`).join(" · ")],
+      [
+        "Banks",
+        status.temperature_degc
+          .map((degc, bank) => `${degc.toFixed(1)} °C, ${status.current_ma[bank] ?? 0} mA`)
+          .join(" · "),
+      ],
       ["Firmware", status.firmware],
     ];
     this.facts.replaceChildren(...rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
@@ -237,7 +301,15 @@ function labelled(text: string, input: HTMLInputElement): HTMLElement {
 }
 
 function numberInput(id: string, value: number, least: number, most: number): HTMLInputElement {
-  return element("input", { id, type: "number", min: `${least}`, max: `${most}`, step: "1", value: `${value}`, required: "" });
+  return element("input", {
+    id,
+    type: "number",
+    min: `${least}`,
+    max: `${most}`,
+    step: "1",
+    value: `${value}`,
+    required: "",
+  });
 }
 
 function ofOthers(count: number): string {

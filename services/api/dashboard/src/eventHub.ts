@@ -12,10 +12,14 @@ const SILENCE_MS = 4 * TELL_MS;
 /** So long the stream stays closed for ALL OFF, so that a connection is free. */
 const CLEAR_MS = 2000;
 
-/** What a page says: which jobs it follows, each after the id of an event that it knows, or that all connections are needed. */
+/**
+ * What a page says: which jobs it follows, each after the id of an event that it knows, or that all connections are
+ * needed.
+ */
 export type Wish = { follow: [job: string, after: number][] } | { clear: true };
 /** What it is told. `text` is an event as JSON; `state` is null of a job that is not there. */
-export type News = { job: string; id: number; text: string } | { job: string; state: string | null } | { open: boolean };
+export type News =
+  { job: string; id: number; text: string } | { job: string; state: string | null } | { open: boolean };
 
 interface Page {
   places: Map<string, number>;
@@ -102,8 +106,14 @@ export class EventHub {
       }
     };
     source.addEventListener("end", (message) => {
-      const { job, state } = JSON.parse((message as MessageEvent<string>).data) as { job: string; state: string | null };
-      this.streamed = this.streamed.split(",").filter((one) => one !== job).join();
+      const { job, state } = JSON.parse((message as MessageEvent<string>).data) as {
+        job: string;
+        state: string | null;
+      };
+      this.streamed = this.streamed
+        .split(",")
+        .filter((one) => one !== job)
+        .join();
       if (!this.streamed) this.close();
       for (const page of this.pages.values()) if (page.places.delete(job)) page.tell({ job, state });
     });

@@ -6,5 +6,6 @@ const hub = new EventHub();
 
 addEventListener("connect", (event) => {
   const port = (event as MessageEvent).ports[0];
-  if (port) port.onmessage = (message: MessageEvent<Wish>) => hub.take(port, message.data, (news) => port.postMessage(news));
+  if (port)
+    port.onmessage = (message: MessageEvent<Wish>) => hub.take(port, message.data, (news) => port.postMessage(news));
 });

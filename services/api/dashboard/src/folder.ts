@@ -16,7 +16,9 @@ export interface Folder {
 }
 
 export function chosen(list: FileList): Folder {
-  return sorted([...list].map((file) => ({ path: file.webkitRelativePath.split("/").slice(1).join("/") || file.name, file })));
+  return sorted(
+    [...list].map((file) => ({ path: file.webkitRelativePath.split("/").slice(1).join("/") || file.name, file })),
+  );
 }
 
 /** What was dropped: one folder, or the files and folders of one. To be called before the drop's event is over. */
@@ -28,14 +30,18 @@ export async function dropped(items: DataTransferItemList): Promise<Folder> {
 }
 
 function sorted(all: FolderFile[]): Folder {
-  const isPart = ({ path }: FolderFile) => !path.split("/").some((part) => part.startsWith(".")) && (OF_A_CAPTURE.test(path) || CHUNK.test(path));
+  const isPart = ({ path }: FolderFile) =>
+    !path.split("/").some((part) => part.startsWith(".")) && (OF_A_CAPTURE.test(path) || CHUNK.test(path));
   const files = all.filter(isPart).sort((a, b) => (a.path < b.path ? -1 : 1));
   return { files, leftOut: all.filter((one) => !isPart(one)).map(({ path }) => path) };
 }
 
 async function walk(entry: FileSystemEntry, above: string): Promise<FolderFile[]> {
   const path = above + entry.name;
-  if (entry.isDirectory) return (await Promise.all((await children(entry as FileSystemDirectoryEntry)).map((one) => walk(one, `${path}/`)))).flat();
+  if (entry.isDirectory)
+    return (
+      await Promise.all((await children(entry as FileSystemDirectoryEntry)).map((one) => walk(one, `${path}/`)))
+    ).flat();
   return [{ path, file: await new Promise<File>((done, fail) => (entry as FileSystemFileEntry).file(done, fail)) }];
 }
 

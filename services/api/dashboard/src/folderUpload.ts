@@ -1,5 +1,6 @@
 /**
- * Uploads a folder: hashes it, tells the server what it holds, and sends by tus what the server lacks. Nothing is kept here: the server knows what it has, so
+ * Uploads a folder: hashes it, tells the server what it holds, and sends by tus what the server lacks. Nothing is kept
+ * here: the server knows what it has, so
  * the same folder, chosen again in this page or another one, goes on where an upload broke.
  */
 
@@ -78,7 +79,10 @@ export class FolderUpload {
   }
 
   private async send(source: File, capture: string, file: KnownFile): Promise<void> {
-    const metadata = { "Upload-Length": `${file.bytes}`, "Upload-Metadata": `capture ${base64(utf8(capture))},path ${base64(utf8(file.path))}` };
+    const metadata = {
+      "Upload-Length": `${file.bytes}`,
+      "Upload-Metadata": `capture ${base64(utf8(capture))},path ${base64(utf8(file.path))}`,
+    };
     let offset = await patiently(() => offsetAfter("POST", "/uploads", metadata));
     const before = this.doneBytes - file.received_bytes;
     this.doneBytes = before + offset;
@@ -104,17 +108,32 @@ export class FolderUpload {
 
 async function append(file: KnownFile, start: number, block: Uint8Array<ArrayBuffer>): Promise<number> {
   const checksum = `sha256 ${base64(sha256(block))}`;
-  const headers = { "Upload-Offset": `${start}`, "Content-Type": "application/offset+octet-stream", "Upload-Checksum": checksum };
+  const headers = {
+    "Upload-Offset": `${start}`,
+    "Content-Type": "application/offset+octet-stream",
+    "Upload-Checksum": checksum,
+  };
   return offsetAfter("PATCH", file.upload.slice("/v1".length), headers, block);
 }
 
 /** Ask by tus; answers with the offset of the next byte. */
-async function offsetAfter(method: string, path: string, headers: Record<string, string>, body?: BodyInit): Promise<number> {
-  const answer = await inUploadLane(() => fetch(`/v1${path}`, { method, headers: { ...TUS, ...headers }, ...(body === undefined ? {} : { body }) }));
+async function offsetAfter(
+  method: string,
+  path: string,
+  headers: Record<string, string>,
+  body?: BodyInit,
+): Promise<number> {
+  const answer = await inUploadLane(() =>
+    fetch(`/v1${path}`, { method, headers: { ...TUS, ...headers }, ...(body === undefined ? {} : { body }) }),
+  );
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
-    const isElsewhere = problem?.code === "upload-offset"; // the server has got other bytes than we believed; it is asked how many
-    throw new (answer.status === 401 ? Unauthenticated : Refusal)(problem?.detail ?? `The server answered ${answer.status}.`, isElsewhere ? 423 : answer.status);
+    // The server has got other bytes than we believed; it is asked how many.
+    const isElsewhere = problem?.code === "upload-offset";
+    throw new (answer.status === 401 ? Unauthenticated : Refusal)(
+      problem?.detail ?? `The server answered ${answer.status}.`,
+      isElsewhere ? 423 : answer.status,
+    );
   }
   return Number(answer.headers.get("Upload-Offset"));
 }
@@ -133,7 +152,8 @@ async function patiently<T>(step: () => Promise<T>): Promise<T> {
 }
 
 function isPassing(problem: unknown): boolean {
-  if (problem instanceof Refusal) return [408, 423, 429].includes(problem.status) || (problem.status >= 500 && problem.status !== 507);
+  if (problem instanceof Refusal)
+    return [408, 423, 429].includes(problem.status) || (problem.status >= 500 && problem.status !== 507);
   return problem instanceof TypeError;
 }
 

@@ -13,8 +13,16 @@ interface Follower {
 const followers = new Map<string, Follower>();
 let send: ((wish: Wish) => void) | null = null;
 
-/** Follow a job's events from the first one to its end; all are told once and in order, whatever happens to the connection. */
-export function followEvents(job: string, onEvent: Follower["onEvent"], onEnd: () => void, onConnection: Follower["onConnection"]): () => void {
+/**
+ * Follow a job's events from the first one to its end; all are told once and in order, whatever happens to the
+ * connection.
+ */
+export function followEvents(
+  job: string,
+  onEvent: Follower["onEvent"],
+  onEnd: () => void,
+  onConnection: Follower["onConnection"],
+): () => void {
   const follower = { newest: 0, onEvent, onEnd, onConnection };
   if (followers.delete(job)) tell(); // so that it is told anew from the first event
   followers.set(job, follower);

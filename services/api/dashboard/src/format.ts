@@ -8,7 +8,10 @@ export function unitOf(estimate: Estimate): string {
   return UNITS[estimate.unit] ?? estimate.unit;
 }
 
-/** The unit of a parameter of a running fit, which tells bare values: lengths occur in coefficients alone, as ``sigma`` or ``sigma_s_reduced``. */
+/**
+ * The unit of a parameter of a running fit, which tells bare values: lengths occur in coefficients alone, as ``sigma``
+ * or ``sigma_s_reduced``.
+ */
 export function unitOfName(name: string): string {
   return /(^|\.)sigma(_\w+)?$/.test(name) ? "mm⁻¹" : "";
 }
@@ -38,7 +41,8 @@ export function significant(value: number): string {
 
 /** What a badge says of a job, and how it is coloured: that a fit did not converge is no success to whoever looks. */
 export function badgeOf(job: Job): { text: string; state: string } {
-  if (job.state === "SUCCEEDED" && job.verdict && !job.verdict.converged) return { text: "not converged", state: "NOT-CONVERGED" };
+  if (job.state === "SUCCEEDED" && job.verdict && !job.verdict.converged)
+    return { text: "not converged", state: "NOT-CONVERGED" };
   return { text: job.state.toLowerCase(), state: job.state };
 }
 
@@ -74,7 +78,8 @@ export function remaining(range: TimeRange): string {
   if (range.low_s === null || range.high_s === null) return `No time range: ${range.reason ?? ""}`;
   const [low, lowUnit] = duration(range.low_s);
   const [high, highUnit] = duration(range.high_s);
-  return `Ends in ${low}${lowUnit === highUnit ? "" : ` ${lowUnit}`} to ${high} ${highUnit}: 80 % range from ${range.past_jobs} past jobs.`;
+  const ends = `${low}${lowUnit === highUnit ? "" : ` ${lowUnit}`} to ${high} ${highUnit}`;
+  return `Ends in ${ends}: 80 % range from ${range.past_jobs} past jobs.`;
 }
 
 function duration(seconds: number): [string, string] {

@@ -35,7 +35,9 @@ export class JobList {
 
   /** Load what is shown again, as older jobs change too; returns the newest one's id. */
   async refresh(): Promise<string | null> {
-    const { jobs, next_before: last } = await listJobs(this.showsOlder ? Math.min(Math.max(this.jobs.length, PAGE), MAX_LISTED) : PAGE);
+    const { jobs, next_before: last } = await listJobs(
+      this.showsOlder ? Math.min(Math.max(this.jobs.length, PAGE), MAX_LISTED) : PAGE,
+    );
     const joint = this.jobs.findIndex((job) => job.number === last);
     const below = this.showsOlder && joint >= 0 ? this.jobs.slice(joint + 1) : [];
     if (!below.length) this.more.hidden = last === null;
@@ -77,7 +79,14 @@ export class JobList {
     const { text, state } = badgeOf(job);
     const badge = element("span", { class: "badge", "data-state": state }, text);
     const label = job.name ? [element("span", { class: "name" }, job.name)] : [];
-    const link = element("a", { href: `#/${job.id}` }, element("strong", {}, `Job ${job.number}`), badge, ...label, element("span", { class: "soft" }, when(job.created_s)));
+    const link = element(
+      "a",
+      { href: `#/${job.id}` },
+      element("strong", {}, `Job ${job.number}`),
+      badge,
+      ...label,
+      element("span", { class: "soft" }, when(job.created_s)),
+    );
     this.mark(link);
     return link;
   }

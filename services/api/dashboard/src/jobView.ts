@@ -70,7 +70,11 @@ export class JobView {
     this.report.href = artifactUrl(id, "report.html");
     this.parameterTable.hidden = true;
     this.parameterTable.href = parameterTableUrl(id);
-    const then = { changed: (job: Job, again: boolean) => this.changed(job, again), deleted: onDeleted, refused: (problem: unknown) => this.refuse(problem) };
+    const then = {
+      changed: (job: Job, again: boolean) => this.changed(job, again),
+      deleted: onDeleted,
+      refused: (problem: unknown) => this.refuse(problem),
+    };
     this.actions = new JobActions(id, then, mayChange);
   }
 
@@ -80,10 +84,15 @@ export class JobView {
     if (this.isStopped) return;
     this.isSlab = job.spec.kind === "slab";
     const source = job.spec.capture ?? job.spec.rig?.mouth ?? "";
-    const section = (title: string, ...content: HTMLElement[]) => element("section", {}, element("h3", {}, title), ...content);
+    const section = (title: string, ...content: HTMLElement[]) =>
+      element("section", {}, element("h3", {}, title), ...content);
     this.root.replaceChildren(
       element("header", {}, this.title, this.state, this.report),
-      element("p", { class: "soft" }, `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`),
+      element(
+        "p",
+        { class: "soft" },
+        `${job.id} · submitted ${when(job.created_s)} · ${job.spec.rig ? "rig" : "capture"} ${source}`,
+      ),
       this.waits,
       this.failure,
       this.verdict.root,
@@ -143,7 +152,8 @@ export class JobView {
     this.tooth = tooth;
     const name = `${typeof channel === "string" ? channel : "all"}${tooth === null ? "" : `, tooth ${tooth}`}`;
     this.chart.add(name, event);
-    if (parameters && typeof parameters === "object") this.parameters.showStep(name, parameters as Record<string, number>);
+    if (parameters && typeof parameters === "object")
+      this.parameters.showStep(name, parameters as Record<string, number>);
   }
 
   /** The replay tells old states too, so the state itself is always asked for. */
@@ -235,7 +245,12 @@ export class JobView {
     this.report.hidden = !files.some((file) => file.path === "report.html");
     this.files.replaceChildren(
       ...shown.map((file) =>
-        element("li", {}, element("a", { href: artifactUrl(this.id, file.path), target: "_blank", rel: "noopener" }, file.path), ` ${bytes(file.bytes)}`),
+        element(
+          "li",
+          {},
+          element("a", { href: artifactUrl(this.id, file.path), target: "_blank", rel: "noopener" }, file.path),
+          ` ${bytes(file.bytes)}`,
+        ),
       ),
     );
   }

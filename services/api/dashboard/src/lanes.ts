@@ -15,7 +15,9 @@ const waiting: (() => void)[] = [];
 export async function inLane<T>(ask: () => Promise<T>): Promise<T> {
   if (!navigator.locks) return inOwnLane(ask);
   for (let lane = 0; lane < LANES; lane += 1) {
-    const taken = await navigator.locks.request(name(lane), { ifAvailable: true }, async (lock) => (lock ? { answer: await ask() } : null));
+    const taken = await navigator.locks.request(name(lane), { ifAvailable: true }, async (lock) =>
+      lock ? { answer: await ask() } : null,
+    );
     if (taken) return taken.answer;
   }
   return navigator.locks.request(name(Math.floor(LANES * Math.random())), ask) as Promise<T>;

@@ -3,7 +3,11 @@
 import { element } from "./element";
 
 export class LightGrid {
-  readonly root = element("div", { class: "lights", role: "group", "aria-label": "Lights; arrow keys choose one, Enter lights it" });
+  readonly root = element("div", {
+    class: "lights",
+    role: "group",
+    "aria-label": "Lights; arrow keys choose one, Enter lights it",
+  });
   private lights: HTMLButtonElement[] = [];
 
   constructor(private readonly onLight: (light: number) => void) {
@@ -26,7 +30,11 @@ export class LightGrid {
   }
 
   private button(light: number): HTMLButtonElement {
-    const button = element("button", { type: "button", "aria-label": `Light ${light}`, "aria-pressed": "false", tabindex: light ? "-1" : "0" }, `${light}`);
+    const button = element(
+      "button",
+      { type: "button", "aria-label": `Light ${light}`, "aria-pressed": "false", tabindex: light ? "-1" : "0" },
+      `${light}`,
+    );
     button.addEventListener("click", () => this.onLight(light));
     return button;
   }
@@ -40,7 +48,14 @@ export class LightGrid {
     const last = this.lights.length - 1;
     const top = this.lights[0]?.offsetTop;
     const columns = this.lights.filter((light) => light.offsetTop === top).length;
-    const steps: Record<string, number> = { ArrowLeft: now - 1, ArrowRight: now + 1, ArrowUp: now - columns, ArrowDown: now + columns, Home: 0, End: last };
+    const steps: Record<string, number> = {
+      ArrowLeft: now - 1,
+      ArrowRight: now + 1,
+      ArrowUp: now - columns,
+      ArrowDown: now + columns,
+      Home: 0,
+      End: last,
+    };
     const next = steps[event.key];
     if (next === undefined) return;
     event.preventDefault();

@@ -47,7 +47,10 @@ export class LossChart {
     this.channels.clear();
   }
 
-  /** Say the result beside the curve, once there is one: renders on the way take few paths, and their errors are less certain. */
+  /**
+   * Say the result beside the curve, once there is one: renders on the way take few paths, and their errors are less
+   * certain.
+   */
   conclude(verdict: Verdict | null): void {
     this.verdict = verdict;
     if (this.plot) this.draw();
@@ -58,7 +61,10 @@ export class LossChart {
     const { step, loss, held_out_error: heldOut, held_out_se: heldOutSe } = event.data;
     if (typeof step !== "number") return;
     const points = this.channels.get(name) ?? new Map<number, Point>();
-    this.channels.set(name, points.set(step, { loss: positive(loss), heldOut: positive(heldOut), heldOutSe: positive(heldOutSe) }));
+    this.channels.set(
+      name,
+      points.set(step, { loss: positive(loss), heldOut: positive(heldOut), heldOutSe: positive(heldOutSe) }),
+    );
     if (!this.stale) requestAnimationFrame(() => this.draw());
     this.stale = true;
   }
@@ -71,9 +77,15 @@ export class LossChart {
     this.stale = false;
     if (!this.channels.size) return;
     const names = [...this.channels.keys()];
-    const steps = [...new Set([...this.channels.values()].flatMap((points) => [...points.keys()]))].sort((a, b) => a - b);
-    const column = (points: Map<number, Point>, key: keyof Point) => steps.map((step) => points.get(step)?.[key] ?? null);
-    const data = [steps, ...[...this.channels.values()].flatMap((points) => [column(points, "loss"), column(points, "heldOut")])] as uPlot.AlignedData;
+    const steps = [...new Set([...this.channels.values()].flatMap((points) => [...points.keys()]))].sort(
+      (a, b) => a - b,
+    );
+    const column = (points: Map<number, Point>, key: keyof Point) =>
+      steps.map((step) => points.get(step)?.[key] ?? null);
+    const data = [
+      steps,
+      ...[...this.channels.values()].flatMap((points) => [column(points, "loss"), column(points, "heldOut")]),
+    ] as uPlot.AlignedData;
     if (this.plot && this.plotted === names.join()) this.plot.setData(data);
     else this.rebuild(names, data);
     this.describe(steps.length);
@@ -82,11 +94,23 @@ export class LossChart {
   private rebuild(names: string[], data: uPlot.AlignedData): void {
     const style = getComputedStyle(document.documentElement);
     const colour = (name: string) => style.getPropertyValue(name).trim();
-    const line = (name: string, index: number) => colour(`--channel-${name.split(",")[0]}`) || colour(`--line-${index % 3}`);
-    const axis = { stroke: colour("--text-soft"), grid: { stroke: colour("--grid"), width: 1 }, ticks: { stroke: colour("--rule") } };
+    const line = (name: string, index: number) =>
+      colour(`--channel-${name.split(",")[0]}`) || colour(`--line-${index % 3}`);
+    const axis = {
+      stroke: colour("--text-soft"),
+      grid: { stroke: colour("--grid"), width: 1 },
+      ticks: { stroke: colour("--rule") },
+    };
     const series = names.flatMap((name, index) => [
       { label: `${name} loss`, stroke: line(name, index), width: 2, spanGaps: true },
-      { label: `${name} held-out error`, stroke: line(name, index), width: 2, dash: [6, 4], points: { show: true, size: 6 }, spanGaps: true },
+      {
+        label: `${name} held-out error`,
+        stroke: line(name, index),
+        width: 2,
+        dash: [6, 4],
+        points: { show: true, size: 6 },
+        spanGaps: true,
+      },
     ]);
     this.plot?.destroy();
     this.plot = new uPlot(
@@ -97,7 +121,9 @@ export class LossChart {
           { ...axis, label: "step", incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500] },
           { ...axis, label: "relative error", size: 70 },
         ],
-        legend: { markers: { dash: (plot, index) => (plot.series[index]?.dash ? "dashed" : "solid"), fill: "transparent" } },
+        legend: {
+          markers: { dash: (plot, index) => (plot.series[index]?.dash ? "dashed" : "solid"), fill: "transparent" },
+        },
         series: [{ label: "step" }, ...series],
       },
       data,
@@ -111,11 +137,14 @@ export class LossChart {
       const last = [...points.values()];
       const loss = last.at(-1)?.loss;
       const told = last.findLast((point) => point.heldOut !== null);
-      return `${name}: loss ${loss ? significant(loss) : "not yet"}${told?.heldOut ? `, held-out error ${percent(told.heldOut, told.heldOutSe)}` : ""}`;
+      const error = told?.heldOut ? `, held-out error ${percent(told.heldOut, told.heldOutSe)}` : "";
+      return `${name}: loss ${loss ? significant(loss) : "not yet"}${error}`;
     });
-    const result = this.verdict && Object.entries(this.verdict.channels).map(([name, error]) => `${name} ${figureOf(error)}`);
+    const result =
+      this.verdict && Object.entries(this.verdict.channels).map(([name, error]) => `${name} ${figureOf(error)}`);
     const onTheWay = `${latest.join("; ")}. Errors on the way are of renders with few paths.`;
-    const text = `${count} steps. ${result ? `Result: ${this.verdict?.error_of} error ${result.join(", ")}.` : onTheWay}`;
+    const found = result ? `Result: ${this.verdict?.error_of} error ${result.join(", ")}.` : onTheWay;
+    const text = `${count} steps. ${found}`;
     this.caption.textContent = text;
     this.canvas.setAttribute("aria-label", `Loss over steps, logarithmic. ${text}`);
   }

@@ -23,21 +23,34 @@ export class NewJobView {
     const options = element("a", { href: SUBMIT }, "choose from the captures that are here already");
     this.root.append(
       element("h2", {}, "New job"),
-      element("p", { class: "soft" }, "A job turns a capture of a person's teeth into a measured, renderable asset. Three ways to begin:"),
+      element(
+        "p",
+        { class: "soft" },
+        "A job turns a capture of a person's teeth into a measured, renderable asset. Three ways to begin:",
+      ),
       element(
         "div",
         { class: "cards" },
-        card("Run the demo", "A simulated dome lights a virtual incisor, and the fit finds its optics again. Nothing is needed; some minutes on two cores.", this.run, this.refusal),
+        card(
+          "Run the demo",
+          "A simulated dome lights a virtual incisor, and the fit finds its optics again. Nothing is needed; " +
+            "some minutes on two cores.",
+          this.run,
+          this.refusal,
+        ),
         card(
           "Upload a capture",
-          "A folder with capture.json, or raw.toml and photographs as cameras write them, with its meshes. Only what the server does not know yet is sent; an upload that breaks goes on when you choose the folder again.",
+          "A folder with capture.json, or raw.toml and photographs as cameras write them, with its meshes. " +
+            "Only what the server does not know yet is sent; an upload that breaks goes on when you choose the " +
+            "folder again.",
           this.upload.root,
           this.ready,
           element("p", { class: "soft" }, "Or ", options, "."),
         ),
         card(
           "Connect a rig",
-          "A dome with its lights and cameras captures for the job. What to set, and where; and whether the dome answers.",
+          "A dome with its lights and cameras captures for the job. What to set, and where; and whether the " +
+            "dome answers.",
           element("a", { class: "button primary", href: RIG }, "Connect a rig"),
         ),
       ),

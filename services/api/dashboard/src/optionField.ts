@@ -1,4 +1,7 @@
-/** One option of a job as a form field, built from its JSON schema: label, input, help with unit, and what is wrong with it. */
+/**
+ * One option of a job as a form field, built from its JSON schema: label, input, help with unit, and what is wrong with
+ * it.
+ */
 
 import { element } from "./element";
 
@@ -37,18 +40,34 @@ export class OptionField {
     this.input = build(this.schema, id);
     if (isRequired) this.input.required = true;
     const unit = Object.entries(UNITS).find(([end]) => name.endsWith(end))?.[1];
-    const label = element("label", { for: id }, words(name), unit ? element("span", { class: "soft" }, `, ${unit}`) : null);
+    const label = element(
+      "label",
+      { for: id },
+      words(name),
+      unit ? element("span", { class: "soft" }, `, ${unit}`) : null,
+    );
     const help = element("p", { id: `${id}-help`, class: "soft help" }, this.help());
     this.refusal = element("p", { id: `${id}-wrong`, class: "bad", role: "alert" });
     this.input.setAttribute("aria-describedby", `${help.id} ${this.refusal.id}`);
-    this.root = element("div", { class: this.schema.type === "boolean" ? "option check" : "option" }, label, this.input, help, this.refusal);
+    this.root = element(
+      "div",
+      { class: this.schema.type === "boolean" ? "option check" : "option" },
+      label,
+      this.input,
+      help,
+      this.refusal,
+    );
     this.input.addEventListener("input", () => this.accuse(""));
     this.reset();
   }
 
   /** Offer values, each with a few words on it; others may be typed all the same. */
   suggest(values: [string, string][]): void {
-    const list = element("datalist", { id: `known-${this.input.id}` }, ...values.map(([value, text]) => element("option", { value }, text)));
+    const list = element(
+      "datalist",
+      { id: `known-${this.input.id}` },
+      ...values.map(([value, text]) => element("option", { value }, text)),
+    );
     this.input.setAttribute("list", list.id);
     this.root.append(list);
   }
@@ -60,7 +79,10 @@ export class OptionField {
   set(value: unknown): void {
     if (this.input instanceof HTMLInputElement && this.input.type === "checkbox") this.input.checked = value === true;
     else if (Array.isArray(value)) this.input.value = value.join(", ");
-    else if (value && typeof value === "object") this.input.value = Object.entries(value).map(([key, one]) => `${key} = ${one}`).join("\n");
+    else if (value && typeof value === "object")
+      this.input.value = Object.entries(value)
+        .map(([key, one]) => `${key} = ${one}`)
+        .join("\n");
     else this.input.value = value === undefined || value === null ? "" : String(value);
   }
 
@@ -93,14 +115,25 @@ export class OptionField {
     const text = this.input.value.trim();
     if (this.schema.type === "object") return table(text);
     if (!text) return Array.isArray(this.schema.default) ? [] : null;
-    if (this.schema.type === "array") return text.split(",").map((part) => part.trim()).filter((part) => part);
+    if (this.schema.type === "array")
+      return text
+        .split(",")
+        .map((part) => part.trim())
+        .filter((part) => part);
     if (this.schema.enum?.some((one) => typeof one === "number")) return Number(text);
     return this.schema.type === "number" || this.schema.type === "integer" ? Number(text) : text;
   }
 
   private help(): string {
     const { minimum, maximum, exclusiveMinimum, type } = this.schema;
-    const limits = minimum !== undefined && maximum !== undefined ? `${minimum} to ${maximum}` : minimum !== undefined ? `${minimum} or more` : exclusiveMinimum !== undefined ? `above ${exclusiveMinimum}` : "";
+    const limits =
+      minimum !== undefined && maximum !== undefined
+        ? `${minimum} to ${maximum}`
+        : minimum !== undefined
+          ? `${minimum} or more`
+          : exclusiveMinimum !== undefined
+            ? `above ${exclusiveMinimum}`
+            : "";
     const form = type === "array" ? "names, separated by commas" : type === "object" ? "one a line" : "";
     const told = this.schema.description ?? "";
     const parts = [told && told[0]?.toUpperCase() + told.slice(1), limits, form].filter((part) => part);
@@ -109,7 +142,8 @@ export class OptionField {
 }
 
 function build(schema: OptionSchema, id: string): Input {
-  if (schema.enum) return element("select", { id }, ...schema.enum.map((one) => element("option", { value: `${one}` }, `${one}`)));
+  if (schema.enum)
+    return element("select", { id }, ...schema.enum.map((one) => element("option", { value: `${one}` }, `${one}`)));
   if (schema.type === "boolean") return element("input", { id, type: "checkbox" });
   if (schema.type === "object") return element("textarea", { id, rows: "2", spellcheck: "false" });
   const input = element("input", { id, type: "text", autocomplete: "off", spellcheck: "false" });
@@ -124,8 +158,13 @@ function build(schema: OptionSchema, id: string): Input {
 
 /** 'enamel.sigma = 4.5', one a line; what is no number is sent as it is, so that the server says so. */
 function table(text: string): Record<string, unknown> {
-  const rows = text.split("\n").map((line) => line.split("=").map((part) => part.trim())).filter(([key]) => key);
-  return Object.fromEntries(rows.map(([key, value]) => [key, value && Number.isFinite(Number(value)) ? Number(value) : (value ?? null)]));
+  const rows = text
+    .split("\n")
+    .map((line) => line.split("=").map((part) => part.trim()))
+    .filter(([key]) => key);
+  return Object.fromEntries(
+    rows.map(([key, value]) => [key, value && Number.isFinite(Number(value)) ? Number(value) : (value ?? null)]),
+  );
 }
 
 function words(name: string): string {

@@ -8,7 +8,11 @@ import { significant, sourcesOf, unitOf, unitOfName, valueOf } from "./format";
 const OF_AN_ATOM = /^(atoms|volumes)\./;
 
 export class ParameterTable {
-  readonly root = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Parameters" }, element("p", { class: "soft" }, "No value yet."));
+  readonly root = element(
+    "div",
+    { class: "scroll", tabindex: "0", role: "region", "aria-label": "Parameters" },
+    element("p", { class: "soft" }, "No value yet."),
+  );
   private readonly current = new Map<string, Record<string, number>>();
   private isFinal = false;
 
@@ -21,7 +25,13 @@ export class ParameterTable {
       return [value === undefined ? "–" : significant(value)];
     };
     const names = [...new Set([...this.current.values()].flatMap(Object.keys))];
-    this.fill("While fitting: current values, uncertainty not known yet.", [...this.current.keys()], names, unitOfName, cell);
+    this.fill(
+      "While fitting: current values, uncertainty not known yet.",
+      [...this.current.keys()],
+      names,
+      unitOfName,
+      cell,
+    );
   }
 
   clear(): void {
@@ -39,17 +49,24 @@ export class ParameterTable {
       return first ? unitOf(first) : "";
     };
     const left = names.length < all.length ? " Those of single atoms of the dictionary are in the report." : "";
-    this.fill(`Result: value ± one standard error, and what most of its square is made of.${left}`, channels, names, unit, (name, channel) => {
-      const estimate = result[channel]?.[name];
-      if (!estimate) return ["–"];
-      const flag = estimate.se === null ? "not fitted" : estimate.determined ? null : "not determined";
-      const sources = sourcesOf(estimate);
-      return [
-        valueOf(estimate),
-        ...(flag ? [element("span", { class: "flag" }, flag)] : []),
-        ...(sources ? [element("div", { class: "soft sources" }, sources)] : []),
-      ];
-    }, heading);
+    this.fill(
+      `Result: value ± one standard error, and what most of its square is made of.${left}`,
+      channels,
+      names,
+      unit,
+      (name, channel) => {
+        const estimate = result[channel]?.[name];
+        if (!estimate) return ["–"];
+        const flag = estimate.se === null ? "not fitted" : estimate.determined ? null : "not determined";
+        const sources = sourcesOf(estimate);
+        return [
+          valueOf(estimate),
+          ...(flag ? [element("span", { class: "flag" }, flag)] : []),
+          ...(sources ? [element("div", { class: "soft sources" }, sources)] : []),
+        ];
+      },
+      heading,
+    );
   }
 
   private fill(
@@ -60,7 +77,11 @@ export class ParameterTable {
     cell: (name: string, channel: string) => (string | HTMLElement)[],
     heading: (channel: string) => string = (channel) => channel,
   ): void {
-    const head = element("tr", {}, ...["parameter", "unit", ...channels.map(heading)].map((text) => element("th", { scope: "col" }, text)));
+    const head = element(
+      "tr",
+      {},
+      ...["parameter", "unit", ...channels.map(heading)].map((text) => element("th", { scope: "col" }, text)),
+    );
     const rows = names.map((name) =>
       element(
         "tr",
@@ -70,6 +91,8 @@ export class ParameterTable {
         ...channels.map((channel) => element("td", { class: "number" }, ...cell(name, channel))),
       ),
     );
-    this.root.replaceChildren(element("table", {}, element("caption", {}, caption), element("thead", {}, head), element("tbody", {}, ...rows)));
+    this.root.replaceChildren(
+      element("table", {}, element("caption", {}, caption), element("thead", {}, head), element("tbody", {}, ...rows)),
+    );
   }
 }

@@ -1,4 +1,7 @@
-/** What a setup link opens: makes the administrator's token and signs the browser in; the token is shown this once, beside the page. */
+/**
+ * What a setup link opens: makes the administrator's token and signs the browser in; the token is shown this once,
+ * beside the page.
+ */
 
 import { sentenceOf, setUp } from "./api";
 import { element } from "./element";
@@ -16,7 +19,12 @@ export class SetupView {
     this.make.addEventListener("click", () => void this.redeem());
     this.root.append(
       element("h2", {}, "Set up this server"),
-      element("p", {}, "Nobody has a token for this server yet. Make the first one: it may do everything, other tokens included, and this browser is signed in with it."),
+      element(
+        "p",
+        {},
+        "Nobody has a token for this server yet. Make the first one: it may do everything, other tokens " +
+          "included, and this browser is signed in with it.",
+      ),
       this.make,
       this.refusal,
     );
@@ -49,7 +57,12 @@ export function tokenCard(token: string, onKept: () => void): HTMLElement {
     "section",
     { class: "setup" },
     element("h2", {}, "Your administrator's token"),
-    element("p", {}, "Keep it where you keep passwords: it is not shown again. This browser is signed in already; the command line reads it from the variable DENTINE__CLIENT__TOKEN."),
+    element(
+      "p",
+      {},
+      "Keep it where you keep passwords: it is not shown again. This browser is signed in already; the command " +
+        "line reads it from the variable DENTINE__CLIENT__TOKEN.",
+    ),
     shown,
     element("p", { class: "fields" }, copy, kept, copied),
   );

@@ -4,7 +4,13 @@ import { sentenceOf, signIn } from "./api";
 import { element } from "./element";
 
 export class SignIn {
-  private readonly token = element("input", { id: "token", type: "password", autocomplete: "current-password", required: "", spellcheck: "false" });
+  private readonly token = element("input", {
+    id: "token",
+    type: "password",
+    autocomplete: "current-password",
+    required: "",
+    spellcheck: "false",
+  });
   private readonly refusal = element("p", { class: "failure", role: "alert" });
   readonly root = element(
     "form",

@@ -7,8 +7,16 @@ import { showPicture } from "./lanes";
 const PICTURE = /^phase_(.+)\.svg$/;
 
 export class SlabView {
-  readonly progress = element("div", { "aria-live": "polite" }, element("p", { class: "soft" }, "No wavelength is done yet; each is fitted as a whole."));
-  readonly phases = element("div", { class: "phases" }, element("p", { class: "soft" }, "No phase function yet; it comes when all wavelengths are done."));
+  readonly progress = element(
+    "div",
+    { "aria-live": "polite" },
+    element("p", { class: "soft" }, "No wavelength is done yet; each is fitted as a whole."),
+  );
+  readonly phases = element(
+    "div",
+    { class: "phases" },
+    element("p", { class: "soft" }, "No phase function yet; it comes when all wavelengths are done."),
+  );
   /** What is told of each wavelength that is done, by its length in nm. */
   private readonly told = new Map<number, string>();
   private shown = "";
@@ -20,12 +28,17 @@ export class SlabView {
     if (typeof wavelength !== "number" || typeof all !== "number") return;
     this.told.set(wavelength, event.message);
     const rows = [...this.told].sort(([one], [other]) => one - other).map(([, message]) => element("li", {}, message));
-    this.progress.replaceChildren(element("p", { class: "soft" }, `${this.told.size} of ${all} wavelengths done.`), element("ul", { class: "wavelengths" }, ...rows));
+    this.progress.replaceChildren(
+      element("p", { class: "soft" }, `${this.told.size} of ${all} wavelengths done.`),
+      element("ul", { class: "wavelengths" }, ...rows),
+    );
   }
 
   /** The report's pictures, once they are there. */
   list(files: Artifact[]): void {
-    const names = files.map((file) => PICTURE.exec(file.path)?.[1]).filter((name): name is string => name !== undefined);
+    const names = files
+      .map((file) => PICTURE.exec(file.path)?.[1])
+      .filter((name): name is string => name !== undefined);
     if (!names.length || this.shown === names.join()) return;
     this.shown = names.join();
     names.sort((one, other) => Number(one) - Number(other));
@@ -33,10 +46,14 @@ export class SlabView {
   }
 
   private figure(name: string): HTMLElement {
-    const alt = `Phase function at ${name} nm: per sr, against the scattering angle from 0 to 180 degrees, with its standard error`;
+    const alt =
+      `Phase function at ${name} nm: per sr, against the scattering angle from 0 to 180 degrees, ` +
+      "with its standard error";
     const picture = element("img", { alt, width: "640", height: "300" });
     showPicture(picture, artifactUrl(this.job, `phase_${name}.svg`));
-    const says = `${name} nm. The band is ± one standard error; in grey ranges the images do not tell, and the values are the prior's.`;
+    const says =
+      `${name} nm. The band is ± one standard error; ` +
+      "in grey ranges the images do not tell, and the values are the prior's.";
     return element("figure", {}, picture, element("figcaption", {}, says));
   }
 }

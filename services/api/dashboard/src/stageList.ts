@@ -28,7 +28,8 @@ export class StageList {
     if (!event.stage) return;
     const row = this.row(event.stage);
     row.root.dataset["state"] = event.kind === "finished" ? "finished" : "running";
-    row.state.textContent = `${event.kind === "finished" ? "finished" : "running"}${event.attempt > 1 ? `, attempt ${event.attempt}` : ""}`;
+    const attempt = event.attempt > 1 ? `, attempt ${event.attempt}` : "";
+    row.state.textContent = `${event.kind === "finished" ? "finished" : "running"}${attempt}`;
     if (event.message) row.note.textContent = event.message;
     if (event.done !== null || event.kind === "started") this.advance(row, event.done ?? 0, event.kind !== "finished");
   }

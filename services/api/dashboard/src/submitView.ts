@@ -1,6 +1,18 @@
 /** The form for a job, built from the server's own schema of options: source, preset, name, then groups of options. */
 
-import { type Capture, getOptions, listCalibrations, listCaptures, listPresets, type NamedCalibration, type OptionsSchema, type Preset, sentenceOf, submitJob, Unauthenticated } from "./api";
+import {
+  type Capture,
+  getOptions,
+  listCalibrations,
+  listCaptures,
+  listPresets,
+  type NamedCalibration,
+  type OptionsSchema,
+  type Preset,
+  sentenceOf,
+  submitJob,
+  Unauthenticated,
+} from "./api";
 import { element } from "./element";
 import { bytes, when } from "./format";
 import { OptionField } from "./optionField";
@@ -9,8 +21,36 @@ const SOURCES = new Set(["capture", "rig"]);
 /** Groups by the options that they hold; what the schema has besides comes last, so that no option is missing. */
 const GROUPS: [string, string[]][] = [
   ["What is fitted", ["kind", "fdi", "boundary", "ior", "dentin", "stains", "lobes"]],
-  ["Images", ["channels", "held_out_lights", "calibration", "accept_calibration", "instrument", "shadows", "pixel_step", "sensor_noise_relative", "sensor_noise_floor"]],
-  ["Accuracy and time", ["samples_per_pixel", "max_samples_per_pixel", "max_steps", "image_tolerance", "search_candidates", "advise", "seed", "priority", "workers", "memory_gib", "device"]],
+  [
+    "Images",
+    [
+      "channels",
+      "held_out_lights",
+      "calibration",
+      "accept_calibration",
+      "instrument",
+      "shadows",
+      "pixel_step",
+      "sensor_noise_relative",
+      "sensor_noise_floor",
+    ],
+  ],
+  [
+    "Accuracy and time",
+    [
+      "samples_per_pixel",
+      "max_samples_per_pixel",
+      "max_steps",
+      "image_tolerance",
+      "search_candidates",
+      "advise",
+      "seed",
+      "priority",
+      "workers",
+      "memory_gib",
+      "device",
+    ],
+  ],
   ["Slab", ["dictionary", "particle_index", "particle_absorption", "effort"]],
   ["Solver", ["solver", "loss", "adam_steps", "adam_rate", "prior", "held"]],
 ];
@@ -45,8 +85,17 @@ export class SubmitView {
   }
 
   async start(): Promise<void> {
-    const [schema, presets, captures, calibrations] = await Promise.all([getOptions(), listPresets(), listCaptures(), listCalibrations()]);
-    this.fill(schema, presets, captures.captures.filter((one) => one.state === "committed"));
+    const [schema, presets, captures, calibrations] = await Promise.all([
+      getOptions(),
+      listPresets(),
+      listCaptures(),
+      listCalibrations(),
+    ]);
+    this.fill(
+      schema,
+      presets,
+      captures.captures.filter((one) => one.state === "committed"),
+    );
     this.offer(calibrations);
   }
 
@@ -55,25 +104,41 @@ export class SubmitView {
   private fill(schema: OptionsSchema, presets: Preset[], captures: Capture[]): void {
     this.presets = presets.filter((one) => !("rig" in one.options));
     const option = (value: string, text: string) => element("option", { value }, text);
-    this.source.append(option("capture", "An uploaded capture"), option("rig", "A rig"), option(DEMO, "The demonstration's virtual incisor"));
-    this.capture.append(...captures.map((one) => option(one.id, `${one.subject ?? one.id}, ${bytes(one.bytes)}, ${when(one.created_s)}`)));
+    this.source.append(
+      option("capture", "An uploaded capture"),
+      option("rig", "A rig"),
+      option(DEMO, "The demonstration's virtual incisor"),
+    );
+    this.capture.append(
+      ...captures.map((one) => option(one.id, `${one.subject ?? one.id}, ${bytes(one.bytes)}, ${when(one.created_s)}`)),
+    );
     this.preset.append(...this.presets.map((one) => option(one.name, one.name)));
     this.preset.value = "standard";
     this.source.value = this.chosen === "rig" ? "rig" : captures.length || this.chosen ? "capture" : DEMO;
     if (captures.some((one) => one.id === this.chosen)) this.capture.value = this.chosen;
 
     const rig = schema.$defs["RigSpec"]?.properties ?? {};
-    const inOrder = [...RIG_FIRST, ...Object.keys(rig).filter((name) => !RIG_FIRST.includes(name) && rig[name]?.["$ref"] === undefined)];
+    const inOrder = [
+      ...RIG_FIRST,
+      ...Object.keys(rig).filter((name) => !RIG_FIRST.includes(name) && rig[name]?.["$ref"] === undefined),
+    ];
     this.rigFields = inOrder.map((name) => new OptionField(`rig.${name}`, rig[name] ?? {}, name === "mouth"));
     this.rigOptions.append(element("div", { class: "options" }, ...this.rigFields.map((field) => field.root)));
 
     const grouped = new Set(GROUPS.flatMap(([, names]) => names));
     const others = Object.keys(schema.properties).filter((name) => !grouped.has(name) && !SOURCES.has(name));
     for (const [title, names] of [...GROUPS, ["Other options", others] as [string, string[]]]) {
-      const fields = names.filter((name) => name in schema.properties).map((name) => new OptionField(name, schema.properties[name] ?? {}));
+      const fields = names
+        .filter((name) => name in schema.properties)
+        .map((name) => new OptionField(name, schema.properties[name] ?? {}));
       if (!fields.length) continue;
       this.fields.push(...fields);
-      const group = element("details", {}, element("summary", {}, title), element("div", { class: "options" }, ...fields.map((field) => field.root)));
+      const group = element(
+        "details",
+        {},
+        element("summary", {}, title),
+        element("div", { class: "options" }, ...fields.map((field) => field.root)),
+      );
       if (title === GROUPS[0]?.[0]) group.open = true;
       this.options.append(group);
     }
@@ -82,18 +147,49 @@ export class SubmitView {
 
   private offer(calibrations: NamedCalibration[]): void {
     const field = this.fields.find((one) => one.name === "calibration");
-    if (calibrations.length) field?.suggest(calibrations.map((one) => [`calibrations/${one.name}`, `${one.name}: ${one.state}`]));
+    if (calibrations.length)
+      field?.suggest(calibrations.map((one) => [`calibrations/${one.name}`, `${one.name}: ${one.state}`]));
   }
 
   private arrange(hasCaptures: boolean): void {
-    const labelled = (text: string, input: HTMLElement, ...more: HTMLElement[]) => element("div", { class: "option" }, element("label", { for: input.id }, text), input, ...more);
-    const upload = element("a", { href: "#/new" }, hasCaptures ? "Upload another one" : "There is none yet; upload one");
+    const labelled = (text: string, input: HTMLElement, ...more: HTMLElement[]) =>
+      element("div", { class: "option" }, element("label", { for: input.id }, text), input, ...more);
+    const upload = element(
+      "a",
+      { href: "#/new" },
+      hasCaptures ? "Upload another one" : "There is none yet; upload one",
+    );
     this.capture.hidden = !hasCaptures;
     this.root.append(
       element("h2", {}, "Submit a job"),
-      element("section", {}, element("h3", {}, "Source"), element("div", { class: "options" }, labelled("What is fitted from", this.source), labelled("Capture", this.capture, element("p", { class: "help" }, upload)))),
+      element(
+        "section",
+        {},
+        element("h3", {}, "Source"),
+        element(
+          "div",
+          { class: "options" },
+          labelled("What is fitted from", this.source),
+          labelled("Capture", this.capture, element("p", { class: "help" }, upload)),
+        ),
+      ),
       this.rigOptions,
-      element("section", {}, element("h3", {}, "Options"), element("div", { class: "options" }, labelled("Preset", this.preset, this.summary), labelled("Name of the job", this.name, element("p", { class: "soft help" }, "A label for people, up to 80 characters; may stay empty."))), this.options),
+      element(
+        "section",
+        {},
+        element("h3", {}, "Options"),
+        element(
+          "div",
+          { class: "options" },
+          labelled("Preset", this.preset, this.summary),
+          labelled(
+            "Name of the job",
+            this.name,
+            element("p", { class: "soft help" }, "A label for people, up to 80 characters; may stay empty."),
+          ),
+        ),
+        this.options,
+      ),
       this.refusal,
       element("p", {}, this.go),
     );
@@ -126,7 +222,11 @@ export class SubmitView {
     if (wrong.length) return;
     this.go.disabled = true;
     try {
-      const job = await submitJob({ ...values(this.fields), ...this.origin(), ...(this.name.value.trim() ? { name: this.name.value.trim() } : {}) });
+      const job = await submitJob({
+        ...values(this.fields),
+        ...this.origin(),
+        ...(this.name.value.trim() ? { name: this.name.value.trim() } : {}),
+      });
       location.hash = `#/${job.id}`;
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
@@ -138,7 +238,12 @@ export class SubmitView {
 
   private origin(): object {
     if (this.source.value === DEMO) return { rig: { mouth: DEMO } };
-    if (this.source.value === "rig") return { rig: Object.fromEntries(Object.entries(values(this.rigFields)).map(([name, value]) => [name.slice("rig.".length), value])) };
+    if (this.source.value === "rig")
+      return {
+        rig: Object.fromEntries(
+          Object.entries(values(this.rigFields)).map(([name, value]) => [name.slice("rig.".length), value]),
+        ),
+      };
     return { capture: `captures/${this.capture.value}` };
   }
 
@@ -157,5 +262,7 @@ export class SubmitView {
 }
 
 function values(fields: OptionField[]): Record<string, unknown> {
-  return Object.fromEntries(fields.map((field) => [field.name, field.value()]).filter(([, value]) => value !== undefined));
+  return Object.fromEntries(
+    fields.map((field) => [field.name, field.value()]).filter(([, value]) => value !== undefined),
+  );
 }

@@ -1,4 +1,7 @@
-/** A place for a folder with a capture: dropped or chosen, uploaded with a bar, and gone on with when the same folder comes again. */
+/**
+ * A place for a folder with a capture: dropped or chosen, uploaded with a bar, and gone on with when the same folder
+ * comes again.
+ */
 
 import { sentenceOf, Unauthenticated } from "./api";
 import { element } from "./element";
@@ -9,7 +12,12 @@ import { bytes } from "./format";
 const LEFT_OUT_SHOWN = 3;
 
 export class UploadCard {
-  private readonly picker = element("input", { id: "folder", type: "file", webkitdirectory: "", class: "hidden-input" });
+  private readonly picker = element("input", {
+    id: "folder",
+    type: "file",
+    webkitdirectory: "",
+    class: "hidden-input",
+  });
   private readonly zone = element(
     "div",
     { class: "drop" },
@@ -73,11 +81,13 @@ export class UploadCard {
     this.note.hidden = false;
     this.leftOut.hidden = leftOut.length === 0;
     const more = leftOut.length > LEFT_OUT_SHOWN ? ` and ${leftOut.length - LEFT_OUT_SHOWN} more` : "";
-    this.leftOut.textContent = `Left out, as no part of a capture: ${leftOut.slice(0, LEFT_OUT_SHOWN).join(", ")}${more}.`;
+    const shown = leftOut.slice(0, LEFT_OUT_SHOWN).join(", ");
+    this.leftOut.textContent = `Left out, as no part of a capture: ${shown}${more}.`;
   }
 
   private tell({ phase, path, doneBytes, totalBytes }: UploadProgress): void {
     this.bar.value = totalBytes ? doneBytes / totalBytes : 0;
-    this.note.textContent = `${phase === "hashing" ? "Reading" : "Sending"} ${path}: ${bytes(doneBytes)} of ${bytes(totalBytes)}.`;
+    const doing = phase === "hashing" ? "Reading" : "Sending";
+    this.note.textContent = `${doing} ${path}: ${bytes(doneBytes)} of ${bytes(totalBytes)}.`;
   }
 }

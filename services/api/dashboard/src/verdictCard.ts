@@ -19,17 +19,38 @@ export class VerdictCard {
     this.shown = told;
     const thickness = verdict.enamel_thickness;
     const errors = Object.entries(verdict.channels).map(([channel, error]) => `${channel} ${figureOf(error)}`);
-    const note = verdict.error_of === "held-out" ? errors.join(", ") : `${errors.join(", ")}; every image was fitted, so nothing tests the result`;
+    const note =
+      verdict.error_of === "held-out"
+        ? errors.join(", ")
+        : `${errors.join(", ")}; every image was fitted, so nothing tests the result`;
     const facts = [
-      fact(verdict.error_of === "held-out" ? "Error on held-out images" : "Error on fitted images", figureOf(verdict.error), note),
+      fact(
+        verdict.error_of === "held-out" ? "Error on held-out images" : "Error on fitted images",
+        figureOf(verdict.error),
+        note,
+      ),
       ...(thickness ? [fact("Enamel thickness", lengthOf(thickness), "mean over what the first camera sees")] : []),
     ];
-    const trouble = element("p", { class: "failure", role: "alert" }, element("strong", {}, verdict.headline), ` ${verdict.advice}`);
+    const trouble = element(
+      "p",
+      { class: "failure", role: "alert" },
+      element("strong", {}, verdict.headline),
+      ` ${verdict.advice}`,
+    );
     const advice = verdict.advice ? [element("p", { class: "soft" }, verdict.advice)] : [];
-    this.root.replaceChildren(...(verdict.converged ? [] : [trouble]), element("dl", {}, ...facts), ...(verdict.converged ? advice : []));
+    this.root.replaceChildren(
+      ...(verdict.converged ? [] : [trouble]),
+      element("dl", {}, ...facts),
+      ...(verdict.converged ? advice : []),
+    );
   }
 }
 
 function fact(name: string, value: string, note: string): HTMLElement {
-  return element("div", {}, element("dt", {}, name), element("dd", {}, element("strong", {}, value), element("span", { class: "soft" }, note)));
+  return element(
+    "div",
+    {},
+    element("dt", {}, name),
+    element("dd", {}, element("strong", {}, value), element("span", { class: "soft" }, note)),
+  );
 }

@@ -28,7 +28,10 @@ export class WorkerList {
 }
 
 function item(worker: Worker): HTMLElement {
-  const tasks = worker.tasks.flatMap((task) => [task.job === null ? `${task.stage} of others` : element("a", { href: `#/${task.job}` }, task.stage), " "]);
+  const tasks = worker.tasks.flatMap((task) => [
+    task.job === null ? `${task.stage} of others` : element("a", { href: `#/${task.job}` }, task.stage),
+    " ",
+  ]);
   const doing = tasks.length > 0 ? tasks : [`${worker.fault || idle(worker)} `];
   const limit = worker.memory_limit_bytes === null ? "" : ` of ${bytes(worker.memory_limit_bytes)}`;
   const memory = element("span", { class: "soft" }, `${worker.host}, ${bytes(worker.memory_bytes)}${limit}`);
