@@ -82,12 +82,22 @@ def _made(folder: Path) -> Path:
 
 
 def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
-    out = tmp_path / "registered"
-    command = [sys.executable, "-m", "services", "register", str(mouth.root), "--out", str(out)]
+    out, calibration = tmp_path / "registered", tmp_path / "calibration.json"
+    known = json.loads((mouth.root / "calibration.json").read_text())
+    limit = {"what": "Lights' positions", "value": 5.0, "limit": 2.0, "unit": "mm"}
+    calibration.write_text(json.dumps(known | {"limits": [limit]}))
+    command = [sys.executable, "-m", "services", "register", str(mouth.root)]
+    command += ["--calibration", str(calibration), "--out", str(out)]
     answer = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
     assert answer.returncode == 0, answer.stderr
     assert "teeth: 11, 12, 13, 21, 22, 23" in answer.stdout
     record = read_record(out / "registration.json", Registration)
+    beyond = (
+        "Calibration calibration.json is beyond its limits: Lights' positions is 5 mm, and 2 mm is the limit; calibrate"
+        " again as its report advises."
+    )
+    assert record.warnings == (beyond,)
+    assert beyond in answer.stdout
     assert [step.name for step in record.steps] == ["landmarks", "outlines"]
     assert record.uncertainty.names == tuple(f"teeth.{axis}" for axis in ("rx", "ry", "rz", "tx", "ty", "tz"))
     assert (out / "registration.html").is_file()

@@ -103,6 +103,15 @@ def test_a_folder_is_described_and_read_again(photographs: Path) -> None:
         import_folder(photographs, None, None, None)
 
 
+def test_a_calibration_that_cannot_be_read_is_refused_before_anything_is_written(photographs: Path) -> None:
+    with pytest.raises(CaptureInputError, match=r"calibration\.json does not exist; check the path\."):
+        import_folder(photographs, None, "GBRG", photographs / "calibration.json")
+    (photographs / "calibration.json").write_text("{}")
+    with pytest.raises(CaptureInputError, match=r"calibration\.json: .*; correct it\."):
+        import_folder(photographs, None, "GBRG", photographs / "calibration.json")
+    assert not (photographs / "raw.toml").exists()
+
+
 def test_what_one_camera_lacks_is_said(photographs: Path) -> None:
     (photographs / "right" / "black_10ms.png").unlink()
     (photographs / "right" / "L2_10ms.png").unlink()

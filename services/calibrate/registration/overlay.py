@@ -71,6 +71,7 @@ def report_page(record: Registration) -> str:
     return template.render(
         teeth=", ".join(map(str, record.teeth)),
         repairs=record.repairs,
+        warnings=record.warnings,
         misfit_mm=f"{record.misfit_mm:.3f}",
         rows=rows,
         pictures=record.pictures,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from services.calibrate.registration.overlay import report_page, write_overlay
 from services.calibrate.registration.photographs import cameras_of, clicks_of, cut_out, photographs, require_facing
 from services.calibrate.registration.pose import Floats, PoseStep, RigidPose
 from services.core.calibration.record import Calibration
+from services.core.calibration.state import warnings_of
 from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import write_mesh
@@ -98,7 +100,8 @@ def register_folder(
     inputs = {
         path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (root / folder.scan.file, calibration_path)
     }
-    record = _record(steps, scanned, misfit_mm, inputs, tuple(pictures))
+    warnings = warnings_of(calibration, calibration_path.name, time.time())
+    record = _record(steps, scanned, misfit_mm, inputs, tuple(pictures), warnings)
     write_atomic(out / PAGE, report_page(record).encode())
     write_record(out / REGISTRATION, record)
     return record
@@ -217,6 +220,7 @@ def _record(
     misfit_mm: float,
     inputs: dict[str, str],
     pictures: tuple[str, ...],
+    warnings: tuple[str, ...],
 ) -> Registration:
     last = steps[-1]
     x, y, z = last.pose.apply(scanned.centre_mm[None])[0]
@@ -242,6 +246,7 @@ def _record(
         repairs=scanned.repairs,
         inputs=inputs,
         pictures=pictures,
+        warnings=warnings,
     )
 
 

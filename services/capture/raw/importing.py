@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from services.capture.raw.names import NamedFrame, named_frame
+from services.core.calibration.record import Calibration
 from services.core.errors import CaptureInputError
 from services.core.files.scans import FORMATS
 from services.core.raw.decoding import CAMERA_RAW, Decoded, decode
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
 from services.core.raw.records import THING_OF, RawFolder
 from services.core.raw.toml_writing import description_toml, toml_value
-from services.core.store import write_atomic
+from services.core.store import read_record, write_atomic
 
 IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
 DEPTHS = (8, 10, 12, 14, 16)
@@ -79,8 +80,8 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         calibration: of the rig.
 
     Raises:
-        CaptureInputError: there is a description already, no file can be understood, or files of a camera differ; names
-            the file.
+        CaptureInputError: there is a description already, no file can be understood, files of a camera differ, or the
+            calibration cannot be read; names the file.
     """
     if (root / DESCRIPTION).exists():
         raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")
@@ -91,6 +92,8 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         raise CaptureInputError(
             f"{root} holds no photograph; put {', '.join(sorted(IMAGES - CAMERA_RAW))} or camera raw files there."
         )
+    if calibration is not None:
+        read_record(calibration, Calibration)
     told = {file: named_frame(file) for file in files}
     frames = [one for one in told.values() if isinstance(one, NamedFrame)]
     unnamed = [

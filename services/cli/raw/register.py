@@ -39,5 +39,7 @@ def register(
         print(f"{step.name}: {step.points} points, {step.residual_mm:.3f} mm in the median")
         for text in step.left_out:
             print(f"  left out: {text}")
+    for sentence in record.warnings:
+        print(sentence)
     print(f"teeth: {', '.join(map(str, record.teeth))}; {record.repairs}")
     print(f"report: {(raw if out is None else out) / PAGE}")

@@ -78,11 +78,19 @@ def require_within_limits(calibration: Calibration, name: str, *, accepted: bool
 
 def refusal(name: str, broken: tuple[str, ...]) -> str:
     """The sentence that refuses a calibration beyond its limits."""
+    return f"{_beyond(name, broken)}, or accept it with accept_calibration = true."
+
+
+def warnings_of(calibration: Calibration, name: str, now_s: float) -> tuple[str, ...]:
+    """Sentences on a calibration beyond its limits, or older than it holds, where it is used all the same."""
+    broken = broken_limits(calibration)
+    beyond = f"{_beyond(name, broken)}." if broken else None
+    return tuple(one for one in (beyond, warning_of_age(calibration, name, now_s)) if one is not None)
+
+
+def _beyond(name: str, broken: tuple[str, ...]) -> str:
     more = f" (and {len(broken) - 1} more)" if broken[1:] else ""
-    return (
-        f"Calibration {name} is beyond its limits: {broken[0]}{more}; "
-        "calibrate again as its report advises, or accept it with accept_calibration = true."
-    )
+    return f"Calibration {name} is beyond its limits: {broken[0]}{more}; calibrate again as its report advises"
 
 
 def _in_words(limit: CalibrationLimit) -> str:
