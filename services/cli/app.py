@@ -61,6 +61,7 @@ def build_app() -> typer.Typer:
     from services.cli.raw.board import board_command
     from services.cli.raw.calibrate import calibrate_command
     from services.cli.raw.import_folder import import_command
+    from services.cli.raw.landmarks import landmarks
     from services.cli.raw.register import register
     from services.cli.run import run
     from services.cli.secrets import build_secrets_app
@@ -78,7 +79,7 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_root)
-    local = serve, dome_sim, capture, run, options, export, register, phantom, bench
+    local = serve, dome_sim, capture, run, options, export, landmarks, register, phantom, bench
     for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo, keep_calibration):
         app.command()(command)
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
@@ -104,6 +105,7 @@ _EXTRAS = MappingProxyType(
         "dome-sim": "capture",
         "bench": "worker,bench",
         "import": "preprocess",
+        "landmarks": "calibrate,preprocess",
         "register": "calibrate,preprocess",
     }
 )

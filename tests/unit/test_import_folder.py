@@ -156,7 +156,7 @@ def test_a_scan_is_offered_to_be_filled_in(tmp_path: Path) -> None:
     np.save(tmp_path / "left_L1_10ms.npy", counts(1, 1))
     (tmp_path / "upper.stl").write_bytes(b"")
     imported = import_folder(tmp_path, None, "RGGB", None)
-    assert imported.missing[-1].endswith("to be filled in for upper.stl at the end of raw.toml.")
+    assert imported.missing[-1].endswith("lines to be filled in for upper.stl stand at the end of raw.toml.")
     text = (tmp_path / "raw.toml").read_text()
     assert '# [scan]\n# file = "upper.stl"' in text
     assert "# [[landmark]]" in text

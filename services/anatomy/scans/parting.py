@@ -131,7 +131,8 @@ def _require_points(mesh: Mesh, points_mm: Mapping[int, Array], teeth: tuple[int
     if len(teeth) < 2:
         raise CaptureInputError(
             f"{what[0].upper()}{what[1:]} has no labels, and landmarks name {len(teeth)} of its teeth; click one point"
-            " on each tooth, in the middle of its edge or chewing surface, or export the scan with its segmentation."
+            " on each tooth, in the middle of its edge or chewing surface, in the page of dentine landmarks, or export"
+            " the scan with its segmentation."
         )
     for fdi in teeth:
         if not (fdi // 10 in PERMANENT_QUADRANTS and 1 <= fdi % 10 <= TEETH_A_QUADRANT):

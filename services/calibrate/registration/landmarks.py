@@ -85,7 +85,7 @@ def fit_landmarks(
     if most < MIN_CLICKS:
         raise CaptureInputError(
             f"No camera sees {MIN_CLICKS} landmarks of the scan (the most are {most}); add [[landmark]] entries to"
-            " raw.toml, spread over the arch."
+            " raw.toml, spread over the arch; dentine landmarks writes a page in which they are clicked."
         )
     starts = list(_starts(cameras, clicks))
     if not starts:

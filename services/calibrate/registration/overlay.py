@@ -37,7 +37,7 @@ def write_overlay(
     """
     import cv2
 
-    picture = _displayed(view.image)
+    picture = displayed(view.image)
     for step in steps:
         contour, _ = tooth_contours(view.camera, _placed(teeth, step.pose), _placed(occluders, step.pose))
         column, row = np.floor(contour.pixels).astype(int).T
@@ -87,8 +87,8 @@ def _placed(meshes: Sequence[Mesh], pose: RigidPose) -> list[Mesh]:
     return [Mesh(pose.apply(mesh.vertices_mm), mesh.faces) for mesh in meshes]
 
 
-def _displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    # Blue, green, red of the first three channels, or grey.
+def displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Blue, green and red (H, W, 3) of the first three channels of linear radiance, or grey, for the eye."""
     bright = max(float(np.percentile(image, BRIGHT_PERCENT)), 1e-12)
     shown = np.clip(image[..., :3] / bright, 0, 1) ** (1 / GAMMA)
     colours = shown[..., ::-1] if shown.shape[-1] == 3 else np.repeat(shown[..., :1], 3, axis=-1)

@@ -41,17 +41,31 @@ def photographs(root: Path, folder: RawFolder, calibration: Calibration) -> dict
     views = {}
     for raw in folder.camera:
         camera = _calibrated(calibration, raw.name, raw.size)
-        frames = folder.frames_of(raw.name, "tracking")[:1] or _some(folder.frames_of(raw.name, "light"))
-        if not frames:
-            raise CaptureInputError(
-                f"Camera {raw.name} has no frame of kind tracking or light; add one that shows the teeth, or remove the"
-                " camera."
-            )
-        black = _black_counts(root, folder, raw.name, camera)
-        images = [_image(root, folder, frame, black) for frame in frames]
-        mean = np.asarray(np.mean(images, axis=0), dtype=np.float32)
-        views[raw.name] = _undistorted(mean, camera)
+        views[raw.name] = _undistorted(mean_photograph(root, folder, raw.name, camera.black_counts), camera)
     return views
+
+
+def mean_photograph(root: Path, folder: RawFolder, name: str, black: float | None = None) -> NDArray[np.float32]:
+    """One camera's teeth under all lights, or under the mean of some, as its lens shows them.
+
+    Args:
+        name: of the camera.
+        black: its black level in counts; None to read it from a black frame.
+
+    Returns:
+        Counts above black a second (H, W, C); of half the size for a mosaic with more pixels than are looked at.
+
+    Raises:
+        CaptureInputError: it has no frame of the teeth.
+    """
+    frames = folder.frames_of(name, "tracking")[:1] or _some(folder.frames_of(name, "light"))
+    if not frames:
+        raise CaptureInputError(
+            f"Camera {name} has no frame of kind tracking or light; add one that shows the teeth, or remove the camera."
+        )
+    level = _black_counts(root, folder, name) if black is None else black
+    images = [_image(root, folder, frame, level) for frame in frames]
+    return np.asarray(np.mean(images, axis=0), dtype=np.float32)
 
 
 def clicks_of(folder: RawFolder, calibration: Calibration, views: Mapping[str, View]) -> list[Click]:
@@ -142,9 +156,7 @@ def _some(frames: Sequence[RawFrame]) -> Sequence[RawFrame]:
     return [frames[k * len(frames) // count] for k in range(count)]
 
 
-def _black_counts(root: Path, folder: RawFolder, name: str, camera: CalibratedCamera) -> float:
-    if camera.black_counts is not None:
-        return camera.black_counts
+def _black_counts(root: Path, folder: RawFolder, name: str) -> float:
     frames = folder.frames_of(name, "black")
     return float(read_counts(root, folder, frames[0]).mean()) if frames else 0.0
 

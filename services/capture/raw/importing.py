@@ -224,8 +224,11 @@ def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[st
     if folder.calibration is None:
         yield "No calibration is named; add [calibration] file, or give a job one by its option 'calibration'."
     if not (root / "teeth").is_dir() and folder.scan is None:
-        found = f" to be filled in for {scans[0]} at the end of {DESCRIPTION}" if scans else ""
-        yield f"There are no teeth; add teeth/<FDI>/outer.ply, or a [scan] and landmarks{found}."
+        found = f"; lines to be filled in for {scans[0]} stand at the end of {DESCRIPTION}" if scans else ""
+        yield (
+            "There are no teeth; add teeth/<FDI>/outer.ply, or a [scan] and landmarks, which are clicked in the page of"
+            f" dentine landmarks{found}."
+        )
 
 
 def _is_out_of_order(folder: RawFolder, camera: str) -> bool:

@@ -1,1 +1,1 @@
-"""The commands that lead from photographs as cameras write them to a capture: import, board, calibrate, register."""
+"""Commands from photographs as cameras write them to a capture: import, board, calibrate, landmarks, register."""

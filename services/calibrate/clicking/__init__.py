@@ -1,0 +1,1 @@
+"""A page in which a person clicks landmarks in a scan and in photographs."""
