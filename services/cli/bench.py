@@ -16,6 +16,7 @@ _BENCHMARKS = MappingProxyType(
     {
         "jaw": "services.bench.fits.jaw:run",
         "prepare": "services.bench.preparation.run:run",
+        "prepare-scale": "services.bench.preparation.scale:run",
         "slab": "services.bench.slab.forward:run",
         "slab-map": "services.bench.slab.accuracy:run",
         "slab-mie": "services.bench.slab.dispersions:run",

@@ -38,10 +38,16 @@ class Scene:
     counts: NDArray[np.uint16]
 
 
-def make_scene(root: Path, size: tuple[int, int], lights: int, tracking: int = 4, seed: int = 1) -> Scene:
-    """Publish a capture of ``size`` (width, height): black frames, tracking frames and one frame a light."""
+def make_scene(
+    root: Path, size: tuple[int, int], lights: int, tracking: int = 4, seed: int = 1, share: float = SHARE_OF_HEIGHT
+) -> Scene:
+    """Publish a capture of ``size`` (width, height): black frames, tracking frames and one frame a light.
+
+    Args:
+        share: height of the tooth by that of the image.
+    """
     width, height = size
-    focal_px = SHARE_OF_HEIGHT / 2 * height / HALF_AXES_MM[1] * DISTANCE_MM
+    focal_px = share / 2 * height / HALF_AXES_MM[1] * DISTANCE_MM
     camera = Camera(
         name="c0",
         size=size,
@@ -75,8 +81,8 @@ def make_scene(root: Path, size: tuple[int, int], lights: int, tracking: int = 4
     grain = rng.normal(scale=20, size=(height, width)).astype(np.float32)
     counts = np.empty((height, width, 3), dtype=np.uint16)
     for frame in frames:
-        share = 0.0 if frame.kind == "black" else max(0.0, (frame.index - 1) / max(tracking - 1, 1))
-        _photograph(counts, grain, focal_px, share if frame.kind == "tracking" else 0.5, lit=frame.kind != "black")
+        moved = max(0.0, (frame.index - 1) / max(tracking - 1, 1)) if frame.kind == "tracking" else 0.5
+        _photograph(counts, grain, focal_px, moved, lit=frame.kind != "black")
         array[0, frame.index] = counts
     ball = trimesh.creation.icosphere(subdivisions=5)
     mesh = Mesh(np.asarray(ball.vertices) * HALF_AXES_MM, np.asarray(ball.faces, dtype=np.int32))
@@ -86,7 +92,7 @@ def make_scene(root: Path, size: tuple[int, int], lights: int, tracking: int = 4
         frames=frames,
         bits=BITS,
         black_level=BLACK,
-        radiance_per_count=1e-3,
+        radiance_per_count=1e-5,
         sensor_noise_relative=0.01,
         sensor_noise_floor=0.002,
         fdi=(11,),
@@ -96,14 +102,14 @@ def make_scene(root: Path, size: tuple[int, int], lights: int, tracking: int = 4
 
 
 def _photograph(
-    counts: NDArray[np.uint16], grain: NDArray[np.float32], focal_px: float, share: float, *, lit: bool
+    counts: NDArray[np.uint16], grain: NDArray[np.float32], focal_px: float, moved: float, *, lit: bool
 ) -> None:
     # A shaded ellipse in parallel projection, near enough for speed, with fixed grain so that no two runs differ
     height, width = grain.shape
-    x = (np.arange(width, dtype=np.float32) - width / 2 - share * MOVED_PX[0]) * (
+    x = (np.arange(width, dtype=np.float32) - width / 2 - moved * MOVED_PX[0]) * (
         DISTANCE_MM / focal_px / HALF_AXES_MM[0]
     )
-    y = (np.arange(height, dtype=np.float32) - height / 2 - share * MOVED_PX[1]) * (
+    y = (np.arange(height, dtype=np.float32) - height / 2 - moved * MOVED_PX[1]) * (
         DISTANCE_MM / focal_px / HALF_AXES_MM[1]
     )
     facing = np.sqrt(np.maximum(1 - x * x - (y * y)[:, None], 0)) if lit else np.zeros_like(grain)

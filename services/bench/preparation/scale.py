@@ -1,0 +1,158 @@
+"""Whole preparations: how time grows with images, what a second worker gains, and what the tooth's region alone gains.
+
+Every preparation is the stage itself, from a published capture to a published store, and runs in processes of its own.
+Seconds are of their processor time, as other work on the machine changes that little; what a second worker gains shows
+in seconds of the clock alone, so measure that on an idle machine.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from services.bench.preparation.scene import SHARE_OF_HEIGHT, make_scene
+from services.core.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SIZES = {True: (1280, 960), False: (5120, 3840)}
+"""Width and height by ``quick``."""
+LIGHTS = 18
+"""Images of one slice, of which capture and store take 4 GB of the disk."""
+SLICES = 9
+FEWER = 6
+SHARES = (0.2, SHARE_OF_HEIGHT, 1.5)
+"""Height of the tooth by that of the image; at 1.5 it fills the image, so that nothing is left out."""
+TURNS = 2
+Row = dict[str, Any]
+Keep = Callable[[list[Row]], object]
+
+
+def run(quick: bool = False, case: str = "images", keep: Keep = lambda _rows: None) -> list[Row]:
+    """Rows of one case.
+
+    Args:
+        case: ``images``: 6, 18, then slices of 18 up to 162. ``workers``: 18 by one and by two, in turns. ``region``: 6
+            of teeth of several sizes.
+
+    Raises:
+        InputError: an unknown case.
+    """
+    cases = {"images": _images, "workers": _workers, "region": _region}
+    if case not in cases:
+        raise InputError(f"Case {case} does not exist; known are {', '.join(cases)}.")
+    rows: list[Row] = []
+    for row in cases[case](SIZES[quick]):
+        rows.append(row)
+        keep(rows)
+    return rows
+
+
+def picture(rows: list[Row]) -> Figure:
+    """Seconds of each row, of the processor where they were measured, else by the clock."""
+    from services.bench.plots import grid
+
+    figure, (axes,) = grid(1)
+    axes.plot([row["seconds"] if "seconds" in row else row["clock_s"] for row in rows], "o")
+    told = ("workers", "tooth_by_height")
+    names = [", ".join(f"{row[key]:g} {key}" for key in ("images", *told) if key in row) for row in rows]
+    axes.set_xticks(range(len(rows)), names, rotation=30, ha="right", fontsize=8)
+    axes.set(ylabel="s", ylim=(0, None))
+    axes.grid(alpha=0.25)
+    return figure
+
+
+def _images(size: tuple[int, int]) -> Iterator[Row]:
+    """Each slice is another capture; the last row is all slices together."""
+    slices = []
+    for number, lights in enumerate((FEWER, *[LIGHTS] * SLICES)):
+        with _captured(size, lights, seed=number + 1) as root:
+            row = _row(lights, *_prepared_apart(root))
+        slices.append(row)
+        yield row
+    whole = slices[1:]
+    seconds, peak_gib = sum(row["seconds"] for row in whole), max(row["peak_gib"] for row in whole)
+    yield _row(LIGHTS * SLICES, seconds, peak_gib) | {"clock_s": sum(row["clock_s"] for row in whole)}
+
+
+def _workers(size: tuple[int, int]) -> Iterator[Row]:
+    """The same capture each time."""
+    with _captured(size, LIGHTS) as root:
+        for _ in range(TURNS):
+            for workers in (1, 2):
+                yield {"images": LIGHTS, "workers": workers, "clock_s": _prepared_on(root, workers)}
+
+
+def _region(size: tuple[int, int]) -> Iterator[Row]:
+    for share in SHARES:
+        with _captured(size, FEWER, share=share) as root:
+            yield {"tooth_by_height": share, **_row(FEWER, *_prepared_apart(root))}
+
+
+def _row(images: int, seconds: float, peak_gib: float, clock_s: float = 0.0) -> Row:
+    return {
+        "images": images,
+        "seconds": seconds,
+        "seconds_per_image": seconds / images,
+        "peak_gib": peak_gib,
+        "clock_s": clock_s,
+    }
+
+
+@contextmanager
+def _captured(size: tuple[int, int], lights: int, seed: int = 1, share: float = SHARE_OF_HEIGHT) -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as folder:
+        make_scene(Path(folder), size, lights, seed=seed, share=share)
+        yield Path(folder)
+
+
+def _prepared_apart(root: Path) -> tuple[float, float, float]:
+    """Processor seconds, peak memory in GiB and seconds by the clock of a preparation in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as apart:
+        return apart.submit(_prepare, root).result()
+
+
+def _prepare(root: Path) -> tuple[float, float, float]:
+    import cv2
+
+    from services.core.records import JobSpec
+    from services.core.stage import LocalContext
+    from services.preprocess import stage
+
+    cv2.setNumThreads(1)
+    stage.check()
+    began_s, clock_s = time.process_time(), time.monotonic()
+    stage.run(JobSpec(capture=root), LocalContext(root))
+    seconds, clock_s = time.process_time() - began_s, time.monotonic() - clock_s
+    return seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, clock_s
+
+
+def _prepared_on(root: Path, workers: int) -> float:
+    """Seconds by the clock of a preparation as a task of a cluster; the workers have imported all before."""
+    from distributed import Client, LocalCluster
+
+    from services.core.placement import STAGES, UNLIMITED
+    from services.core.records import JobSpec
+    from services.core.stage import LocalContext
+    from services.preprocess import stage
+
+    shutil.rmtree(root / "prepared", ignore_errors=True)
+    with (
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, dashboard_address=None, resources={STAGES: UNLIMITED}
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        client.run(stage.check)
+        began_s = time.monotonic()
+        client.submit(stage.run, JobSpec(capture=root), LocalContext(root), resources={STAGES: 1}).result()
+        return time.monotonic() - began_s
