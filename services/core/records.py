@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from enum import IntFlag
 from pathlib import Path
 from types import MappingProxyType
@@ -43,6 +44,23 @@ DictionaryName = Annotated[
 """Of ``DICTIONARIES``."""
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
 Priority = Literal["low", "normal", "high"]
+
+
+STORE_URL = r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9_=-][A-Za-z0-9._=-]{0,99}){0,8}$"
+
+
+def _store_url(value: str) -> str:
+    if not re.fullmatch(STORE_URL, value):
+        raise PydanticCustomError(
+            "store_url",
+            "give s3://BUCKET/PREFIX of letters, digits, '.', '_', '=' and '-', without a slash at the end; "
+            "endpoint and credentials are the environment's",
+        )
+    return value
+
+
+StoreUrl = Annotated[str, AfterValidator(_store_url), WithJsonSchema({"type": "string", "pattern": STORE_URL})]
+"""A place on an S3 server; neither a host nor a key can be written in it, nor a part that leads elsewhere."""
 
 
 class MaskBit(IntFlag):
@@ -245,6 +263,12 @@ class JobSpec(Record):
             "most memory, GiB, that a worker takes to prepare a raw folder's images: "
             "its photographs are worked on in strips as high as that allows"
         ),
+    )
+    store: StoreUrl | None = Field(
+        default=None,
+        description="s3://BUCKET/PREFIX below which the prepared images are kept in place of the job's folder; "
+        "endpoint, region and credentials are those of the workers' environment (AWS_ENDPOINT_URL, AWS_REGION, "
+        "AWS_ACCESS_KEY_ID, …)",
     )
     pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit means over squares of n x n pixels")
     samples_per_pixel: Whole = Field(

@@ -155,6 +155,11 @@ class ServerSettings(Record):
             " commas; default: none where callers need tokens, any on an open server"
         ),
     )
+    stores: str = Field(
+        default="",
+        description="s3://BUCKET/PREFIX below which jobs may keep what they prepare, separated by commas; "
+        "default: none",
+    )
     names: str = Field(
         default="", description="further host names that clients use for this server, separated by commas"
     )

@@ -48,6 +48,7 @@ from services.core.errors import (
     MissingStageError,
     ReadOnlyStoreError,
 )
+from services.core.files.object_store import discard, place_of, remote_folder
 from services.core.geometry import Record
 
 R = TypeVar("R", bound=Record)
@@ -161,22 +162,22 @@ class StageWriter:
         with self._alone():
             self.require_lease()
             if final.exists():
-                shutil.rmtree(retired, ignore_errors=True)
+                discard(retired)
                 final.rename(retired)
             self.folder.rename(final)
             _fsync_folder(self.root)
-        shutil.rmtree(retired, ignore_errors=True)
+        discard(retired)
         return final
 
 
 def withdraw(root: Path, stage: str) -> None:
     """Remove a stage's published result, for readers all at once."""
     published, retired = Path(root) / stage, Path(root) / f".{stage}.retired"
-    shutil.rmtree(retired, ignore_errors=True)
+    discard(retired)
     if published.exists():
         published.rename(retired)
         _fsync_folder(Path(root))
-        shutil.rmtree(retired)
+        discard(retired)
 
 
 def is_published(root: Path, stage: str) -> bool:
@@ -249,6 +250,8 @@ def _require_intact(folder: Path, stage: str, files: dict[str, Any]) -> None:
             raise CorruptStoreError(
                 f"{path} of published stage {stage} differs from its published checksum; {_remedy(stage)}."
             )
+        if path.suffix == ".zarr" and (remote := remote_folder(path)) is not None:
+            remote.require_intact(_remedy(stage))
 
 
 def _remedy(stage: str) -> str:
@@ -270,13 +273,15 @@ def create_array(
     chunk: tuple[int, ...] | None = None,
     codec: Literal["zstd", "lz4"] = "zstd",
 ) -> zarr.Array[Any]:
-    """Create a zarr v3 array. One writer per shard; ``shard`` is also the chunk unless ``chunk`` divides it.
+    """Create a zarr v3 array, where ``place_of`` says.
+
+    One writer per shard; ``shard`` is also the chunk unless ``chunk`` divides it.
 
     Args:
         codec: lz4 takes a third of zstd's time and 5 % more room for noisy single-precision numbers.
     """
     return zarr.create_array(
-        folder / name,
+        place_of(folder / name),
         shape=shape,
         chunks=chunk or shard,
         shards=shard if chunk else None,
@@ -294,8 +299,13 @@ def image_pieces(height: int, width: int) -> tuple[tuple[int, int], tuple[int, i
     return chunk, (rows, columns)
 
 
+def writable_array(path: Path) -> zarr.Array[Any]:
+    """An array that ``create_array`` has made, to be written."""
+    return zarr.open_array(place_of(path), mode="r+", zarr_format=3)
+
+
 class StoredArray:
-    """An array on disk, read by indexing.
+    """An array on disk or on a server, read by indexing.
 
     Raises:
         CorruptStoreError: there is none, or a chunk of what is asked for is damaged; names the array.
@@ -304,7 +314,7 @@ class StoredArray:
     def __init__(self, path: Path) -> None:
         self._path = path
         with self._telling_damage():
-            self._array = zarr.open_array(path, mode="r")
+            self._array = zarr.open_array(place_of(path), mode="r", zarr_format=3)
 
     def __getitem__(self, selection: Any) -> NDArray[Any]:
         with self._telling_damage(asked=(selection,)):

@@ -64,8 +64,8 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
 
     workshop = Workshop(StageWriter(context.root, STAGE, context.attempt))
     digest = digest_of_inputs(spec, source, masks)
-    if not workshop.begin(digest):
-        create_arrays(workshop.folder / "prepared.zarr", source, with_shadows=spec.shadows)
+    if not workshop.begin(digest, spec.store):
+        create_arrays(workshop.arrays, source, with_shadows=spec.shadows)
         workshop.announce(digest)
 
     lights = [source.lights_of(k) for k in range(len(cameras))]

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from services.core.errors import StoreError
+from services.core.files.object_store import discard_remote
 from services.core.store import write_atomic
 
 
@@ -24,18 +25,20 @@ class Erased:
 
 
 def erase(folder: Path) -> Erased:
-    """Remove a folder and everything below it; an absent one counts as empty.
+    """Remove a job's folder, everything below it and what its stages keep on S3 servers; an absent one counts as empty.
 
     A removal that was cut short is gone on with, and counts from its beginning.
 
     Raises:
         StoreError: something could not be read or removed, or what is removed not be noted.
+        PlatformError: what speaks to an S3 server is not installed.
     """
     listing = _listing(folder)
     try:
         if not listing.exists():
             listing.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(listing, json.dumps(asdict(_measure(folder))).encode())
+        discard_remote(folder, "*/*.zarr")
         while folder.exists():
             with suppress(FileNotFoundError):  # gone meanwhile, by whomever
                 shutil.rmtree(folder)

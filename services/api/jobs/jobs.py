@@ -22,11 +22,11 @@ from services.api.jobs.light_limits import LightLimits
 from services.api.jobs.records import Creation, Deletion, Job
 from services.api.jobs.repository import Repository
 from services.api.jobs.runner import RunJob, Runner
-from services.api.jobs.server_paths import ServerPaths
+from services.api.jobs.server_paths import ServerPaths, ServerStores
 from services.api.jobs.table import JobFilter
 from services.api.jobs.time_ranges import TimeRange, TimeRanges
 from services.client.errors import JobStateError, UnknownJobError
-from services.core.errors import SettingsError, StoreError
+from services.core.errors import DentineError, SettingsError
 from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.masks import is_stale
@@ -76,6 +76,7 @@ class Jobs:
         self.captures = Captures(self.repository.engine, self._data, settings.uploads, reader=self.reader)
         self.calibrations = Calibrations(self._data)
         self._light_limits, self.server_paths = LightLimits(settings.dome), ServerPaths.of(settings)
+        self._stores = ServerStores(settings)
         has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
         self._admission = Admission(
             lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks
@@ -86,6 +87,7 @@ class Jobs:
         )
 
         def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
+            self._stores.require(spec)
             return run(self._light_limits.lowered(spec), folder, events)
 
         self._runner = Runner(
@@ -138,8 +140,8 @@ class Jobs:
         """Queue a job, under a label where it is given one.
 
         Raises:
-            SettingsError: a path is relative, absent or may not be named, or an uploaded capture is not committed or
-                somebody else's.
+            SettingsError: a path is relative, absent or may not be named, nor its store, or an uploaded capture is not
+                committed or somebody else's.
             JobTooLargeError: the machine could never run it.
             ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another
                 job.
@@ -151,6 +153,7 @@ class Jobs:
             raise SettingsError("Option 'channels' is empty; name a channel, or leave it out to fit all.")
         if spec.capture is not None and not is_uploaded(spec.capture):
             self.server_paths.require("capture", spec.capture, "upload it, with dentine submit --upload or in the page")
+        self._stores.require(spec)
         if spec.rig is not None:
             self._light_limits.require(spec.rig)
         if spec.rig is not None and not spec.is_demo and not is_uploaded(spec.rig.mouth):
@@ -204,8 +207,8 @@ class Jobs:
         """Remove everything that is stored of a job that has ended, and give a receipt.
 
         Raises:
-            UnknownJobError: there is no such job. JobStateError: it has not ended. StoreError: a file could not be
-                removed; delete it again.
+            UnknownJobError: there is no such job. JobStateError: it has not ended.
+            StoreError: a file, or what it keeps on an S3 server, could not be removed; delete it again.
         """
         self.repository.apply(job_id, Trigger.DELETE)
         with self._deleting:
@@ -289,7 +292,7 @@ class Jobs:
                 self.delete(job_id)
             except UnknownJobError:
                 continue  # deleted meanwhile
-            except (StoreError, OSError) as problem:
+            except (DentineError, OSError) as problem:
                 logging.getLogger(__name__).warning("job %s: %s", job_id, problem)
 
 

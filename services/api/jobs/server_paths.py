@@ -1,16 +1,53 @@
-"""Which folders of the server a job may name: those below the roots that the settings allow, and none where callers
-need tokens and no root is set.
+"""Which folders of the server and which S3 stores a job may name.
+
+Folders are those below the roots that the settings allow, and none where callers need tokens and no root is set. Stores
+are those that the settings name and what lies below them, on every server: whoever submits a job else chose where the
+server's own credentials write.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from services.core.errors import SettingsError
-from services.core.records import JobSpec
+from services.core.files.object_store import require_library
+from services.core.records import STORE_URL, JobSpec
 from services.core.settings import ServerSettings
 
 SETTING = "DENTINE__SERVER__JOB_ROOTS"
+STORES_SETTING = "DENTINE__SERVER__STORES"
+
+
+class ServerStores:
+    """The S3 stores that a server's jobs may name.
+
+    Raises:
+        SettingsError: a setting is no such URL. PlatformError: there is one, and what speaks to S3
+            servers is not installed.
+    """
+
+    def __init__(self, settings: ServerSettings) -> None:
+        self._allowed = tuple(one.strip() for one in settings.stores.split(",") if one.strip())
+        if wrong := next((one for one in self._allowed if not re.fullmatch(STORE_URL, one)), None):
+            raise SettingsError(
+                f"Setting {STORES_SETTING}: {wrong} is no s3://BUCKET/PREFIX without a slash at its end; correct it."
+            )
+        if self._allowed:
+            require_library()
+
+    def require(self, spec: JobSpec) -> None:
+        """Refuse a job whose store is not allowed, before anything is connected to.
+
+        Raises:
+            SettingsError: it is not.
+        """
+        if spec.store is not None and not any(f"{spec.store}/".startswith(f"{one}/") for one in self._allowed):
+            known = ", ".join(self._allowed) or "none"
+            raise SettingsError(
+                f"Option 'store': this server does not keep what jobs prepare at {spec.store}, but below: {known}; "
+                f"name one of them or leave the option out, or have {STORES_SETTING} name this one."
+            )
 
 
 class ServerPaths:

@@ -30,7 +30,7 @@ from services.fit.export.previews import write_pictures, write_preview
 from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack
 
 CHECKPOINT = "fit-checkpoint"
-NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", *SLAB_OPTIONS})
+NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", "store", *SLAB_OPTIONS})
 """Options that the answer of a fit does not depend on; what the capture holds counts by its contents."""
 ALWAYS_NAMED = frozenset(
     [

@@ -143,6 +143,7 @@ def _flag(workshop: Workshop, subject: Subject, view: View, camera: int, light: 
         ),
         "tooth_pixels": tuple(subject.pixels_of_teeth(view.footprint, bits).tolist()),
         "files": workshop.files_of(camera, light, picture),
+        "objects": workshop.objects_of(camera, light),
         "shaded": True,
     }
     workshop.put_image(camera, light, done.model_copy(update=changed))

@@ -172,6 +172,7 @@ class Desk:
             colour=image.colour,
             notes=self.source.notes,
             files=self.workshop.files_of(self.view.number, light, picture),
+            objects=self.workshop.objects_of(self.view.number, light),
             seconds=time.monotonic() - began_s,
         )
 

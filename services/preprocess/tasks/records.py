@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from services.core.files.object_store import StoredObject
 from services.core.geometry import Record
 from services.preprocess.brightness import ImageLight
 from services.preprocess.colours import FrameColour
@@ -50,6 +51,7 @@ class ImageDone(Record):
     light: ImageLight | None
     colour: FrameColour | None = None
     files: dict[str, StoredFile] = Field(description="by path in the stage's folder")
+    objects: dict[str, StoredObject] = Field(default={}, description="on a server, by path below the arrays' URL")
     notes: tuple[str, ...] = Field(default=(), description="what the source said of the camera when it read the image")
     seconds: float = Field(description="how long it took")
     shaded: bool = Field(

@@ -41,7 +41,7 @@ def summarise(
 
     Raises:
         CaptureInputError: no pixel is valid, no tooth is as bright as these, or channels look exchanged. FencedError:
-            another attempt has begun.
+            another attempt has begun. StoreError: a server of the arrays refuses, does not answer or has lost one.
     """
     workshop.writer.require_lease()
     images = _images(workshop, source)
@@ -89,6 +89,7 @@ def summarise(
     # What a kill has left of a file that was being written
     for partial in workshop.folder.rglob("*.partial"):
         partial.unlink()
+    workshop.seal(images)
     motions = [report.motion_px for report in reports if report.motion_px is not None]
     manifest = PreparedManifest(
         channels=source.description.channels,

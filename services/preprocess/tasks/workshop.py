@@ -3,7 +3,7 @@
 ::
 
     JOB/
-      .prepared.<attempt>/      the store being written
+      .prepared.<attempt>/      the store being written; where a job names a URL, a file in it says where its arrays are
       .prepared.work/
         plan.json               digest of all that the store depends on
         <camera>/               footprint and black image as .npy, view.json, measures.json, motion-<frame>.json,
@@ -17,15 +17,16 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import zarr
 
+from services.core.files.object_store import RemoteFolder, StoredObject, discard, new_remote_folder, remote_folder
 from services.core.geometry import Camera, Record
-from services.core.store import StageWriter, write_atomic, write_record
+from services.core.store import StageWriter, writable_array, write_atomic, write_record
 from services.preprocess.projection import Footprint
 from services.preprocess.scratch import write_array
 from services.preprocess.source import Motions, View
@@ -33,6 +34,9 @@ from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone, 
 
 R = TypeVar("R", bound=Record)
 STAGE = "prepared"
+ARRAYS = "prepared.zarr"
+OF_AN_IMAGE = ("radiance", "variance", "valid", "motion", "shadow")
+"""The arrays in which each image has a shard of its own."""
 WORK = ".prepared.work"
 PLAN = "plan.json"
 FOOTPRINT = ("mesh", "depth_mm", "normal", "covered")
@@ -62,14 +66,24 @@ class Workshop:
         """Of what is not published."""
         return self.writer.root / WORK
 
-    def begin(self, digest: str) -> bool:
+    @property
+    def arrays(self) -> Path:
+        """Where the arrays lie, or the file that says at which URL they are."""
+        return self.folder / ARRAYS
+
+    def begin(self, digest: str, url: str | None = None) -> bool:
         """Take over what an attempt at the same store has left, or clear all away; returns whether there was something.
 
         Args:
             digest: of all that the store depends on.
+            url: below which the arrays are to be kept; None to keep them in the folder.
+
+        Raises:
+            StoreError: the server of the arrays refuses or does not answer.
+            PlatformError: what speaks to it is not installed.
         """
         earlier = sorted(self._attempts(), key=lambda path: int(path.name.rpartition(".")[2]))
-        left = [path for path in earlier if (path / "prepared.zarr").is_dir()]
+        left = [path for path in earlier if (path / ARRAYS).exists()]
         plan = _read(self.work / PLAN, _Plan)
         kept = left[-1] if plan is not None and plan.digest == digest and left else None
         if kept is None:
@@ -78,12 +92,16 @@ class Workshop:
             shutil.rmtree(self.work, ignore_errors=True)
         for path in earlier:
             if path != kept:
-                shutil.rmtree(path, ignore_errors=True)
+                discard(path)
         if kept is None:
             self.folder.mkdir(exist_ok=True)
             self.work.mkdir()
+            if url is not None:
+                write_record(self.arrays, new_remote_folder(self.arrays, url))
         elif kept != self.folder:
             kept.rename(self.folder)
+        if kept is not None:
+            self._forget_what_is_gone()
         return kept is not None
 
     def announce(self, digest: str) -> None:
@@ -96,7 +114,7 @@ class Workshop:
 
     def array(self, name: str) -> zarr.Array[Any]:
         """An array of the store being written."""
-        return zarr.open_array(self.folder / "prepared.zarr" / name, mode="r+")
+        return writable_array(self.arrays / name)
 
     def scratch(self, camera: int) -> Path:
         """Folder of what a camera's blocks share."""
@@ -142,7 +160,7 @@ class Workshop:
         self._put(self.scratch(camera) / f"image-{light}.json", done)
 
     def image(self, camera: int, light: int) -> ImageDone | None:
-        """What was made of an image; None where it is not stored whole."""
+        """What was made of an image; None where it is not stored whole. What a server has acknowledged is."""
         done = self.record(camera, light)
         if done is None:
             return None
@@ -164,7 +182,7 @@ class Workshop:
 
     def files_of(self, camera: int, light: int, picture: Path) -> dict[str, StoredFile]:
         """The files of an image as they are now."""
-        shards = sorted((self.folder / "prepared.zarr").glob(f"*/c/{camera}/{light}/**/*"))
+        shards = sorted(self.arrays.glob(f"*/c/{camera}/{light}/**/*")) if self.arrays.is_dir() else []
         found = {}
         for path in [*shards, picture]:
             if path.is_file() and not path.name.endswith(".partial"):
@@ -172,6 +190,37 @@ class Workshop:
                     sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
                 found[path.relative_to(self.folder).as_posix()] = StoredFile(bytes=path.stat().st_size, sha256=sha256)
         return found
+
+    def objects_of(self, camera: int, light: int) -> dict[str, StoredObject]:
+        """The objects of an image as the server lists them now; none where the arrays lie on this disk."""
+        remote = remote_folder(self.arrays)
+        if remote is None:
+            return {}
+        listings = [remote.listed(f"{name}/c/{camera}/{light}") for name in OF_AN_IMAGE]
+        return {name: one for listing in listings for name, one in listing.items()}
+
+    def seal(self, images: Iterable[ImageDone]) -> None:
+        """Write into the file that stands for the arrays what the server holds, once all images are there.
+
+        Raises:
+            CorruptStoreError: names an object that is not there as it was written.
+        """
+        remote = remote_folder(self.arrays)
+        if remote is None:
+            return
+        written = {name: one for done in images for name, one in done.objects.items()}
+        there = RemoteFolder(url=remote.url, objects=written).require_intact("retry the job, which makes it anew")
+        self.writer.require_lease()
+        write_record(self.arrays, RemoteFolder(url=remote.url, objects=there))
+
+    def _forget_what_is_gone(self) -> None:
+        """Remove the records of images of which a server no longer has every object, so that they are made again."""
+        remote = remote_folder(self.arrays)
+        there = {} if remote is None else remote.listed()
+        for path in self.work.glob("*/image-*.json"):
+            done = _read(path, ImageDone)
+            if done is not None and any(there.get(name) != one for name, one in done.objects.items()):
+                path.unlink()
 
     def _put(self, path: Path, record: Record) -> None:
         # An attempt that was overtaken says nothing any more
