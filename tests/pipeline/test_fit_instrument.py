@@ -15,8 +15,9 @@ from services.core.calibration.uncertainty import TWIST
 from services.core.records import JobSpec, PreparedManifest
 from services.core.results import Estimate, FitReport
 from services.core.stage import LocalContext
-from services.core.store import MANIFEST
+from services.core.store import MANIFEST, open_stage
 from services.fit.inputs.observations import Observations, ViewStack, read_channel
+from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.stage import export, run
 from tests.support.prepared import TRUTH, write_prepared
 
@@ -144,3 +145,23 @@ def test_results_and_report_show_the_instrument(brighter: tuple[Path, FitReport]
     assert page.index("Assumed, as the calibration") < page.index("Error on held-out images")
     assert "What each ± is made of" in page
     assert "light_gain.l0" in page
+
+
+def test_a_fit_whose_prior_took_it_too_far_looks_again_from_there(tmp_path: Path) -> None:
+    found: list[Uncertainty] = []
+
+    def cut_at_first(*args: Any, **named: Any) -> Uncertainty:
+        found.append(replace(uncertainty(*args, **named), is_whole=bool(found)))
+        return found[-1]
+
+    with patch("services.fit.execution.channel_fit.uncertainty", cut_at_first):
+        report = fit(tmp_path, gains=(1.02,) * 6)
+    stage, _ = open_stage(tmp_path, "fit", FitReport)
+    history = json.loads((stage / "history.json").read_text())
+    assert history[-1]["stage"] == "again"
+    assert [step["step"] for step in history] == list(range(1, report.steps + 1))
+    assert report.converged, report.advice
+    # What the second end says is told: from where the first was, which lay at the minimum, it is nowhere else.
+    first, second = found
+    assert report.instrument["green"]["gain.green"].value == second.x[second.domain.tissue_count]
+    assert np.abs((second.x - first.x) / np.sqrt(np.diag(first.covariance))).max() < 1

@@ -242,3 +242,49 @@ def test_errors_follow_the_step_that_the_tissue_takes_and_not_the_one_it_asked_f
     assert np.linalg.norm(step[:3] / domain.scale[:3]) < 0.5 * np.linalg.norm(whole[:3] / domain.scale[:3])
     for change in (-1e-3, 1e-3):
         assert model.promise(step + np.array([0.0, 0.0, 0.0, change]))[0] > model.promise(step)[0]
+
+
+def test_a_prior_used_in_full_takes_the_tissue_back_along_a_direction_that_images_leave_open() -> None:
+    # A gain of -10 % and a tissue that is 0.1 brighter make nearly the same images, so noisy derivatives leave that
+    # direction open. The prior of 1 % takes both back together. What is left of the step, 0.05 of another coordinate,
+    # counts as error, and would hold the tissue if the gain went along with it as if no direction were open.
+    domain, count, sensor, opened = (
+        Domain(DOMAIN.coordinates, InstrumentErrors(("gain.green",), ((1e-4,),))),
+        400,
+        0.01,
+        0,
+    )
+    for seed in range(10):
+        rng = np.random.default_rng([11, seed])
+        gain = rng.uniform(0.5, 1.0, count)
+        exact = np.stack([gain, *0.1 * rng.standard_normal((2, count)), gain])
+        exact[0] += 0.01 * rng.standard_normal(count)
+        residual = np.array([0.3, 0.05, 0.0, -0.1]) @ exact - sensor * rng.standard_normal(count)
+        noise = [np.append(0.15 * rng.standard_normal((3, count)), np.zeros((1, count)), axis=0) for _ in range(2)]
+        residuals = [residual + 0.05 * rng.standard_normal(count) for _ in range(2)]
+        weight = np.full(count, sensor**-2)
+        equations = normal_equations(exact + noise[0], exact + noise[1], *residuals, 1 / weight, weight, exact=1)
+        x = np.array([1.0, 2.0, 2.0, -0.1])
+        known = uncertainty(domain, x, equations)
+        if known.open_directions.shape[1]:
+            opened += 1
+            assert known.x[3] - x[3] == pytest.approx(0.1, abs=0.01)
+            # To a tenth: with the gain of the whole step it was 0.05 to 0.09.
+            assert known.x[0] - x[0] == pytest.approx(-0.1, abs=0.01)
+    assert opened >= 5
+
+
+def test_an_answer_that_its_prior_would_take_too_far_goes_one_scale_and_states_the_rest_as_error() -> None:
+    # The tissue follows the gain one to one, and noise of renders leaves it to the gain's prior.
+    domain = Domain(DOMAIN.coordinates[:1], InstrumentErrors(("gain.green",), ((1e-6,),)))
+    scale, rows, weight = float(domain.scale[0]), np.stack(2 * [np.linspace(0.5, 1.0, 50)]), np.full(50, 1e4)
+    noise = 30 * np.cos(np.arange(50))
+    equations = normal_equations(rows, rows, noise, -noise, 1 / weight, weight, exact=1)
+    for off, moved, rest in ((0.5, 0.5, 0.0), (3.0, 1.0, 2.0)):
+        x = np.array([1.0, -off * scale])
+        known = uncertainty(domain, x, equations)
+        np.testing.assert_allclose((known.x - x) / scale, [-moved, moved], rtol=1e-6)
+        assert known.is_whole is (rest == 0)
+        parts = known.se_parts(np.array([1.0, 0.0]))
+        assert parts.get("unfinished", 0.0) == pytest.approx(rest * scale, rel=1e-6)
+        assert known.covariance[0, 0] == pytest.approx(sum(part**2 for part in parts.values()), rel=1e-9)

@@ -42,6 +42,8 @@ CLOSING_TRIALS = 2
 """Lengths tried of the step after the closing measurement."""
 CLOSING_MIN_SHARE = 0.1
 """No step is tried that is shorter than so much of the one before."""
+AGAIN = "again"
+"""The stage of a fit that goes on where its first end has put the answer far from it."""
 MIN_SAMPLES = 4
 """Paths per pixel, however many pixels there are."""
 
@@ -253,14 +255,13 @@ class Stages(ABC, Generic[Optics]):
         samples = max(
             solution.samples, self.fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel))
         )
-        equations = solution.equations
-        if equations is None:
-            self.pause()
-            stored, _ = self.journal.once(
-                f"{self.scope}/final", lambda: problem.linearise(solution.x, samples=samples, step=0).record()
-            )
-            equations = NormalEquations.of(stored)
-        problem, solution, known = self._close(problem, solution, equations, samples)
+        problem, solution, equations, known = self._close(problem, solution, samples)
+        if not known.is_whole:
+            # Too far for one linear model: look again from there, once.
+            self._see(problem.domain, solution.x)
+            again = replace(problem, passes=self.passes, stage=AGAIN)
+            base, solution = self._iterate(again, self.options(self.files.full), samples)
+            problem, solution, equations, known = self._close(replace(again, base=base), solution, samples)
         self._see(problem.domain, solution.x)
         samples_shown = self.fewer(self.spec.max_samples_per_pixel)
         evaluation = self._evaluate("final", problem.base, samples_shown, self.files.full, by_frame=True)
@@ -280,15 +281,33 @@ class Stages(ABC, Generic[Optics]):
         )
 
     def _close(
-        self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, samples: int
-    ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
+        self, problem: StackProblem[Optics], solution: Solution, samples: int
+    ) -> tuple[StackProblem[Optics], Solution, NormalEquations, Uncertainty]:
+        # The uncertainty at a solution, moved where the instrument's errors use their prior in full; all of them where
+        # that puts the answer. Curvature and noise are rendered anew only where the solver ended without them.
+        again, equations = f".{AGAIN}" if problem.stage == AGAIN else "", solution.equations
+        if equations is None:
+            self.pause()
+            stored, _ = self.journal.once(
+                f"{self.scope}/final{again}",
+                lambda: problem.linearise(solution.x, samples=samples, step=0).record(),
+            )
+            equations = NormalEquations.of(stored)
+        if problem.jacobian_g is None or solution.result is Result.STALLED:
+            known = uncertainty(problem.domain, solution.x, equations)
+            if not problem.domain.errors.names:
+                return problem, solution, equations, known
+        else:
+            known = self._measured(f"{self.scope}/closing{again}", problem, solution.x, equations, samples)
+        base = problem.domain.tissue_at(known.x, problem.base)
+        return replace(problem, base=base), replace(solution, x=known.x), equations, known
+
+    def _measured(
+        self, key: str, problem: StackProblem[Optics], x: Array, equations: NormalEquations, samples: int
+    ) -> Uncertainty:
         # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step
         # made by it where it promises more than noise does, and is better by that promise and by images together.
-        domain, x = problem.domain, solution.x
-        if problem.jacobian_g is None or solution.result is Result.STALLED:
-            found = uncertainty(domain, x, equations)
-            # Only errors of the instrument move x once more.
-            return self._settled(problem, solution, found) if domain.errors.names else (problem, solution, found)
+        domain = problem.domain
         known, moves = whitening(domain, equations), self.files.moves
 
         def compute() -> dict[str, Any]:
@@ -303,20 +322,10 @@ class Stages(ABC, Generic[Optics]):
             }
 
         self.pause()
-        entry, _ = self.journal.once(f"{self.scope}/closing", compute)
+        entry, _ = self.journal.once(key, compute)
         step = np.array(entry["step"])
-        measured = uncertainty(
-            domain, x + step, equations, ClosingSums.of(entry["sums"]), step, [m.body for m in moves]
-        )
-        return self._settled(problem, solution, measured)
-
-    @staticmethod
-    def _settled(
-        problem: StackProblem[Optics], solution: Solution, known: Uncertainty
-    ) -> tuple[StackProblem[Optics], Solution, Uncertainty]:
-        # All of them where the last measurement puts the answer.
-        base = problem.domain.tissue_at(known.x, problem.base)
-        return replace(problem, base=base), replace(solution, x=known.x), known
+        sums = ClosingSums.of(entry["sums"])
+        return uncertainty(domain, x + step, equations, sums, step, [m.body for m in moves])
 
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float

@@ -56,6 +56,8 @@ class Uncertainty:
     """Covariances (F, F) that add up to the whole, by their source (``results.Estimate``)."""
     faults: tuple[Fault, ...] = ()
     """Errors of the instrument that the images put down to a fault of the calibration."""
+    is_whole: bool = True
+    """Whether the prior of the instrument's errors, used in full, moved x no farther than one model reaches."""
 
     def standard_error(self, slope: Array) -> float:
         """One standard error of a quantity with gradient ``slope`` (F,) to x."""
@@ -179,13 +181,24 @@ class ClosingModel:
         The instrument's errors go where they are best for the tissue as the step leaves it, which is not where a whole
         one would.
         """
-        domain, open_directions, count = self.domain, self.known.open_directions, self.domain.tissue_count
-        scaled = -self.known.transform @ self.inverse @ self.gradient / domain.scale
-        scaled = scaled - open_directions @ (open_directions.T @ scaled)
+        domain, scaled, count = self.domain, self._whole_step(), self.domain.tissue_count
         low, high = domain.bounds
         length = float(np.linalg.norm(scaled[:count])) / np.sqrt(part_count)
         step = np.clip(self.x + domain.scale * scaled / max(1.0, length), low, high) - self.x
         return np.asarray(np.concatenate([step[:count], self._errors_after(step[:count])]))
+
+    def rest(self) -> Array:
+        """All that is left to the minimum (F,) along what is not open, with the errors that are best for the tissue.
+
+        Errors that followed it along an open direction too would tell of a move that it does not make.
+        """
+        tissue = (self.domain.scale * self._whole_step())[: self.domain.tissue_count]
+        return np.asarray(np.concatenate([tissue, self._errors_after(tissue)]))
+
+    def _whole_step(self) -> Array:
+        # In scales.
+        scaled = -self.known.transform @ self.inverse @ self.gradient / self.domain.scale
+        return np.asarray(scaled - self.known.open_directions @ (self.known.open_directions.T @ scaled))
 
     def _errors_after(self, tissue: Array) -> Array:
         # Change of the errors (K,) at which F = g'z + z'z / 2, z = M y, is least after a step of the tissue, which
@@ -276,12 +289,19 @@ def uncertainty(
         left = pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, gone) - prior @ gone
 
     # What is left of the step counts as error along what is not open.
-    rest = t @ inverse @ left / domain.scale
-    rest = domain.scale * (rest - known.open_directions @ (known.open_directions.T @ rest))
+    rest = ClosingModel(domain, x, known, inverse, left, parts["rendering"]).rest()
     found = settle(domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(rest, rest))
     covariance = 0.5 * (found.covariance + found.covariance.T)
     return Uncertainty(
-        domain, found.x, covariance, known.open_directions, t @ t.T, found.sandwich, found.parts, found.faults
+        domain,
+        found.x,
+        covariance,
+        known.open_directions,
+        t @ t.T,
+        found.sandwich,
+        found.parts,
+        found.faults,
+        found.is_whole,
     )
 
 

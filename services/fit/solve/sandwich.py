@@ -64,6 +64,8 @@ class Settled:
     parts: dict[str, Array]
     sandwich: Sandwich
     faults: tuple[Fault, ...]
+    is_whole: bool = True
+    """Whether the answer went all the way there, or as far as one linear model reaches."""
 
 
 def settle(domain: Domain, x: Array, sandwich: Sandwich, meats: Mapping[str, Array], unfinished: Array) -> Settled:
@@ -89,15 +91,16 @@ def settle(domain: Domain, x: Array, sandwich: Sandwich, meats: Mapping[str, Arr
     through = np.eye(len(x))
     through[:, count:] += change
     parts = {name: through @ part @ through.T for name, part in plain.items()} | _of_prior(domain, after)
-    return Settled(_moved(domain, x, change @ x[count:]), after.covariance, parts, replace(sandwich, wrong=wrong), told)
 
-
-def _moved(domain: Domain, x: Array, step: Array) -> Array:
-    # By the step, or as much of it as moves the tissue by one scale: what frees an error is not linear farther than
-    # that.
-    count, (low, high) = domain.tissue_count, domain.bounds
+    # As much of the step as moves the tissue by one scale, as images are not linear farther than that; the rest of it
+    # counts as error.
+    step, (low, high) = change @ x[count:], domain.bounds
     length = float(np.linalg.norm((step / domain.scale)[:count]))
-    return np.asarray(np.clip(x + step / max(1.0, length), low, high))
+    gone = np.asarray(step / max(1.0, length), dtype=np.float64)
+    left = np.outer(step - gone, step - gone)
+    parts["unfinished"] = parts["unfinished"] + left
+    moved = np.clip(x + gone, low, high)
+    return Settled(moved, after.covariance + left, parts, replace(sandwich, wrong=wrong), told, length <= 1)
 
 
 def _of_prior(domain: Domain, found: Recombination) -> dict[str, Array]:
