@@ -20,6 +20,7 @@ from services.core.records import JobSpec, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import StoredArray, open_stage, require_intact, withdraw
 from services.fit.inputs.levels import LevelReader
+from services.fit.inputs.observations import read_channel, read_observations
 from services.preprocess.stage import run
 from services.preprocess.tasks import workshop
 from tests.support.folder_captures import prepare, write_folder, write_tree
@@ -54,6 +55,14 @@ def assert_same(root: Path, other: Path) -> None:
         np.testing.assert_array_equal(values, there[name], strict=True)
 
 
+def assert_fit_reads_the_same(capture: Path, root: Path, other: Path) -> None:
+    spec = JobSpec(capture=capture, pixel_step=2)
+    views, there = (read_channel(read_observations(one, spec), "blue", spec) for one in (root, other))
+    for view, again in zip(views, there, strict=True):
+        np.testing.assert_array_equal(view.reference, again.reference, strict=True)
+        np.testing.assert_array_equal(view.variance, again.variance, strict=True)
+
+
 def pointer(root: Path) -> dict[str, Any]:
     return dict(json.loads((root / "prepared" / "prepared.zarr").read_text()))
 
@@ -66,6 +75,7 @@ def test_same_pixels_by_one_put_a_shard(server: S3Server, capture: Path, tmp_pat
     assert server.count("PUT", found=True) == shards + descriptions == len(server.objects())
     assert not [one for one in (tmp_path / "there" / "prepared").rglob("c") if one.is_dir()]
     assert_same(tmp_path / "here", tmp_path / "there")
+    assert_fit_reads_the_same(capture, tmp_path / "here", tmp_path / "there")
     told = pointer(tmp_path / "there")
     assert {f"lab/one/{told['url'].removeprefix(f'{URL}/')}/{name}" for name in told["objects"]} == set(
         server.objects()

@@ -22,7 +22,7 @@ CHANNELS = ("red", "green", "blue")
 COLOUR = (3000.0, 2700.0, 2200.0)
 """Counts of a surface that faces the light."""
 MOVED_PX = (1.3, 0.7)
-"""By how much the tooth moves from the first tracking frame to the last."""
+"""By how much the tooth moves from the first frame in light to the last."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,18 @@ def make_scene(
     lamps = tuple(
         Light(name=f"l{k}", position_mm=(200.0 + 5 * k, -300.0, -700.0), intensity=(1e6,) * 3) for k in range(lights)
     )
-    kinds = ["black", *["tracking"] * tracking, *["light"] * lights]
+    # Tracking frames at even intervals among the lights, one at either end, so that no light's motion is extrapolated
+    kinds = ["light"] * lights
+    for place in np.linspace(lights, 0, tracking).round().astype(int).tolist():
+        kinds.insert(place, "tracking")
+    kinds.insert(0, "black")
+    names = iter(lamps)
     frames = tuple(
         FrameRecord.model_validate(
             {
                 "index": index,
                 "kind": kind,
-                "light": lamps[index - 1 - tracking].name if kind == "light" else None,
+                "light": next(names).name if kind == "light" else None,
                 "exposure_s": 0.05,
                 "level": 0.0 if kind == "black" else 1.0,
                 "time_s": 0.06 * index,
@@ -81,7 +86,7 @@ def make_scene(
     grain = rng.normal(scale=20, size=(height, width)).astype(np.float32)
     counts = np.empty((height, width, 3), dtype=np.uint16)
     for frame in frames:
-        moved = max(0.0, (frame.index - 1) / max(tracking - 1, 1)) if frame.kind == "tracking" else 0.5
+        moved = max(0, frame.index - 1) / (len(frames) - 2)
         _photograph(counts, grain, focal_px, moved, lit=frame.kind != "black")
         array[0, frame.index] = counts
     ball = trimesh.creation.icosphere(subdivisions=5)
