@@ -21,6 +21,7 @@ _BENCHMARKS = MappingProxyType(
         "slab-map": "services.bench.slab.accuracy:run",
         "slab-mie": "services.bench.slab.dispersions:run",
         "slab-solvers": "services.bench.slab.solvers:run",
+        "slab-stock": "services.bench.slab.stock:run",
         "slab-surface": "services.bench.slab.surface:run",
         "stability": "services.bench.stability.run:run",
         "tooth": "services.bench.fits.tooth:run",

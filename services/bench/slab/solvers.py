@@ -96,13 +96,15 @@ def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) ->
     return rows
 
 
-def compared(truth: Truth, found: Material, peer: str, setting: str, seconds: float) -> SolverRow:
+def compared(
+    truth: Truth, found: Material, peer: str, setting: str, seconds: float, benchmark: str = "slab-solvers"
+) -> SolverRow:
     """The row of one solution."""
     phase, true = truth.phase_per_sr(), truth.material()
     difference = np.interp(FINE_RAD, ANGLES_RAD, found.phase_per_sr) - phase
     reduced, true_reduced = (one.scattering_per_mm * (1 - one.mean_cosine) for one in (found, true))
     return SolverRow(
-        benchmark="slab-solvers",
+        benchmark=benchmark,
         peer=peer,
         seconds=seconds,
         error=float(np.sqrt((difference**2).sum() / (phase**2).sum())),

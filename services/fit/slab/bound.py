@@ -18,17 +18,16 @@ from services.fit.slab.model.rig import Rig
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import quadratic_at
 from services.fit.slab.solve.normal import normal_equations
-from services.fit.slab.solve.prior import SCALES, Quadratic, flag_scales, is_thick, precision
+from services.fit.slab.solve.prior import SCALES, Quadratic, flag_scales, is_thick, precision, widened
 from services.fit.slab.solve.smooth import smoother_of
 from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, phase_chain
 from services.fit.slab.solve.weights import independent_weights
 
 Array = NDArray[np.float64]
 
-BATCHES, PATHS, PATHS_THICK = 8, 8000, 60_000
-"""Of the render that gives the curvature: as many as a step of the search takes, and more where a cell ``is_thick``.
-There noise passes for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s was bounded by 0.36 % with 8,000 paths, 1.4
-% with 40,000, 0.85 % with 250,000."""
+BATCHES, PATHS = 8, 60_000
+"""Of the render that gives the curvature. Fewer pass noise for signal in a thick cell (200 nm spheres at sigma_t w = 9.1: sigma_s bounded by
+0.36 % with 8,000, 1.4 % with 40,000, 0.85 % with 250,000) and signal for noise where light goes forward (800 nm in blue: 2.1 % with 8,000)."""
 FIRST_STEP = 2**33
 """Numbers its random streams apart from a fit's."""
 
@@ -59,7 +58,7 @@ def bound_of(
     noise: float,
     variances: Array | None = None,
     seed: int = 1,
-    scale: float | None = None,
+    scale: float | Array | None = None,
     paths: int | None = None,
     blocks: Blocks = map,
 ) -> Bound:
@@ -68,13 +67,13 @@ def bound_of(
     Args:
         noise: standard deviation of a pixel that has its image's mean, as a share of it.
         variances: of the measurement beside its shot noise (images, values), such as a reference's own.
-        paths: of a batch and light, instead of the number that the thickness asks for.
+        paths: of a batch and light, instead of ``PATHS``.
         scale: of the smoothness prior, per rad2; the loosest that a fit may choose where it is not given.
     """
     quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths, blocks=blocks)
     x = Knots().unknowns(material)
     if scale is None:
-        scale = max(SCALES)
+        scale = widened(max(SCALES), material)
     chosen, alone = (covariance_of(quadratic, precision(one)) for one in (scale, flag_scales()))
     uncertainty = Uncertainty(chosen, alone, (chosen, alone))
     return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)
@@ -92,9 +91,8 @@ def curvature_of(
 ) -> Quadratic:
     """What images tell of ln f and sigma_a; arguments as of ``bound_of``."""
     thick = is_thick(material, rig.width_mm)
-    paths = paths or (PATHS_THICK if thick else PATHS)
     batches = render(
-        rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths, scores=True, blocks=blocks
+        rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths or PATHS, scores=True, blocks=blocks
     )
     mean = batches.mean
     halves = 2 if rig.grid.folded else 1

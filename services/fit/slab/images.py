@@ -59,7 +59,7 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
                 f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again."
             )
         faults += image_faults(f"{entry.camera} under {entry.light}", image, folder.pixels, folder.beam)
-        value, of_value = _folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
+        value, of_value = folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
         values.append(value)
         variances.append(of_value)
     held_out = np.array([entry.held_out for entry in entries])
@@ -113,7 +113,7 @@ def _read(root: Path, folder: SlabFolder, entry: SlabImage, file: str) -> Array:
     return image.astype(np.float64)
 
 
-def _folded(value: Array, variance: Array, grid: Grid) -> tuple[Array, Array]:
+def folded(value: Array, variance: Array, grid: Grid) -> tuple[Array, Array]:
     """Means of the two halves by inverse variance where the grid is folded, and their variances; flat (pixels,)."""
     if not grid.folded:
         return value.ravel(), variance.ravel()

@@ -55,7 +55,7 @@ def next_measurement(
     index: float,
     measured: Measurements,
     material: Material,
-    scale: float,
+    scale: float | Array,
     seed: int,
     blocks: Blocks = map,
 ) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
 from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import RIDGE, SCALES, Quadratic, flag_scales, precision
+from services.fit.slab.solve.prior import RIDGE, SCALES, Quadratic, flag_scales, precision, widened
 
 Array = NDArray[np.float64]
 
@@ -47,10 +47,10 @@ class Coordinates(Protocol):
         themselves.
         """
 
-    def scale(self, material: Material, quadratic: Quadratic) -> float:
-        """Scale of the prior, near a medium and as its images suggest."""
+    def scale(self, material: Material, quadratic: Quadratic, *, sharp: bool) -> float | Array:
+        """Scale of the prior, near a medium and as its images suggest; ``sharp`` where it follows what the medium shows already."""
 
-    def precision(self, scale: float) -> Array:
+    def precision(self, scale: float | Array) -> Array:
         """Inverse covariance of the prior (U, U) for one scale."""
 
     def weak_precision(self, material: Material) -> Array:
@@ -98,11 +98,12 @@ class Knots:
     def chain(self, material: Material) -> None:
         """None: these are what the forward model derives by."""
 
-    def scale(self, material: Material, quadratic: Quadratic) -> float:  # noqa: ARG002 - as ln f needs no size
-        """The curvature of ln f of most evidence."""
-        return max(SCALES, key=lambda scale: self.log_evidence(quadratic, scale))
+    def scale(self, material: Material, quadratic: Quadratic, *, sharp: bool) -> float | Array:
+        """The curvature of ln f of most evidence; see ``prior.widened`` for a ``sharp`` one."""
+        every: list[float | Array] = [widened(scale, material) if sharp else scale for scale in SCALES]
+        return max(every, key=lambda scale: self.log_evidence(quadratic, scale))
 
-    def precision(self, scale: float) -> Array:
+    def precision(self, scale: float | Array) -> Array:
         """Of a smooth ln f; nothing is assumed of the absorption."""
         return precision(scale)
 
@@ -150,7 +151,7 @@ class Knots:
         """None counts as bound: ln f has no bound, and the ± of an absorption at zero are those of a free one."""
         return np.zeros(len(x), dtype=bool)
 
-    def log_evidence(self, quadratic: Quadratic, scale: float) -> float:
+    def log_evidence(self, quadratic: Quadratic, scale: float | Array) -> float:
         """Of a scale of the prior, but for a constant that all scales share.
 
         The mean derivatives are taken as if they were exact: the matrix is then positive, and a scale cannot win by
@@ -161,7 +162,7 @@ class Knots:
         x = self.minimum(total + RIDGE * float(np.diag(total).max()) * np.eye(UNKNOWNS), -linear)
         sign, log_determinant = np.linalg.slogdet(total)
         return (
-            float(-(linear @ x + 0.5 * x @ total @ x) - 0.5 * log_determinant - (KNOTS - 1) * np.log(scale))
+            float(-(linear @ x + 0.5 * x @ total @ x) - 0.5 * log_determinant - (KNOTS - 1) * np.log(scale).mean())
             if sign > 0
             else -np.inf
         )

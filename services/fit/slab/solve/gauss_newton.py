@@ -36,12 +36,12 @@ WEIGHTS_DIFFER = 0.5
 anew for each render, and misfits of one medium were seen to differ by a third. A low one would else refuse all steps
 after it."""
 MAX_HALVINGS = 4
-WORTHWHILE = 2.0
-"""A step that promises less than so many times what noise alone does waits for more paths."""
-UNFINISHED, UNFINISHED_THICK = 5.0, 1.0
-"""At the end, a step that promised more than so many times what noise does is followed by another. Where sigma_t w
-exceeds ``prior.THICK``, what is left along sigma_s at a constant sigma_s' promises little beside the noise of all
-directions and is still a tenth of sigma_s."""
+WORTHWHILE, WORTHWHILE_THICK = 2.0, 1.0
+"""A step that promises less than so many times what noise alone does waits for more paths; at the end, one that promised more is followed
+by another. Where sigma_t w exceeds ``prior.THICK``, what is left along sigma_s at a constant sigma_s' promises little beside the noise of
+all directions and is still a tenth of sigma_s."""
+UNFINISHED = 5.0
+"""A fit whose last step promised more than so many times what noise does has not converged."""
 NEAR = 0.05
 """Of ln sigma_s, within which residuals of several media join: what is not linear is then below a thousandth."""
 ENOUGH_PATHS = 0.5
@@ -96,7 +96,7 @@ class Solution:
     quadratic: Quadratic
     """Of half the misfit, at the last linearisation."""
     gradient_noise: Array
-    scale: float
+    scale: float | Array
     used: int
     steps: int
     converged: bool
@@ -173,7 +173,7 @@ class GaussNewton:
         """One step, and whether the search has come as far as its paths can tell."""
         x = self.coordinates.unknowns(state.material)
         quadratic = quadratic_at(x, state.equations)
-        prior = self.coordinates.precision(self.coordinates.scale(state.material, quadratic))
+        prior = self.coordinates.precision(self.coordinates.scale(state.material, quadratic, sharp=False))
         change = self.change(quadratic, prior, state.equations, state.material, state.damping)
         promise = promised(quadratic, prior, x, change)
         noise = noise_of_promise(quadratic, prior, state.equations.gradient_noise)
@@ -210,7 +210,7 @@ class GaussNewton:
             # Where residuals of media near by join, the gradient is that at the mean of these media.
             centre = equations.residuals.place if self.joins(material) else x
             quadratic = quadratic_at(centre, equations)
-            scale = self.coordinates.scale(material, quadratic)
+            scale = self.coordinates.scale(material, quadratic, sharp=True)
             prior = self.coordinates.precision(scale)
             change = self.change(quadratic, prior, equations, material, DAMPING)
             moved = self.coordinates.material_at(x + change)
@@ -237,7 +237,7 @@ class GaussNewton:
                 join.
         """
         thick = self.is_thick(moved)
-        enough, most = (UNFINISHED_THICK, self.budget.most_last_thick) if thick else (UNFINISHED, self.budget.most_last)
+        enough, most = (WORTHWHILE_THICK, self.budget.most_last_thick) if thick else (WORTHWHILE, self.budget.most_last)
         went = abs(math.log(moved.scattering_per_mm / standing.material.scattering_per_mm))
         is_over = (worth < enough and rest < ENOUGH_PATHS and (went < NEAR or not thick)) or standing.step + 1 >= most
         assert self.path_noise is not None

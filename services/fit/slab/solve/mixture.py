@@ -78,11 +78,11 @@ class Mixtures:
         matrix[KNOTS, -1] = 1
         return matrix
 
-    def scale(self, material: Material, quadratic: Quadratic) -> float:  # noqa: ARG002 - they say nothing of it
+    def scale(self, material: Material, quadratic: Quadratic, *, sharp: bool) -> float:  # noqa: ARG002 - one for all
         """Standard deviation of a weight, per mm."""
         return SHARE * material.scattering_per_mm
 
-    def precision(self, scale: float) -> Array:
+    def precision(self, scale: float | Array) -> Array:
         """Of weights about zero; nothing is assumed of the absorption."""
         return np.diag(np.append(np.full(self.atoms.shape[1], scale**-2.0), 0.0))
 

@@ -61,6 +61,16 @@ def precision(scale: float | Array) -> Array:
     return matrix
 
 
+def widened(scale: float, material: Material) -> Array:
+    """A scale at each knot (KNOTS,), wider by what the medium bends there already: Cauchy's prior by repeated weighting.
+
+    Troughs between the rings of large spheres bend by hundreds per rad2 and the rest of their phase function by tens. With 30 alone,
+    the prior drew sigma_s of 800 nm spheres in blue by -3.3 %, with this by -1.1 %. A wider scale for all knots left it to the noise of
+    other samples: with 100, phase functions of 500 nm spheres came out two times as far off.
+    """
+    return np.asarray(np.hypot(scale, second_differences() @ np.log(material.scattering)))
+
+
 def flag_scales() -> Array:
     """The weak prior's scale at each knot, by the angle from the nearer pole."""
     from_pole = np.minimum(ANGLES_RAD, math.pi - ANGLES_RAD)

@@ -1,14 +1,13 @@
-"""Images of an index-matched cell by stock Mitsuba: truths for the slab's fit that share no code with its kernel.
+"""Images of an index-matched cell by stock Mitsuba, which share no code with the slab's kernel.
 
-Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black
-plate whose opacity is one minus the beam's profile is one: ``volpath`` multiplies what a plate lets through into every
-connection.
+Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black plate
+whose opacity is one minus the beam's profile is one: its integrators multiply what a plate lets through into every connection.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -31,8 +30,9 @@ RENDERS = 8
 
 
 def matched_folder() -> SlabFolder:
-    """The benchmarks' cell with a matched boundary, under a beam of 1 mm: as broad as stock Mitsuba can light well, as
-    a connection from outside of it brings nothing.
+    """The benchmarks' cell with a matched boundary, under a beam of 1 mm.
+
+    That is as broad as stock Mitsuba can light well, as a connection from outside of it brings nothing.
     """
     return near_beam_folder(
         cell={"width_mm": 1.0, "index": None, "boundary": "matched"},
@@ -56,25 +56,36 @@ def stock_images(
     prepare_device()
     import mitsuba as mi
 
-    lights = {light.name: light for light in folder.lights}
-    cameras = {camera.name: camera for camera in folder.cameras}
-    plate = mi.Bitmap(_plate(folder).astype(np.float32)[..., None])
     means, variances = [], []
-    for number, entry in enumerate(folder.images):
-        scene = _scene(folder, medium, lights[entry.light], cameras[entry.camera], plate)
+    for number, (scene, front) in enumerate(scenes(folder, medium, "volpath")):
         renders = np.stack(
             [
                 np.array(mi.render(scene, spp=max(1, samples // RENDERS), seed=seed + RENDERS * number + k))[..., 0]
                 for k in range(RENDERS)
             ]
         ).astype(np.float64)
-        # A film's rows go down, and those of a camera in front run against the world's x.
-        renders = renders[:, ::-1, ::-1] if cameras[entry.camera].side == "front" else renders[:, ::-1]
-        means.append(renders.mean(axis=0))
-        variances.append(renders.var(axis=0, ddof=1) / RENDERS)
+        means.append(turned(renders.mean(axis=0), front=front))
+        variances.append(turned(renders.var(axis=0, ddof=1), front=front) / RENDERS)
         if done is not None:
             done(number)
     return np.stack(means), np.stack(variances)
+
+
+def scenes(folder: SlabFolder, medium: dict[str, Any], integrator: str) -> Iterator[tuple[Any, bool]]:
+    """A scene for each of the folder's images, and whether its camera is in front."""
+    import mitsuba as mi
+
+    lights = {light.name: light for light in folder.lights}
+    cameras = {camera.name: camera for camera in folder.cameras}
+    plate = mi.Bitmap(_plate(folder).astype(np.float32)[..., None])
+    for entry in folder.images:
+        light, camera = lights[entry.light], cameras[entry.camera]
+        yield _scene(folder, medium, light, camera, plate, integrator), camera.side == "front"
+
+
+def turned(image: Array, *, front: bool) -> Array:
+    """A film (rows, columns) as a folder's image, or the other way: its rows go down, and those of a camera in front run against x."""
+    return image[::-1, ::-1] if front else image[::-1]
 
 
 def medium_of(extinction_per_mm: float, albedo: float, phase_per_sr: Callable[[Array], Array]) -> dict[str, Any]:
@@ -83,13 +94,18 @@ def medium_of(extinction_per_mm: float, albedo: float, phase_per_sr: Callable[[A
     Args:
         phase_per_sr: of the scattering angle in rad; its scale is free.
     """
-    values = phase_per_sr(np.arccos(np.linspace(-1.0, 1.0, COSINES)))
+    values = phase_per_sr(node_angles())
     return {
         "type": "homogeneous",
         "sigma_t": extinction_per_mm,
         "albedo": albedo,
         "phase": {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values)},
     }
+
+
+def node_angles() -> Array:
+    """Scattering angles of the phase function's table, rad (COSINES,)."""
+    return np.asarray(np.arccos(np.linspace(-1.0, 1.0, COSINES)))
 
 
 def _plate(folder: SlabFolder) -> Array:
@@ -105,7 +121,9 @@ def _direction(side: str, angle_deg: float, *, arriving: bool) -> Array:
     return np.array([math.sin(math.radians(angle_deg)), 0.0, forward * math.cos(math.radians(angle_deg))])
 
 
-def _scene(folder: SlabFolder, medium: dict[str, Any], light: Light, camera: SlabCamera, plate: Any) -> Any:
+def _scene(
+    folder: SlabFolder, medium: dict[str, Any], light: Light, camera: SlabCamera, plate: Any, integrator: str
+) -> Any:
     import mitsuba as mi
 
     width = folder.cell.width_mm
@@ -122,7 +140,7 @@ def _scene(folder: SlabFolder, medium: dict[str, Any], light: Light, camera: Sla
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "volpath", "max_depth": MAX_ORDER, "rr_depth": 2 * MAX_ORDER},
+            "integrator": {"type": integrator, "max_depth": MAX_ORDER, "rr_depth": 2 * MAX_ORDER},
             "cell": {
                 "type": "cube",
                 "to_world": transform().translate([0, 0, width / 2]).scale([HALF_CELL_MM, HALF_CELL_MM, width / 2]),

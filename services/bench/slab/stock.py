@@ -1,0 +1,183 @@
+"""``dentine bench slab-stock``: an index-matched cell measured by the default solver, and by stock Mitsuba with its own gradients and Adam.
+
+Stock Mitsuba cannot light a cell through smooth glass, so the boundary is matched (``stock_cell``). Images are those of plain photons,
+and both begin at the same medium. Adam moves the logarithms of the weights of HG lobes, one ``tabphase`` with values D w, and of the
+absorption: a smooth dictionary, which holds the true lobe itself, spares it the prior that the default's 200 knots need.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.bench.slab.accuracy import PHASES
+from services.bench.slab.dispersions import Keep
+from services.bench.slab.recovery import Truth, photographed
+from services.bench.slab.solvers import ABSORPTION_PER_MM, EFFORTS, PHASE, QUICK_EFFORTS, SCATTERING_PER_MM, compared
+from services.bench.slab.stock_cell import matched_folder, medium_of, node_angles, scenes, turned
+from services.fit.slab.dictionaries.hg import COSINES
+from services.fit.slab.images import Measurements, folded
+from services.fit.slab.model.dictionary import Material, hg_values
+from services.fit.slab.model.rig import rig_of
+from services.fit.slab.solve.coordinates import Knots
+from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
+from services.fit.slab.solve.mixture import Mixtures, unit_atoms
+from services.fit.slab.solve.start import start
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+PHOTONS, QUICK_PHOTONS = 500_000, 20_000
+"""Of each image."""
+RATES, QUICK_RATES = (0.03, 0.1), (0.1,)
+"""Of Adam, in the logarithms of weights."""
+ITERATIONS, QUICK_ITERATIONS = (10, 20, 40, 80), (1,)
+"""After which its medium is told."""
+SAMPLES = 64
+"""Of a pixel in a render and in its gradient."""
+MEAN_DECAY, SQUARE_DECAY, SMALL = 0.9, 0.999, 1e-8
+"""Adam's own (Kingma and Ba 2015)."""
+SMALLEST_PER_MM = 1e-4
+"""Of an absorption whose logarithm is taken."""
+STOCK = "stock Mitsuba"
+EXTINCTION, ALBEDO, VALUES = (
+    f"cell.interior_medium.{name}" for name in ("sigma_t.value.value", "albedo.value.value", "phase_function.values")
+)
+
+
+def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
+    """Rows of both."""
+    folder = matched_folder()
+    truth = Truth(PHASE, folder, SCATTERING_PER_MM, ABSORPTION_PER_MM, PHASES[PHASE])
+    images, variances = photographed(truth, QUICK_PHOTONS if quick else PHOTONS, seed=61)
+    rig = rig_of(folder, folder.wavelengths_nm[0])
+    halves = [folded(image, variance, rig.grid) for image, variance in zip(images, variances, strict=True)]
+    names = tuple(entry.file for entry in folder.images)
+    values, of_values = (np.stack(each) for each in zip(*halves, strict=True))
+    measured = Measurements(values, of_values, np.zeros(len(values), dtype=bool), names, assumed_noise=False)
+    begun = time.process_time()
+    guess = start(rig, measured, 1, map)
+    start_seconds = time.process_time() - begun
+    rows: list[dict[str, Any]] = []
+
+    def add(peer: str, setting: str, found: Material, seconds: float) -> None:
+        rows.append(compared(truth, found, peer, setting, start_seconds + seconds, "slab-stock").model_dump())
+        keep(rows)
+
+    add("start", "HG of three numbers", guess, 0.0)
+    for effort in QUICK_EFFORTS if quick else EFFORTS:
+        begun = time.process_time()
+        found = GaussNewton(rig, measured, 1, Budget().scaled(effort), map, Knots()).solve(lambda: guess).material
+        add("dentine", f"effort {effort:g}", found, time.process_time() - begun)
+    for rate in QUICK_RATES if quick else RATES:
+        for iterations, found, seconds in descend(truth, guess, images, variances, rate, quick=quick):
+            add(STOCK, f"rate {rate:g}, {iterations} iterations", found, seconds)
+    return rows
+
+
+def descend(
+    truth: Truth, guess: Material, images: Array, variances: Array, rate: float, *, quick: bool
+) -> Iterator[tuple[int, Material, float]]:
+    """Iterations, the medium after them and processor seconds, by Adam on gradients of stock Mitsuba.
+
+    Args:
+        images: measured (images, rows, columns), and their variances.
+    """
+    from services.fit.transport.platform import prepare_device
+
+    prepare_device()
+    import mitsuba as mi
+
+    atoms = Mixtures(unit_atoms(np.stack([hg_values(g) for g in COSINES], axis=1)))
+    tables = np.stack([hg_values(g, node_angles()) for g in COSINES], axis=1)
+    begun = atoms.begun(guess)
+    x = np.log(np.append(begun.atom_weights, max(begun.absorption_per_mm, SMALLEST_PER_MM)))
+    medium = medium_of(1.0, 0.5, PHASES[PHASE])
+    views = [
+        (scene, mi.traverse(scene), turned(image, front=front), turned(variance, front=front))
+        for (scene, front), image, variance in zip(
+            scenes(truth.folder, medium, "prbvolpath"), images, variances, strict=True
+        )
+    ]
+    mean, square, told = np.zeros_like(x), np.zeros_like(x), QUICK_ITERATIONS if quick else ITERATIONS
+    seconds = 0.0
+    for iteration in range(1, max(told) + 1):
+        clock = time.process_time()
+        slope = np.zeros_like(x)
+        for number, view in enumerate(views):
+            slope += _slope(*view, np.exp(x), tables, seed=2 * (iteration * len(views) + number))
+        mean, square = (
+            MEAN_DECAY * mean + (1 - MEAN_DECAY) * slope,
+            SQUARE_DECAY * square + (1 - SQUARE_DECAY) * slope**2,
+        )
+        unbiased = np.sqrt(square / (1 - SQUARE_DECAY**iteration)) + SMALL
+        x = x - rate * mean / (1 - MEAN_DECAY**iteration) / unbiased
+        seconds += time.process_time() - clock
+        if iteration in told:
+            yield iteration, atoms.material_at(np.exp(x)), seconds
+
+
+def _slope(scene: Any, params: Any, image: Array, variance: Array, known: Array, tables: Array, *, seed: int) -> Array:
+    """Derivative of half the misfit of one image by the logarithms of weights and absorption, which are ``known``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    extinction, albedo, values = medium_numbers(known, tables)
+    params[EXTINCTION], params[ALBEDO], params[VALUES] = mi.Float(extinction), mi.Float(albedo), mi.Float(values)
+    for name in (EXTINCTION, ALBEDO, VALUES):
+        dr.enable_grad(params[name])
+    params.update()
+    # The image and its derivative have streams of their own, so that their product is not biased.
+    rendered = mi.render(scene, params, spp=SAMPLES, seed=seed, seed_grad=seed + 1)
+    measured, own = (mi.TensorXf(np.ascontiguousarray(one[..., None], dtype=np.float32)) for one in (image, variance))
+    dr.backward(0.5 * dr.sum(dr.square(rendered - measured) / own, axis=None))
+    by_extinction, by_albedo = (float(dr.grad(params[name])[0]) for name in (EXTINCTION, ALBEDO))
+    return chained(by_extinction, by_albedo, np.array(dr.grad(params[VALUES]), dtype=np.float64), known, tables)
+
+
+def medium_numbers(known: Array, tables: Array) -> tuple[float, float, Array]:
+    """Extinction, albedo and the table of the phase function, from weights and the absorption."""
+    extinction = float(known.sum())
+    return extinction, float(known[:-1].sum()) / extinction, tables @ known[:-1]
+
+
+def chained(by_extinction: float, by_albedo: float, by_values: Array, known: Array, tables: Array) -> Array:
+    """Derivative by the logarithms of what is ``known`` from those by ``medium_numbers``."""
+    extinction = float(known.sum())
+    by_weights = by_extinction + by_albedo * known[-1] / extinction**2 + tables.T @ by_values
+    by_absorption = by_extinction - by_albedo * (extinction - known[-1]) / extinction**2
+    return np.asarray(np.append(by_weights, by_absorption) * known)
+
+
+def times_faster(rows: list[dict[str, Any]]) -> float | None:
+    """How many times as long stock Mitsuba took as the default's shortest run whose errors of sigma_s and phase function are no larger.
+
+    The least over its media; None where no run of the default is as near as any.
+    """
+    ratios = []
+    for row in (row for row in rows if row["peer"] == STOCK):
+        as_near = [
+            other["seconds"]
+            for other in rows
+            if other["peer"] == "dentine" and all(other[key] <= row[key] for key in ("error", "scattering_error"))
+        ]
+        ratios += [row["seconds"] / min(as_near)] if as_near else []
+    return min(ratios, default=None)
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Errors of the phase function and of sigma_s against core-seconds."""
+    from services.bench.plots import draw_errors, finish, grid
+
+    figure, panels = grid(2)
+    for axes, key, title in zip(panels, ("error", "scattering_error"), ("phase function, L2", "σs"), strict=True):
+        draw_errors(axes, [row | {"error": row[key]} for row in rows], lines=False)
+        finish(axes, "core-seconds", "relative error")
+        axes.set_title(title)
+    return figure

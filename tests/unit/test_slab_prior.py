@@ -1,0 +1,48 @@
+"""The smoothness prior of a slab's phase function: what it draws a medium by that bends sharply at few angles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, henyey_greenstein
+from services.fit.slab.solve.coordinates import Knots
+from services.fit.slab.solve.prior import Quadratic, precision, second_differences, widened
+
+TROUGH = KNOTS // 3
+"""Knot of a trough between two rings, three knots wide: ln f bends there by 100 per rad2 and more."""
+SHARP = Material(
+    henyey_greenstein(1.0, 0.5, 0.0).scattering * np.exp(-0.3 * np.exp(-0.5 * ((np.arange(KNOTS) - TROUGH) / 3) ** 2)),
+    0.0,
+)
+CURVATURE = 30.0
+"""Of each knot's ln f by the images: one knot alone is known to 18 %."""
+
+
+def drawn(scale: float | np.ndarray) -> float:
+    """What the prior moves ln f in the trough by."""
+    x, prior = Knots().unknowns(SHARP), precision(scale)
+    return float(-(np.linalg.solve(prior + CURVATURE * np.eye(KNOTS + 1), prior @ x))[TROUGH])
+
+
+def test_a_trough_that_is_seen_is_filled_less_where_the_prior_follows_it() -> None:
+    # No random numbers here: 0.21 and 0.11, of a trough that is 0.3 deep.
+    assert drawn(10.0) > 0.2
+    assert drawn(widened(10.0, SHARP)) < 0.6 * drawn(10.0)
+
+
+def test_a_scale_follows_a_medium_where_it_bends_and_nowhere_else() -> None:
+    scale, bends = widened(10.0, SHARP), np.abs(second_differences() @ np.log(SHARP.scattering))
+    assert bends[TROUGH] > 100
+    assert scale[TROUGH] >= bends[TROUGH]
+    assert scale[TROUGH + 40 :].max() < 11
+
+
+def test_evidence_is_asked_for_sharp_scales_at_the_end_alone() -> None:
+    # Images that fix ln f everywhere, and show the trough.
+    x, nothing = Knots().unknowns(SHARP), np.zeros((KNOTS + 1, KNOTS + 1))
+    matrix = 1e4 * np.eye(KNOTS + 1)
+    quadratic = Quadratic(matrix, -matrix @ x, nothing, np.zeros(KNOTS + 1), nothing)
+    assert np.ndim(Knots().scale(SHARP, quadratic, sharp=False)) == 0
+    sharp = np.asarray(Knots().scale(SHARP, quadratic, sharp=True))
+    assert sharp.shape == ANGLES_RAD.shape
+    assert sharp[TROUGH] > 5 * np.median(sharp)
