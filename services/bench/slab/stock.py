@@ -2,7 +2,7 @@
 
 Stock Mitsuba cannot light a cell through smooth glass, so the boundary is matched (``stock_cell``). Images are those of plain photons,
 and both begin at the same medium. Adam moves the logarithms of the weights of HG lobes, one ``tabphase`` with values D w, and of the
-absorption: a smooth dictionary, which holds the true lobe itself, spares it the prior that the default's 200 knots need.
+absorption: a smooth dictionary, which holds the true lobes themselves or neighbours of them, spares it the prior that the default's 200 knots need.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from services.bench.slab.accuracy import PHASES
 from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import Truth, photographed
-from services.bench.slab.solvers import ABSORPTION_PER_MM, EFFORTS, PHASE, QUICK_EFFORTS, SCATTERING_PER_MM, compared
+from services.bench.slab.solvers import ABSORPTION_PER_MM, EFFORTS, QUICK_EFFORTS, SCATTERING_PER_MM, compared
 from services.bench.slab.stock_cell import matched_folder, medium_of, node_angles, scenes, turned
 from services.fit.slab.dictionaries.hg import COSINES
 from services.fit.slab.images import Measurements, folded
@@ -33,11 +33,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+PHASE = "two lobes"
+"""Unlike the start's one lobe."""
 PHOTONS, QUICK_PHOTONS = 500_000, 20_000
 """Of each image."""
-RATES, QUICK_RATES = (0.03, 0.1), (0.1,)
+RATES, QUICK_RATES = (0.05, 0.2), (0.2,)
 """Of Adam, in the logarithms of weights."""
-ITERATIONS, QUICK_ITERATIONS = (10, 20, 40, 80), (1,)
+ITERATIONS, QUICK_ITERATIONS = (5, 10, 20, 40), (1,)
 """After which its medium is told."""
 SAMPLES = 64
 """Of a pixel in a render and in its gradient."""
