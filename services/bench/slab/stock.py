@@ -1,8 +1,9 @@
-"""``dentine bench slab-stock``: an index-matched cell measured by the default solver, and by stock Mitsuba with its own gradients and Adam.
+"""``dentine bench slab-stock``: an index-matched cell measured by the default solver and by stock Mitsuba.
 
-Stock Mitsuba cannot light a cell through smooth glass, so the boundary is matched (``stock_cell``). Images are those of plain photons,
-and both begin at the same medium. Adam moves the logarithms of the weights of HG lobes, one ``tabphase`` with values D w, and of the
-absorption: a smooth dictionary, which holds the true lobes themselves or neighbours of them, spares it the prior that the default's 200 knots need.
+Stock Mitsuba cannot light a cell through smooth glass, so the boundary is matched (``stock_cell``). Images are those of
+plain photons, and both begin at the same medium. By gradients of Mitsuba, Adam moves the logarithms of the weights of
+HG lobes, one ``tabphase`` with values D w, and of the absorption: a smooth dictionary, which holds the true lobes
+themselves or neighbours of them, spares it the prior that the default's 200 knots need.
 """
 
 from __future__ import annotations
@@ -158,9 +159,10 @@ def chained(by_extinction: float, by_albedo: float, by_values: Array, known: Arr
 
 
 def times_faster(rows: list[dict[str, Any]]) -> float | None:
-    """How many times as long stock Mitsuba took as the default's shortest run whose errors of sigma_s and phase function are no larger.
+    """How many times as long stock Mitsuba took as the default's shortest run that came as near.
 
-    The least over its media; None where no run of the default is as near as any.
+    That has no larger errors of sigma_s and of the phase function. The least over Mitsuba's media; None where no run of
+    the default is as near as any.
     """
     ratios = []
     for row in (row for row in rows if row["peer"] == STOCK):

@@ -1,7 +1,8 @@
 """Images of an index-matched cell by stock Mitsuba, which share no code with the slab's kernel.
 
-Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black plate
-whose opacity is one minus the beam's profile is one: its integrators multiply what a plate lets through into every connection.
+Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black
+plate whose opacity is one minus the beam's profile is one: its integrators multiply what a plate lets through into
+every connection.
 """
 
 from __future__ import annotations
@@ -84,7 +85,10 @@ def scenes(folder: SlabFolder, medium: dict[str, Any], integrator: str) -> Itera
 
 
 def turned(image: Array, *, front: bool) -> Array:
-    """A film (rows, columns) as a folder's image, or the other way: its rows go down, and those of a camera in front run against x."""
+    """A film (rows, columns) as a folder's image, or the other way.
+
+    A film's rows go down, and those of a camera in front run against x.
+    """
     return image[::-1, ::-1] if front else image[::-1]
 
 

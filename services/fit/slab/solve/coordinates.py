@@ -48,7 +48,7 @@ class Coordinates(Protocol):
         """
 
     def scale(self, material: Material, quadratic: Quadratic, *, sharp: bool) -> float | Array:
-        """Scale of the prior, near a medium and as its images suggest; ``sharp`` where it follows what the medium shows already."""
+        """Scale of the prior, near a medium and as its images suggest; ``sharp`` where it follows that medium."""
 
     def precision(self, scale: float | Array) -> Array:
         """Inverse covariance of the prior (U, U) for one scale."""

@@ -37,9 +37,9 @@ anew for each render, and misfits of one medium were seen to differ by a third. 
 after it."""
 MAX_HALVINGS = 4
 WORTHWHILE, WORTHWHILE_THICK = 2.0, 1.0
-"""A step that promises less than so many times what noise alone does waits for more paths; at the end, one that promised more is followed
-by another. Where sigma_t w exceeds ``prior.THICK``, what is left along sigma_s at a constant sigma_s' promises little beside the noise of
-all directions and is still a tenth of sigma_s."""
+"""A step that promises less than so many times what noise alone does waits for more paths; at the end, one that
+promised more is followed by another. Where sigma_t w exceeds ``prior.THICK``, what is left along sigma_s at a constant
+sigma_s' promises little beside the noise of all directions and is still a tenth of sigma_s."""
 UNFINISHED = 5.0
 """A fit whose last step promised more than so many times what noise does has not converged."""
 NEAR = 0.05
