@@ -1,7 +1,9 @@
 #!/bin/sh
-# Runs make targets on bare machines: a fresh Debian or Ubuntu with apt, make and python3 alone, in a folder, entered by chroot.
+# Runs make targets on bare machines: a fresh Debian or Ubuntu with apt, make and python3 alone, in a folder, entered by
+# chroot.
 #   deploy/bare_machine.sh SUITE [TARGET...]     SUITE: bookworm, trixie, noble ...; TARGET: of the Makefile, default demo and test
-# Needs root and mmdebstrap. The tree is what is committed. Of what it mounts nothing is seen outside, and all ends with it.
+# Needs root and mmdebstrap. The tree is what is committed. Of what it mounts nothing is seen outside, and all ends with
+# it.
 #   BARE_FOLDER     where the machine lies, 10 GB; default /var/tmp/dentine-bare. Logs and times stay there, the machine does not
 #   BARE_USER       yes: targets are run by an ordinary user who may call sudo; default: by root
 #   BARE_KEEP       yes: the machine is left in its folder

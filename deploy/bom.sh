@@ -1,5 +1,6 @@
 #!/bin/sh
-# Writes what each image is made of as CycloneDX bills of material: deploy/bom.sh FOLDER. They are made of the locks and checked against the format's schema.
+# Writes what each image is made of as CycloneDX bills of material: deploy/bom.sh FOLDER. They are made of the locks and
+# checked against the format's schema.
 set -eu
 folder=${1:?give the folder to write to}
 cd "$(dirname "$0")/.."

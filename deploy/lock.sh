@@ -1,5 +1,6 @@
 #!/bin/sh
-# Writes what each image installs, with versions and hashes: deploy/images/{build,api,worker}.lock. Needs network; commit what it writes.
+# Writes what each image installs, with versions and hashes: deploy/images/{build,api,worker}.lock. Needs network;
+# commit what it writes.
 #   deploy/lock.sh             keeps the versions that the files name already, where pyproject.toml still allows them
 #   deploy/lock.sh --upgrade   takes the newest
 set -eu

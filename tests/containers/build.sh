@@ -1,7 +1,8 @@
 #!/bin/sh
-# Builds what tests/containers runs. Where the public bases cannot be pulled, set DENTINE_PYTHON_IMAGE to one that deploy/images/base.sh has made; a database
-# is then built on it too. DENTINE_BUILD is the build command (default `docker build`), with whatever mounts or networks this machine needs; where it is
-# podman's and the engine docker's, the images are handed over.
+# Builds what tests/containers runs. Where the public bases cannot be pulled, set DENTINE_PYTHON_IMAGE to one that
+# deploy/images/base.sh has made; a database is then built on it too. DENTINE_BUILD is the build command (default
+# `docker build`), with whatever mounts or networks this machine needs; where it is podman's and the engine docker's,
+# the images are handed over.
 set -eu
 cd "$(dirname "$0")/../.."
 build=${DENTINE_BUILD:-docker build}

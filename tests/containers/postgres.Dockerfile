@@ -1,4 +1,5 @@
-# Stands in for the public Postgres image where none can be pulled: Debian's server behind the same variables, folders and users.
+# Stands in for the public Postgres image where none can be pulled: Debian's server behind the same variables, folders
+# and users.
 ARG PYTHON_IMAGE
 FROM ${PYTHON_IMAGE}
 RUN mkdir -p /usr/share/man/man1 /usr/share/man/man7 && apt-get update -qq && apt-get install -qq -y --no-install-recommends postgresql && apt-get clean && rm -rf /var/lib/apt/lists/* \
