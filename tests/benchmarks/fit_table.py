@@ -2,8 +2,8 @@
 JSON.
 
 python -m tests.benchmarks.fit_table --cases homogeneous,known --json fit_table.json
-python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' --json
-starts.json
+python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' \\
+    --json starts.json
 
 Reduced scattering and 1 - alpha' are relative errors of what the report says; image errors have sensor noise and the
 truth's Monte Carlo noise taken out, and are not below what the photographs' noise resolves. Fits run in this process,

@@ -3,8 +3,8 @@
 
 python -m tests.benchmarks.instrument_errors --json instrument_errors.json
 python -m tests.benchmarks.instrument_errors --errors none,gain --pixel-step 3 --json gain.json
-python -m tests.benchmarks.instrument_errors --errors none,far_gain,far_light,far_scan,exchanged --seeds 3 --instrument
-on --json faults.json
+python -m tests.benchmarks.instrument_errors --errors none,far_gain,far_light,far_scan,exchanged --seeds 3 \\
+    --instrument on --json faults.json
 
 The stored central incisor as stock Mitsuba renders it, with sensor noise, is photographed by an instrument with one
 error: its images are scaled, or light is added to them, or its lights, scan or dome are said to be elsewhere, by two of

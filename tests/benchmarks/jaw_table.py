@@ -2,9 +2,9 @@
 (``tests/support/jaw_truth.py``), as JSON.
 
 python -m tests.benchmarks.jaw_table --json jaw_table.json
-python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "max_steps": 6}' --workers 2 --json
-jaw_table.json python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --json
-jaw_table.json
+python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "max_steps": 6}' --workers 2 \\
+    --json jaw_table.json
+python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --json jaw_table.json
 
 Every visible tooth is held to the limits of a single one with known dentin. The photographs' own noise, that of the
 sensor and of the renderer, is part of every number: a medium's figure comes with its standard error, an image's with

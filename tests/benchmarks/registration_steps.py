@@ -1,7 +1,8 @@
 """What landmarks and outlines each bring to the pose of a scan, and whether their ± are honest.
 
-python -m tests.benchmarks.registration_steps --json steps.json [--draws 12] [--places 7]     some 6 s of processor time
-a draw
+python -m tests.benchmarks.registration_steps --json steps.json [--draws 12] [--places 7]
+
+A draw takes some 6 s of processor time.
 
 Each draw is a phantom subject of its own before three cameras, pixels of 0.2 mm, clicks to 0.3 mm, and a scan with
 noise of 0.02 mm in a frame of its own, cut off behind a place from the midline. The photographs are drawn

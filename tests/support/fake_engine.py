@@ -3,12 +3,11 @@
 The image of a pixel with enamel of thickness d under a light at angle c has a near part from enamel and a deep part
 from dentin::
 
-    I = c (1 - T) a_e^1.5 + T c^(1/2) a_d^1.5 (1 - exp(-s_d c^2)) + 0.05,   T = exp(-s_e d),   s = reduced scattering, a
-    = reduced albedo
+    I = c (1 - T) a_e^1.5 + T c^(1/2) a_d^1.5 (1 - exp(-s_d c^2)) + 0.05,   T = exp(-s_e d)
 
-so reduced quantities are fixed by the images and nothing else is. A stain multiplies by a_t at the texel a pixel looks
-at, and by its mean over all texels of the tooth, for the way in. Noise is Gaussian, relative, falls with the samples
-and depends on seed and pixel alone.
+with reduced scattering s and reduced albedo a, so reduced quantities are fixed by the images and nothing else is. A
+stain multiplies by a_t at the texel a pixel looks at, and by its mean over all texels of the tooth, for the way in.
+Noise is Gaussian, relative, falls with the samples and depends on seed and pixel alone.
 """
 
 # ruff: noqa: ARG002 - signatures are those of what is replaced

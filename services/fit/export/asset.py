@@ -7,12 +7,15 @@
     gums.ply, cavity.ply       of a jaw
     surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
     teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer
-    surface's u, v rig.json                   cameras, lights and channels by name
+                               surface's u, v
+    rig.json                   cameras, lights and channels by name
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number,
-    ``11.enamel.sigma`` errors.json                fitted and held-out image error, whether the fit converged,
-    correlations, what the capture tells; of a jaw's teeth too NOT-CONVERGED.txt          only where it did not: what to
-    do render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for
-    boundary thin
+                               ``11.enamel.sigma``
+    errors.json                fitted and held-out image error, whether the fit converged, correlations, what the
+                               capture tells; of a jaw's teeth too
+    NOT-CONVERGED.txt          only where it did not: what to do
+    render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for
+                               boundary thin
 """
 
 from __future__ import annotations

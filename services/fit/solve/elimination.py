@@ -4,8 +4,9 @@ Images are exactly linear in the errors e, and their columns B have no Monte Car
 errors are known in closed form, and a step p of the tissue takes them along by -R p. What is left are equations of the
 tissue (variable projection, Golub and Pereyra 1973):
 
-    S = B'WB + P,   R = S^-1 B'WJ,   H = J'WJ - J'WB R,   g = J'Wr - R'(B'Wr + P e),   P the precision of the errors'
-    prior
+    S = B'WB + P,   R = S^-1 B'WJ,   H = J'WJ - J'WB R,   g = J'Wr - R'(B'Wr + P e),
+
+with P the precision of the errors' prior.
 
 J'WB comes from noisy derivatives, so J'WB S^-1 B'WJ is too large by what its noise squares to, which its own covariance
 tells and which is taken off.

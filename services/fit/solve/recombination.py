@@ -6,8 +6,8 @@ own. Held mean cosines, moves of scan and dome, and those derivatives leave an a
 so its errors e, the last K of x, may be worse than their prior was. The prior says e = m + n, n of covariance V. With B
 = dx / dm, the answer's response to the prior, and d = e - m,
 
-    c = Cov(x, d) = C[:, e] - B V,   D = Cov(d) = C[e, e] - B[e] V - V B[e]' + V,   x <- x - G d,   C <- C - c D^-1 c',
-    G = c D^-1
+    c = Cov(x, d) = C[:, e] - B V,   D = Cov(d) = C[e, e] - B[e] V - V B[e]' + V,   G = c D^-1,
+    x <- x - G d,   C <- C - c D^-1 c'
 
 is the linear unbiased combination of least variance (Gauss and Markov). Where the fit used its prior in full, c = 0 and
 nothing changes; after it no ± of an error is larger than the prior's. The tissue goes along as far as its error goes

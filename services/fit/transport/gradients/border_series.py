@@ -6,8 +6,8 @@ travels so, a change of the media changes an image by dI = -int dV int dw L+ [ds
 that moves by v along the dentin's outward normal n exchanges enamel for dentin in the volume it sweeps. In real
 spherical harmonics, in which f is diagonal with its Legendre moments f_j,
 
-    dI/dc = -int dA (n . v) sum_j c_j sum_k L_jk L+_jk,        c_j = [sigma - sigma_s f_j] dentin - [sigma - sigma_s
-    f_j] enamel.
+    dI/dc = -int dA (n . v) sum_j c_j sum_k L_jk L+_jk,
+    c_j = [sigma - sigma_s f_j] dentin - [sigma - sigma_s f_j] enamel.
 
 What extinction takes and scattering returns cancels in c_0 before anything is sampled: c_0 is the difference of
 absorption.
