@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 SIZES = {True: (1280, 960), False: (5120, 3840)}
 """Width and height by ``quick``."""
-LIGHTS = 18
-"""Images of one slice, of which capture and store take 4 GB of the disk."""
-SLICES = 9
-FEWER = 6
+LIGHTS = 54
+"""Images of one slice, as many as a camera of the rig takes; capture and store take 15 GB of the disk meanwhile."""
+SLICES = 3
+FEWER = (6, 18)
 SHARES = (0.2, SHARE_OF_HEIGHT, 1.5)
 """Height of the tooth by that of the image; at 1.5 it fills the image, so that nothing is left out."""
 TURNS = 2
@@ -41,7 +41,7 @@ def run(quick: bool = False, case: str = "images", keep: Keep = lambda _rows: No
     """Rows of one case.
 
     Args:
-        case: ``images``: 6, 18, then slices of 18 up to 162. ``workers``: 18 by one and by two, in turns. ``region``: 6
+        case: ``images``: 6, 18, then three times 54 to 162. ``workers``: 18 by one and by two, in turns. ``region``: 6
             of teeth of several sizes.
 
     Raises:
@@ -74,28 +74,28 @@ def picture(rows: list[Row]) -> Figure:
 def _images(size: tuple[int, int]) -> Iterator[Row]:
     """Each slice is another capture; the last row is all slices together."""
     slices = []
-    for number, lights in enumerate((FEWER, *[LIGHTS] * SLICES)):
+    for number, lights in enumerate((*FEWER, *[LIGHTS] * SLICES)):
         with _captured(size, lights, seed=number + 1) as root:
             row = _row(lights, *_prepared_apart(root))
         slices.append(row)
         yield row
-    whole = slices[1:]
+    whole = slices[len(FEWER) :]
     seconds, peak_gib = sum(row["seconds"] for row in whole), max(row["peak_gib"] for row in whole)
     yield _row(LIGHTS * SLICES, seconds, peak_gib) | {"clock_s": sum(row["clock_s"] for row in whole)}
 
 
 def _workers(size: tuple[int, int]) -> Iterator[Row]:
     """The same capture each time."""
-    with _captured(size, LIGHTS) as root:
+    with _captured(size, FEWER[1]) as root:
         for _ in range(TURNS):
             for workers in (1, 2):
-                yield {"images": LIGHTS, "workers": workers, "clock_s": _prepared_on(root, workers)}
+                yield {"images": FEWER[1], "workers": workers, "clock_s": _prepared_on(root, workers)}
 
 
 def _region(size: tuple[int, int]) -> Iterator[Row]:
     for share in SHARES:
-        with _captured(size, FEWER, share=share) as root:
-            yield {"tooth_by_height": share, **_row(FEWER, *_prepared_apart(root))}
+        with _captured(size, FEWER[0], share=share) as root:
+            yield {"tooth_by_height": share, **_row(FEWER[0], *_prepared_apart(root))}
 
 
 def _row(images: int, seconds: float, peak_gib: float, clock_s: float = 0.0) -> Row:
