@@ -106,7 +106,9 @@ def test_steps_of_single_teeth_come_before_those_of_the_whole(
     teeth = [s["tooth"] for s in steps]
     assert set(teeth) == {11, 12, None}
     assert teeth.index(None) == len(teeth) - teeth[::-1].index(12)
-    assert {s["stage"] for s in steps if s["tooth"] is None} == {"start.0", "start.1", "start.2", "joint", "exact"}
+    stages = {s["stage"] for s in steps if s["tooth"] is None}
+    # The last stage looks again where the prior of the instrument's errors has moved the answer far.
+    assert stages - {"again"} == {"start.0", "start.1", "start.2", "joint", "exact"}
     folder, stored = open_stage(root, "fit", FitReport)
     assert stored == report
     assert len(json.loads((folder / "history.json").read_text())) == report.steps

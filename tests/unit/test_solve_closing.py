@@ -280,9 +280,10 @@ def test_an_answer_that_its_prior_would_take_too_far_goes_one_scale_and_states_t
     scale, rows, weight = float(domain.scale[0]), np.stack(2 * [np.linspace(0.5, 1.0, 50)]), np.full(50, 1e4)
     noise = 30 * np.cos(np.arange(50))
     equations = normal_equations(rows, rows, noise, -noise, 1 / weight, weight, exact=1)
-    for off, moved, rest in ((0.5, 0.5, 0.0), (3.0, 1.0, 2.0)):
+    # Of a jaw of four teeth each may move by a scale, which is two in their common norm.
+    for off, part_count, moved, rest in ((0.5, 1, 0.5, 0.0), (3.0, 1, 1.0, 2.0), (3.0, 4, 2.0, 1.0)):
         x = np.array([1.0, -off * scale])
-        known = uncertainty(domain, x, equations)
+        known = uncertainty(domain, x, equations, part_count=part_count)
         np.testing.assert_allclose((known.x - x) / scale, [-moved, moved], rtol=1e-6)
         assert known.is_whole is (rest == 0)
         parts = known.se_parts(np.array([1.0, 0.0]))

@@ -294,7 +294,7 @@ class Stages(ABC, Generic[Optics]):
             )
             equations = NormalEquations.of(stored)
         if problem.jacobian_g is None or solution.result is Result.STALLED:
-            known = uncertainty(problem.domain, solution.x, equations)
+            known = uncertainty(problem.domain, solution.x, equations, part_count=self.part_count)
             if not problem.domain.errors.names:
                 return problem, solution, equations, known
         else:
@@ -325,7 +325,8 @@ class Stages(ABC, Generic[Optics]):
         entry, _ = self.journal.once(key, compute)
         step = np.array(entry["step"])
         sums = ClosingSums.of(entry["sums"])
-        return uncertainty(domain, x + step, equations, sums, step, [m.body for m in moves])
+        bodies = [move.body for move in moves]
+        return uncertainty(domain, x + step, equations, sums, step, bodies, self.part_count)
 
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float

@@ -10,6 +10,8 @@ joint      the same                                                        simil
 shape      the same, the mean cosine of all enamel, and each tooth's       exact    converged, or max_steps; only where
            blend weights                                                            blend weights are fitted
 exact      the same                                                        exact    converged, or max_steps
+again      the same                                                        exact    as before; only where errors
+                                                                                    moved x far
 =========  ==============================================================  =======  ===========================
 
 Before the first stage every tooth was looked at alone, as if homogeneous. Which of its two media is the denser one is

@@ -250,6 +250,7 @@ def uncertainty(
     sums: ClosingSums | None = None,
     step: Array | None = None,
     moved: Sequence[str] = (),
+    part_count: int = 1,
 ) -> Uncertainty:
     """Uncertainty at a solution from the normal equations there.
 
@@ -261,6 +262,7 @@ def uncertainty(
         step: what the fit moved after it.
         moved: what the last of the closing measurement's changes are of, ``teeth`` or ``dome`` each; the others are of
             held mean cosines.
+        part_count: how many things the fit is about that images tell apart, such as the teeth of a jaw.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
     known = whitening(domain, equations)
@@ -290,7 +292,7 @@ def uncertainty(
 
     # What is left of the step counts as error along what is not open.
     rest = ClosingModel(domain, x, known, inverse, left, parts["rendering"]).rest()
-    found = settle(domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(rest, rest))
+    found = settle(domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(rest, rest), part_count)
     covariance = 0.5 * (found.covariance + found.covariance.T)
     return Uncertainty(
         domain,

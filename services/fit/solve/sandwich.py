@@ -68,12 +68,20 @@ class Settled:
     """Whether the answer went all the way there, or as far as one linear model reaches."""
 
 
-def settle(domain: Domain, x: Array, sandwich: Sandwich, meats: Mapping[str, Array], unfinished: Array) -> Settled:
+def settle(
+    domain: Domain,
+    x: Array,
+    sandwich: Sandwich,
+    meats: Mapping[str, Array],
+    unfinished: Array,
+    part_count: int = 1,
+) -> Settled:
     """Use the prior of the instrument's errors in full, but that of an error that is a fault of the calibration.
 
     Args:
         meats: whitened, by source; they add up to the sandwich's.
         unfinished: covariance (F, F) of what is left of the step.
+        part_count: how many things the fit is about that images tell apart, such as the teeth of a jaw.
     """
     count, plain = domain.tissue_count, {name: sandwich.plain(sandwich.inverse, meat) for name, meat in meats.items()}
     whole = sandwich.plain(sandwich.inverse, sandwich.meat) + unfinished
@@ -92,10 +100,10 @@ def settle(domain: Domain, x: Array, sandwich: Sandwich, meats: Mapping[str, Arr
     through[:, count:] += change
     parts = {name: through @ part @ through.T for name, part in plain.items()} | _of_prior(domain, after)
 
-    # As much of the step as moves the tissue by one scale, as images are not linear farther than that; the rest of it
-    # counts as error.
+    # As much of the step as moves the tissue by one scale for each thing, as images are not linear farther than that;
+    # the rest of it counts as error.
     step, (low, high) = change @ x[count:], domain.bounds
-    length = float(np.linalg.norm((step / domain.scale)[:count]))
+    length = float(np.linalg.norm((step / domain.scale)[:count]) / np.sqrt(part_count))
     gone = np.asarray(step / max(1.0, length), dtype=np.float64)
     left = np.outer(step - gone, step - gone)
     parts["unfinished"] = parts["unfinished"] + left
