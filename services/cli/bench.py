@@ -20,6 +20,7 @@ _BENCHMARKS = MappingProxyType(
         "slab": "services.bench.slab.forward:run",
         "slab-map": "services.bench.slab.accuracy:run",
         "slab-mie": "services.bench.slab.dispersions:run",
+        "slab-novel": "services.bench.slab.novel:run",
         "slab-solvers": "services.bench.slab.solvers:run",
         "slab-stock": "services.bench.slab.stock:run",
         "slab-surface": "services.bench.slab.surface:run",

@@ -100,8 +100,8 @@ def photographed(truth: Truth, photons: int, seed: int) -> tuple[Array, Array]:
     return images + shot * np.random.default_rng(seed).normal(size=images.shape), total
 
 
-def recovered(truth: Truth, images: Array, variances: Array, seed: int) -> Recovery:
-    """Fit the images and compare."""
+def fitted(truth: Truth, images: Array, variances: Array, seed: int) -> SlabFit:
+    """Fit images of a truth's folder."""
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         (root / "slab.json").write_text(truth.folder.model_dump_json())
@@ -110,6 +110,12 @@ def recovered(truth: Truth, images: Array, variances: Array, seed: int) -> Recov
             assert entry.variance_file is not None
             np.save(root / entry.variance_file, variance)
         (fit,) = fit_slab(root, SlabOptions(seed=seed))
+    return fit
+
+
+def recovered(truth: Truth, images: Array, variances: Array, seed: int) -> Recovery:
+    """Fit the images and compare."""
+    fit = fitted(truth, images, variances, seed)
     rig = rig_of(truth.folder, fit.wavelength_nm)
     # What the walk's noise adds to the shot noise of a measured value.
     beside = variances - NOISE**2 * np.maximum(images, 0) * images.mean(axis=(1, 2), keepdims=True)
@@ -157,6 +163,19 @@ def compared(truth: Truth, fit: SlabFit, bound: Bound, seed: int) -> Recovery:
         fit_error=fit.errors.fit_error,
         converged=fit.converged,
     )
+
+
+def squared_share(residuals: Array, squares: float) -> tuple[float, float]:
+    """Square of the mean of batches' residuals (B, values) as a share of ``squares``, and its standard error.
+
+    Products are of different batches alone, so that no noise is squared; the error comes from leaving each batch out.
+    """
+    products = residuals @ residuals.T / squares
+    np.fill_diagonal(products, 0)
+    count, total = len(residuals), float(products.sum())
+    without = (total - 2 * products.sum(axis=1)) / ((count - 1) * (count - 2))
+    spread = math.sqrt((count - 1) / count * float(((without - without.mean()) ** 2).sum()))
+    return total / (count * (count - 1)), spread
 
 
 def _share(difference: Array, of: Array) -> float:

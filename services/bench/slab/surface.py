@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from services.bench import Row
 from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import Keep
+from services.bench.slab.recovery import squared_share
 from services.fit.slab.model.dictionary import Material, hg_values
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import Rig, rig_of
@@ -78,9 +79,9 @@ def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
             for number, point in enumerate(mixtures(steps)):
                 begun = time.process_time()
                 mixed = tuple(part / steps for part in point)
-                squared, spread = _squared_error(
-                    _render(rig, mixture_of(mixed, extinction), step=number + 1, paths=PATHS), images
-                )
+                batches = _render(rig, mixture_of(mixed, extinction), step=number + 1, paths=PATHS)
+                residuals = (batches - images).reshape(len(batches), -1)
+                squared, spread = squared_share(residuals, float((images**2).sum()))
                 rows.append(
                     SurfaceRow(
                         benchmark="slab-surface",
@@ -100,17 +101,6 @@ def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
 
 def _render(rig: Rig, material: Material, *, step: int, paths: int) -> Array:
     return render(rig, material, seed=17, step=step, batches=BATCHES, paths=paths, scores=False).images
-
-
-def _squared_error(batches: Array, truth: Array) -> tuple[float, float]:
-    """Mean over pairs of different batches, and its standard error by leaving each batch out."""
-    residuals = (batches - truth).reshape(len(batches), -1)
-    products = residuals @ residuals.T / float((truth**2).sum())
-    np.fill_diagonal(products, 0)
-    count, total = len(batches), float(products.sum())
-    squared = total / (count * (count - 1))
-    without = (total - 2 * products.sum(axis=1)) / ((count - 1) * (count - 2))
-    return squared, math.sqrt((count - 1) / count * float(((without - without.mean()) ** 2).sum()))
 
 
 def other_minima(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

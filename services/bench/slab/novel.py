@@ -1,0 +1,94 @@
+"""``dentine bench slab-novel``: what a fit says of cells and angles that it has not seen (Gkioulekas et al. 2013, 6.4).
+
+A dispersion is measured in one cell by images of plain photons. Images of other cells under other beams are then
+predicted from what was found, and compared with those of what is true. Both come from the fit's own walk, which is held
+to others elsewhere: so what differs is the medium.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.bench import Row
+from services.bench.slab.cell import near_beam_folder
+from services.bench.slab.dispersions import Keep, mie_truth
+from services.bench.slab.recovery import fitted, photographed, squared_share
+from services.core.slab.folder import SlabFolder
+from services.fit.slab.model.dictionary import Material
+from services.fit.slab.model.forward import render
+from services.fit.slab.model.rig import rig_of
+from services.fit.slab.results.result import SlabFit
+
+Array = NDArray[np.float64]
+
+DIAMETER_NM, COLOUR, DILUTION = 500.0, "G", 0.05
+"""sigma_t w is 1.6 in the cell that is measured, and 8 in the widest that is predicted."""
+PHOTONS, QUICK_PHOTONS = 1_000_000, 50_000
+"""Of each image that is fitted."""
+ANGLES_DEG = (10.0, 20.0)
+"""Of the beams; those that are fitted have 5, 15 and 25."""
+WIDTHS_MM = (1.0, 2.5, 5.0)
+BATCHES, PATHS, QUICK_PATHS = 8, 25_000, 1000
+
+
+class NovelRow(Row):
+    """One cell. ``error`` is the relative L2 difference of its images, noise taken out, 0 where that is negative."""
+
+    width_mm: float
+    lights: str
+    squared: float
+    """Square of the error, which noise may take below zero."""
+    squared_se: float
+
+
+def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
+    """A row for the cell that was fitted, and one for each that was not."""
+    truth = mie_truth(DIAMETER_NM, COLOUR, DILUTION, near_beam_folder())
+    images, variances = photographed(truth, QUICK_PHOTONS if quick else PHOTONS, seed=301)
+    begun = time.process_time()
+    found = medium_of_fit(fitted(truth, images, variances, seed=41))
+    seconds = time.process_time() - begun
+    rows: list[dict[str, Any]] = []
+    for folder in (truth.folder, *(novel_folder(width_mm) for width_mm in WIDTHS_MM)):
+        squared, spread = squared_error(folder, found, truth.material(), QUICK_PATHS if quick else PATHS)
+        rows.append(
+            NovelRow(
+                benchmark="slab-novel",
+                peer="dentine",
+                seconds=seconds,
+                error=math.sqrt(max(squared, 0.0)),
+                width_mm=folder.cell.width_mm,
+                lights=", ".join(f"{light.angle_deg:g}" for light in folder.lights),
+                squared=squared,
+                squared_se=spread,
+            ).model_dump()
+        )
+        keep(rows)
+    return rows
+
+
+def novel_folder(width_mm: float) -> SlabFolder:
+    """The benchmarks' cell with another width and other beams."""
+    lights = [{"name": f"n{k}", "side": "front", "angle_deg": angle} for k, angle in enumerate(ANGLES_DEG)]
+    return near_beam_folder(cell={"width_mm": width_mm, "index": 1.33}, lights=lights)
+
+
+def medium_of_fit(fit: SlabFit) -> Material:
+    """The medium that a fit tells of."""
+    known = fit.parameters
+    return Material(known.sigma_s.value * np.array(fit.phase.value_per_sr), known.sigma_a.value)
+
+
+def squared_error(folder: SlabFolder, found: Material, true: Material, paths: int) -> tuple[float, float]:
+    """Squared difference of all images as a share of their squares, and its standard error."""
+    rig = rig_of(folder, folder.wavelengths_nm[0])
+    ours, theirs = (
+        render(rig, medium, seed=seed, step=0, batches=BATCHES, paths=paths, scores=False).images.reshape(BATCHES, -1)
+        for medium, seed in ((found, 71), (true, 72))
+    )
+    return squared_share(ours - theirs, float((theirs.mean(axis=0) ** 2).sum()))
