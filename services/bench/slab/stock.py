@@ -40,7 +40,7 @@ PHOTONS, QUICK_PHOTONS = 500_000, 20_000
 """Of each image."""
 RATES, QUICK_RATES = (0.05, 0.2), (0.2,)
 """Of Adam, in the logarithms of weights."""
-ITERATIONS, QUICK_ITERATIONS = (5, 10, 20, 40), (1,)
+ITERATIONS, QUICK_ITERATIONS = (5, 10, 20), (1,)
 """After which its medium is told."""
 SAMPLES = 64
 """Of a pixel in a render and in its gradient."""
