@@ -26,8 +26,8 @@ from services.fit.slab.solve.weights import independent_weights
 Array = NDArray[np.float64]
 
 BATCHES, PATHS = 8, 60_000
-"""Of the render that gives the curvature. Fewer pass noise for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s was
-bounded by 0.36 % with 8,000 paths, 1.4 % with 40,000, 0.85 % with 250,000."""
+"""Of the render that gives the curvature. Fewer pass noise for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s
+was bounded by 0.36 % with 8,000 paths, 1.4 % with 40,000, 0.85 % with 250,000."""
 FIRST_STEP = 2**33
 """Numbers its random streams apart from a fit's."""
 

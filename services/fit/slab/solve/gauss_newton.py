@@ -210,7 +210,7 @@ class GaussNewton:
             # Where residuals of media near by join, the gradient is that at the mean of these media.
             centre = equations.residuals.place if self.joins(material) else x
             quadratic = quadratic_at(centre, equations)
-            scale = self.coordinates.scale(material, quadratic, sharp=True)
+            scale = self.coordinates.scale(material, quadratic, sharp=not self.is_thick(material))
             prior = self.coordinates.precision(scale)
             change = self.change(quadratic, prior, equations, material, DAMPING)
             moved = self.coordinates.material_at(x + change)
