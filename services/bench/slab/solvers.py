@@ -39,7 +39,7 @@ TRUTH_PATHS, QUICK_TRUTH_PATHS = 400_000, 20_000
 """Of each light, eight times: their noise is a third of a pixel's 1 %."""
 EFFORTS, QUICK_EFFORTS = (0.02, 0.1, 0.3, 1.0), (0.02,)
 """Of the default solver, in units of its budget of paths."""
-ITERATIONS, QUICK_ITERATIONS = (20, 80), (5,)
+ITERATIONS, QUICK_ITERATIONS = (20, 80, 320), (5,)
 RATES = (1e-12, 1e-11, 1e-10)
 """Of the paper's steps: five of the largest throw the weights about (error 0.11 to 0.70), five of 1e-11 hardly move
 them (0.115)."""
