@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from enum import IntFlag
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +14,7 @@ from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
+from services.core.store_url import StoreUrl
 
 
 def _no_stand_in(value: Any) -> Any:
@@ -44,23 +44,6 @@ DictionaryName = Annotated[
 """Of ``DICTIONARIES``."""
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
 Priority = Literal["low", "normal", "high"]
-
-
-STORE_URL = r"^s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9](/[A-Za-z0-9_=-][A-Za-z0-9._=-]{0,99}){0,8}$"
-
-
-def _store_url(value: str) -> str:
-    if not re.fullmatch(STORE_URL, value):
-        raise PydanticCustomError(
-            "store_url",
-            "give s3://BUCKET/PREFIX of letters, digits, '.', '_', '=' and '-', without a slash at the end; "
-            "endpoint and credentials are the environment's",
-        )
-    return value
-
-
-StoreUrl = Annotated[str, AfterValidator(_store_url), WithJsonSchema({"type": "string", "pattern": STORE_URL})]
-"""A place on an S3 server; neither a host nor a key can be written in it, nor a part that leads elsewhere."""
 
 
 class MaskBit(IntFlag):

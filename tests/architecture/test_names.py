@@ -15,6 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 NAME = re.compile(r"services(\.\w+)+(:\w+)?")
 MAX_SIDE_BY_SIDE = 20
+MAX_LINES = 400
 
 
 def sources(*folders: str) -> Iterator[Path]:
@@ -82,6 +83,11 @@ def test_no_folder_is_so_full_that_a_file_cannot_be_found() -> None:
         for folder in {path.parent for path in sources("services")}
     }
     assert not {str(folder.relative_to(ROOT)): count for folder, count in counts.items() if count > MAX_SIDE_BY_SIDE}
+
+
+def test_no_file_is_too_long_to_be_read_at_once() -> None:
+    lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in sources("services", "tests")}
+    assert not {str(path.relative_to(ROOT)): length for path, length in lengths.items() if length > MAX_LINES}
 
 
 def test_every_name_that_is_imported_is_there() -> None:
