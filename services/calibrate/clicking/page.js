@@ -13,7 +13,7 @@ function bytes(base64) {
   return Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
 }
 
-/** Begin, choose, save. */
+/** A landmark is begun by its tooth and point; one that is there already is taken up again. */
 document.getElementById("landmark").addEventListener("submit", (event) => {
   event.preventDefault();
   const tooth = Number(document.getElementById("tooth").value);
