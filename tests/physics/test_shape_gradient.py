@@ -3,7 +3,7 @@ random numbers.
 
 Tolerance: the series ends and light is averaged over patches of the border. On these scenes, thin enamel, lights nearly
 behind the camera and media that are clear, or scatter forwards, that was measured to move the derivative by 1 % and by
-10 to 15 % (``services/fit/README.md``): the bias each case allows.
+10 to 15 % (``docs/how/shape-gradient.md``): the bias each case allows.
 """
 
 from __future__ import annotations
