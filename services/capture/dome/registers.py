@@ -168,7 +168,7 @@ def level_word(level: float) -> int:
 
 
 def markdown_table() -> str:
-    """The map as the README prints it."""
+    """The map as docs/use/registers.md prints it."""
     rows = ["| register | space | address | count | unit | meaning |", "|---|---|---|---|---|---|"]
     rows += [f"| {r.name} | {r.space} | {r.address} | {r.count} | {r.unit} | {r.meaning} |" for r in TABLE]
     return "\n".join(rows)
