@@ -20,7 +20,7 @@ def test_a_tooth_is_measured_from_raw_frames(tmp_path: Path) -> None:
     assert outcome.exit_code == 0
     told = json.loads(outcome.stdout)
     # The design's target, and three times what pixels of 0.19 mm leave of a turn
-    # (services/calibrate/registration/README.md).
+    # (docs/measured/registration.md).
     assert told["steps"]["teeth_mm"] < 0.05
     assert told["steps"]["teeth_deg"] < 0.25
     asked = told["asked"]["held-out error over that with perfect calibration and pose"]
