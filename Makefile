@@ -41,10 +41,10 @@ roles: ## every part of the service in a virtual environment of its own, and a s
 	@$(BIN)/python -m pytest tests/architecture/test_role_packages.py tests/pipeline/test_roles.py tests/pipeline/test_api_install.py
 
 SUITE ?= bookworm
-bare-test: ## demo and test on a machine with apt, make and python3 alone, in a folder; SUITE names it; needs root and mmdebstrap, see deploy/README.md
+bare-test: ## demo and test on a machine with apt, make and python3 alone, in a folder; SUITE names it; needs root and mmdebstrap, see docs/start/install.md
 	@deploy/bare_machine.sh $(SUITE)
 
-deploy-test: setup ## build the images, run the composed system in real containers and disturb it, half an hour; needs an engine, see deploy/README.md
+deploy-test: setup ## build the images, run the composed system in real containers and disturb it, half an hour; needs an engine, see docs/use/deployment.md
 	@tests/containers/build.sh
 	@$(BIN)/python -m pytest tests/containers
 
