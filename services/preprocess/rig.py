@@ -14,7 +14,7 @@ from services.core.errors import CaptureInputError
 from services.core.records import CaptureManifest, FrameRecord, MaskBit
 from services.core.store import MANIFEST, StoredArray
 from services.preprocess.radiometry import Merge, Radiometry
-from services.preprocess.scratch import write_array
+from services.preprocess.scratch import kept_array
 from services.preprocess.source import Image, LightImage, Motions, View
 from services.preprocess.stabilisation.motion import Displacement, ViewMotion, frames_to_match, jaws
 from services.preprocess.stabilisation.seen import SeenFlow
@@ -90,12 +90,14 @@ class RigSource:
         motion = self._motion(view)
         array = StoredArray(self.root / "capture.zarr")
         # Without the black image, whose noise would be the same in every frame and speak for no motion at all
-        level = float(np.median(self._black_image(view, array, motion.window)))
+        level = kept_array(
+            view.kept("level"), lambda: np.asarray(np.median(self._black_image(view, array, motion.window)))
+        )
 
         def picture(frame: FrameRecord) -> NDArray[np.uint16]:
             return array[view.number, frame.index, motion.window.rows, motion.window.columns]
 
-        return motion.measure(frames, picture, level)
+        return motion.measure(frames, picture, float(level))
 
     def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
         """See ``Source``."""
@@ -127,17 +129,16 @@ class RigSource:
 
     def _black_image(self, view: View, array: StoredArray, window: Window) -> Image:
         """Mean (H, W, C) of the black frames, counts; made once for a view that keeps it."""
-        kept = None if view.scratch is None else view.scratch / "black.npy"
-        if kept is not None and kept.exists():
-            return np.asarray(np.load(kept, mmap_mode="r"))
-        black = np.zeros((*window.shape, len(self.description.channels)), dtype=np.float32)
-        for frame in self._black:
-            counts = array[view.number, frame.index, window.rows, window.columns]
-            for rows in bands(window.shape):
-                black[rows] += counts[rows] / np.float32(len(self._black))
-        if kept is not None:
-            write_array(kept, black)
-        return black
+
+        def mean() -> Image:
+            black = np.zeros((*window.shape, len(self.description.channels)), dtype=np.float32)
+            for frame in self._black:
+                counts = array[view.number, frame.index, window.rows, window.columns]
+                for rows in bands(window.shape):
+                    black[rows] += counts[rows] / np.float32(len(self._black))
+            return black
+
+        return kept_array(view.kept("black"), mean)
 
 
 def _image(

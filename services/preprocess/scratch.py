@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+A = TypeVar("A", bound=np.generic)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
@@ -17,3 +20,16 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
     with partial.open("xb") as stream:
         np.save(stream, array)
     partial.replace(path)
+
+
+def kept_array(path: Path | None, make: Callable[[], NDArray[A]]) -> NDArray[A]:
+    """The array of a file, mapped from the disk; where there is none yet it is made and left there for others.
+
+    Args:
+        path: None to make it each time.
+    """
+    if path is None:
+        return make()
+    if not path.exists():
+        write_array(path, make())
+    return np.asarray(np.load(path, mmap_mode="r"))

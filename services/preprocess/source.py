@@ -43,6 +43,10 @@ class View:
     footprint: Footprint
     scratch: Path | None = None
 
+    def kept(self, name: str) -> Path | None:
+        """The file of an array that the camera's images share; None where nothing is kept."""
+        return None if self.scratch is None else self.scratch / f"{name}.npy"
+
 
 @dataclass(frozen=True)
 class LightImage:

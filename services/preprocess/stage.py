@@ -80,12 +80,13 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         ]
         for _ in workers.run(blocks_of(spec, workshop, "match", frames, workers.threads)):
             context.raise_if_cancelled()
+        # Neither of what follows waits for the other; comparisons, a camera's whole one in a block, come first
         uncompared = [k for k in range(len(cameras)) if source.measures_motion and workshop.flow(k) is None]
-        for _ in workers.run([Block(spec, workshop, "compare", k) for k in uncompared]):
-            context.raise_if_cancelled()
+        compare = [Block(spec, workshop, "compare", k) for k in uncompared]
         missing = [[j for j in own if workshop.image(k, j) is None] for k, own in enumerate(lights)]
         progress.begin(sum(len(own) for own in missing), workers.threads)
-        for block in workers.run(blocks_of(spec, workshop, "develop", missing, workers.threads)):
+        develop = blocks_of(spec, workshop, "develop", missing, workers.threads)
+        for block in workers.run([*compare, *develop]):
             for done in images_of(block, workshop):
                 progress.tell(done)
             context.raise_if_cancelled()

@@ -23,7 +23,7 @@ from services.preprocess.raw.checks import require_like_exposures
 from services.preprocess.raw.demosaic import demosaic
 from services.preprocess.raw.lens import Lens, fitted_vignetting
 from services.preprocess.raw.response import NEAR_FULL, Linearity, Series, measure_linearity
-from services.preprocess.scratch import write_array
+from services.preprocess.scratch import kept_array
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
@@ -172,15 +172,14 @@ class CameraFrames:
     def _mean_of_black(self, frames: Sequence[RawFrame]) -> Image:
         """Mean counts of black frames of one gain and exposure; made once for all blocks that share a folder."""
         name = f"black-{frames[0].gain!r}-{frames[0].exposure_s!r}.npy"
-        kept = None if self._scratch is None else self._scratch / name
-        if kept is not None and kept.is_file():
-            return np.asarray(np.load(kept, mmap_mode="r"))
-        mean = np.zeros_like(self._black_counts(frames[0]))
-        for frame in frames:
-            mean += self._black_counts(frame) / np.float32(len(frames))
-        if kept is not None:
-            write_array(kept, mean)
-        return mean
+
+        def mean() -> Image:
+            counts = np.zeros_like(self._black_counts(frames[0]))
+            for frame in frames:
+                counts += self._black_counts(frame) / np.float32(len(frames))
+            return counts
+
+        return kept_array(None if self._scratch is None else self._scratch / name, mean)
 
     def _black_counts(self, frame: RawFrame) -> Image:
         counts = read_counts(self._root, self._folder, frame).astype(np.float32)

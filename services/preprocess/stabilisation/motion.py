@@ -100,7 +100,8 @@ class ViewMotion:
         """Where a pixel of the view may come from: as many pixels larger as a jaw may move."""
         self._inner = view.window.within(self.window)
         around = _placed(view.footprint, self.window.shape, self._inner)
-        self._bodies = [body for body in (SurfaceFlow(around, meshes) for meshes in bodies) if body.seen.any()]
+        laid = [SurfaceFlow(around, meshes, view.kept(f"relief-{k}")) for k, meshes in enumerate(bodies)]
+        self._bodies = [body for body in laid if body.seen.any()]
         # Medians need no more than evenly strided pixels
         self._step = max(1, int(np.sqrt(np.prod(view.window.shape) / MEDIAN_PIXELS)))
 

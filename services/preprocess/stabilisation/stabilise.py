@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.preprocess.projection import Footprint
+from services.preprocess.scratch import kept_array
 from services.preprocess.window import bands
 
 Image = NDArray[np.float32]
@@ -46,11 +48,10 @@ class SurfaceFlow:
     Args:
         footprint: what the camera sees at the reference time.
         meshes: indices of the body's meshes in the footprint.
+        kept: file in which the relief is looked for, and left where it is not found; None to make it here.
     """
 
-    def __init__(self, footprint: Footprint, meshes: Sequence[int]) -> None:
-        import cv2
-
+    def __init__(self, footprint: Footprint, meshes: Sequence[int], kept: Path | None = None) -> None:
         seen = np.isin(footprint.mesh, list(meshes))
         self.seen = seen
         if not seen.any():
@@ -58,13 +59,7 @@ class SurfaceFlow:
         rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
         self._centre_px = np.array([columns.mean(), rows.mean()])
         self._scale_px = max(1.0, 0.5 * max(np.ptp(columns), np.ptp(rows)))
-        # Relief is depth in standard deviations, continued beyond the outline so that the outline itself can be matched
-        depth = np.where(seen, footprint.depth_mm, 0).astype(np.float32)
-        mean, spread = float(footprint.depth_mm[seen].mean()), max(float(footprint.depth_mm[seen].std()), 1e-6)
-        weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), BAND_PX)
-        beyond = cv2.GaussianBlur(depth, (0, 0), BAND_PX) / np.maximum(weight, 1e-6)
-        beyond = np.where(weight > 1e-3, beyond, mean)
-        self._relief = ((np.where(seen, depth, beyond) - mean) / spread).astype(np.float32)
+        self._relief = kept_array(kept, lambda: _relief(footprint.depth_mm, seen))
         self.extent_px = float(min(np.ptp(columns), np.ptp(rows)) + 1)
 
     def terms(self, relief: Image, x_px: Image, y_px: Image) -> Image:
@@ -114,6 +109,18 @@ class SurfaceFlow:
         region = cv2.dilate(seen, disc) > 0
         y, x = np.mgrid[0 : size[1], 0 : size[0]].astype(np.float32)
         return region, self.terms(relief, (x + 0.5) * factor - 0.5, (y + 0.5) * factor - 0.5)
+
+
+def _relief(depth_mm: Image, seen: BoolArray) -> Image:
+    """Depth (H, W) in standard deviations, continued beyond the outline so that the outline itself can be matched."""
+    import cv2
+
+    depth = np.where(seen, depth_mm, 0).astype(np.float32)
+    mean, spread = float(depth_mm[seen].mean()), max(float(depth_mm[seen].std()), 1e-6)
+    weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), BAND_PX)
+    beyond = cv2.GaussianBlur(depth, (0, 0), BAND_PX) / np.maximum(weight, 1e-6)
+    beyond = np.where(weight > 1e-3, beyond, mean)
+    return np.asarray((np.where(seen, depth, beyond) - mean) / spread, dtype=np.float32)
 
 
 @dataclass(frozen=True)
