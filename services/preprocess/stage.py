@@ -41,12 +41,12 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     from services.preprocess.masking.valid import require_plausible_scale
     from services.preprocess.opening import open_source
     from services.preprocess.subject import read_subject
+    from services.preprocess.tasks.attempt_files import STAGE, AttemptFiles
     from services.preprocess.tasks.blocks import Block, blocks_of, images_of
     from services.preprocess.tasks.plan import create_arrays, digest_of_inputs, held_out_images
     from services.preprocess.tasks.progress import Progress
     from services.preprocess.tasks.spread import spread
     from services.preprocess.tasks.summary import summarise
-    from services.preprocess.tasks.workshop import STAGE, Workshop
 
     # Check everything that needs no pixel
     source = open_source(spec, context.root)
@@ -62,42 +62,42 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     subject = read_subject(source.root, whole=spec.kind == "jaw", fdi=spec.fdi)
     require_plausible_scale(cameras, source.description.lights, subject.teeth)
 
-    workshop = Workshop(StageWriter(context.root, STAGE, context.attempt))
+    files = AttemptFiles(StageWriter(context.root, STAGE, context.attempt))
     digest = digest_of_inputs(spec, source, masks)
-    if not workshop.begin(digest, spec.store):
-        create_arrays(workshop.arrays, source, with_shadows=spec.shadows)
-        workshop.announce(digest)
+    if not files.begin(digest, spec.store):
+        create_arrays(files.arrays, source, with_shadows=spec.shadows)
+        files.announce(digest)
 
     lights = [source.lights_of(k) for k in range(len(cameras))]
     progress = Progress(context, sum(len(own) for own in lights), len(cameras))
     with spread(spec.priority) as workers:
-        unseen = [k for k, camera in enumerate(cameras) if workshop.view(k, camera) is None]
-        for _ in workers.run([Block(spec, workshop, "look", k) for k in unseen]):
+        unseen = [k for k, camera in enumerate(cameras) if files.view(k, camera) is None]
+        for _ in workers.run([Block(spec, files, "look", k) for k in unseen]):
             context.raise_if_cancelled()
         frames = [
-            [one for one in source.matched(k) if one not in workshop.motions(k, source.matched(k))]
+            [one for one in source.matched(k) if one not in files.motions(k, source.matched(k))]
             for k in range(len(cameras))
         ]
-        for _ in workers.run(blocks_of(spec, workshop, "match", frames, workers.threads)):
+        for _ in workers.run(blocks_of(spec, files, "match", frames, workers.threads)):
             context.raise_if_cancelled()
         # Neither of what follows waits for the other; comparisons, a camera's whole one in a block, come first
-        uncompared = [k for k in range(len(cameras)) if source.measures_motion and workshop.flow(k) is None]
-        compare = [Block(spec, workshop, "compare", k) for k in uncompared]
-        missing = [[j for j in own if workshop.image(k, j) is None] for k, own in enumerate(lights)]
+        uncompared = [k for k in range(len(cameras)) if source.measures_motion and files.flow(k) is None]
+        compare = [Block(spec, files, "compare", k) for k in uncompared]
+        missing = [[j for j in own if files.image(k, j) is None] for k, own in enumerate(lights)]
         progress.begin(sum(len(own) for own in missing), workers.threads)
-        develop = blocks_of(spec, workshop, "develop", missing, workers.threads)
+        develop = blocks_of(spec, files, "develop", missing, workers.threads)
         for block in workers.run([*compare, *develop]):
-            for done in images_of(block, workshop):
+            for done in images_of(block, files):
                 progress.tell(done)
             context.raise_if_cancelled()
         if spec.shadows:
-            unshaded = [k for k, own in enumerate(lights) if not all(workshop.is_shaded(k, j) for j in own)]
+            unshaded = [k for k, own in enumerate(lights) if not all(files.is_shaded(k, j) for j in own)]
             progress.shade(len(unshaded))
-            for _ in workers.run([Block(spec, workshop, "shade", k) for k in unshaded]):
+            for _ in workers.run([Block(spec, files, "shade", k) for k in unshaded]):
                 context.raise_if_cancelled()
 
-    manifest, known = summarise(workshop, source, subject, held_out, masks.digest, context)
-    workshop.writer.publish(manifest, known)
-    workshop.end()
+    manifest, known = summarise(files, source, subject, held_out, masks.digest, context)
+    files.writer.publish(manifest, known)
+    files.end()
     progress.finish()
     return manifest

@@ -22,7 +22,7 @@ from services.core.store import StoredArray, open_stage, require_intact, withdra
 from services.fit.inputs.levels import LevelReader
 from services.fit.inputs.observations import read_channel, read_observations
 from services.preprocess.stage import run
-from services.preprocess.tasks import workshop
+from services.preprocess.tasks import attempt_files
 from tests.support.folder_captures import prepare, write_folder, write_tree
 from tests.support.s3_server import BUCKET, S3Server, environment, s3_server, use
 
@@ -185,7 +185,7 @@ def test_images_that_a_server_lost_meanwhile_are_made_again(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(workshop.Workshop, "seal", cut_off)
+        patch.setattr(attempt_files.AttemptFiles, "seal", cut_off)
         with pytest.raises(KeyboardInterrupt):
             prepare(capture, tmp_path / "job", store=URL)
     lost = next(name for name in server.objects() if "radiance/c/1/0" in name)

@@ -28,7 +28,7 @@ from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter
 from services.preprocess.stage import run
-from services.preprocess.tasks import blocks, workshop
+from services.preprocess.tasks import attempt_files, blocks
 from tests.support.folder_captures import write_folder, write_tree
 
 KILLS = 50
@@ -78,9 +78,9 @@ def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
         return wrapped
 
     with monkeypatch.context() as patch:
-        patch.setattr(workshop, "write_atomic", counted(workshop.write_atomic, after=False))
-        patch.setattr(workshop, "write_array", counted(workshop.write_array, after=True))
-        patch.setattr(workshop.Workshop, "array", counted(workshop.Workshop.array, after=False))
+        patch.setattr(attempt_files, "write_atomic", counted(attempt_files.write_atomic, after=False))
+        patch.setattr(attempt_files, "write_array", counted(attempt_files.write_array, after=True))
+        patch.setattr(attempt_files.AttemptFiles, "array", counted(attempt_files.AttemptFiles.array, after=False))
         patch.setattr(blocks, "write_picture", counted(blocks.write_picture, after=True))
         patch.setattr(StageWriter, "publish", counted(StageWriter.publish, after=False))
         yield
@@ -107,7 +107,7 @@ def test_killed_at_any_write(
         break
     assert attempts > 4
     assert contents(tmp_path) == expected
-    assert not (tmp_path / workshop.WORK).exists()
+    assert not (tmp_path / attempt_files.WORK).exists()
 
 
 @pytest.mark.parametrize("at", [1, 6, 12, 17])

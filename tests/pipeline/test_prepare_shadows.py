@@ -16,8 +16,8 @@ from services.core.records import MaskBit
 from services.preprocess.masking.shadows import expected_irradiance
 from services.preprocess.projection import project
 from services.preprocess.quality import QualityReport
+from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.blocks import Block
-from services.preprocess.tasks.workshop import Workshop
 from tests.support.folder_captures import prepare
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 
@@ -83,10 +83,10 @@ def test_shading_that_was_cut_off_is_done_again_on_another_worker(
     def twice(block: Block) -> None:
         if block.step == "shade":
             with monkeypatch.context() as patch:
-                patch.setattr(Workshop, "files_of", Mock(side_effect=KeyboardInterrupt))
+                patch.setattr(AttemptFiles, "files_of", Mock(side_effect=KeyboardInterrupt))
                 with pytest.raises(KeyboardInterrupt):
                     kept(block)
-            assert [k for k in range(8) if block.workshop.image(0, k) is None]
+            assert [k for k in range(8) if block.files.image(0, k) is None]
         kept(block)
 
     monkeypatch.setattr(Block, "__call__", twice)

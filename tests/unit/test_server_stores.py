@@ -14,7 +14,7 @@ from services.core.errors import PlatformError, SettingsError, StoreError
 from services.core.files import object_store
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
-from services.preprocess.tasks.workshop import Workshop
+from services.preprocess.tasks.attempt_files import AttemptFiles
 from tests.support.folder_captures import prepare, write_folder
 from tests.support.s3_server import BUCKET, s3_server, use
 
@@ -79,7 +79,7 @@ def test_what_is_deleted_is_gone_there_too(tmp_path: Path, monkeypatch: pytest.M
         use(monkeypatch, server.endpoint)
         prepare(tmp_path / "capture", tmp_path / "published", store=f"s3://{BUCKET}/lab")
         with monkeypatch.context() as patch:
-            patch.setattr(Workshop, "seal", cut_off)
+            patch.setattr(AttemptFiles, "seal", cut_off)
             with pytest.raises(KeyboardInterrupt):
                 prepare(tmp_path / "capture", tmp_path / "begun", store=f"s3://{BUCKET}/lab")
         others = len(server.objects())

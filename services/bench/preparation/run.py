@@ -94,25 +94,25 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
     from services.preprocess.masking.valid import valid_bits
     from services.preprocess.opening import open_source
     from services.preprocess.subject import read_subject
-    from services.preprocess.tasks.blocks import Desk
+    from services.preprocess.tasks.attempt_files import STAGE, AttemptFiles
+    from services.preprocess.tasks.blocks import ImageWriter
     from services.preprocess.tasks.plan import create_arrays
-    from services.preprocess.tasks.workshop import STAGE, Workshop
 
     source = open_source(JobSpec(capture=scene.root), scene.root)
     subject = read_subject(source.root, whole=False)
-    workshop = Workshop(StageWriter(scene.root, STAGE, 1))
-    workshop.begin("")
-    create_arrays(workshop.folder / "prepared.zarr", source, with_shadows=False)
+    files = AttemptFiles(StageWriter(scene.root, STAGE, 1))
+    files.begin("")
+    create_arrays(files.folder / "prepared.zarr", source, with_shadows=False)
     camera, light = source.description.cameras[0], source.description.lights[LIGHT]
-    workshop.put_view(subject.view_of(0, camera))
-    view = workshop.view(0, camera)
+    files.put_view(subject.view_of(0, camera))
+    view = files.view(0, camera)
     assert view is not None
     frames = source.matched(0)
     motions = dict(source.match(view, frames))
-    desk = Desk(workshop, source, subject, HandMasks(scene.root, source.description), view)
+    writer = ImageWriter(files, source, subject, HandMasks(scene.root, source.description), view)
     images = source.images(view, (LIGHT,) * (TURNS + 1), motions)
     _, image = next(images)
-    desk.store(LIGHT, image, 0.0)
+    writer.store(LIGHT, image, 0.0)
     peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     bits = valid_bits(image, view.footprint, view.camera, light)
     pair = tuple(
@@ -127,19 +127,19 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
             BareMask(image.radiance, image.variance, np.ascontiguousarray(view.footprint.normal)),
         ),
         "store": (
-            lambda: _store(desk, image, bits),
+            lambda: _store(writer, image, bits),
             BareStore(scene.root, image.radiance, image.variance, bits),
         ),
         "flow": (lambda: dict(source.match(view, frames[1:2])), BareFlow(*pair)),
     }, peak_gib
 
 
-def _store(desk: Any, image: Any, bits: NDArray[np.uint16]) -> None:
+def _store(writer: Any, image: Any, bits: NDArray[np.uint16]) -> None:
     """Write an image as if for the first time, and sum up its files."""
     for name in ("radiance", "variance", "valid", "motion"):
-        shutil.rmtree(desk.workshop.folder / "prepared.zarr" / name / "c", ignore_errors=True)
-    desk.store_masked(LIGHT, image, bits)
-    desk.workshop.files_of(0, LIGHT, desk.workshop.folder / "none")
+        shutil.rmtree(writer.files.folder / "prepared.zarr" / name / "c", ignore_errors=True)
+    writer.store_masked(LIGHT, image, bits)
+    writer.files.files_of(0, LIGHT, writer.files.folder / "none")
 
 
 class BareImage:

@@ -17,7 +17,7 @@ from services.preprocess.projection import Footprint
 from services.preprocess.quality import assess, write_picture
 from services.preprocess.source import Image, Source, View
 from services.preprocess.subject import Subject
-from services.preprocess.tasks.workshop import Workshop
+from services.preprocess.tasks.attempt_files import AttemptFiles
 
 PIXEL_MM = 0.25
 """Shadows are looked for in images averaged to about this pixel: finer than their edges, which light inside a tooth
@@ -47,7 +47,7 @@ class _Coarse:
         return (weighted / (divisor if weighted.ndim == 2 else divisor[..., None])).astype(np.float32), sums
 
 
-def shade(workshop: Workshop, source: Source, subject: Subject, view: View, context: StageContext) -> None:
+def shade(files: AttemptFiles, source: Source, subject: Subject, view: View, context: StageContext) -> None:
     """Flag SHADOW in all images of a camera and store how sure that is, in per cent.
 
     Surfaces that the fit renders throw their shadows there; gums and teeth that it does not render shade here by their
@@ -65,7 +65,7 @@ def shade(workshop: Workshop, source: Source, subject: Subject, view: View, cont
     for place, j in enumerate(lights):
         context.raise_if_cancelled()
         lamp = source.description.lights[j]
-        radiance[place], variance[place] = _brightness(workshop, view, j, coarse)
+        radiance[place], variance[place] = _brightness(files, view, j, coarse)
         irradiance[place], facing[place] = _light_on(coarse, lamp, rendered)
         if subject.in_the_way:
             free = reached_by(coarse.points_mm, coarse.normal, lamp.position_mm, list(subject.in_the_way))
@@ -78,7 +78,7 @@ def shade(workshop: Workshop, source: Source, subject: Subject, view: View, cont
         confidence = np.maximum(confidence, found)
     for place, j in enumerate(lights):
         context.raise_if_cancelled()
-        _flag(workshop, subject, view, camera, j, _finer(confidence[place], coarse.step, view.footprint.covered))
+        _flag(files, subject, view, camera, j, _finer(confidence[place], coarse.step, view.footprint.covered))
 
 
 def _averaged(view: View) -> _Coarse:
@@ -99,9 +99,9 @@ def _pixel_mm(camera: Camera, footprint: Footprint) -> float:
     return float(np.median(depth)) / camera.K[0][0] if len(depth) else PIXEL_MM
 
 
-def _brightness(workshop: Workshop, view: View, light: int, coarse: _Coarse) -> tuple[Image, Image]:
+def _brightness(files: AttemptFiles, view: View, light: int, coarse: _Coarse) -> tuple[Image, Image]:
     """Mean over channels of an image and its variance; infinite where a square holds no pixel with a value."""
-    radiance, variance, valid = (_read(workshop, view, name, light) for name in ("radiance", "variance", "valid"))
+    radiance, variance, valid = (_read(files, view, name, light) for name in ("radiance", "variance", "valid"))
     weight = (view.footprint.covered & (valid & NO_VALUE == 0)).astype(np.float32)
     value, sums = coarse.mean(radiance.mean(axis=-1), weight)
     spread, _ = coarse.mean(variance.mean(axis=-1) / variance.shape[-1], weight)
@@ -117,19 +117,19 @@ def _light_on(coarse: _Coarse, lamp: Light, rendered: Sequence[Any]) -> tuple[Im
     return irradiance * np.float32(np.mean(lamp.intensity)), facing.astype(np.float32)
 
 
-def _flag(workshop: Workshop, subject: Subject, view: View, camera: int, light: int, confidence: Image) -> None:
+def _flag(files: AttemptFiles, subject: Subject, view: View, camera: int, light: int, confidence: Image) -> None:
     """Write one image's flags, confidence and picture, and say that it is done."""
     # Where a worker died between the flags and the record, the files no longer have the record's sizes; all but flags
     # is as it was
-    done = workshop.record(camera, light)
+    done = files.record(camera, light)
     assert done is not None, "images are stored before shadows are looked for"
-    bits = _read(workshop, view, "valid", light)
+    bits = _read(files, view, "valid", light)
     bits = bits & ~np.uint16(MaskBit.SHADOW) | np.where(confidence > SHADOWED, MaskBit.SHADOW, 0).astype(np.uint16)
     for name, values in (("valid", bits), ("shadow", np.rint(100 * confidence).astype(np.uint8))):
-        workshop.array(name)[camera, light, view.window.rows, view.window.columns] = values
+        files.array(name)[camera, light, view.window.rows, view.window.columns] = values
     quality = done.quality
-    picture = workshop.folder / "quality" / f"{quality.camera}_{quality.light}.png"
-    write_picture(picture, _read(workshop, view, "radiance", light), bits)
+    picture = files.folder / "quality" / f"{quality.camera}_{quality.light}.png"
+    write_picture(picture, _read(files, view, "radiance", light), bits)
     covered, error_px = view.footprint.covered, quality.motion_error_px
     changed = {
         "quality": assess(
@@ -142,11 +142,11 @@ def _flag(workshop: Workshop, subject: Subject, view: View, camera: int, light: 
             (quality.levels, quality.noise),
         ),
         "tooth_pixels": tuple(subject.pixels_of_teeth(view.footprint, bits).tolist()),
-        "files": workshop.files_of(camera, light, picture),
-        "objects": workshop.objects_of(camera, light),
+        "files": files.files_of(camera, light, picture),
+        "objects": files.objects_of(camera, light),
         "shaded": True,
     }
-    workshop.put_image(camera, light, done.model_copy(update=changed))
+    files.put_image(camera, light, done.model_copy(update=changed))
 
 
 def _squares(values: NDArray[Any], step: int) -> NDArray[np.float32]:
@@ -161,5 +161,5 @@ def _finer(confidence: Image, step: int, covered: NDArray[np.bool_]) -> Image:
     return np.where(covered, fine, np.float32(0))
 
 
-def _read(workshop: Workshop, view: View, name: str, light: int) -> NDArray[Any]:
-    return np.asarray(workshop.array(name)[view.number, light, view.window.rows, view.window.columns])
+def _read(files: AttemptFiles, view: View, name: str, light: int) -> NDArray[Any]:
+    return np.asarray(files.array(name)[view.number, light, view.window.rows, view.window.columns])

@@ -30,8 +30,8 @@ from services.preprocess.quality_flow import camera_flow, write_flow
 from services.preprocess.source import Bits, LightImage, Motions, Source, View
 from services.preprocess.stabilisation.motion import stored_step
 from services.preprocess.subject import NOTHING, Subject, read_subject
+from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone
-from services.preprocess.tasks.workshop import Workshop
 
 NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)
 """Pixels that tell nothing of an image's levels and noise."""
@@ -51,7 +51,7 @@ class Block:
     """
 
     spec: JobSpec
-    workshop: Workshop
+    files: AttemptFiles
     step: Step
     camera: int
     items: tuple[int, ...] = ()
@@ -63,88 +63,88 @@ class Block:
             CaptureInputError, StoreError: as ``Source`` and ``require_seen`` say. JobCancelledError. FencedError:
                 another attempt has begun.
         """
-        context = LocalContext(self.workshop.writer.root, self.workshop.writer.attempt)
+        context = LocalContext(self.files.writer.root, self.files.writer.attempt)
         context.raise_if_cancelled()
-        self.workshop.writer.require_lease()
+        self.files.writer.require_lease()
         source = open_source(self.spec, context.root, verify=False)
         subject = read_subject(source.root, whole=self.spec.kind == "jaw", fdi=self.spec.fdi)
         if self.step == "look":
-            _look(self.workshop, source, subject, self.camera)
+            _look(self.files, source, subject, self.camera)
             return
-        view = self.workshop.view(self.camera, source.description.cameras[self.camera])
+        view = self.files.view(self.camera, source.description.cameras[self.camera])
         assert view is not None, "blocks that need a view wait for it"
         if self.step == "match":
             for frame, coefficients in source.match(view, self.items):
                 motion = FrameMotion(coefficients=coefficients.tolist())
-                self.workshop.put_motion(self.camera, frame, motion)
+                self.files.put_motion(self.camera, frame, motion)
                 context.raise_if_cancelled()
             return
         if self.step == "shade":
-            shade(self.workshop, source, subject, view, context)
+            shade(self.files, source, subject, view, context)
             return
-        motions = self.workshop.motions(self.camera, source.matched(self.camera))
+        motions = self.files.motions(self.camera, source.matched(self.camera))
         if self.step == "compare":
-            _compare(self.workshop, source, view, motions)
+            _compare(self.files, source, view, motions)
             return
-        lights = [light for light in self.items if self.workshop.image(self.camera, light) is None]
-        desk = Desk(self.workshop, source, subject, HandMasks(context.root, source.description), view)
+        lights = [light for light in self.items if self.files.image(self.camera, light) is None]
+        writer = ImageWriter(self.files, source, subject, HandMasks(context.root, source.description), view)
         began_s = time.monotonic()
         for light, image in source.images(view, lights, motions):
-            self.workshop.put_image(self.camera, light, desk.store(light, image, began_s))
+            self.files.put_image(self.camera, light, writer.store(light, image, began_s))
             context.raise_if_cancelled()
             began_s = time.monotonic()
 
 
 def blocks_of(
-    spec: JobSpec, workshop: Workshop, step: Step, items: Sequence[Sequence[int]], threads: int
+    spec: JobSpec, files: AttemptFiles, step: Step, items: Sequence[Sequence[int]], threads: int
 ) -> tuple[Block, ...]:
     """One step for some frames or lights of each camera, in as many blocks as keep all threads busy."""
     size = -(-sum(len(own) for own in items) // (BLOCKS_PER_THREAD * threads))
     size = min(max(size, 1), LARGEST_BLOCK)
     return tuple(
-        Block(spec, workshop, step, camera, tuple(own[k : k + size]))
+        Block(spec, files, step, camera, tuple(own[k : k + size]))
         for camera, own in enumerate(items)
         for k in range(0, len(own), size)
     )
 
 
-def images_of(block: Block, workshop: Workshop) -> Iterator[ImageDone]:
+def images_of(block: Block, files: AttemptFiles) -> Iterator[ImageDone]:
     """What a block has made."""
-    workshop.writer.require_lease()
+    files.writer.require_lease()
     for light in block.items:
-        done = workshop.image(block.camera, light)
+        done = files.image(block.camera, light)
         assert done is not None, "a block has ended once its images are stored"
         yield done
 
 
-def _look(workshop: Workshop, source: Source, subject: Subject, camera: int) -> None:
+def _look(files: AttemptFiles, source: Source, subject: Subject, camera: int) -> None:
     """Find a camera's window and footprint; what has no image is said to be unlit."""
     whole = source.description.cameras[camera]
     view = subject.view_of(camera, whole)
     require_seen(view.footprint, len(subject.teeth), whole)
-    surface, valid = (workshop.array(name) for name in ("surface", "valid"))
+    surface, valid = (files.array(name) for name in ("surface", "valid"))
     labels = np.full(surface.shape[1:], NOTHING, dtype=np.int16)
     labels[view.window.rows, view.window.columns] = view.footprint.mesh
     surface[camera] = labels
     for light in sorted(set(range(valid.shape[1])) - set(source.lights_of(camera))):
         valid[camera, light] = np.uint16(MaskBit.UNLIT | MaskBit.OUTSIDE)
-    workshop.put_view(view)
+    files.put_view(view)
 
 
-def _compare(workshop: Workshop, source: Source, view: View, motions: Motions) -> None:
+def _compare(files: AttemptFiles, source: Source, view: View, motions: Motions) -> None:
     """Draw what flow sees before and after the motion is taken out."""
     seen = source.seen_flow(view, motions)
     flow = None if seen is None else camera_flow(view.whole.name, seen)
     if seen is not None and flow is not None:
-        write_flow(workshop.folder / "quality" / "flow", seen, flow)
-    workshop.put_flow(view.number, FlowDone(flow=flow))
+        write_flow(files.folder / "quality" / "flow", seen, flow)
+    files.put_flow(view.number, FlowDone(flow=flow))
 
 
 @dataclass(frozen=True)
-class Desk:
+class ImageWriter:
     """All that a camera's images need to be judged and stored."""
 
-    workshop: Workshop
+    files: AttemptFiles
     source: Source
     subject: Subject
     masks: HandMasks
@@ -160,7 +160,7 @@ class Desk:
         if shown is not None and shown.dark:
             bits |= np.uint16(MaskBit.UNLIT)
         self.store_masked(light, image, bits)
-        picture = self.workshop.folder / "quality" / f"{camera.name}_{lamp.name}.png"
+        picture = self.files.folder / "quality" / f"{camera.name}_{lamp.name}.png"
         write_picture(picture, image.radiance, bits)
         valued = footprint.covered & (bits & NO_VALUE == 0)
         stops = by_stop(image.radiance, image.variance, valued)
@@ -171,8 +171,8 @@ class Desk:
             light=shown,
             colour=image.colour,
             notes=self.source.notes,
-            files=self.workshop.files_of(self.view.number, light, picture),
-            objects=self.workshop.objects_of(self.view.number, light),
+            files=self.files.files_of(self.view.number, light, picture),
+            objects=self.files.objects_of(self.view.number, light),
             seconds=time.monotonic() - began_s,
         )
 
@@ -180,14 +180,14 @@ class Desk:
         """Write an image's arrays and its mask (H, W)."""
         place, window = (self.view.number, light), self.view.window
         for name, values in (("radiance", image.radiance), ("variance", image.variance)):
-            self.workshop.array(name)[*place, window.rows, window.columns] = values
-        valid = self.workshop.array("valid")
+            self.files.array(name)[*place, window.rows, window.columns] = values
+        valid = self.files.array("valid")
         whole = np.full(valid.shape[2:], MaskBit.OUTSIDE, dtype=np.uint16)
         whole[window.rows, window.columns] = bits
         valid[place] = whole
         if image.displacement is None:
             return
-        motion = self.workshop.array("motion")
+        motion = self.files.array("motion")
         step = stored_step((valid.shape[2], valid.shape[3]))
         top, left = -(-window.top // step), -(-window.left // step)
         rows, columns = image.displacement.shape[:2]

@@ -18,15 +18,15 @@ from services.preprocess.quality import QualityReport, unusable_note
 from services.preprocess.quality_page import write_page
 from services.preprocess.source import Source
 from services.preprocess.subject import Subject
+from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import ImageDone
-from services.preprocess.tasks.workshop import Workshop
 
 Known = dict[str, tuple[int, str]]
 """Size and SHA-256 of files by their path in the store."""
 
 
 def summarise(
-    workshop: Workshop,
+    files: AttemptFiles,
     source: Source,
     subject: Subject,
     held_out: tuple[tuple[str, str], ...],
@@ -43,8 +43,8 @@ def summarise(
         CaptureInputError: no pixel is valid, no tooth is as bright as these, or channels look exchanged. FencedError:
             another attempt has begun. StoreError: a server of the arrays refuses, does not answer or has lost one.
     """
-    workshop.writer.require_lease()
-    images = _images(workshop, source)
+    files.writer.require_lease()
+    images = _images(files, source)
     reports, brightness = [done.quality for done in images], Brightness()
     for done in images:
         brightness.add(done.quality.camera, done.quality.light, done.light)
@@ -81,15 +81,15 @@ def summarise(
         done.quality.model_copy(update={"valid_by_tooth": dict(zip(fdi, done.tooth_pixels, strict=True))})
         for done in images
     )
-    looked_at = [workshop.flow(k) for k in range(len(source.description.cameras))]
+    looked_at = [files.flow(k) for k in range(len(source.description.cameras))]
     flows = tuple(done.flow for done in looked_at if done is not None and done.flow is not None)
-    write_record(workshop.folder / "quality.json", QualityReport(images=covered, flows=flows))
-    write_page(workshop.folder, covered, flows, notes)
-    _copy_meshes(source.root, workshop.folder, fdi)
+    write_record(files.folder / "quality.json", QualityReport(images=covered, flows=flows))
+    write_page(files.folder, covered, flows, notes)
+    _copy_meshes(source.root, files.folder, fdi)
     # What a kill has left of a file that was being written
-    for partial in workshop.folder.rglob("*.partial"):
+    for partial in files.folder.rglob("*.partial"):
         partial.unlink()
-    workshop.seal(images)
+    files.seal(images)
     motions = [report.motion_px for report in reports if report.motion_px is not None]
     manifest = PreparedManifest(
         channels=source.description.channels,
@@ -111,9 +111,9 @@ def summarise(
     return manifest, known
 
 
-def _images(workshop: Workshop, source: Source) -> list[ImageDone]:
+def _images(files: AttemptFiles, source: Source) -> list[ImageDone]:
     """All images, in the order of cameras and lights, whichever was done first."""
-    found = [workshop.image(k, j) for k in range(len(source.description.cameras)) for j in source.lights_of(k)]
+    found = [files.image(k, j) for k in range(len(source.description.cameras)) for j in source.lights_of(k)]
     assert all(done is not None for done in found), "every block has ended"
     return [done for done in found if done is not None]
 

@@ -46,7 +46,7 @@ class _Plan(Record):
     digest: str
 
 
-class Workshop:
+class AttemptFiles:
     """One attempt's hold on the folders; it travels to the workers.
 
     Args:
