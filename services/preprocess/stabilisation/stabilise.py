@@ -4,7 +4,7 @@ Only tooth pixels are kept, and teeth of one jaw are one rigid body of known sha
 shift, a linear and a quadratic part, and a parallax in proportion to the scan's relief. Direct alignment (Lucas &
 Kanade 1981, with the parametric warps of Baker & Matthews 2004, section 2, and Irani & Anandan's plane plus parallax,
 1996) finds those few coefficients from all pixels at once. Dense flow, which has two unknowns per pixel, follows
-shading and reflections instead of the tooth; README.md has the comparison.
+shading and reflections instead of the tooth; docs/measured/preparation.md has the comparison.
 """
 
 from __future__ import annotations
