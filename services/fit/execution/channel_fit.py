@@ -132,6 +132,8 @@ class Stages(ABC, Generic[Optics]):
     spec: JobSpec
     journal: Journal
     report: Callable[[StepReport, Evaluation], None]
+    say: Callable[[str], None]
+    """Tells whoever watches one sentence."""
     pause: Callable[[], None]
     """Called between steps; raises when the job is cancelled."""
     shown: Shown = ()
@@ -311,6 +313,8 @@ class Stages(ABC, Generic[Optics]):
         known, moves = whitening(domain, equations), self.files.moves
 
         def compute() -> dict[str, Any]:
+            place = self.files.channel if self.tooth is None else f"{self.files.channel}, tooth {self.tooth}"
+            self.say(f"{place}: renders around the answer tell its ±, which may take as long as all steps.")
             sums = measure_closing(
                 problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1), moves
             )

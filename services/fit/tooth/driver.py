@@ -133,6 +133,7 @@ class FitDriver:
             report=attempt.teller(
                 observations, views, journal, lambda step: (place[0] + min(step / expected, 0.99)) / place[1]
             ),
+            say=attempt.log,
             pause=attempt.context.raise_if_cancelled,
             shown=shown_images(views),
         )

@@ -86,7 +86,7 @@ export class ParameterTable {
       element(
         "tr",
         {},
-        element("th", { scope: "row" }, name),
+        element("th", { scope: "row" }, ...breakable(name)),
         element("td", {}, unit(name)),
         ...channels.map((channel) => element("td", { class: "number" }, ...cell(name, channel))),
       ),
@@ -95,4 +95,9 @@ export class ParameterTable {
       element("table", {}, element("caption", {}, caption), element("thead", {}, head), element("tbody", {}, ...rows)),
     );
   }
+}
+
+/** A name that may be broken after its dots, so that it needs little room on a phone and no word is cut. */
+function breakable(name: string): (string | HTMLElement)[] {
+  return name.split(/(?<=\.)/).flatMap((part, place) => (place ? [element("wbr"), part] : [part]));
 }
