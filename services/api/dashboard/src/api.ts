@@ -4,8 +4,10 @@ import { clearTheWay } from "./follow";
 import { inLane } from "./lanes";
 import type { OptionSchema } from "./optionField";
 
-/** A dome that has not told its state by then has not told it. */
+/** A dome that is watched and has not told its state by then has not told it. */
 const DOME_PATIENCE_MS = 3000;
+/** The same for one that is asked for the first time: a simulated dome's process is started by that. */
+export const FIRST_PATIENCE_MS = 20_000;
 
 export type JobState =
   "SUBMITTED" | "QUEUED" | "RUNNING" | "CANCELLING" | "CANCELLED" | "SUCCEEDED" | "FAILED" | "DELETING";
@@ -288,8 +290,8 @@ export const renameJob = (id: string, name: string | null): Promise<Job> => ask(
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
 export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "POST");
-export const getDome = (): Promise<DomeState> =>
-  inLane(() => request("/dome", { signal: AbortSignal.timeout(DOME_PATIENCE_MS) }));
+export const getDome = (patience_ms = DOME_PATIENCE_MS): Promise<DomeState> =>
+  inLane(() => request("/dome", { signal: AbortSignal.timeout(patience_ms) }));
 
 /**
  * ALL OFF waits for no lane, and the stream of events makes room for it. It is sent without the cookie, by the

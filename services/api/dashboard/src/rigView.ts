@@ -1,6 +1,6 @@
 /** How a rig is connected: what to set and where, and whether the server's dome answers. */
 
-import { getDome, listCalibrations, type NamedCalibration, sentenceOf, Unauthenticated } from "./api";
+import { FIRST_PATIENCE_MS, getDome, listCalibrations, type NamedCalibration, sentenceOf, Unauthenticated } from "./api";
 import { element } from "./element";
 import { when } from "./format";
 import { SUBMIT } from "./newJobView";
@@ -114,7 +114,7 @@ export class RigView {
     this.found.className = "";
     this.found.textContent = "The dome is being asked.";
     try {
-      const { address, status } = await getDome();
+      const { address, status } = await getDome(FIRST_PATIENCE_MS);
       const faults = [
         ...status.faults,
         ...(status.interlock_closed ? [] : ["its interlock is open"]),
