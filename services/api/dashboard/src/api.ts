@@ -290,8 +290,8 @@ export const renameJob = (id: string, name: string | null): Promise<Job> => ask(
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
 export const retryJob = (id: string): Promise<Job> => ask(`/jobs/${id}/retry`, "POST");
-export const getDome = (patience_ms = DOME_PATIENCE_MS): Promise<DomeState> =>
-  inLane(() => request("/dome", { signal: AbortSignal.timeout(patience_ms) }));
+export const getDome = (patienceMs = DOME_PATIENCE_MS): Promise<DomeState> =>
+  inLane(() => request("/dome", { signal: AbortSignal.timeout(patienceMs) }));
 
 /**
  * ALL OFF waits for no lane, and the stream of events makes room for it. It is sent without the cookie, by the
