@@ -138,15 +138,18 @@ def _prepare(root: Path) -> tuple[float, float, float]:
 
 def _prepared_on(root: Path, workers: int) -> float:
     """Seconds by the clock of a preparation as a task of a cluster; the workers have imported all before."""
+    import dask
     from distributed import Client, LocalCluster
 
     from services.core.placement import STAGES, UNLIMITED
     from services.core.records import JobSpec
     from services.core.stage import LocalContext
+    from services.pipeline.dask_config import DASK_CONFIG
     from services.preprocess import stage
 
     shutil.rmtree(root / "prepared", ignore_errors=True)
     with (
+        dask.config.set(DASK_CONFIG),
         LocalCluster(
             n_workers=workers, threads_per_worker=1, dashboard_address=None, resources={STAGES: UNLIMITED}
         ) as cluster,
