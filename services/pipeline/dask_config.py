@@ -20,8 +20,9 @@ DASK_CONFIG: Mapping[str, Any] = MappingProxyType(
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
         # Dask has workers give freed memory back at once, and to glibc any value given here also says to map and clear
-        # every array above 128 kB anew, which took a third of a preparation's time. These are the values that glibc
-        # comes to by itself where it is told nothing: bytes from which an array is mapped, and that are kept when free.
+        # every array above 128 kB anew, which took a fifth of a preparation's time on one worker and a third on two.
+        # These are the values that glibc comes to by itself where it is told nothing: bytes from which an array is
+        # mapped, and bytes that are kept when free.
         "distributed.nanny.pre-spawn-environ": {
             "MALLOC_MMAP_THRESHOLD_": 1 << 25,
             "MALLOC_TRIM_THRESHOLD_": 1 << 26,

@@ -109,6 +109,15 @@ def test_events_show_a_falling_loss_and_previews(finished: tuple[Path, FitReport
     assert all(e.done is None or 0 <= e.done <= 1 for e in events)
 
 
+def test_renders_around_the_answer_are_announced(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
+    _, report, events = finished
+    announced = [k for k, e in enumerate(events) if e.kind == "log" and "renders around the answer" in e.message]
+    last_step = max(k for k, e in enumerate(events) if e.kind == "step")
+    assert announced
+    assert announced[-1] > last_step
+    assert events[announced[-1]].message.partition(":")[0] in report.fit_error
+
+
 def test_photographs_that_no_medium_explains_do_not_count_as_converged(tmp_path: Path) -> None:
     # Alternate photographs differ by a factor 1.5: the best common scale leaves 0.2 of the images, above the 0.15 that
     # still counts as explained.

@@ -20,7 +20,7 @@ from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
 from services.core.verdict import MAX_ERROR
 from services.fit.checks.evaluate import ErrorSums, Evaluation
-from services.fit.execution.channel_fit import ChannelFit, StepReport, history_key
+from services.fit.execution.channel_fit import ChannelFit, StepReport, history_key, told_place
 from services.fit.execution.executors import Executor, executor
 from services.fit.execution.journal import Journal
 from services.fit.execution.numerics import numerics_name
@@ -130,7 +130,7 @@ class Attempt:
 
         def tell(step: StepReport, evaluation: Evaluation) -> None:
             data = asdict(step)
-            place = step.channel if step.tooth is None else f"{step.channel}, tooth {step.tooth}"
+            place = told_place(step.channel, step.tooth)
             message = f"{place} {step.stage} step {step.stage_step}: loss {step.loss:.3e}, {step.verdict}."
             journal.once(history_key(step.channel, step.step), lambda: data)
             self.context.report(StageEvent(stage="fit", kind="step", message=message, done=done(step.step), data=data))

@@ -70,6 +70,11 @@ class StepReport:
     """FDI number, while a jaw's fit looks at one tooth alone."""
 
 
+def told_place(channel: str, tooth: int | None) -> str:
+    """What a fit's sentences begin with: the channel, and the tooth while a jaw's fit looks at one alone."""
+    return channel if tooth is None else f"{channel}, tooth {tooth}"
+
+
 def history_key(channel: str, step: int) -> str:
     """The journal's key of a step's report."""
     return f"{channel}/history/{step}"
@@ -313,7 +318,7 @@ class Stages(ABC, Generic[Optics]):
         known, moves = whitening(domain, equations), self.files.moves
 
         def compute() -> dict[str, Any]:
-            place = self.files.channel if self.tooth is None else f"{self.files.channel}, tooth {self.tooth}"
+            place = told_place(self.files.channel, self.tooth)
             self.say(f"{place}: renders around the answer tell its ±, which may take as long as all steps.")
             sums = measure_closing(
                 problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1), moves

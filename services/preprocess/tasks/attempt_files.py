@@ -6,8 +6,8 @@
       .prepared.<attempt>/      the store being written; where a job names a URL, a file in it says where its arrays are
       .prepared.work/
         plan.json               digest of all that the store depends on
-        <camera>/               footprint, relief and black image as .npy, view.json, measures.json, flow.json,
-                                motion-<frame>.json, image-<light>.json
+        <camera>/               footprint, relief, black image and its level as .npy, view.json, measures.json,
+                                flow.json, motion-<frame>.json, image-<light>.json
 
 A record is written last, once what it speaks of is on the disk, so a kill at any moment costs what was being made and
 nothing else.

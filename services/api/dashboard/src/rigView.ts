@@ -1,6 +1,13 @@
 /** How a rig is connected: what to set and where, and whether the server's dome answers. */
 
-import { FIRST_PATIENCE_MS, getDome, listCalibrations, type NamedCalibration, sentenceOf, Unauthenticated } from "./api";
+import {
+  FIRST_PATIENCE_MS,
+  getDome,
+  listCalibrations,
+  type NamedCalibration,
+  sentenceOf,
+  Unauthenticated,
+} from "./api";
 import { element } from "./element";
 import { when } from "./format";
 import { SUBMIT } from "./newJobView";
