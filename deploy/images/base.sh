@@ -7,9 +7,11 @@ name=${1:?give the name of the image}
 suite=${2:-bookworm}
 engine=${DENTINE_ENGINE:-$(command -v podman || command -v docker)}
 exclude() { printf -- '--dpkgopt=path-exclude=%s ' "$@"; }
-# Manuals, texts and translations are half of what a root holds and nothing reads them there.
+# Manuals, texts and translations are half of what a root holds and nothing reads them there. usr-is-merged is what
+# mmdebstrap has done already, and keeps apt from taking usrmerge, which brings 50 MB of Perl.
 # shellcheck disable=SC2046
-mmdebstrap --quiet --variant=apt --include=python3,python3-venv,ca-certificates \
+mmdebstrap --quiet --variant=apt --include=python3,python3-venv,ca-certificates,usr-is-merged \
+    --hook-dir=/usr/share/mmdebstrap/hooks/maybe-merged-usr \
     $(exclude '/usr/share/doc/*' '/usr/share/man/*' '/usr/share/locale/*' '/usr/share/info/*') \
     --customize-hook='rm -rf "$1"/var/cache/apt/archives/*.deb "$1"/var/lib/apt/lists/*' "$suite" - |
     "$engine" import - "$name"
