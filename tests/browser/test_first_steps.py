@@ -212,6 +212,26 @@ def test_the_form_is_the_schema_and_submits_what_was_changed(
     assert job["name"] == "Anna"
 
 
+def test_the_demonstration_brings_the_options_that_its_capture_needs(chromium: Browser, server: httpx.Client) -> None:
+    with watched_page(chromium, address_of(server)) as page:
+        page.goto("/#/submit")
+        source = page.get_by_label("What is fitted from")
+        expect(source).to_have_value("demo")
+        expect(page.get_by_label("Boundary")).to_have_value("matched")
+        source.select_option("rig")
+        expect(page.get_by_label("Boundary")).not_to_have_value("matched")
+        page.get_by_label("Index of refraction").fill("1.6")
+        source.select_option("capture")
+        expect(page.get_by_label("Index of refraction")).to_have_value("1.6")
+        source.select_option("demo")
+        page.get_by_label("Preset").select_option("quick")
+        expect(page.get_by_label("Boundary")).to_have_value("matched")
+        page.get_by_role("button", name="Submit the job").click()
+        job = submitted(server, page)
+    preset = {name: server.get(f"/v1/presets/{name}").json()["options"] for name in ("demo", "quick")}
+    assert JobSpec.model_validate(job["spec"]) == JobSpec.model_validate(preset["quick"] | preset["demo"])
+
+
 def test_what_is_wrong_stands_beside_its_field(chromium: Browser, server: httpx.Client, tmp_path: Path) -> None:
     upload_capture(server, contents_of(write_capture(tmp_path / "mine")))
     with watched_page(chromium, address_of(server), expected=("422",)) as page:

@@ -61,7 +61,7 @@ def merge(exposures: Sequence[Exposure], noise: NoiseModel) -> tuple[Image, Imag
     # Then each exposure at the inverse variance that this expectation gives it.
     weighted, weights = (np.zeros_like(light) for _ in range(2))
     for one, seen in zip(order, usable, strict=True):
-        variance = noise.variance(expected * np.float32(one.factor), one.gain) + np.float32(1) * one.extra_variance
+        variance = noise.variance(expected * np.float32(one.factor), one.gain) + one.extra_variance
         weight = np.where(seen, np.float32(one.factor) ** 2 / variance, 0).astype(np.float32)
         weighted += weight * (one.signal / np.float32(one.factor))
         weights += weight

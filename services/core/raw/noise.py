@@ -28,8 +28,6 @@ BINS = 24
 """Levels of signal at which the variance of a pair is looked at."""
 MIN_IN_BIN = 200
 """Pixels without which a bin says little: its variance is unsure by 10 % then."""
-MIN_LEVEL_COUNTS = 10.0
-"""Signal of the darkest bin that is used: below it sorting by level sorts read noise."""
 MIN_SLOPE_SIGMAS = 5.0
 """A slope less certain than this is no measurement."""
 

@@ -56,6 +56,7 @@ const GROUPS: [string, string[]][] = [
 ];
 const RIG_FIRST = ["dome", "mouth", "level", "exposure_s"];
 const LONGEST_NAME = "80";
+/** Name of the demonstration as a source, and of the preset with the options that its capture needs. */
 const DEMO = "demo";
 
 export class SubmitView {
@@ -72,11 +73,16 @@ export class SubmitView {
   private fields: OptionField[] = [];
   private rigFields: OptionField[] = [];
   private presets: Preset[] = [];
+  private demo: Preset["options"] = {};
+  private filledForDemo = false;
 
   /** `chosen`: id of a capture, or "rig"; else the newest capture. */
   constructor(private readonly chosen: string) {
     this.refusal.hidden = true;
-    this.source.addEventListener("change", () => this.showSource());
+    this.source.addEventListener("change", () => {
+      this.showSource();
+      if (this.isDemo !== this.filledForDemo) this.takePreset();
+    });
     this.preset.addEventListener("change", () => this.takePreset());
     this.root.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -102,7 +108,8 @@ export class SubmitView {
   stop(): void {}
 
   private fill(schema: OptionsSchema, presets: Preset[], captures: Capture[]): void {
-    this.presets = presets.filter((one) => !("rig" in one.options));
+    this.presets = presets.filter((one) => one.name !== DEMO);
+    this.demo = presets.find((one) => one.name === DEMO)?.options ?? {};
     const option = (value: string, text: string) => element("option", { value }, text);
     this.source.append(
       option("capture", "An uploaded capture"),
@@ -197,18 +204,24 @@ export class SubmitView {
     this.showSource();
   }
 
+  private get isDemo(): boolean {
+    return this.source.value === DEMO;
+  }
+
   private showSource(): void {
     this.rigOptions.hidden = this.source.value !== "rig";
     const place = this.capture.parentElement;
     if (place) place.hidden = this.source.value !== "capture";
   }
 
-  /** The demonstration's own preset is its source's. */
+  /** Fill the form with the preset's options; those that the demonstration's capture needs have precedence. */
   private takePreset(): void {
     const preset = this.presets.find((one) => one.name === this.preset.value);
     this.summary.textContent = preset?.summary ?? "";
+    this.filledForDemo = this.isDemo;
+    const options = { ...preset?.options, ...(this.isDemo ? this.demo : {}) };
     for (const field of this.fields) {
-      if (preset && field.name in preset.options) field.set(preset.options[field.name]);
+      if (field.name in options) field.set(options[field.name]);
       else field.reset();
     }
   }
@@ -237,7 +250,7 @@ export class SubmitView {
   }
 
   private origin(): object {
-    if (this.source.value === DEMO) return { rig: { mouth: DEMO } };
+    if (this.isDemo) return { rig: this.demo["rig"] };
     if (this.source.value === "rig")
       return {
         rig: Object.fromEntries(
