@@ -1,1 +1,1 @@
-"""From photographs of boards, spheres and charts to a calibration that knows its own errors."""
+"""Calibration of a rig from photographs of boards, spheres and charts, with the uncertainty of every result."""

@@ -1,7 +1,8 @@
 """Levenberg–Marquardt with Huber's weights, for some hundreds of unknowns and thousands of residuals.
 
-SciPy's trust region on the same problems took 10 to 50 times as long with a robust loss (it rescales rows by the loss's
-second derivative, which is 0 beyond the threshold, and crawls there); reweighting does not (Holland & Welsch 1977).
+SciPy's trust-region solver took 10 to 50 times as long on the same problems with a robust loss, because it rescales
+rows by the loss's second derivative, which is 0 beyond the threshold, and makes little progress there. Iteratively
+reweighted least squares does not have this problem (Holland & Welsch 1977).
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-12, 1e8
-"""As a share of each unknown's own curvature."""
+"""Damping of the first step, and its smallest and largest value, as a fraction of each unknown's own curvature (the
+diagonal of the normal matrix)."""
 DAMPING_STEP = 10.0
+"""Factor by which the damping falls after a step that lowers the cost, and rises after one that does not."""
 SMALL_DECREASE = 1e-9
-"""Of the cost, relative: of R residuals of one σ a step that gains less moves no unknown by more than √(10⁻⁹ R) of its
-±, 0.003 of 9,000."""
+"""Relative decrease of the cost below which the iteration ends. With R residuals of one σ each, a step that gains less
+moves no unknown by more than √(10⁻⁹ R) of its standard error: 0.003 of it for 9,000 residuals."""
 
 
 def solve_reweighted(
@@ -27,14 +30,15 @@ def solve_reweighted(
     huber: float | None = None,
     max_steps: int = 60,
 ) -> Floats:
-    """The unknowns (P,) of least squared, or least Huber-weighted, residuals (R,).
+    """Return the unknowns (P,) that minimise the sum of squared, or of Huber's loss of, the residuals (R,).
 
     Args:
-        residuals: in units of their σ.
-        derivative: (R, P).
-        start: where to begin.
-        huber: residuals beyond it count by their size and not by their square; None for plain least squares.
-        max_steps: after which the best so far is returned.
+        residuals: function from the unknowns (P,) to the residuals (R,), in units of their σ.
+        derivative: function from the unknowns (P,) to the residuals' derivative (R, P).
+        start: first guess of the unknowns (P,).
+        huber: threshold in σ beyond which the loss grows linearly with the residual instead of quadratically; None for
+            plain least squares.
+        max_steps: largest number of steps; after them the best unknowns so far are returned.
     """
     values, damping = start, FIRST_DAMPING
     off = residuals(values)
@@ -45,8 +49,8 @@ def solve_reweighted(
         scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float64).tiny))
         scaled = normal * np.outer(scale, scale)
         before, gained = _cost(off, huber), 0.0
-        # More damping until a step gains; with the most none does, and the unknowns are as good as rounding lets them
-        # be.
+        # Raise the damping until a step lowers the cost. If none does even with the largest damping, the unknowns are
+        # as good as rounding lets them be.
         while damping <= MAX_DAMPING:
             step = -scale * np.linalg.solve(scaled + damping * np.eye(len(values)), scale * side)
             tried = residuals(values + step)

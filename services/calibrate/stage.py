@@ -1,4 +1,4 @@
-"""The doors of calibration: ``run`` registers the scan of a raw folder, ``calibrate`` is the whole of a job of kind
+"""Entry points of calibration: ``run`` registers the scan of a raw folder, ``calibrate`` does a whole job of kind
 calibration.
 """
 
@@ -18,17 +18,18 @@ if TYPE_CHECKING:
     from services.core.stage import StageContext
 
 STEPS = 4
-"""Cameras, lights, intensities, colours: what a calibration tells as it begins."""
+"""Number of steps whose start a calibration reports: cameras, lights, intensities and colours."""
 
 
 def run(spec: JobSpec, context: StageContext) -> Registration:
     """Register the scan of ``spec.capture``, a raw folder, as ``dentine register`` does, and publish ``registered``.
 
-    Pictures of a refusal stay in the job's folder, which the message names.
+    If the registration is refused, its pictures stay in the job's folder, which the message names.
 
     Raises:
-        CaptureInputError: something is missing or contradicts, or the pose is not to be believed. MeshError: the scan
-            cannot be made solid. JobCancelledError.
+        CaptureInputError: an input is missing or contradicts another one, or the pose is not plausible.
+        MeshError: the scan cannot be made solid.
+        JobCancelledError: the job was cancelled.
     """
     from services.calibrate.registration.register import PICTURES, register_folder
 
@@ -53,12 +54,12 @@ def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
     """Calibrate the rig of ``spec.capture``, a raw folder, as ``dentine calibrate`` does, and publish the record as the
     asset.
 
-    The report lies in the job's folder, where those of other kinds lie. A calibration beyond its limits is published
-    all the same, with what to photograph again; jobs that name it refuse it.
+    The report lies in the job's folder, where jobs of other kinds have theirs. A calibration that exceeds its limits is
+    published too, with advice on what to photograph again; jobs that name it refuse it.
 
     Raises:
         CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy.
-            JobCancelledError.
+        JobCancelledError: the job was cancelled.
     """
     from services.calibrate.session.report import write_report
     from services.calibrate.session.run import CALIBRATION, RESIDUALS, write_session

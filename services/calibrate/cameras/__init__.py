@@ -1,1 +1,1 @@
-"""Boards in photographs, lenses, and where all cameras of a rig stand."""
+"""Detection of boards in photographs, and calibration of the lenses and poses of all cameras of a rig."""

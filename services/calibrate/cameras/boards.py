@@ -1,4 +1,4 @@
-"""Boards: where their corners lie on the plate, and where a photograph shows them."""
+"""Positions of a board's corners on the board itself, and their detection in a photograph."""
 
 from __future__ import annotations
 
@@ -17,8 +17,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Detection:
-    """Corners of a board in one photograph: numbers (N,), places on the board (N, 3) mm, pixels (N, 2), and markers
-    found (M,).
+    """Corners of a board that were found in one photograph.
+
+    Attributes:
+        ids: numbers of the corners (N,).
+        corners_mm: positions of the corners on the board (N, 3).
+        pixels: positions of the corners in the photograph (N, 2), pixel centres at half-integers.
+        markers: numbers of the markers found (M,).
     """
 
     ids: NDArray[np.int64]
@@ -28,7 +33,7 @@ class Detection:
 
 
 def corners_on_board(board: Board) -> Floats:
-    """All corners of a board (N, 3) in mm by their numbers, as OpenCV counts them; z = 0."""
+    """Return the positions (N, 3) in mm of all corners on a board, in OpenCV's order of numbers; z = 0."""
     columns, rows = board.squares
     if board.type == "chessboard":
         x, y = np.meshgrid(np.arange(columns - 1), np.arange(rows - 1))
@@ -41,12 +46,12 @@ def corners_on_board(board: Board) -> Floats:
 
 
 def opencv_board(board: Board) -> Any:
-    """OpenCV's own board of a ChArUco or ArUco board.
+    """Return OpenCV's board object for a ChArUco or ArUco board.
 
-    Of an ArUco board ``square_mm`` is the distance from one marker's edge to the next one's.
+    For an ArUco board ``square_mm`` is the distance from one marker's edge to the same edge of the next marker.
 
     Raises:
-        CaptureInputError: unknown dictionary, or one with fewer markers than the board shows.
+        CaptureInputError: the dictionary is unknown or has fewer markers than the board shows.
     """
     import cv2
 
@@ -74,8 +79,9 @@ def opencv_board(board: Board) -> Any:
 def detect(image: NDArray[np.uint8], board: Board) -> Detection:
     """Find a board's corners in a grey 8-bit photograph (H, W).
 
-    A board that is not there gives no corners. A chessboard has no numbers on its squares, so it is found whole or not
-    at all, and a board that looks the same turned by 180° must be photographed less than 90° turned between cameras.
+    A photograph without the board gives a detection without corners. A chessboard has no markers that number its
+    squares, so it is found whole or not at all; one that looks the same when turned by 180° must appear turned by less
+    than 90° between cameras.
     """
     find = {"charuco": _detect_charuco, "chessboard": _detect_chessboard, "aruco": _detect_aruco}[board.type]
     ids, pixels, markers = find(image, board)
@@ -85,7 +91,7 @@ def detect(image: NDArray[np.uint8], board: Board) -> Detection:
 def _detect_charuco(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64]]:
     import cv2
 
-    # Markers only say which corner is which, so theirs are not refined; the squares' corners always are.
+    # Markers only identify the squares' corners, so the markers' own corners are not refined; the squares' always are.
     detector = cv2.aruco.CharucoDetector(opencv_board(board))
     pixels, ids, _, markers = detector.detectBoard(image)
     return _numbers(ids), _pixels(pixels), _numbers(markers)

@@ -1,9 +1,10 @@
-"""Bundle adjustment: lenses, camera poses and board poses that together draw the corners where they were seen.
+"""Bundle adjustment: lenses, camera poses and board poses that minimise the reprojection error of all corners.
 
-The world's frame is that of the board at place 0, so that place has no parameters. A camera draws a corner c of the
-board at place p at π(R (R_p c + t_p) + t). Corners' errors are independent and of one σ a camera. A fit with Huber's
-loss comes first; corners that it leaves far outside are left out, and a plain fit of the others gives value and
-covariance σ² (JᵀJ)⁻¹, with σ² from the residuals and their degrees of freedom (Triggs et al., Bundle Adjustment, 2000).
+The world frame is that of the board at place 0, so this place has no parameters. A camera projects a corner c of the
+board at place p to π(R (R_p c + t_p) + t). The corners' errors are taken as independent, with one σ per camera. A fit
+with Huber's loss comes first. Corners with large residuals after it are left out as outliers, and a plain
+least-squares fit of the others gives the values and their covariance σ² (JᵀJ)⁻¹, with σ² from the residuals and their
+degrees of freedom (Triggs et al., Bundle Adjustment, 2000).
 """
 
 from __future__ import annotations
@@ -21,29 +22,38 @@ from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 HUBER_SIGMAS = 1.345
-"""Huber's constant: 95 % as efficient as least squares where all errors are normal."""
+"""Threshold of Huber's loss in σ: with it the estimate is 95 % as efficient as least squares where all errors are
+normal."""
 OUTLIER_SIGMAS = 5.0
-"""A good session has 10⁴ corners, and 2·10⁴ normal coordinates exceed 5 σ once in a hundred sessions."""
+"""Residual in σ beyond which a corner is an outlier. A good session has 10⁴ corners, and 2·10⁴ normal coordinates
+exceed 5 σ once in a hundred sessions."""
 SIGMA_FLOOR_PX = 1e-6
-"""Exact synthetic corners have no scatter; the whitening must not divide by it."""
+"""Smallest σ of a corner in px, because exact synthetic corners have no scatter and residuals are divided by σ."""
 ROBUST_ROUNDS = 3
+"""Largest number of rounds that alternate between an estimate of σ and a robust fit."""
 SETTLED_SCALE = 0.1
-"""Of the robust scale between two rounds: outliers lie far beyond a tenth of σ."""
+"""Relative change of the robust σ between two rounds below which the rounds end: outliers lie far beyond a tenth
+of σ."""
 STEP_PRECISION = 1e-10
-"""Of the linear solver within a step: with less the steps are no Gauss–Newton steps and a hundred of them are
-needed."""
+"""Tolerance of the linear solver within a step. With a looser one the steps are no Gauss–Newton steps, and a hundred of
+them are needed."""
 MAD_TO_SIGMA = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 MISPLACED_PX, MISPLACED_TIMES = 10.0, 10.0
-"""Median distance of a photograph's corners from where the first guess draws them, in px and over that of all
-photographs: first guesses are off by some pixels, and frames that were interchanged by hundreds."""
+"""Limits of a photograph's median reprojection error under the first guess: in px, and as a multiple of the median over
+all photographs. The larger one holds. First guesses are off by some pixels, interchanged frames by hundreds."""
 MIN_INLIERS = 4
-"""Corners that fix a pose."""
+"""Number of corners that determine a pose."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Parameters of a bundle: K lenses, K poses camera_from_world (K, 6), and P poses world_from_board (P, 6), the
-    first zero.
+    """Parameters of a bundle adjustment.
+
+    Attributes:
+        lenses: intrinsics of the K cameras.
+        cameras: poses camera_from_world (K, 6), each a rotation vector in rad and a translation in mm.
+        places: poses world_from_board (P, 6); the first is zero.
     """
 
     lenses: tuple[Lens, ...]
@@ -53,7 +63,14 @@ class Rig:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where each parameter stands in the vector: lenses, camera poses, then the poses of places 1 to P − 1."""
+    """Positions of the parameters in the parameter vector: lenses, camera poses, then the poses of places 1 to P − 1.
+
+    Attributes:
+        sizes: width and height in pixels of each of the K cameras.
+        lens_lengths: number of intrinsic values of each lens.
+        n_places: number P of places.
+        lenses_fixed: whether the lenses are kept out of the vector.
+    """
 
     sizes: tuple[tuple[int, int], ...]
     lens_lengths: tuple[int, ...]
@@ -62,7 +79,7 @@ class Layout:
 
     @property
     def lens_starts(self) -> list[int]:
-        """First column of each lens."""
+        """First column of each lens, and the column after the last one."""
         return [0, *np.cumsum(self.lens_lengths).tolist()]
 
     @property
@@ -80,7 +97,7 @@ class Layout:
         return self.first_pose + 6 * camera + np.arange(6)
 
     def lens_columns(self, camera: int) -> NDArray[np.int64]:
-        """Columns of a camera's lens; none where lenses are fixed."""
+        """Columns of a camera's lens; empty where the lenses are fixed."""
         count = 0 if self.lenses_fixed else self.lens_lengths[camera]
         return self.lens_starts[camera] + np.arange(count)
 
@@ -89,12 +106,12 @@ class Layout:
         return self.first_pose + 6 * (len(self.sizes) + place - 1) + np.arange(6)
 
     def pack(self, rig: Rig) -> Floats:
-        """The parameters of a rig, (length,)."""
+        """Return the parameter vector (length,) of a rig."""
         lenses = [] if self.lenses_fixed else [lens.values for lens in rig.lenses]
         return np.concatenate([*lenses, rig.cameras.ravel(), rig.places[1:].ravel()])
 
     def unpack(self, values: Floats, template: Rig) -> Rig:
-        """The rig of parameters; what is fixed comes from the template."""
+        """Return the rig of a parameter vector; fixed lenses and the pose of place 0 come from the template."""
         starts = self.lens_starts
         lenses = template.lenses
         if not self.lenses_fixed:
@@ -106,17 +123,18 @@ class Layout:
 
 @dataclass(frozen=True)
 class BundleFit:
-    """What bundle adjustment found.
+    """Result of a bundle adjustment.
 
     Attributes:
         rig: lenses and poses.
-        layout: the order of the covariance.
-        covariance: of all parameters (length, length), in the frame of place 0.
-        sigma_px: standard deviation of one coordinate of a corner, by camera (K,); the common scale is from the
-            residuals.
-        residuals_px: seen minus drawn (N, 2), of all corners in the order of the views, outliers too.
-        inliers: which corners the final fit used (N,).
-        corners: the corners.
+        layout: order of the parameters in the covariance.
+        covariance: covariance of all parameters (length, length), in the frame of place 0.
+        sigma_px: standard deviation of one coordinate of a corner, by camera (K,); their common scale is estimated from
+            the residuals.
+        residuals_px: observed minus projected position (N, 2) of all corners in the order of the views, outliers
+            included.
+        inliers: True for each corner that the final fit used (N,).
+        corners: all corners, in the order of the residuals.
         converged: whether the solver met its tolerance.
     """
 
@@ -130,13 +148,13 @@ class BundleFit:
     converged: bool
 
     def rms_px(self, camera: int | None = None) -> float:
-        """Root mean square distance between seen and drawn corners, of the inliers of one camera or of all."""
+        """Root mean square reprojection error in px, over the inliers of one camera or of all cameras."""
         chosen = self.inliers if camera is None else self.inliers & (self.corners.camera == camera)
         return float(np.sqrt((self.residuals_px[chosen] ** 2).sum(axis=1).mean()))
 
 
 def layout_of(rig: Rig, *, lenses_fixed: bool = False) -> Layout:
-    """The layout of a rig's parameters."""
+    """Return the layout of a rig's parameters."""
     return Layout(
         tuple(lens.size for lens in rig.lenses),
         tuple(len(lens.values) for lens in rig.lenses),
@@ -146,7 +164,7 @@ def layout_of(rig: Rig, *, lenses_fixed: bool = False) -> Layout:
 
 
 def draw(rig: Rig, corners: Corners) -> Floats:
-    """Pixels (N, 2) at which a rig draws corners."""
+    """Return the pixels (N, 2) to which a rig projects corners."""
     pixels = np.empty_like(corners.pixels)
     local = pose_apply(rig.places[corners.place], corners.corners_mm)
     for camera, lens in enumerate(rig.lenses):
@@ -159,11 +177,11 @@ def draw(rig: Rig, corners: Corners) -> Floats:
 def derivative_blocks(
     rig: Rig, corners: Corners, camera: int
 ) -> tuple[NDArray[np.int64], Floats, Floats, Floats, Floats]:
-    """What moves the drawn corners of one camera.
+    """Compute the projected corners of one camera and their derivatives with respect to lens and poses.
 
     Returns:
-        Which rows it sees (M,), their pixels (M, 2), and derivatives to its lens (M, 2, 4 + D), its pose (M, 2, 6) and
-        the pose of each corner's place (M, 2, 6).
+        The rows (M,) of the corners that this camera sees, their pixels (M, 2), and the pixels' derivatives with
+        respect to the camera's lens (M, 2, 4 + D), its pose (M, 2, 6) and the pose of each corner's place (M, 2, 6).
     """
     rows = np.flatnonzero(corners.camera == camera)
     place = rig.places[corners.place[rows]]
@@ -192,11 +210,11 @@ def fit_bundle(
     Args:
         views: photographs of boards; every camera and every place must be linked to place 0 by shared views.
         start: a first guess, as from ``services.calibrate.cameras.start``.
-        sigma_px: how the cameras' corners scatter against each other (K,), as single cameras' fits tell; all alike by
-            default. It is not estimated here: in a joint fit the camera of the smallest residuals would draw all weight
-                to itself.
-        lenses_fixed: keep the guess's intrinsics.
-        robust: look for outliers.
+        sigma_px: standard deviations of the cameras' corners (K,) from fits of each camera alone, of which only the
+            ratios count; all equal by default. The ratios are not estimated here, because in a joint fit the camera of
+            the smallest residuals would draw all weight to itself.
+        lenses_fixed: keep the intrinsics of the first guess.
+        robust: find outliers and leave them out.
 
     Raises:
         CaptureInputError: photographs of a place or a camera fit no common pose.
@@ -229,7 +247,7 @@ def fit_bundle(
 def _without_outliers(
     layout: Layout, start: Rig, corners: Corners, values: Floats, weights: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """A robust fit, and the corners that are no outliers of it."""
+    """Return the parameters (length,) of a robust fit, and a mask (N,) of the corners that are inliers of it."""
     scale, kept = 1.0, corners.kept(~_misplaced(corners, draw(layout.unpack(values, start), corners)))
     for _ in range(ROBUST_ROUNDS):
         off = np.abs(kept.pixels - draw(layout.unpack(values, start), kept)) / weights[kept.camera, None]
@@ -242,10 +260,11 @@ def _without_outliers(
 
 
 def _misplaced(corners: Corners, drawn: Floats) -> NDArray[np.bool_]:
-    """Corners (N,) of photographs that the first guess draws elsewhere altogether, as frames that were interchanged.
+    """Return a mask (N,) of the corners of photographs that the first guess projects far away, such as those of frames
+    that were interchanged.
 
-    Huber's loss bounds the pull of single corners, and a whole photograph of them still bends its place's and its
-    camera's pose. Of every camera and every place at least one photograph stays.
+    Huber's loss bounds the influence of each corner, but a whole photograph of wrong corners still biases the poses of
+    its place and its camera. At least one photograph of every camera and of every place stays.
     """
     off = np.linalg.norm(corners.pixels - drawn, axis=1)
     median = np.array([float(np.median(off[corners.view == view])) for view in range(corners.view.max() + 1)])
@@ -258,10 +277,10 @@ def _misplaced(corners: Corners, drawn: Floats) -> NDArray[np.bool_]:
 
 
 def _require_inliers(views: Sequence[View], corners: Corners, inliers: NDArray[np.bool_]) -> None:
-    """Refuse a session in which a camera or a place has no pose.
+    """Refuse a session in which a camera or a place has too few inliers for a pose.
 
     Raises:
-        CaptureInputError: too few corners of it fit.
+        CaptureInputError: a camera or a place has fewer than ``MIN_INLIERS`` inliers.
     """
     for what, numbers in (("the board at one place", corners.place), ("one camera", corners.camera)):
         for number in np.unique(numbers):
@@ -275,7 +294,9 @@ def _require_inliers(views: Sequence[View], corners: Corners, inliers: NDArray[n
 
 
 def jacobian(layout: Layout, rig: Rig, corners: Corners, sigma_px: Floats) -> object:
-    """Sparse derivative (2N, length) of the drawn corners, each divided by its camera's σ, to the parameters."""
+    """Return the sparse derivative (2N, length) of the projected corners, each divided by its camera's σ, with respect
+    to the parameters.
+    """
     from scipy.sparse import csr_array
 
     entries, rows, columns = [], [], []
@@ -301,7 +322,7 @@ def jacobian(layout: Layout, rig: Rig, corners: Corners, sigma_px: Floats) -> ob
 
 
 def pose_apply(pose: Floats, points: Floats) -> Floats:
-    """Points (N, 3) moved by one pose (6,) or each by its own (N, 6)."""
+    """Return points (N, 3) transformed by one pose (6,), or each by its own pose (N, 6)."""
     matrix = pose_matrix(pose)
     moved = np.einsum("...ij,...j->...i", matrix[..., :3, :3], points) + matrix[..., :3, 3]
     return np.asarray(moved, dtype=np.float64)
@@ -310,7 +331,11 @@ def pose_apply(pose: Floats, points: Floats) -> Floats:
 def _solve(
     layout: Layout, template: Rig, corners: Corners, values: Floats, sigma: Floats, *, huber: bool = False
 ) -> tuple[Floats, bool]:
-    """Least squares over all parameters by SciPy's trust region on the sparse derivative."""
+    """Minimise over all parameters with SciPy's trust-region solver and the sparse derivative.
+
+    Returns:
+        The parameters (length,), and whether the solver met its tolerance.
+    """
     from scipy.optimize import least_squares
 
     def residuals(x: Floats) -> Floats:
@@ -336,7 +361,9 @@ def _solve(
 
 
 def _covariance(whitened: object) -> Floats:
-    """(JᵀJ)⁻¹ through columns of one length, so that pixels, radians and millimetres lose no digits to each other."""
+    """Return (JᵀJ)⁻¹, computed with the columns of J scaled to unit length, so that the different sizes of pixels,
+    radians and millimetres cost no digits.
+    """
     from scipy.linalg import cho_factor, cho_solve
 
     normal = np.asarray((whitened.T @ whitened).todense())  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""How a lens draws points: a pinhole and OpenCV's distortion polynomials, with derivatives."""
+"""Projection of points by a lens, a pinhole with OpenCV's distortion polynomials, and its derivatives."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 MODELS = {"pinhole": 0, "radial-tangential-4": 4, "radial-tangential-5": 5, "rational-8": 8}
-"""Distortion models by their number of coefficients, from the simplest: k1, k2, p1, p2; k3; k4, k5, k6 (OpenCV's
-order)."""
+"""Number of coefficients of each distortion model, the simplest first. In OpenCV's order they are k1, k2, p1, p2, then
+k3, then k4, k5, k6."""
 HALF_PIXEL = 0.5
-"""Pixel centres lie at half-integers here and at integers in OpenCV."""
+"""Offset in px from OpenCV's pixel coordinates to those of this project: pixel centres lie at half-integers here and at
+integers in OpenCV."""
 UNDISTORTION_STEPS = 40
 UNDISTORTION_PRECISION = 1e-11
+"""Largest number of iterations of OpenCV's inversion of the distortion, and the error at which it ends."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class Lens:
 
     Attributes:
         size: width and height in pixels.
-        values: fx, fy, cx, cy in pixels (centres at half-integers), then the distortion's coefficients, (4 + D,).
+        values: fx, fy, cx, cy in pixels (pixel centres at half-integers), then the D distortion coefficients (4 + D,).
     """
 
     size: tuple[int, int]
@@ -37,7 +39,7 @@ class Lens:
 
     @property
     def distortion(self) -> Floats:
-        """Coefficients in OpenCV's order, (D,)."""
+        """Distortion coefficients (D,) in OpenCV's order."""
         return self.values[4:]
 
     @property
@@ -46,14 +48,15 @@ class Lens:
         return next(name for name, count in MODELS.items() if count == len(self.values) - 4)
 
     def project(self, points_mm: Floats) -> Floats:
-        """Pixels (N, 2) of points (N, 3) in the camera's axes, in mm."""
+        """Return the pixels (N, 2) of points (N, 3) in the camera's axes, in mm."""
         return self.project_with_derivatives(points_mm)[0]
 
     def project_with_derivatives(self, points_mm: Floats) -> tuple[Floats, Floats, Floats]:
-        """Pixels (N, 2) of points (N, 3) in the camera's axes, and their derivatives.
+        """Return the pixels of points (N, 3) in the camera's axes, in mm, and their derivatives.
 
         Returns:
-            Pixels, their derivative to the point (N, 2, 3), and to the intrinsic values (N, 2, 4 + D).
+            Pixels (N, 2), and their derivatives with respect to the point (N, 2, 3) and to the intrinsic values
+            (N, 2, 4 + D).
         """
         import cv2
 
@@ -61,13 +64,14 @@ class Lens:
         coefficients = self.distortion if len(self.distortion) else np.zeros(4)
         still = np.zeros(3)
         pixels, jacobian = cv2.projectPoints(points, still, still, self.matrix, coefficients)
-        # With the camera at rest a translation is a move of the point: OpenCV's columns 3 to 5.
+        # With the camera's pose at zero, a change of its translation moves the point, so OpenCV's columns 3 to 5 are
+        # the derivative with respect to the point.
         jacobian = np.asarray(jacobian).reshape(len(points), 2, -1)
         own = jacobian[:, :, 6 : 6 + len(self.values)]
         return np.asarray(pixels).reshape(-1, 2), jacobian[:, :, 3:6], own
 
     def undistort(self, pixels: Floats) -> Floats:
-        """Directions (N, 3) with z = 1, in the camera's axes, of pixels (N, 2)."""
+        """Return the directions (N, 3) of pixels (N, 2) in the camera's axes, with z = 1."""
         import cv2
 
         coefficients = self.distortion if len(self.distortion) else np.zeros(4)

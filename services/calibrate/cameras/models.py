@@ -1,4 +1,4 @@
-"""Which distortion model a lens needs, judged by boards that did not take part in its fit."""
+"""Choice of a lens's distortion model by cross-validation on held-out boards."""
 
 from __future__ import annotations
 
@@ -15,21 +15,24 @@ from services.calibrate.cameras.start import board_pose, first_lens, first_rig, 
 
 Floats = NDArray[np.float64]
 FOLDS = 5
+"""Number of folds of the cross-validation."""
 MODEL_FOR_OUTLIERS = "radial-tangential-5"
-"""OpenCV's default: rich enough that bad corners stand out, and determined by any session that can be used."""
+"""Distortion model of the fit that finds outliers. This is OpenCV's default: it has enough coefficients for bad corners
+to stand out, and any usable session determines them."""
 
 MIN_BOARDS, MODEL_OF_FEW = 6, "radial-tangential-4"
-"""With fewer boards nothing can be left out and judged; four coefficients serve all lenses but wide ones."""
+"""Smallest number of boards for cross-validation, and the model that is used with fewer: its four coefficients suffice
+for all but wide-angle lenses."""
 
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """A lens, and what held-out boards say of every model.
+    """A lens, and the held-out error of every distortion model.
 
     Attributes:
-        lens: of the chosen model, from all boards.
-        sigma_px: scatter of one coordinate of its corners about a fit of this camera alone.
-        held_out_px: rms distance of the corners of boards that were left out, by model; empty where there were too few
+        lens: the lens of the chosen model, fitted to all boards.
+        sigma_px: standard deviation of one coordinate of the corners in a fit of this camera alone.
+        held_out_px: rms reprojection error of the corners of held-out boards, by model; empty where there were too few
             boards.
     """
 
@@ -39,7 +42,7 @@ class ModelChoice:
 
 
 def fit_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> BundleFit:
-    """Intrinsics of one camera from its own boards, by bundle adjustment."""
+    """Fit the intrinsics of one camera to its own boards by bundle adjustment."""
     good = of_one_camera(usable(views))
     return fit_bundle(good, first_rig(good, [first_lens(good, size, model, name)], [name]))
 
@@ -47,12 +50,13 @@ def fit_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str
 def choose_lens(
     views: Sequence[View], size: tuple[int, int], name: str, models: Sequence[str] = tuple(MODELS), folds: int = FOLDS
 ) -> ModelChoice:
-    """The simplest distortion model that no other beats on held-out boards by more than its standard error.
+    """Choose the simplest distortion model that no other model beats on held-out boards by more than one standard
+    error.
 
-    Corners that fit nowhere are left out first. Each fold then leaves every ``folds``-th board out, fits the others,
-    and judges the lens by how well it draws the left out boards with a pose of their own. The difference of two models
-    is a mean over boards, and so is its standard error. Of fewer than six boards none can be left out, and the model is
-    held.
+    Outliers are left out first. Each fold then holds every ``folds``-th board out, fits the lens to the others, and
+    measures its reprojection error on the held-out boards, each with its best pose. The difference of two models is the
+    mean over boards, and its standard error comes from the scatter over boards. With fewer than six boards none is held
+    out, and the model is ``MODEL_OF_FEW``.
 
     Raises:
         CaptureInputError: the camera shows fewer than three boards.
@@ -68,20 +72,18 @@ def choose_lens(
 
 
 def without_outliers(views: Sequence[View], fit: BundleFit) -> list[View]:
-    """The views without the corners that a fit left out."""
+    """Return the usable views without the corners that are outliers of a fit."""
     return usable([view.kept(fit.inliers[fit.corners.view == number]) for number, view in enumerate(views)])
 
 
 def held_out_squares(views: Sequence[View], lens: Lens) -> Floats:
-    """Mean squared distance in px² of each view's corners from where a lens draws them, with the view's best pose
-    (V,).
-    """
+    """Return the mean squared reprojection error (V,) in px² of each view, with the pose that fits the view best."""
     drawn = (lens.project(pose_apply(board_pose(view, lens), view.corners_mm)) for view in views)
     return np.array([((d - view.pixels) ** 2).sum(axis=1).mean() for d, view in zip(drawn, views, strict=True)])
 
 
 def of_one_camera(views: Sequence[View]) -> list[View]:
-    """The views as those of camera 0, each at a place of its own."""
+    """Return the views renumbered as those of camera 0, each at a place of its own."""
     return [replace(view, camera=0, place=number) for number, view in enumerate(views)]
 
 

@@ -1,4 +1,6 @@
-"""Boards as PDF, to scale: black rectangles in millimetres, which no library of this project's dependencies writes."""
+"""Boards as PDF files, to scale: pages of black rectangles in millimetres, which none of this project's dependencies
+can write.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +14,22 @@ from services.core.raw.targets import Board
 
 POINTS_PER_MM = 72 / 25.4
 MARGIN_MM = 10.0
-"""White around a board: half a square at least, so that its outer squares are found."""
+"""Width of the white margin around a board: at least half a square, so that the outer squares are found."""
 RULER_MM, RULER_HEIGHT_MM = 100.0, 1.0
+"""Length and height of the printed ruler, by which the print's scale can be checked."""
 Rectangle = tuple[float, float, float, float]
-"""x, y, width and height in mm, from the board's upper left corner, y down."""
+"""A rectangle's x, y, width and height in mm, from the board's upper left corner, y down."""
 
 
 def board_rectangles(board: Board) -> list[Rectangle]:
-    """What is black on a board."""
+    """Return the black rectangles of a board."""
     if board.type == "chessboard":
         return list(_squares(board))
     return [*(_squares(board) if board.type == "charuco" else ()), *_markers(board)]
 
 
 def board_pdf(board: Board) -> bytes:
-    """A page of the board's own size with margins, and a ruler of 100 mm below it, as PDF."""
+    """Return a PDF of one page that shows the board at its true size with margins, and a ruler of 100 mm below it."""
     columns, rows = board.squares
     width, height = columns * board.square_mm, rows * board.square_mm
     page_width = max(width, RULER_MM) + 2 * MARGIN_MM
@@ -42,8 +45,8 @@ def board_pdf(board: Board) -> bytes:
 
 
 def _squares(board: Board) -> Iterator[Rectangle]:
-    """Black squares; OpenCV's boards begin with a black one, ChArUco's of the legacy pattern with even rows with a
-    white one.
+    """Yield the black squares. The upper left square of OpenCV's boards is black, but that of a ChArUco board of the
+    legacy pattern with an even number of rows is white.
     """
     columns, rows = board.squares
     first = 1 if board.legacy_pattern and rows % 2 == 0 else 0
@@ -55,7 +58,7 @@ def _squares(board: Board) -> Iterator[Rectangle]:
 
 
 def _markers(board: Board) -> Iterator[Rectangle]:
-    """Black cells of all markers, joined along rows."""
+    """Yield the black cells of all markers, joined along rows."""
     import cv2
 
     made = opencv_board(board)
@@ -71,13 +74,13 @@ def _markers(board: Board) -> Iterator[Rectangle]:
 
 
 def _runs(black: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """First cell and length of each run of black cells."""
+    """Yield the first cell and the length of each run of black cells."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], black.astype(int), [0]])))
     yield from ((int(start), int(stop - start)) for start, stop in zip(edges[::2], edges[1::2], strict=True))
 
 
 def _document(content: bytes, width: float, height: float) -> bytes:
-    """A PDF of one page (ISO 32000-1, 7.5)."""
+    """Return a PDF of one page with this content (ISO 32000-1, 7.5); width and height in points."""
     page = f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.5f} {height:.5f}] /Contents 4 0 R /Resources << >> >>"
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R >>",

@@ -1,10 +1,10 @@
-"""How far off a calibrated camera may draw a point, all over its image.
+"""Uncertainty of a calibrated camera's projection, all over its image.
 
-Lens and pose are exchangeable in part: a lens that is wrong by a shift of its principal point, with boards turned to
-fit, draws almost as before. So the question is asked as mrcal asks it (Kogan, mrcal's documentation of projection
-uncertainty, "mean-pcam"): a point that the camera sees is fixed to the boards as they were solved; when all parameters
-err, the boards carry it along, the mean over the boards says where the camera then believes it to be, and the erring
-lens draws that.
+Errors of lens and pose compensate each other in part: a lens whose principal point is shifted, with the boards rotated
+to fit, projects almost the same pixels. The uncertainty is therefore defined as in mrcal (Kogan, mrcal's documentation
+of projection uncertainty, "mean-pcam"): a point that the camera sees is fixed to every solved board. When all
+parameters change by an error, each board carries the point along, the mean over the boards is the point's new position
+in the camera's axes, and the changed lens projects it.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ Floats = NDArray[np.float64]
 
 
 def image_grid(size: tuple[int, int], columns: int, rows: int) -> Floats:
-    """Pixels (rows · columns, 2) at the centres of equal cells of the image, row by row."""
+    """Return the pixels (rows · columns, 2) at the centres of equal cells of the image, row by row."""
     x, y = (np.arange(columns) + 0.5) * size[0] / columns, (np.arange(rows) + 0.5) * size[1] / rows
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def projection_covariance(fit: BundleFit, camera: int, pixels: Floats, distance_mm: float) -> Floats:
-    """Covariance in px² (N, 2, 2) of where a camera draws the points that it sees at pixels (N, 2) and a distance in
-    mm.
+    """Return the covariance (N, 2, 2) in px² of a camera's projection of the points that it sees at pixels (N, 2), at a
+    distance in mm from the camera.
     """
     lens, pose = fit.rig.lenses[camera], fit.rig.cameras[camera]
     directions = lens.undistort(pixels)
     points = distance_mm * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     world = pose_apply(inverse_pose(pose), points)
-    # Only boards that this camera saw carry its points.
+    # Take the mean over the boards that this camera saw.
     places = np.unique(fit.corners.place[fit.inliers & (fit.corners.camera == camera)])
     columns = np.zeros((len(pixels), 2, fit.layout.length))
     for place in places:
@@ -50,6 +50,8 @@ def projection_covariance(fit: BundleFit, camera: int, pixels: Floats, distance_
 
 
 def projection_sigma(fit: BundleFit, camera: int, pixels: Floats, distance_mm: float) -> Floats:
-    """Standard deviation in px (N,), in the worst direction, of where a camera draws what it sees at pixels (N, 2)."""
+    """Return the standard deviation (N,) in px, in the worst direction, of a camera's projection of the points that it
+    sees at pixels (N, 2), at a distance in mm from the camera.
+    """
     covariance = projection_covariance(fit, camera, pixels, distance_mm)
     return np.asarray(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))

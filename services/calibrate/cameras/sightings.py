@@ -1,4 +1,4 @@
-"""Corners of boards as cameras saw them: the one input of lens and rig calibration."""
+"""Corners of boards as detected in photographs: the only input of lens and rig calibration."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class View:
 
     Attributes:
         camera: number of the camera.
-        place: number of the place where the board lay; cameras that share it saw it unmoved.
-        corners_mm: the corners on the board (N, 3).
-        pixels: where they were seen (N, 2), pixel centres at half-integers.
-        ids: the corners' numbers on the board (N,).
-        name: of the photograph, for messages.
+        place: number of the place where the board lay; the board did not move between photographs of one place.
+        corners_mm: positions of the corners on the board (N, 3).
+        pixels: detected positions of the corners (N, 2), pixel centres at half-integers.
+        ids: numbers of the corners on the board (N,).
+        name: name of the photograph, for messages.
     """
 
     camera: int
@@ -32,18 +32,20 @@ class View:
     name: str = ""
 
     def kept(self, mask: NDArray[np.bool_]) -> View:
-        """The same view with some of its corners."""
+        """Return the view with only the corners that the mask (N,) selects."""
         return replace(self, corners_mm=self.corners_mm[mask], pixels=self.pixels[mask], ids=self.ids[mask])
 
 
 @dataclass(frozen=True)
 class Corners:
-    """All corners of all views, one row a corner.
+    """All corners of all views, one row per corner.
 
     Attributes:
-        camera, place, view: numbers (N,).
-        corners_mm: on their boards (N, 3).
-        pixels: where they were seen (N, 2).
+        camera: number of each corner's camera (N,).
+        place: number of each corner's place (N,).
+        view: number of each corner's view (N,).
+        corners_mm: positions of the corners on their boards (N, 3).
+        pixels: detected positions of the corners (N, 2).
     """
 
     camera: NDArray[np.int64]
@@ -53,12 +55,12 @@ class Corners:
     pixels: Floats
 
     def kept(self, mask: NDArray[np.bool_]) -> Corners:
-        """Some of the corners."""
+        """Return the corners that the mask (N,) selects."""
         return Corners(self.camera[mask], self.place[mask], self.view[mask], self.corners_mm[mask], self.pixels[mask])
 
 
 def joined(views: Sequence[View]) -> Corners:
-    """The corners of all views in their order."""
+    """Return the corners of all views, in the order of the views."""
     counts = [len(view.pixels) for view in views]
     return Corners(
         camera=np.repeat([view.camera for view in views], counts).astype(np.int64),

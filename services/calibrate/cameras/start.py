@@ -1,5 +1,5 @@
-"""First guesses for bundle adjustment: each camera's lens from its own boards, then poses by cameras that see one
-board.
+"""First guesses for bundle adjustment: each camera's lens from its own boards, then the poses of cameras and boards
+from boards that several cameras see.
 """
 
 from __future__ import annotations
@@ -17,28 +17,35 @@ from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 MIN_CORNERS = 6
-"""Of a view: four fix a pose without any check, and six still outvote one bad corner."""
+"""Smallest number of corners of a usable view: four determine a pose without any check, and six still outvote one bad
+corner."""
 VOTES = 2
-"""Rounds: the first mends what a single wrong photograph led astray, the second what hung on that."""
+"""Rounds of voting: the first corrects poses that a single wrong photograph spoilt, the second corrects poses that
+were derived from those."""
 MIN_VIEWS = 3
-"""A plane's views fix five intrinsic values from three on (Zhang 2000)."""
+"""Smallest number of views for a lens: three views of a plane determine the five intrinsic values (Zhang 2000)."""
 
 
 def usable(views: Sequence[View]) -> list[View]:
-    """Views with enough corners that do not lie on one line."""
+    """Return the views with at least ``MIN_CORNERS`` corners that do not lie on one line."""
     return [view for view in views if len(view.pixels) >= MIN_CORNERS and _spans_a_plane(view.corners_mm)]
 
 
 def first_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> Lens:
-    """A camera's intrinsics by OpenCV from its own views (Zhang 2000); raises what ``lens_and_scatter`` does."""
+    """Estimate a camera's intrinsics by OpenCV from its own views (Zhang 2000).
+
+    Raises:
+        CaptureInputError: the camera has fewer than ``MIN_VIEWS`` usable views.
+    """
     return lens_and_scatter(views, size, model, name)[0]
 
 
 def lens_and_scatter(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> tuple[Lens, float]:
-    """A camera's intrinsics by OpenCV, and the scatter in px of one coordinate of its corners, by degrees of freedom.
+    """Estimate a camera's intrinsics by OpenCV, and the standard deviation in px of one coordinate of its corners from
+    the residuals and their degrees of freedom.
 
     Raises:
-        CaptureInputError: it has too few views.
+        CaptureInputError: the camera has fewer than ``MIN_VIEWS`` usable views.
     """
     import cv2
 
@@ -54,7 +61,8 @@ def lens_and_scatter(views: Sequence[View], size: tuple[int, int], model: str, n
     rms, K, distortion, _, _ = cv2.calibrateCamera(points, pixels, size, None, None, flags=flags)
     count = MODELS[model]
     focal = [K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL]
-    # OpenCV's rms is that of distances of corners; each has two coordinates, and each view's pose costs six of them.
+    # OpenCV's rms is that of the corners' distances. Each corner has two coordinates, and the pose of each view costs
+    # six degrees of freedom.
     corners = sum(len(view.pixels) for view in good)
     freedom = max(2 * corners - len(focal) - count - 6 * len(good), 1)
     lens = Lens(size, np.concatenate([focal, np.ravel(distortion)[:count]]))
@@ -62,7 +70,11 @@ def lens_and_scatter(views: Sequence[View], size: tuple[int, int], model: str, n
 
 
 def board_pose(view: View, lens: Lens) -> Floats:
-    """The pose (6,) camera_from_board of one view, its squared pixel errors least."""
+    """Return the pose (6,) camera_from_board of one view that minimises the squared reprojection errors.
+
+    Raises:
+        CaptureInputError: no pose projects the board's corners to the view.
+    """
     import cv2
 
     flat = np.ascontiguousarray(lens.undistort(view.pixels)[:, :2])
@@ -77,8 +89,8 @@ def board_pose(view: View, lens: Lens) -> Floats:
 
 
 def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str]) -> Rig:
-    """Poses of all cameras and boards: from place 0 on, always through the pair of camera and board that shares most
-    corners.
+    """Return first poses of all cameras and boards, found from place 0 on, at each step through the linked view with
+    the most corners.
 
     Raises:
         CaptureInputError: a camera or a place shares no board with the others.
@@ -126,10 +138,10 @@ def _vote(
     cameras: dict[int, Floats],
     places: dict[int, Floats],
 ) -> None:
-    """Give each camera, then each place but the first, the pose that draws most of its corners where they are.
+    """Give each camera, then each place but the first, the proposed pose with the least median reprojection error.
 
-    The poses are those that its own photographs propose, so a photograph that is not what its frame says does not lead
-    the others astray.
+    Each of its own photographs proposes one pose, so a single photograph that is wrongly described does not spoil the
+    poses of the others. With two photographs or fewer the pose stays as it is.
     """
     linked = [number for number in poses if views[number].camera in cameras and views[number].place in places]
     for camera in cameras:
@@ -149,8 +161,10 @@ def _vote(
 
 
 def _best(drawn: Sequence[tuple[View, Lens, list[Floats]]]) -> int:
-    """Which of the proposed poses camera_from_board, one list a view, has the least median distance over all
-    corners.
+    """Return the number of the proposed pose with the least median reprojection error over the corners of all views.
+
+    Args:
+        drawn: for each view, its lens and the proposed poses camera_from_board (4, 4), in the same order for all views.
     """
     offs = [
         [
