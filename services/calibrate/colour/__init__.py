@@ -1,1 +1,1 @@
-"""From a camera's channels to colours, by a chart of patches."""
+"""Colour calibration: the transform from a camera's channels to XYZ, fitted to the patches of a chart."""

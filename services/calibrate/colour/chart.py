@@ -16,25 +16,28 @@ COLUMNS, ROWS = 6, 4
 NEUTRALS = slice(18, 24)
 """Patches 19 to 24, from white to black, have the same reflectance in all channels to a few per cent."""
 PATCH_SHARE = 0.25
-"""Half width of the part of a patch that is averaged, in units of the distance to the next one: half of a patch."""
+"""Half width of the averaged square of a patch, as a fraction of the distance between patch centres: the square spans
+half of it."""
 SAMPLES = 15
-"""Across a patch, in each direction."""
+"""Number of samples across the averaged square, in each direction."""
 LARGEST_SATURATED_SHARE = 0.01
+"""Largest fraction of saturated samples in a usable patch."""
 
 
 @dataclass(frozen=True)
 class Patches:
-    """Means (24, C) of a chart's patches, and which of them may be used (24,)."""
+    """Means (24, C) of a chart's patches, and whether each patch is usable (24,)."""
 
     means: Floats
     usable: NDArray[np.bool_]
 
 
 def read_reference(path: Path, chart: str) -> Floats:
-    """XYZ (24, 3) under D50, Y = 1 for a perfect diffuser, from a table with columns X, Y, Z in hundreds.
+    """Read the XYZ (24, 3) of a chart's patches under D50, Y = 1 for a perfect diffuser, from a table with columns X, Y
+    and Z in which it has Y = 100.
 
     Raises:
-        CaptureInputError: not 24 rows of those columns.
+        CaptureInputError: the table has no columns X, Y and Z, not 24 rows, or a cell that is no number.
     """
     with path.open(newline="", encoding="utf-8-sig") as stream:
         rows = [row for row in csv.reader(stream) if row and not row[0].startswith("#")]
@@ -60,8 +63,11 @@ def patch_means(values: NDArray[np.float32], saturated: NDArray[np.bool_], corne
 
     Args:
         values: an image (h, w, C).
-        saturated: where it is full (h, w).
-        corners: centres (4, 2) of patches 1, 6, 24, 19, in its own pixels with centres at half-integers.
+        saturated: mask of its saturated pixels (h, w).
+        corners: centres (4, 2) of patches 1, 6, 24, 19 in pixels of this image, pixel centres at half-integers.
+
+    Returns:
+        Means and usability of the patches. A patch that leaves the image has NaN as mean and is not usable.
     """
     import cv2
 
@@ -84,8 +90,8 @@ def patch_means(values: NDArray[np.float32], saturated: NDArray[np.bool_], corne
 
 
 def find_corners(eight_bit: NDArray[np.uint8]) -> Floats | None:
-    """Centres (4, 2) of patches 1, 6, 24, 19 in a colour photograph (H, W, 3), blue first; None where no chart is
-    found.
+    """Find the centres (4, 2) in pixels of patches 1, 6, 24, 19 in a photograph (H, W, 3) with channels blue, green,
+    red; None where no chart is found.
     """
     import cv2
 
@@ -97,10 +103,12 @@ def find_corners(eight_bit: NDArray[np.uint8]) -> Floats | None:
 
 
 def over_white(patches: Patches, xyz: Floats, camera: str) -> Floats:
-    """Means (24, C) divided by those of a perfect diffuser in the same light, which the neutral patches tell.
+    """Return the patch means (24, C) divided by those of a perfect diffuser in the same light.
+
+    The diffuser's means are estimated from the neutral patches and their reference luminances.
 
     Raises:
-        CaptureInputError: fewer than three neutral patches can be used.
+        CaptureInputError: fewer than three neutral patches are usable.
     """
     good = np.zeros(24, dtype=bool)
     good[NEUTRALS] = patches.usable[NEUTRALS]
@@ -110,6 +118,6 @@ def over_white(patches: Patches, xyz: Floats, camera: str) -> Floats:
             " less."
         )
     luminance = xyz[good, 1:2]
-    # Least squares through the origin: the white that makes greys as bright as their luminance says.
+    # Fit the means of the neutral patches as white times luminance, by least squares through the origin.
     white = (patches.means[good] * luminance).sum(axis=0) / (luminance**2).sum()
     return np.asarray(patches.means / white)

@@ -9,10 +9,11 @@ Floats = NDArray[np.float64]
 D50 = np.array([0.96422, 1.0, 0.82521])
 """XYZ of the white of illuminant D50, 2° observer (ICC)."""
 D65 = np.array([0.95047, 1.0, 1.08883])
+"""XYZ of the white of illuminant D65, 2° observer."""
 
 
 def lab_from_xyz(xyz: Floats, white: Floats = D50) -> Floats:
-    """CIE 1976 L*, a*, b* (N, 3) of XYZ (N, 3) in which the white has Y = 1."""
+    """Return the CIE 1976 L*, a*, b* (N, 3) of XYZ (N, 3), in which the white has Y = 1."""
     t = np.asarray(xyz) / white
     epsilon, kappa = (6 / 29) ** 3, (29 / 6) ** 2 / 3
     f = np.where(t > epsilon, np.cbrt(np.maximum(t, epsilon)), kappa * t + 4 / 29)
@@ -20,8 +21,8 @@ def lab_from_xyz(xyz: Floats, white: Floats = D50) -> Floats:
 
 
 def delta_e_2000(one: Floats, two: Floats) -> Floats:
-    """ΔE2000 (N,) of L*a*b* colours (N, 3) (Sharma, Wu & Dalal, Color Research and Application 30, 2005, eqs. 2 to
-    22).
+    """Return the colour difference ΔE2000 (N,) of L*a*b* colours (N, 3) (Sharma, Wu & Dalal, Color Research and
+    Application 30, 2005, eqs. 2 to 22).
     """
     (l1, a1, b1), (l2, a2, b2) = np.asarray(one).T, np.asarray(two).T
     mean_chroma = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2

@@ -1,5 +1,5 @@
-"""A camera's channels to XYZ: a 3 × 3 matrix or a root polynomial, whichever draws patches better that it has not
-seen.
+"""Transform from a camera's channels to XYZ: a 3 × 3 matrix or a root polynomial, whichever has the smaller error on
+held-out patches.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 MIN_PATCHES = 12
-"""A root polynomial has six terms; with twice as many patches leaving one out still tells."""
+"""Smallest number of patches for a fit: twice the six terms of a root polynomial, so that leave-one-out
+cross-validation is still meaningful."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,11 @@ class ColourFit:
 
     Attributes:
         matrix: XYZ from RGB (3, 3).
-        root_polynomial: (3, 6) on r, g, b, √(rg), √(gb), √(rb); None where the matrix does as well.
-        held_out: ΔE2000 of every patch by a fit to the others (N,), of what was chosen.
-        held_out_by_model: its mean by model.
-        fitted: ΔE2000 of every patch by the fit to all (N,).
-        residuals: XYZ of the fit to all minus the reference (N, 3).
+        root_polynomial: coefficients (3, 6) of r, g, b, √(rg), √(gb), √(rb); None where the matrix is as good.
+        held_out: ΔE2000 (N,) of every patch, by a fit of the chosen model to the other patches.
+        held_out_by_model: mean of that ΔE2000 over the patches, by model.
+        fitted: ΔE2000 (N,) of every patch by the fit to all patches.
+        residuals: XYZ of the fit to all patches minus the reference (N, 3).
     """
 
     matrix: Floats
@@ -38,39 +39,39 @@ class ColourFit:
     residuals: Floats
 
     def xyz(self, rgb: Floats) -> Floats:
-        """XYZ (N, 3) of channels (N, 3), with Y = 1 for a perfect diffuser."""
+        """Return the XYZ (N, 3) of channels (N, 3), with Y = 1 for a perfect diffuser."""
         if self.root_polynomial is None:
             return np.asarray(rgb @ self.matrix.T)
         return np.asarray(root_terms(rgb) @ self.root_polynomial.T)
 
 
 def root_terms(rgb: Floats) -> Floats:
-    """Terms of degree 2 (N, 6), which double where the light doubles (Finlayson, Mackiewicz & Hurlbert 2015, table
-    I).
+    """Return the root-polynomial terms of degree 2 (N, 6) of channels (N, 3), which scale with the light as the
+    channels do (Finlayson, Mackiewicz & Hurlbert 2015, table I).
     """
     r, g, b = np.maximum(rgb, 0).T
     return np.stack([r, g, b, np.sqrt(r * g), np.sqrt(g * b), np.sqrt(r * b)], axis=1)
 
 
 def least_squares_matrix(terms: Floats, xyz: Floats) -> Floats:
-    """The matrix (3, T) that takes terms (N, T) to XYZ (N, 3) with least squared errors."""
+    """Return the matrix (3, T) that maps terms (N, T) to XYZ (N, 3) with least squared errors."""
     return np.asarray(np.linalg.lstsq(terms, xyz, rcond=None)[0].T)
 
 
 def fit_colour(rgb: Floats, xyz: Floats, camera: str, white: Floats = D50) -> ColourFit:
     """Fit a camera's colours to patches.
 
-    A root polynomial has twice the coefficients, so it is taken only where it draws patches that were left out better
-    by more than the standard error of the difference.
+    A root polynomial has twice the coefficients, so it is chosen only where its mean error on held-out patches is
+    smaller by more than the standard error of the difference.
 
     Args:
-        rgb: patch means (N, 3), radiance over that of a perfect diffuser in the same light.
-        xyz: of the same patches (N, 3), Y = 1 for a perfect diffuser.
-        camera: its name, for messages.
-        white: XYZ of the light that ``xyz`` is under.
+        rgb: patch means (N, 3), radiance divided by that of a perfect diffuser in the same light.
+        xyz: reference XYZ of the same patches (N, 3), Y = 1 for a perfect diffuser.
+        camera: name of the camera, for messages.
+        white: XYZ of the illuminant of ``xyz``.
 
     Raises:
-        CaptureInputError: too few patches, or colours that do not depend on the channels.
+        CaptureInputError: there are fewer than ``MIN_PATCHES`` patches.
     """
     if len(rgb) < MIN_PATCHES:
         raise CaptureInputError(
@@ -99,7 +100,9 @@ def fit_colour(rgb: Floats, xyz: Floats, camera: str, white: Floats = D50) -> Co
 
 
 def _left_out(terms: Floats, xyz: Floats) -> Floats:
-    """Each patch's XYZ by a fit to all others (N, 3): residuals of linear least squares grow by 1 ÷ (1 − leverage)."""
+    """Return each patch's XYZ by a fit to all other patches (N, 3): in linear least squares, leaving a row out
+    multiplies its residual by 1 ÷ (1 − leverage).
+    """
     hat = terms @ np.linalg.pinv(terms)
     residuals = xyz - hat @ xyz
     return np.asarray(xyz - residuals / (1 - np.diag(hat))[:, None])

@@ -1,1 +1,1 @@
-"""Where lights are, by their highlights on mirror spheres, and how bright they are, by white ones."""
+"""Calibration of lights: positions from highlights on mirror spheres, intensities from white spheres."""

@@ -1,4 +1,4 @@
-"""Centres of spheres from their outlines in all cameras, where no highlights tell."""
+"""Centres of spheres from their outlines in all cameras, for spheres without highlights."""
 
 from __future__ import annotations
 
@@ -14,14 +14,22 @@ from services.calibrate.reweighted import solve_reweighted
 
 Floats = NDArray[np.float64]
 EDGE_SE_PX = 0.1
-"""Of one edge point, against which the shift that all edges of a camera share is held; the answer hardly depends on
-it."""
+"""Standard error of one edge point. It weighs the edge points against the prior of the shift that all edges of a camera
+share; the answer hardly depends on it."""
 STEP_MM = 1e-3
+"""Step of the central differences."""
 
 
 @dataclass(frozen=True)
 class OutlineView:
-    """A sphere's outline (E, 2) in one camera: numbers of camera and place, and the radius in mm."""
+    """The outline of one sphere in one camera.
+
+    Attributes:
+        camera: number of the camera.
+        place: number of the place where the sphere stood.
+        radius_mm: radius of the sphere.
+        outline_px: points of its outline (E, 2), pixel centres at half-integers.
+    """
 
     camera: int
     place: int
@@ -30,10 +38,10 @@ class OutlineView:
 
 
 def fit_centres(views: Sequence[OutlineView], eyes: Sequence[Eye]) -> Floats:
-    """Centres (P, 3) by place, in mm.
+    """Fit the spheres' centres (P, 3) by place, in mm.
 
-    All edges of a camera may be found outside or inside of the true outline alike. One camera would take that for a
-    nearer or farther sphere; cameras together tell it from distance.
+    All edges of a camera may be detected outside or inside the true outline by one common shift. In one camera this
+    shift looks like a nearer or farther sphere; several cameras together separate it from the distance.
     """
     count = max(view.place for view in views) + 1
     start = np.zeros(3 * count + len(eyes))

@@ -1,4 +1,4 @@
-"""Spheres in photographs: their outline and the highlights on them."""
+"""Detection of spheres in photographs: their outlines and the highlights on them."""
 
 from __future__ import annotations
 
@@ -12,30 +12,34 @@ from services.calibrate.lights.mirror import Eye, outline_errors, sphere_from_ou
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 SEARCH_WIDTH = 640
-"""Pixels across the image in which a sphere is searched; its outline is then measured in the whole one."""
+"""Width in pixels of the reduced image in which a sphere is searched; its outline is then measured in the full
+image."""
 RADII = (0.5, 2.0)
-"""Of a sphere's image, as a multiple of the one that it has at the boards' distance."""
+"""Smallest and largest radius of a sphere's image, as multiples of the radius that it has at the expected distance."""
 CIRCLE_QUALITY = (0.85, 0.6, 0.35)
-"""Of OpenCV's circle search, from nearly perfect outlines to half hidden ones; the first that finds any circle
-counts."""
+"""Thresholds of OpenCV's circle search, from nearly perfect outlines to half hidden ones; the first with which any
+circle is found is used."""
 RAYS = 180
+"""Number of rays from the middle along which the edge is searched."""
 BANDS = (0.12, 0.04, 0.02)
-"""Half widths, as parts of the radius, in which the edge is searched around the last outline."""
+"""Half widths of the bands in which the edge is searched around the last outline, as fractions of the radius."""
 MIN_BAND_PX = 4.0
 SMOOTHING_PX = 1.0
 OUTLIER_SIGMAS = 3.5
 MIN_EDGES = RAYS // 3
-"""A third of an outline fixes the sphere; less is no outline."""
+"""Smallest number of edge points of an outline: a third of the outline determines the sphere."""
 INSIDE = 0.97
-"""Part of the radius within which highlights are searched: nearer to the outline they are lines."""
+"""Fraction of the radius within which highlights are searched: closer to the outline they are drawn out to lines."""
 HALF = 0.5
+"""Fraction of the peak above which a pixel belongs to the highlight."""
 MIN_CONTRAST = 8.0
-"""Of a highlight's peak over the sphere, in units of the sphere's own scatter."""
+"""Smallest height of a highlight's peak above the sphere's median, in units of the robust standard deviation of the
+sphere's pixels."""
 
 
 @dataclass(frozen=True)
 class Outline:
-    """Edge points (E, 2) of a sphere in pixels, and their rms distance to the fitted outline."""
+    """Edge points (E, 2) of a sphere in pixels, and their rms distance from the fitted outline."""
 
     points_px: Floats
     rms_px: float
@@ -43,8 +47,12 @@ class Outline:
 
 @dataclass(frozen=True)
 class Logs:
-    """Logarithm of the light in a part of an image (h, w), where the part begins (2,) as column and row, and the whole
-    image's size.
+    """Logarithms of the pixel values in a part of an image.
+
+    Attributes:
+        values: logarithms (h, w).
+        first_px: column and row (2,) of the part's first pixel in the whole image.
+        size: width and height of the whole image.
     """
 
     values: Image
@@ -53,24 +61,27 @@ class Logs:
 
 
 def about_outline(outline_px: Floats, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of an image (H, W) that hold a sphere's outline, from even numbers on as a mosaic needs."""
+    """Return the rows and columns of an image (H, W) that contain a sphere's outline; both begin and end at even
+    numbers, so that the crop keeps the colour mosaic's pattern.
+    """
     low = np.maximum(np.floor(outline_px.min(axis=0)).astype(int) - 2, 0) // 2 * 2
     high = np.minimum(np.ceil(outline_px.max(axis=0)).astype(int) + 4, shape[1::-1]) // 2 * 2
     return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
 
 def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) -> Outline | None:
-    """The outline of a sphere of known radius at about a distance, or None.
+    """Find the outline of a sphere of known radius at about the given distance; None where none is found.
 
-    A circle search in a small image comes first. Then the steepest brightness along rays from the middle is followed to
-    a fraction of a pixel, each time in a narrower band about the outline of the sphere that fits the last points.
+    A circle search in a reduced image comes first. Then the steepest change of brightness along rays from the middle is
+    located to a fraction of a pixel, each time in a narrower band about the outline of the sphere that fits the last
+    points.
     """
     import cv2
 
     height, width = grey.shape
     shrink = max(width / SEARCH_WIDTH, 1.0)
     small = cv2.resize(grey, (round(width / shrink), round(height / shrink)), interpolation=cv2.INTER_AREA)
-    # The bright end is cut at four times the 60th percentile, as highlights outshine every outline.
+    # Clip at four times the 60th percentile, because highlights are much brighter than any outline.
     top = 4 * float(np.percentile(small, 60)) + 1e-12
     eight = np.clip(small / top * 255, 0, 255).astype(np.uint8)
     expected = float(eye.lens.values[0]) * radius_mm / distance_mm / shrink
@@ -78,9 +89,9 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
     if circle is None:
         return None
     points = circle[:2] * shrink + circle[2] * shrink * _unit_circle()
-    # Light is compared by its logarithm: an edge is as steep in the dark as in the bright.
+    # Search edges in the logarithm, where an edge of a given ratio is equally steep in dark and in bright parts.
     floor = 0.02 * top
-    # Only about the circle: the widest band lies within.
+    # Crop to the surroundings of the circle, which contain the widest band.
     reach = circle[2] * shrink * (1 + 2 * BANDS[0]) + 2 * MIN_BAND_PX
     low = np.maximum(np.floor(circle[:2] * shrink - reach).astype(int), 0)
     high = np.minimum(np.ceil(circle[:2] * shrink + reach).astype(int), [width, height])
@@ -98,10 +109,10 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
 
 
 def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
-    """The centre (2,) in pixels of the brightest highlight within a sphere's outline, or None.
+    """Find the centre (2,) in pixels of the brightest highlight within a sphere's outline; None where there is none.
 
-    It is the mean place of the patch that is brighter than half of the peak and holds it, weighted by the light above a
-    quarter.
+    The centre is the centroid of the connected region that contains the peak and exceeds half of it, weighted by the
+    brightness above a quarter of the peak; brightness counts from the sphere's median.
     """
     import cv2
 
@@ -112,7 +123,7 @@ def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
     part = grey[y0:y1, x0:x1].astype(np.float32)
     y, x = np.mgrid[y0:y1, x0:x1]
     inside = (x + 0.5 - middle[0]) ** 2 + (y + 0.5 - middle[1]) ** 2 < reach**2
-    # The peak is that of the image smoothed by a pixel, so that no single hot pixel is one.
+    # Search the peak in the image smoothed by one pixel, so that a single hot pixel is not taken for it.
     smooth = np.where(inside, cv2.GaussianBlur(part, (0, 0), 1.0), -np.inf)
     row, column = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
     level = float(np.median(part[inside]))
@@ -135,7 +146,7 @@ def _unit_circle() -> Floats:
 
 
 def _circle(image: NDArray[np.uint8], expected_px: float) -> Floats | None:
-    """Centre and radius (3,) of the clearest circle of about the expected radius."""
+    """Return the centre and radius (3,) in pixels of the clearest circle of about the expected radius, or None."""
     import cv2
 
     least, most = (max(round(expected_px * part), 4) for part in RADII)
@@ -156,7 +167,7 @@ def _circle(image: NDArray[np.uint8], expected_px: float) -> Floats | None:
 
 
 def _edges(logs: Logs, eye: Eye, sphere_mm: Floats, radius_mm: float, band: float) -> Floats:
-    """Points (E, 2) of steepest change across the outline of a sphere, within a band about it."""
+    """Return the points (E, 2) of steepest change across the outline of a sphere, within a band about it."""
     import cv2
 
     middle = eye.project(sphere_mm[None])[0]
@@ -187,7 +198,7 @@ def _edges(logs: Logs, eye: Eye, sphere_mm: Floats, radius_mm: float, band: floa
 
 
 def _without_outliers(points: Floats, eye: Eye, radius_mm: float) -> Floats:
-    """Points near one sphere's outline: those far from it leave, three times."""
+    """Return the points (E, 2) without outliers from the outline of one sphere, which is fitted again three times."""
     for _ in range(3):
         if len(points) < MIN_EDGES:
             return points

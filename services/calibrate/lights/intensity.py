@@ -1,10 +1,11 @@
-"""How bright each light is in each channel, from white spheres of known reflectance.
+"""Intensity of each light in each channel, from white spheres of known reflectance.
 
 A Lambertian sphere under a point light has the radiance ρ ÷ π · I · cos θ ÷ d². Every photograph of a white sphere
-under one light gives one number a channel: the slope of its pixels against that known factor. Its logarithm is a sum of
-what belongs to the camera (counts per radiance), to the light (its intensity) and, where the sphere stood in several
-places, of the lights' common lobe. So all photographs together are linear least squares. Only products of intensity and
-radiance per count are measurable: the mean of the intensities is 1 in every channel.
+under one light gives one slope per channel: the ratio of its pixels to the known factor ρ ÷ π · cos θ ÷ d². The
+slope's logarithm is the sum of a term of the camera (counts per radiance), a term of the light (its intensity) and,
+where the sphere stood in several places, a term of the lights' common lobe, so all photographs together form a linear
+least-squares problem. Only the product of intensity and counts per radiance is measurable, so the mean of the
+intensities is set to 1 in every channel.
 """
 
 from __future__ import annotations
@@ -20,32 +21,40 @@ from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 MIN_COSINE_OF_LIGHT = 0.35
-"""Beyond 70° light grazes: cos changes by a tenth within 2°, and no paint is Lambertian there."""
+"""Smallest cosine of the angle between light and normal at a usable pixel. Beyond 70° the light grazes: cos changes by
+a tenth within 2°, and no paint is Lambertian there."""
 MIN_COSINE_OF_VIEW = 0.5
-"""Of the angle to the camera: towards the outline pixels mix with the background."""
+"""Smallest cosine of the angle between camera and normal at a usable pixel: towards the outline pixels mix with the
+background."""
 MIN_PIXELS = 50
+"""Smallest number of usable pixels of a photograph."""
 MIN_PLACES_FOR_A_LOBE = 3
+"""Smallest number of places of the sphere from which a lobe is estimated."""
 LOBE_SIGMAS = 4.0
-"""An exponent that is not this far from 0 is taken to be 0."""
+"""Smallest exponent of the lobe in its standard errors; a smaller one is set to 0."""
 SIGMA_FLOOR = 1e-6
+"""Smallest relative standard deviation of a slope, for exact synthetic photographs."""
 MAD_TO_SIGMA = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 WRONG_SIGMAS, MIN_WRONG = 8.0, 0.05
-"""A photograph that the others put off by more, robustly, and by 5 %: another light, exposure or level than raw.toml
-says."""
+"""Limits of a photograph's residual against the fit of the others, in robust standard deviations and as a relative
+error. A photograph beyond both was taken with another light, exposure or level than raw.toml says."""
 MAX_WRONG_SHARE = 0.1
-"""Of the photographs: with more of them wrong the list as a whole is not to be trusted."""
+"""Largest fraction of photographs that are left out as wrong: with more of them the whole list is not trustworthy."""
 MIN_FREEDOM = 0.2
-"""Of a photograph, 1 minus its leverage."""
+"""Smallest value of 1 − leverage with which a photograph is compared with the others."""
 
 
 @dataclass(frozen=True)
 class WhitePhoto:
-    """A white sphere under one light.
+    """One photograph of a white sphere under one light.
 
     Attributes:
-        camera, place, light: numbers.
-        pixels: of the photograph (N, 2), saturated ones left out.
-        values: counts above black over exposure, gain, level and the lens' fall of light, (N, C).
+        camera: number of the camera.
+        place: number of the place where the sphere stood.
+        light: number of the light.
+        pixels: positions (N, 2) of the photograph's pixels, without saturated ones.
+        values: counts above black, divided by exposure, gain, level and the lens's vignetting (N, C).
     """
 
     camera: int
@@ -57,7 +66,7 @@ class WhitePhoto:
 
 @dataclass(frozen=True)
 class WhiteSphere:
-    """Where a white sphere stood: centre (3,), radius in mm, and its reflectance by channel (C,)."""
+    """A white sphere at one place: its centre (3,) and radius in mm, and its reflectance by channel (C,)."""
 
     centre_mm: Floats
     radius_mm: float
@@ -66,20 +75,22 @@ class WhiteSphere:
 
 @dataclass(frozen=True)
 class IntensityFit:
-    """Lights and cameras by channel.
+    """Fitted intensities of the lights and sensitivities of the cameras, by channel.
 
     Attributes:
-        intensity: towards the mean of the spheres, mean 1 over the lights (L, C); NaN for lights that no photograph
-            shows.
-        radiance_per_count: of each camera (K, C).
-        exponent: of the lights' common lobe about their direction to the spheres' mean, and its standard error.
-        covariance: of the logarithms of the S seen lights' intensities, by light and then channel, from the
-            photographs' scatter and the positions together (S · C, S · C).
-        by_positions: derivative of those logarithms to the lights' positions (S · C, 3 L), for errors that are shared.
-        sigma: scatter of one photograph's slope, relative, by channel (C,).
-        residuals: of the slopes' logarithms (photographs that could be used, C), also of those that fit no other and
-            were left out.
-        used: numbers of those photographs.
+        intensity: intensity (L, C) of each light towards the mean of the spheres, with mean 1 over the lights; NaN for
+            lights that no photograph shows.
+        radiance_per_count: radiance per count of each camera (K, C).
+        exponent: exponent of the lights' common lobe about their direction to the spheres' mean.
+        exponent_se: standard error of the exponent.
+        covariance: covariance (S · C, S · C) of the logarithms of the intensities of the S lights that photographs
+            show, by light and then channel, from the photographs' scatter and the uncertainty of the positions.
+        by_positions: derivative (S · C, 3 L) of those logarithms with respect to the lights' positions, by which errors
+            of the positions are propagated jointly.
+        sigma: relative standard deviation of one photograph's slope, by channel (C,).
+        residuals: residuals (U, C) of the logarithms of the slopes of the U usable photographs, including those that
+            were left out as wrong.
+        used: numbers of the usable photographs (U,).
     """
 
     intensity: Floats
@@ -94,8 +105,8 @@ class IntensityFit:
 
 
 def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """The factor cos θ ÷ (π d²) in mm⁻² at pixels (N,), and which of them show a part of the sphere that can be
-    used.
+    """Return the factor cos θ ÷ (π d²) in mm⁻² at pixels (N,), and a mask (N,) of the pixels that show a usable part of
+    the sphere.
     """
     rays, origin = eye.directions(pixels), eye.centre_mm
     towards = sphere.centre_mm - origin
@@ -112,13 +123,14 @@ def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> 
 
 
 def slope(photo: WhitePhoto, eye: Eye, sphere: WhiteSphere, light_mm: Floats) -> Floats | None:
-    """Values over the known factor (C,), by least squares over the pixels with shot noise; None where too few can be
-    used.
+    """Return the ratio (C,) of the values to the known factor times the reflectance, by least squares under shot noise;
+    None where fewer than ``MIN_PIXELS`` pixels are usable.
     """
     factor, usable = shading(eye, sphere, light_mm, photo.pixels)
     if np.count_nonzero(usable) < MIN_PIXELS:
         return None
-    # Shot noise grows with the value, which goes with the factor: weights 1 ÷ factor make the slope a ratio of sums.
+    # The variance of shot noise is proportional to the value and so to the factor: with weights 1 ÷ factor the
+    # least-squares slope is a ratio of sums.
     return np.asarray(photo.values[usable].sum(axis=0) / (factor[usable].sum() * sphere.reflectance))
 
 
@@ -130,18 +142,18 @@ def fit_intensity(
     light_names: Sequence[str],
     position_covariance: Floats | None = None,
 ) -> IntensityFit:
-    """All lights from all photographs.
+    """Fit the intensities of all lights to all photographs.
 
     Args:
-        photos: white spheres, light by light.
+        photos: photographs of white spheres, each under one light.
         eyes: calibrated cameras.
-        spheres: by place.
-        lights_mm: positions (L, 3).
-        light_names: for messages.
-        position_covariance: of the lights' positions (3 L, 3 L), mm².
+        spheres: white spheres by place.
+        lights_mm: positions of the lights (L, 3).
+        light_names: names of the lights, for messages.
+        position_covariance: covariance of the lights' positions (3 L, 3 L) in mm²; exact positions by default.
 
     Raises:
-        CaptureInputError: no photograph has enough pixels, or a light is dark.
+        CaptureInputError: no photograph has enough pixels, or a sphere is dark in some channel under a light.
     """
     found = [slope(one, eyes[one.camera], spheres[one.place], lights_mm[one.light]) for one in photos]
     numbers = tuple(number for number, value in enumerate(found) if value is not None)
@@ -181,17 +193,20 @@ def fit_intensity(
 
 
 def _without_wrong_photographs(design: Floats, logs: Floats) -> NDArray[np.bool_]:
-    """Which photographs (R,) agree with the others; the one that is furthest off leaves first, as it draws its light's
-    others with it.
+    """Return a mask (R,) of the photographs that agree with the others.
+
+    Photographs leave one by one, the one with the largest residual first, because it also biases the fit of the other
+    photographs of its light.
 
     Args:
-        design: which light and camera each shows (R, P).
+        design: design matrix (R, P) of the photographs' lights and cameras.
         logs: logarithms of the slopes (R, C).
     """
     brightness, good = logs.mean(axis=1), np.ones(len(logs), dtype=bool)
     for _ in range(int(MAX_WRONG_SHARE * len(logs))):
         hat = design[good] @ np.linalg.pinv(design[good])
-        # By the others' fit: a photograph whose leverage is near 1 tells its light alone, and nothing contradicts it.
+        # Take each residual against the fit of the other photographs. A photograph whose leverage is near 1 determines
+        # its light alone, so the others cannot contradict it.
         left = 1 - np.diag(hat)
         off = np.where(
             left > MIN_FREEDOM, (brightness[good] - hat @ brightness[good]) / np.maximum(left, MIN_FREEDOM), 0.0
@@ -205,7 +220,7 @@ def _without_wrong_photographs(design: Floats, logs: Floats) -> NDArray[np.bool_
 
 
 def _design(photos: Sequence[WhitePhoto], seen: NDArray[np.int64], n_cameras: int) -> Floats:
-    """One column a light that was seen, and one a camera but the first."""
+    """Return the design matrix (R, P): a column for each light in ``seen``, then one for each camera but the first."""
     design = np.zeros((len(photos), len(seen) + n_cameras - 1))
     for row, photo in enumerate(photos):
         design[row, np.searchsorted(seen, photo.light)] = 1
@@ -215,8 +230,8 @@ def _design(photos: Sequence[WhitePhoto], seen: NDArray[np.int64], n_cameras: in
 
 
 def _log_cosines(photos: Sequence[WhitePhoto], spheres: Sequence[WhiteSphere], lights_mm: Floats) -> Floats:
-    """Logarithm of the cosine between a light's direction to the photographed sphere and to the mean of all spheres
-    (R,).
+    """Return the logarithm (R,) of the cosine between a light's directions to the photographed sphere and to the mean
+    of all spheres.
     """
     middle = np.mean([sphere.centre_mm for sphere in spheres], axis=0)
     lights = lights_mm[[photo.light for photo in photos]]
@@ -227,7 +242,9 @@ def _log_cosines(photos: Sequence[WhitePhoto], spheres: Sequence[WhiteSphere], l
 
 
 def _common_exponent(design: Floats, logs: Floats, cosines: Floats, n_places: int) -> tuple[float, float]:
-    """Exponent of the lobe and its standard error; 0 where the places cannot tell it from an even light."""
+    """Return the exponent of the lobe and its standard error; the exponent is 0 where it is not significant or there
+    are fewer than ``MIN_PLACES_FOR_A_LOBE`` places.
+    """
     if n_places < MIN_PLACES_FOR_A_LOBE:
         return 0.0, float("inf")
     full = np.column_stack([design, cosines])
@@ -242,7 +259,9 @@ def _common_exponent(design: Floats, logs: Floats, cosines: Floats, n_places: in
 def _by_positions(
     photos: Sequence[WhitePhoto], eyes: Sequence[Eye], spheres: Sequence[WhiteSphere], lights_mm: Floats
 ) -> Floats:
-    """Derivative (R, 3 L) of the slopes' logarithms to the lights' positions, by differences over 0.1 mm."""
+    """Return the derivative (R, 3 L) in 1/mm of the slopes' logarithms with respect to the lights' positions, by
+    central differences with a step of 0.1 mm.
+    """
     derivative, step = np.zeros((len(photos), 3 * len(lights_mm))), 0.1
     for row, photo in enumerate(photos):
         for axis in range(3):
@@ -263,14 +282,15 @@ def _covariance(
     relative: Floats,
     position_covariance: Floats | None,
 ) -> tuple[Floats, Floats]:
-    """Covariance (S · C, S · C) of the seen lights' logarithms, by light and then channel, and their derivative to
-    positions.
+    """Return the covariance (S · C, S · C) of the logarithms of the intensities, by light and then channel, and their
+    derivative (S · C, 3 L) with respect to the lights' positions.
     """
     n_lights, n_channels = relative.shape
     size = n_lights * n_channels
     covariance, moved = np.zeros((size, size)), np.zeros((size, by_positions.shape[1]))
     for channel in range(n_channels):
-        # The gauge: a logarithm minus the mean of all, weighted by the intensities.
+        # Apply the gauge, a mean intensity of 1: subtract from each logarithm's error the mean of all, weighted by the
+        # intensities.
         gauge = np.eye(n_lights) - relative[:, channel] / relative[:, channel].sum()
         rows = np.arange(n_lights) * n_channels + channel
         own = gauge @ solver

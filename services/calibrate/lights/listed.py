@@ -1,5 +1,5 @@
-"""A list of light positions that somebody measured in a frame of its own, laid over the lights that highlights
-found.
+"""Rigid alignment of a list of light positions, measured in a frame of its own, with the positions found from
+highlights.
 """
 
 from __future__ import annotations
@@ -13,32 +13,36 @@ from services.calibrate.cameras.rotations import pose_matrix, pose_vector
 
 Floats = NDArray[np.float64]
 MIN_LIGHTS = 4
-"""Three fix a rigid motion; the fourth tells whether it fits."""
+"""Smallest number of lights for an alignment: three determine a rigid motion, the fourth checks it."""
 ROUNDS = 20
+"""Number of rounds of the reweighted alignment."""
 CAUCHY_SIGMAS = 3.0
-"""Where a light's weight is halved: a good list loses nothing, and one light off by 10 σ keeps a tenth."""
+"""Distance in σ at which a light's weight is halved: a good list loses almost nothing, and a light that is off by 10 σ
+keeps a tenth of its weight."""
 NOISE_FLOOR_MM = 0.5
-"""Nobody measures a lamp's place better by hand."""
+"""Smallest σ of a list: nobody measures a lamp's position better by hand."""
 OUTLIER_SIGMAS = 5.0
+"""Distance in σ beyond which a light is an outlier."""
 MIRRORED_TIMES = 5.0
-"""Lights in one plane fit as well mirrored; a right-handed list never fits five times better so."""
+"""Ratio of σ to that of the mirrored list above which the list counts as mirrored. Lights in one plane fit equally well
+mirrored, and a right-handed list never fits five times better when mirrored."""
 MIN_OUTLIER_MM = 20.0
-"""Of a list measured by hand coordinates are off by some 4 mm, so nearer lights lie where they are listed, however well
-few lights fit."""
+"""Smallest distance of an outlier. Coordinates of a list measured by hand are off by some 4 mm, so lights closer than
+this are not misplaced, however well the few lights fit."""
 MAD_OF_DISTANCES = 1.538
-"""Of the length of a vector with three normal coordinates: its median is 1.538 σ."""
+"""Median length of a vector with three normal coordinates, in units of their σ."""
 
 
 @dataclass(frozen=True)
 class AlignedList:
-    """A list in the world's frame.
+    """A list of light positions in the world frame.
 
     Attributes:
-        positions_mm: of all listed lights (L, 3).
-        sigma_mm: scatter of one coordinate of the list about the lights that were found.
-        off_mm: distance of listed and found, NaN where no highlight was found (L,).
-        outliers: numbers of the lights that lie elsewhere than listed.
-        scale: how many times as far apart lights were found as listed.
+        positions_mm: positions of all listed lights (L, 3).
+        sigma_mm: standard deviation of one coordinate of the list about the found positions.
+        off_mm: distance between listed and found position (L,), NaN where no highlight was found.
+        outliers: numbers of the lights that do not lie where they are listed.
+        scale: median ratio of the distances between found lights to those between listed lights.
         is_mirrored: whether the list's mirror image fits far better, so that its frame is left-handed.
     """
 
@@ -51,14 +55,15 @@ class AlignedList:
 
 
 def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
-    """Lay a list over found lights by the rigid motion of least weighted squares (Kabsch 1976), with Cauchy's weights.
+    """Align a list with the found lights by the rigid motion of least weighted squares (Kabsch 1976), with Cauchy's
+    weights.
 
     Args:
         listed_mm: positions in the list's frame (L, 3).
         found_mm: positions in the world (L, 3), NaN where a light was not found.
 
     Returns:
-        None where fewer than four lights were found.
+        The aligned list; None where fewer than four lights were found.
     """
     known = np.isfinite(found_mm).all(axis=1)
     if np.count_nonzero(known) < MIN_LIGHTS:
@@ -80,7 +85,9 @@ def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
 
 
 def _laid_over(source: Floats, target: Floats) -> tuple[Floats, Floats, float]:
-    """The rigid motion (4, 4), distances that it leaves (N,), and the scatter of one coordinate."""
+    """Return the rigid motion (4, 4) of the alignment, the remaining distances (N,) in mm, and the standard deviation
+    of one coordinate in mm.
+    """
     weights = np.ones(len(source))
     for _ in range(ROUNDS):
         motion = _rigid(source, target, weights)
@@ -91,7 +98,9 @@ def _laid_over(source: Floats, target: Floats) -> tuple[Floats, Floats, float]:
 
 
 def _scale(source: Floats, target: Floats) -> float:
-    """The median ratio of distances between pairs, which no motion and no few wrong lights change."""
+    """Return the median ratio, found to listed, of the distances between pairs of lights; it does not depend on the
+    motion, and a few wrong lights do not change it.
+    """
     one, two = np.triu_indices(len(source), 1)
     listed, found = (np.linalg.norm(points[one] - points[two], axis=1) for points in (source, target))
     apart = listed > NOISE_FLOOR_MM
@@ -99,7 +108,7 @@ def _scale(source: Floats, target: Floats) -> float:
 
 
 def swapped_names(found_mm: Floats, aligned: AlignedList) -> list[tuple[int, int]]:
-    """Pairs (a, b) of outliers where light a was found where the list has b, within the list's own scatter."""
+    """Return pairs (a, b) where outlier a was found at the listed position of light b, within the list's scatter."""
     limit = max(OUTLIER_SIGMAS * aligned.sigma_mm, MIN_OUTLIER_MM)
     pairs = []
     for one in aligned.outliers:

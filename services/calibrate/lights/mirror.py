@@ -1,4 +1,4 @@
-"""A mirror sphere before a camera: its outline, and where a light shows on it."""
+"""Geometry of a mirror sphere in front of a camera: its outline, and the highlight of a light on it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from services.calibrate.cameras.rotations import rotation_matrix
 
 Floats = NDArray[np.float64]
 ANGLE_PRECISION = 1e-14
-"""Radians: a millionth of a nanometre on a sphere of 20 mm."""
+"""Change of the angle in radians at which the iteration ends: less than a millionth of a nanometre on a sphere of
+20 mm."""
 MAX_STEPS = 60
-"""Halving alone would need 48; Newton's steps end after five to eight."""
+"""Largest number of iterations: bisection alone would need 48, Newton's method ends after five to eight."""
 
 
 @dataclass(frozen=True)
@@ -27,29 +28,30 @@ class Eye:
 
     @cached_property
     def rotation(self) -> Floats:
-        """From world to camera (3, 3)."""
+        """Rotation from world to camera axes (3, 3)."""
         return rotation_matrix(self.pose[:3])
 
     @cached_property
     def centre_mm(self) -> Floats:
-        """Where it stands in the world (3,)."""
+        """Position of the camera's centre in the world (3,)."""
         return np.asarray(-self.rotation.T @ self.pose[3:])
 
     def project(self, points_mm: Floats) -> Floats:
-        """Pixels (N, 2) of world points (N, 3)."""
+        """Return the pixels (N, 2) of world points (N, 3) in mm."""
         return self.lens.project(points_mm @ self.rotation.T + self.pose[3:])
 
     def directions(self, pixels: Floats) -> Floats:
-        """Unit directions (N, 3) in the world of pixels (N, 2)."""
+        """Return the unit directions (N, 3) in world axes of pixels (N, 2)."""
         local = self.lens.undistort(pixels)
         return np.asarray(local @ self.rotation / np.linalg.norm(local, axis=1, keepdims=True))
 
 
 def sphere_from_outline(eye: Eye, outline_px: Floats, radius_mm: float) -> Floats:
-    """Centre (3,) in mm of a sphere of known radius from pixels (E, 2) of its outline.
+    """Return the centre (3,) in mm of a sphere of known radius from pixels (E, 2) of its outline.
 
-    The rays to the outline form a right cone, so w · d = 1 for all their unit directions d: its axis is w's, and the
-    cosine of its opening is 1 ÷ |w|. That is linear, and holds for the ellipse that the outline is in the image.
+    The rays to the outline form a right circular cone, so one vector w has w · d = 1 for the unit directions d of all
+    rays: w points along the cone's axis, and the cosine of the cone's half angle is 1 ÷ |w|. This is linear in w, and
+    exact although the outline is an ellipse in the image.
     """
     rays = eye.directions(outline_px)
     axis = np.linalg.lstsq(rays, np.ones(len(rays)), rcond=None)[0]
@@ -59,12 +61,19 @@ def sphere_from_outline(eye: Eye, outline_px: Floats, radius_mm: float) -> Float
 
 
 def outline_errors(eye: Eye, outline_px: Floats, centres_mm: Floats, radii_mm: Floats | float) -> Floats:
-    """How far outside spheres' drawn outlines pixels (E, 2) lie, in px (E,); spheres are one or one a pixel."""
+    """Return the signed distances (E,) in px of pixels (E, 2) from the projected outlines of spheres, positive outside.
+
+    Args:
+        eye: the calibrated camera.
+        outline_px: detected points of outlines (E, 2).
+        centres_mm: centre of the one sphere (3,), or of each pixel's sphere (E, 3).
+        radii_mm: radius of the one sphere, or of each pixel's sphere (E,).
+    """
     towards = np.broadcast_to(centres_mm - eye.centre_mm, (len(outline_px), 3))
     distance = np.linalg.norm(towards, axis=1, keepdims=True)
     axis, sine = towards / distance, np.broadcast_to(radii_mm, len(outline_px))[:, None] / distance
     rays = eye.directions(outline_px)
-    # The outline's point on the side of each pixel: the ray tilted from the axis by exactly the cone's opening.
+    # The outline's point next to each pixel: tilt the cone's axis towards the pixel's ray by exactly the half angle.
     across = rays - (rays * axis).sum(axis=1, keepdims=True) * axis
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     edge = np.sqrt(1 - sine**2) * axis + sine * across
@@ -75,11 +84,11 @@ def outline_errors(eye: Eye, outline_px: Floats, centres_mm: Floats, radii_mm: F
 
 
 def highlight_points(eyes_mm: Floats, lights_mm: Floats, centres_mm: Floats, radii_mm: Floats | float) -> Floats:
-    """Points (N, 3) of spheres that mirror lights (N, 3) into eyes (N, 3) or (3,): Alhazen's problem.
+    """Return the points (N, 3) in mm of spheres that reflect lights (N, 3) into eyes (N, 3) or (3,): Alhazen's problem.
 
-    The point lies in the plane of eye, centre and light, at an angle from the eye's direction that makes both angles to
-    the normal alike. Their difference grows with that angle, so Newton's steps find it, halved brackets keeping them.
-    Centres are (N, 3) or (3,), radii (N,) or a number.
+    The point lies in the plane of eye, centre and light, at the angle from the eye's direction for which eye and light
+    have equal angles to the normal. The difference of the two angles grows with this angle, so Newton's method finds
+    its zero, safeguarded by bisection. Centres are (N, 3) or (3,), radii (N,) or a number, both in mm.
     """
     to_light = lights_mm - centres_mm
     to_eye = np.broadcast_to(eyes_mm - centres_mm, to_light.shape)
@@ -87,7 +96,7 @@ def highlight_points(eyes_mm: Floats, lights_mm: Floats, centres_mm: Floats, rad
     first = to_eye / eye_distance[:, None]
     along = (to_light * first).sum(axis=1)
     second = to_light - along[:, None] * first
-    # A light exactly behind the eye mirrors at the middle; any second axis does then.
+    # A light exactly in the eye's direction is reflected at angle 0, where the second axis does not matter.
     aside = np.linalg.norm(second, axis=1)
     second = np.where(aside[:, None] > 1e-9, second / np.maximum(aside, 1e-9)[:, None], 0.0)
     between = np.arctan2(aside, along)
@@ -107,8 +116,13 @@ def highlight_points(eyes_mm: Floats, lights_mm: Floats, centres_mm: Floats, rad
 
 
 def _from_normal(angle: Floats, distance_mm: Floats, radii_mm: Floats | float) -> tuple[Floats, Floats]:
-    """At a point of a sphere: the angle between its normal and a thing, whose direction from the centre is ``angle``
-    away, and the derivative.
+    """Return the angle between the normal at a point of a sphere and the direction from this point to an eye or light,
+    and the derivative of this angle with respect to ``angle``.
+
+    Args:
+        angle: angle at the sphere's centre between the normal and the direction to the eye or light, in rad (N,).
+        distance_mm: distance of the eye or light from the sphere's centre (N,).
+        radii_mm: radius of the spheres, (N,) or a number.
     """
     cosine = np.cos(angle)
     found = np.arctan2(distance_mm * np.sin(angle), distance_mm * cosine - radii_mm)
@@ -117,9 +131,10 @@ def _from_normal(angle: Floats, distance_mm: Floats, radii_mm: Floats | float) -
 
 
 def mirrored_rays(eye: Eye, highlights_px: Floats, centre_mm: Floats, radius_mm: float) -> tuple[Floats, Floats]:
-    """Points (N, 3) where rays through pixels (N, 2) meet a sphere, and unit directions (N, 3) in which they leave it.
+    """Return the points (N, 3) where rays through pixels (N, 2) meet a sphere, and the unit directions (N, 3) of the
+    reflected rays.
 
-    A ray that misses the sphere leaves from the point that it comes nearest to.
+    A ray that misses the sphere is reflected at the ray's point nearest to the centre.
     """
     rays, origin = eye.directions(highlights_px), eye.centre_mm
     towards = centre_mm - origin
@@ -131,8 +146,10 @@ def mirrored_rays(eye: Eye, highlights_px: Floats, centre_mm: Floats, radius_mm:
 
 
 def nearest_point(origins_mm: Floats, directions: Floats) -> Floats:
-    """The point (3,) whose squared distances from lines (N, 3) are least."""
+    """Return the point (3,) with the least sum of squared distances from lines of origins (N, 3) and unit directions
+    (N, 3).
+    """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    # A small pull to the origins keeps nearly parallel lines from an answer at infinity.
+    # A small term that draws the point to the mean origin keeps the answer finite for nearly parallel lines.
     normal, side = across.sum(axis=0) + 1e-9 * np.eye(3), (across @ origins_mm[:, :, None]).sum(axis=0)[:, 0]
     return np.asarray(np.linalg.solve(normal, side + 1e-9 * origins_mm.mean(axis=0)))

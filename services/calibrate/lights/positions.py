@@ -1,9 +1,10 @@
-"""Positions of lights from their highlights on mirror spheres, all spheres, cameras and lights at once.
+"""Positions of lights from their highlights on mirror spheres, by one fit of all spheres, cameras and lights.
 
-Unknown are the spheres' centres, the lights, for each camera by how far its edges are found outside the true outline
-(blur and contrast shift all edges of a camera alike; a radius that is given wrongly shows there too), and the cameras
-themselves within the covariance that their own calibration left. Observed are outlines and highlights in pixels. So
-lights and cameras err together, and the spheres may mend the cameras a little.
+The unknowns are the spheres' centres, the lights' positions, one edge shift for each camera (the distance by which its
+edges are detected outside the true outline, because blur and contrast shift all edges of a camera alike; a wrong radius
+appears there too), and the cameras' parameters, with the covariance of their own calibration as prior. The observations
+are outlines and highlights in pixels. The result has the joint covariance of lights and cameras, and the spheres may
+improve the cameras a little.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from services.calibrate.reweighted import solve_reweighted
 
 Floats = NDArray[np.float64]
 EDGE_SHIFT_SE_PX = 0.3
-"""By how far a camera's edges may be found off: half a pixel of blur, seen against a background of another
+"""Standard deviation of the prior of a camera's edge shift: half a pixel of blur, against a background of another
 brightness."""
 HUBER_SIGMAS = 1.345
 OUTLIER_SIGMAS = 5.0
@@ -29,17 +30,17 @@ SIGMA_FLOOR_PX = 1e-6
 MAD_TO_SIGMA = 1.4826
 ROBUST_ROUNDS = 3
 STEP = 1e-4
-"""Of a central difference, mm or px: a millionth of the distances, so its error is 1e-12 and rounding's 1e-9 of the
-derivative."""
+"""Step of the central differences of positions in mm: a millionth of the distances, so the truncation error is 1e-12
+and the rounding error 1e-9 of the derivative."""
 
 
 STEP_SIGMAS = 0.01
-"""Of a difference in a camera's value, in its own ±."""
+"""Step of the central differences of a camera's parameter, in its own standard errors."""
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """A highlight that fits no position that the others allow: its camera, place and light, and how far off it is."""
+    """A highlight that disagrees with the other ones of its light: its camera, place and light, and its residual."""
 
     camera: int
     place: int
@@ -49,19 +50,20 @@ class Outlier:
 
 @dataclass(frozen=True)
 class LightsFit:
-    """What the highlights say.
+    """Positions of lights and spheres, fitted to highlights and outlines.
 
     Attributes:
-        lights: numbers of the lights that were found (M,), in order.
-        positions_mm: where they are (M, 3).
-        centres_mm: of the spheres by place (P, 3).
-        edge_shifts_px: by camera (K,).
-        eyes: the cameras, as spheres and boards together say.
-        covariance: of lights (3 M, mm), centres (3 P, mm), edge shifts (K, px), and, where the cameras' was given, the
-            lens values and pose of each camera in turn.
-        highlight_sigma_px, outline_sigma_px: scatter of the two kinds of observation.
-        highlight_errors_px: found minus drawn (N, 2), in the order of the views' highlights.
-        outliers: what was left out.
+        lights: numbers of the lights whose highlights were found (M,), in order.
+        positions_mm: positions of these lights (M, 3).
+        centres_mm: centres of the spheres by place (P, 3).
+        edge_shifts_px: edge shift of each camera (K,), positive outside the true outline.
+        eyes: the cameras, estimated from spheres and boards together.
+        covariance: joint covariance of lights (3 M, mm), centres (3 P, mm), edge shifts (K, px) and, where the cameras'
+            covariance was given, the lens values and pose of each camera in turn.
+        highlight_sigma_px: standard deviation of one coordinate of a highlight.
+        outline_sigma_px: standard deviation of an edge point across the outline.
+        highlight_errors_px: detected minus projected highlights (N, 2), in the order of the views' highlights.
+        outliers: highlights that the fit left out.
     """
 
     lights: NDArray[np.int64]
@@ -78,9 +80,17 @@ class LightsFit:
 
 @dataclass(frozen=True)
 class _Weighted:
-    """The problem with weights: residuals in units of their σ.
+    """The problem with residuals in units of their σ.
 
-    Cameras are moved by ``spread @ z`` with z of unit prior.
+    The cameras' parameters change by ``spread @ z``, where z has a standard normal prior; z follows the problem's own
+    unknowns in the vector of values.
+
+    Attributes:
+        problem: residuals of all views.
+        eyes: the cameras at z = 0.
+        spread: square root (C, z) of the covariance of the cameras' C parameters; no columns for fixed cameras.
+        sigmas: σ of a highlight's coordinate and of an edge point, in px (2,).
+        good: mask of the highlights that are not outliers (N,).
     """
 
     problem: Problem
@@ -90,7 +100,7 @@ class _Weighted:
     good: NDArray[np.bool_]
 
     def moved_eyes(self, values: Floats) -> tuple[Eye, ...]:
-        """The cameras of all values."""
+        """Return the cameras for the given values."""
         off, first, moved = self.spread @ values[self.problem.length :], 0, []
         for eye in self.eyes:
             count = len(eye.lens.values)
@@ -100,7 +110,7 @@ class _Weighted:
         return tuple(moved)
 
     def residuals(self, values: Floats) -> Floats:
-        """Highlights, edges, edge shifts against their prior, cameras against theirs."""
+        """Return the residuals of the highlights, the edges, and the priors of edge shifts and of cameras."""
         eyes, problem = self.moved_eyes(values), self.problem
         off = problem.highlights(eyes, values) * self.good[:, None] / self.sigmas[0]
         shifts = problem.split(values)[2] / EDGE_SHIFT_SE_PX
@@ -109,9 +119,10 @@ class _Weighted:
         )
 
     def by_own(self, values: Floats) -> Floats:
-        """Derivative to lights, centres and shifts.
+        """Return the derivative of the residuals before the cameras' prior with respect to lights, centres and shifts.
 
-        No residual depends on two of a kind, so one axis of all is moved at once.
+        Each residual depends on at most one light and one centre, so one axis of all lights, or of all centres, is
+        changed at once.
         """
         problem, eyes = self.problem, self.moved_eyes(values)
         n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
@@ -137,8 +148,10 @@ class _Weighted:
         return derivative
 
     def by_cameras(self, values: Floats) -> Floats:
-        """Derivative to z, through that to the cameras' own values: no residual depends on two cameras, so one value of
-        all is moved at once.
+        """Return the derivative of all residuals with respect to z, by way of that with respect to the cameras'
+        parameters.
+
+        Each residual depends on one camera only, so one parameter of all cameras is changed at once.
         """
         problem, eyes = self.problem, self.moved_eyes(values)
         n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
@@ -173,12 +186,12 @@ class _Weighted:
 
 
 def _length(eye: Eye) -> int:
-    """Number of a camera's values: of its lens and its pose."""
+    """Return the number of a camera's parameters, those of its lens and its pose."""
     return len(eye.lens.values) + 6
 
 
 def _moved(eye: Eye, value: int, step: float) -> Eye:
-    """The camera with one of its values changed."""
+    """Return the camera with one of its parameters changed by a step."""
     values = np.concatenate([eye.lens.values, eye.pose])
     if step:
         values[value] += step
@@ -191,23 +204,24 @@ def fit_lights(
     light_names: Sequence[str],
     camera_covariance: Floats | None = None,
 ) -> LightsFit:
-    """Find lights and spheres.
+    """Fit the positions of lights and spheres.
 
     Args:
         views: mirror spheres in photographs.
         eyes: the calibrated cameras.
-        light_names: for messages.
-        camera_covariance: of lens values and pose of each camera in turn, (C, C); exact cameras by default.
+        light_names: names of the lights, for messages.
+        camera_covariance: covariance (C, C) of the lens values and pose of each camera in turn; exact cameras by
+            default.
 
     Raises:
-        CaptureInputError: a light that shows only once.
+        CaptureInputError: a light has only one highlight.
     """
     problem = Problem(views, len(eyes), light_names)
     spread = _square_root(camera_covariance) if camera_covariance is not None else np.zeros((_states(eyes), 0))
     weighted = _Weighted(problem, tuple(eyes), spread, np.ones(2), np.ones(len(problem.row), dtype=bool))
     values, weighted = _without_outliers(weighted, problem.start(eyes))
     values = np.concatenate([values, np.zeros(spread.shape[1])])
-    # The first plain fit finds the scatter of highlights and edges, the second weighs by it.
+    # The first plain fit estimates the σ of highlights and edges, the second uses them as weights.
     for _ in range(2):
         values = _solve(weighted, values)
         moved = weighted.moved_eyes(values)
@@ -223,17 +237,20 @@ def _states(eyes: Sequence[Eye]) -> int:
 
 
 def _square_root(covariance: Floats) -> Floats:
-    """L with L Lᵀ = covariance, through unit variances."""
+    """Return L with L Lᵀ = covariance, computed from the correlation matrix so that different units cost no digits."""
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0)))
 
 
 def _without_outliers(weighted: _Weighted, values: Floats) -> tuple[Floats, _Weighted]:
-    """Fits by Huber's loss with the cameras held, first over pixels, then over the scatter that is left; outliers leave
-    the weights.
+    """Fit with Huber's loss and fixed cameras, first with the given σ, then with σ from the residuals, and mark the
+    outliers.
 
-    Of a light that would lose all highlights but one, all stay, and its large errors show in the residuals.
+    If a light would lose all highlights but one, all of them stay, and its large errors appear in the residuals.
+
+    Returns:
+        The values, and the problem with its new σ and mask of good highlights.
     """
     problem = weighted.problem
     held = replace(weighted, spread=np.zeros((len(weighted.spread), 0)))
@@ -251,7 +268,7 @@ def _without_outliers(weighted: _Weighted, values: Floats) -> tuple[Floats, _Wei
 
 
 def _solve(weighted: _Weighted, values: Floats, huber: float | None = None) -> Floats:
-    # Cameras move by fractions of a pixel, so what they move is linear in them and its slope is taken once.
+    # The cameras change by fractions of a pixel, so the residuals are linear in them and one derivative suffices.
     by_cameras = weighted.by_cameras(values)
     return solve_reweighted(
         weighted.residuals,
@@ -262,7 +279,7 @@ def _solve(weighted: _Weighted, values: Floats, huber: float | None = None) -> F
 
 
 def _finished(weighted: _Weighted, values: Floats, *, with_cameras: bool) -> LightsFit:
-    """The covariance at the solution, (JᵀJ)⁻¹ with cameras in their own units, and the record of it."""
+    """Return the result with the covariance (JᵀJ)⁻¹ at the solution, the cameras' parameters in their own units."""
     problem = weighted.problem
     slope = np.concatenate([weighted.by_own(values), weighted.by_cameras(values)], axis=1)
     scale = 1 / np.sqrt((slope**2).sum(axis=0))

@@ -1,4 +1,4 @@
-"""What mirror spheres show, as equations: found minus drawn pixels of outlines and highlights."""
+"""Residuals of mirror spheres: detected minus projected pixels of outlines and highlights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 MIN_HIGHLIGHTS = 2
-"""Of one light: a highlight tells two of a position's three coordinates."""
+"""Smallest number of highlights of one light: a single highlight determines two of the three coordinates."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,12 @@ class SphereView:
     """One mirror sphere in one camera.
 
     Attributes:
-        camera, place: numbers; cameras that share a place saw the sphere unmoved.
-        radius_mm: of the sphere.
+        camera: number of the camera.
+        place: number of the place; the sphere did not move between photographs of one place.
+        radius_mm: radius of the sphere.
         outline_px: points of its outline (E, 2), pixel centres at half-integers.
         lights: numbers of the lights whose highlights were found (H,).
-        highlights_px: where (H, 2).
+        highlights_px: centres of these highlights (H, 2).
     """
 
     camera: int
@@ -46,7 +47,8 @@ class SphereView:
 class Problem:
     """Residuals of all views.
 
-    The unknowns stand in the order lights (3 each), spheres' centres by place (3 each), edge shifts by camera.
+    The order of the unknowns is lights (3 each), spheres' centres by place (3 each), edge shifts by camera (1 each).
+    Those after them in a vector of values do not belong to this problem.
     """
 
     def __init__(self, views: Sequence[SphereView], n_cameras: int, light_names: Sequence[str]) -> None:
@@ -74,21 +76,23 @@ class Problem:
 
     @property
     def first_centre(self) -> int:
-        """Where the centres begin among the unknowns."""
+        """Index of the first coordinate of a centre among the unknowns."""
         return 3 * len(self.lights)
 
     @property
     def first_shift(self) -> int:
-        """Where the edge shifts begin."""
+        """Index of the first edge shift among the unknowns."""
         return self.first_centre + 3 * self.n_places
 
     def split(self, values: Floats) -> tuple[Floats, Floats, Floats]:
-        """Lights (M, 3), centres (P, 3) and edge shifts (K,)."""
+        """Return the lights (M, 3) and centres (P, 3) in mm and the edge shifts (K,) in px."""
         first, second = self.first_centre, self.first_shift
         return values[:first].reshape(-1, 3), values[first:second].reshape(-1, 3), values[second : self.length]
 
     def start(self, eyes: Sequence[Eye]) -> Floats:
-        """Each sphere from its outlines alone, and each light where its mirrored rays come nearest to each other."""
+        """Return first values of the unknowns: each sphere from its outlines alone, and each light at the point nearest
+        to its reflected rays; edge shifts are 0.
+        """
         centres = np.zeros((self.n_places, 3))
         for place in range(self.n_places):
             here = [view for view in self.views if view.place == place]
@@ -103,7 +107,7 @@ class Problem:
         return np.concatenate([np.ravel(lights), centres.ravel(), np.zeros(self.n_cameras)])
 
     def highlights(self, eyes: Sequence[Eye], values: Floats) -> Floats:
-        """Found minus drawn highlights (N, 2)."""
+        """Return detected minus projected highlights (N, 2) in px."""
         lights, centres, _ = self.split(values)
         where = np.array([eye.centre_mm for eye in eyes])[self.camera]
         points = highlight_points(where, lights[self.row], centres[self.place], self._radius)
@@ -115,7 +119,9 @@ class Problem:
         return off
 
     def outlines(self, eyes: Sequence[Eye], values: Floats) -> Floats:
-        """Found minus drawn edges, outward (E,)."""
+        """Return the distances (E,) in px of detected edges from the projected outlines, positive outside, minus the
+        camera's edge shift.
+        """
         _, centres, shifts = self.split(values)
         off = np.empty(len(self._edges))
         for camera, eye in enumerate(eyes):
