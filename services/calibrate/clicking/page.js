@@ -3,7 +3,7 @@ const landmarks = content.landmarks.map((one) => ({
   ...one,
   pixels: new Map(one.pixels.map((seen) => [seen.camera, seen.xy_px])),
 }));
-/** Pixels of the screen by which a press may move and still be a click. */
+/** Largest movement of a press, in pixels of the screen, that still counts as a click. */
 const STILL_PX = 4;
 let chosen = landmarks.length - 1;
 let isSaved = true;
@@ -13,7 +13,7 @@ function bytes(base64) {
   return Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
 }
 
-/** A landmark is begun by its tooth and point; one that is there already is taken up again. */
+/** Begin a landmark by its tooth and point; if the list already has it, choose it again. */
 document.getElementById("landmark").addEventListener("submit", (event) => {
   event.preventDefault();
   const tooth = Number(document.getElementById("tooth").value);

@@ -1,7 +1,8 @@
-"""A raw folder's scan and one photograph of each camera in one file, which any browser opens without a network.
+"""A page that shows a raw folder's scan and one photograph of each camera; one file, which any browser opens offline.
 
-The scan turns under the mouse, and a click on it is a point of its surface; a click in a photograph is a point of its
-pixels, without regard to the lens. What was clicked is saved as the ``[[landmark]]`` entries of ``raw.toml``.
+The mouse rotates the scan. A click on the scan gives a point of its surface, and a click in a photograph gives its
+pixel, which is not corrected for lens distortion. The page saves the clicked points as the ``[[landmark]]`` entries of
+``raw.toml``.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from services.core.store import write_atomic
 PAGE = "landmarks.html"
 SCRIPTS = ("photographs.js", "scan.js", "page.js")
 WIDEST_PX = 1600
-"""Of a photograph in the page: teeth that fill it are then seen to 0.05 mm, a sixth of what a click is worth."""
+"""Largest width in pixels of a photograph in the page. Teeth that fill it are then resolved to 0.05 mm, a sixth of the
+uncertainty of a click."""
 JPEG_QUALITY = 90
 
 
@@ -80,7 +82,8 @@ def _scan(root: Path, folder: RawFolder) -> dict[str, Any]:
 
 
 def _towards_the_chewing_side(mesh: Mesh) -> NDArray[np.float64]:
-    # Rows to the right, up and to the eye of one who looks at the side away from the surface's opening.
+    # The rows are the directions right, up and towards a viewer who looks at the side opposite to the surface's
+    # opening.
     away = vector_area_mm2(mesh)
     if not np.linalg.norm(away) > 0:
         return np.eye(3)

@@ -1,4 +1,4 @@
-/** Follow a canvas: a press that stays is a click, one that moves drags. All places are pixels of the canvas. */
+/** Handle the pointer on a canvas: a press that stays is a click, one that moves drags. Positions are canvas pixels. */
 function follow(canvas, { click, drag, zoom }) {
   let from = null;
   let last = null;
@@ -75,7 +75,7 @@ class PhotographView {
     this.image = new Image();
     this.image.onload = () => this.draw();
     this.image.src = `data:image/jpeg;base64,${jpeg}`;
-    /** Canvas pixels a pixel of the camera, and where its corner lies; null until it is drawn. */
+    /** Canvas pixels per camera pixel, null until the photograph is first drawn; then its corner in canvas pixels. */
     this.scale = null;
     this.corner = [0, 0];
     follow(canvas, {

@@ -14,7 +14,7 @@ void main() {
   colour = vec4(vec3(0.93, 0.89, 0.82) * light, 1.0);
 }`;
 
-/** A parallel view of the scan: a point is seen at turn * (point - middle), x to the right, y up, z to the eye. */
+/** A parallel projection of the scan: turn * (point - middle) has x to the right, y up and z towards the viewer. */
 class ScanView {
   constructor(surface, canvas, { vertices, faces, turn }) {
     this.surface = surface;
@@ -88,7 +88,7 @@ class ScanView {
     const angle = Math.hypot(dx, dy) / (0.6 * Math.min(this.canvas.width, this.canvas.height));
     const [x, y] = [dy, dx].map((value) => value / Math.hypot(dx, dy));
     const [c, s] = [Math.cos(angle), Math.sin(angle)];
-    // About (x, y, 0) by Rodrigues' formula.
+    // Rotate about the axis (x, y, 0) by Rodrigues' formula.
     const about = [
       [c + x * x * (1 - c), x * y * (1 - c), y * s],
       [x * y * (1 - c), c + y * y * (1 - c), -x * s],
@@ -101,7 +101,7 @@ class ScanView {
     return this.turn.map((row) => row[0] * x + row[1] * y + row[2] * z);
   }
 
-  /** The nearest point of the surface under a place of the canvas, mm in the scan; null where there is none. */
+  /** The surface point nearest to the viewer at a canvas position, in mm in the scan; null where there is none. */
   point([left, top]) {
     const x = (left - this.canvas.width / 2 - this.shift[0]) / this.scale;
     const y = (this.canvas.height / 2 - top - this.shift[1]) / this.scale;

@@ -1,1 +1,1 @@
-"""Where the teeth of a scan stand in the rig: a rigid pose from landmarks, then from outlines, with its covariance."""
+"""Registration of a scan's teeth in the rig: a rigid pose from landmarks, refined on outlines, with its covariance."""

@@ -1,5 +1,5 @@
-"""How much a pixel looks like tooth: learned in each photograph from the teeth's present outline, and from what lies
-around it.
+"""Likeness of each pixel to tooth, learned in each photograph from the pixels inside and around the teeth's outline at
+the present pose.
 """
 
 from __future__ import annotations
@@ -13,32 +13,36 @@ from numpy.typing import NDArray
 from services.calibrate.registration.pose import Floats
 
 BINS = 20
-"""Along each feature, between its 1st and 99th percentile."""
+"""Number of histogram bins along each feature, between its 1st and 99th percentile."""
 SMOOTH_BINS = 1.0
+"""Width in bins (standard deviation) of the Gaussian that smooths the histograms."""
 INSIDE_PX, OUTSIDE_PX, BAND_PX = 1, 3, 25
-"""Pixels this far inside an outline teach what tooth is; those from so far outside to this far, what it is not. Teeth
-darken towards their rims, so that what is learned from their middles alone puts an outline up to 1.5 pixels too far
-in."""
+"""Training pixels of tooth lie farther than the first distance inside an outline, those of its surroundings between the
+second and the third distance outside. The first is small because teeth darken towards their rims: learning from their
+middles alone puts an outline up to 1.5 pixels too far in."""
 TOOTH_BINS = 2.0
-"""Of brightness, that tooth is smoothed by: it comes in more shades than the few pixels at its rims show."""
+"""Width in bins of the Gaussian that smooths the tooth's histogram along brightness, because teeth have more shades
+than the few pixels at their rims show."""
 PERHAPS = 0.3
-"""Likeness to tooth from which a pixel outside teaches nothing, as it may be of a tooth that the scan does not have."""
+"""Likeness to tooth from which a pixel outside is no longer used for training, because it may show a tooth that the
+scan does not have."""
 LOOKS = 3
-"""How often that is learned, each time without such pixels."""
+"""Number of rounds of training, each without the pixels that the previous round left out."""
 MIN_LEFT = 1 / 3
-"""Share of the pixels outside that must go on teaching; where teeth and their surroundings look alike, all would be
-left out."""
+"""Smallest fraction of the pixels outside that must remain for training. Where teeth and their surroundings look alike,
+all of them would be left out."""
 SMOOTH_PX = 1.0
+"""Width in px of the Gaussian that smooths the two resulting images."""
 MAX_CHANNELS = 3
-"""Of a camera with more, neighbouring ones are averaged: the features' joint histogram grows as the power of their
-number."""
+"""Largest number of channels: neighbouring channels of a camera with more are averaged, because the size of the
+features' joint histogram grows exponentially with their number."""
 FLOOR = 1e-3
-"""Of the brightest pixels, added before the logarithm: darker ones are noise."""
+"""Offset added before the logarithm, as a fraction of the 99th percentile: darker pixels are noise."""
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Two images (H, W) in which outlines are looked for."""
+    """Two images (H, W) in which outlines are searched."""
 
     likeness: NDArray[np.float32]
     """Probability of tooth by colour and brightness, 0 to 1."""
@@ -47,12 +51,16 @@ class Appearance:
 
 
 def learn_appearance(image: NDArray[np.float32], tooth: NDArray[np.bool_], size_px: float = 1.0) -> Appearance:
-    """Learn from one photograph.
+    """Learn the appearance of tooth and of its surroundings from one photograph.
 
     Args:
-        image: (H, W, C), 0 at black.
-        tooth: (H, W), where the scan is seen at the present pose.
-        size_px: by how many pixels the pose may be off: so much further from its outline is learned from.
+        image: linear image (H, W, C), 0 at black.
+        tooth: mask (H, W) of the pixels that show the scan's teeth at the present pose.
+        size_px: possible error of the pose in px; training pixels keep this additional distance from the outline.
+
+    Returns:
+        Likeness and brightness; 0.5 and 0 everywhere if there are no training pixels inside or outside, so that no
+        outline is found.
     """
     import cv2
 
@@ -62,7 +70,6 @@ def learn_appearance(image: NDArray[np.float32], tooth: NDArray[np.bool_], size_
     distance_out = cv2.distanceTransform((~tooth).astype(np.uint8), cv2.DIST_L2, 5)
     inside, outside = distance_in > inner, (distance_out > beside) & (distance_out < outer)
     if not inside.any() or not outside.any():
-        # No tooth is seen, or nothing else: every pixel is as likely, and no outline is found here.
         return Appearance(np.full(tooth.shape, 0.5, dtype=np.float32), np.zeros(tooth.shape, dtype=np.float32))
     low, high = np.percentile(features[inside | outside], [1, 99], axis=0)
     index = np.clip((features - low) / np.maximum(high - low, 1e-6) * BINS, 0, BINS - 1).astype(np.int64)
@@ -82,7 +89,8 @@ def learn_appearance(image: NDArray[np.float32], tooth: NDArray[np.bool_], size_
 
 
 def _features(image: NDArray[np.float32]) -> Floats:
-    # Logarithms: brightness, and the ratios of neighbouring channels, which shading does not change.
+    # Features (H, W, F): logarithms of the brightness and of the ratios of neighbouring channels, which shading does
+    # not change.
     bright = np.percentile(image, 99)
     groups = np.array_split(np.maximum(image, 0), min(image.shape[-1], MAX_CHANNELS), axis=-1)
     logs = [np.log(group.mean(axis=-1) + FLOOR * bright) for group in groups]

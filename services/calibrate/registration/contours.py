@@ -1,5 +1,5 @@
-"""Outlines of teeth as a camera sees them at a pose: points on the surface, with the direction across the line in the
-image.
+"""Outlines of teeth as a camera sees them at a pose: points on the surface, with the direction across the outline in
+the image.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ from services.calibrate.registration.visible import NOTHING, seen_surfaces
 from services.core.geometry import Camera, Mesh
 
 SMOOTH_PX = 1.5
-"""Width of the Gaussian that a tooth's mask is smoothed with before its slope gives the direction across the
-outline."""
+"""Width of the Gaussian that smooths a tooth's mask before its gradient gives the direction across the outline."""
 MARGIN_PX = 6
-"""Around a tooth's box, so that smoothing sees all of its mask."""
+"""Margin around a tooth's bounding box, so that the smoothing sees all of its mask."""
 
 
 @dataclass(frozen=True)
@@ -26,25 +25,26 @@ class Contour:
     """N points of outlines in one camera."""
 
     points_mm: Floats
-    """(N, 3) in the rig, on the nearer surface."""
+    """Positions (N, 3) in the rig, on the nearer surface."""
     pixels: Floats
-    """(N, 2)"""
+    """Positions (N, 2) in the image, pixel centres at half-integers."""
     outward: Floats
-    """(N, 2), unit: out of the tooth, in the image."""
+    """Unit vectors (N, 2) in the image that point out of the tooth."""
     tooth: NDArray[np.int64]
-    """(N,) number of the tooth."""
+    """Number of the tooth (N,)."""
     between: NDArray[np.bool_]
-    """(N,) whether another tooth is on the other side."""
+    """True where another tooth lies on the other side (N,)."""
     gums: NDArray[np.bool_]
-    """(N,) whether an occluder, which gums are, is there."""
+    """True where an occluder, such as gums, lies on the other side (N,)."""
 
 
 def tooth_contours(
     camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = ()
 ) -> tuple[Contour, NDArray[np.int16]]:
-    """Where a pixel of a tooth has something else beside it, and the number (H, W) of the tooth that each pixel sees.
+    """Return the outlines between pixels of a tooth and pixels of anything else, and the number (H, W) of the tooth
+    that each pixel shows, -1 where it shows none.
 
-    The line runs midway between the two pixels' centres, so that it lies on neither side of the true one in the mean.
+    An outline runs midway between the two pixels' centres, so that it has no mean offset from the true outline.
     """
     label, depth = seen_surfaces(camera, [*teeth, *occluders])
     teeth_alone = np.where(label < len(teeth), label, NOTHING).astype(np.int16)
@@ -55,7 +55,7 @@ def tooth_contours(
         own = tooth == number
         outward[own] = _outward(teeth_alone == number, x[own], y[own])
     origin, direction = camera.rays(x, y)
-    # A depth is measured along the camera's axis, a ray along itself.
+    # Depth is measured along the camera's axis, so divide it by the ray's component along this axis.
     along = direction @ np.asarray(camera.camera_from_world)[2, :3]
     points = origin + direction * (nearer / along)[:, None]
     good = np.isfinite(outward).all(axis=1)
@@ -68,7 +68,7 @@ def tooth_contours(
 def _steps(
     label: NDArray[np.int16], depth: Floats, teeth: NDArray[np.int16], axis: int
 ) -> tuple[Floats, Floats, Floats, NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-    # Pairs of neighbouring pixels of which one or both see a tooth, and not the same thing.
+    # Find pairs of neighbouring pixels that show different things, at least one of them a tooth.
     low = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
     high = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
     one, two = teeth[low], teeth[high]

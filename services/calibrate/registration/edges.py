@@ -1,9 +1,10 @@
-"""Where an edge lies to a small part of a pixel: by how much light it lets through, not by what its pixels look like.
+"""Position of an edge to a small fraction of a pixel, from the profile of the light across it instead of from the
+likeness to tooth.
 
-A pixel that shows two things is a mean of their light, so the share of the inner one's light across an edge sums to
-where the edge is, however wide the lens, the pixels and a mosaic's interpolation make it. Likeness to tooth is no such
-mean: a pixel of the dark with a fifth of tooth in it has a tooth's colour and a shaded tooth's brightness, and looks
-like tooth.
+The value of a pixel that shows two things is the mean of their light, weighted by area. The integral of the inner
+side's fraction along a line across the edge therefore gives the edge's position, whatever the blur by the lens, the
+pixels and a mosaic's interpolation. The likeness to tooth is not such a mean: a pixel that shows the dark mouth and a
+fifth of tooth has a tooth's colour and the brightness of a shaded tooth, so its likeness is high.
 """
 
 from __future__ import annotations
@@ -14,17 +15,19 @@ from numpy.typing import NDArray
 from services.calibrate.registration.pose import Floats
 
 STEP_PX = 0.5
-"""Between samples across an edge."""
+"""Distance between samples across an edge."""
 HALF_PX, LEVEL_PX = 4.0, 2.0
-"""Samples reach so far to both sides; those beyond the second tell the light of either side. A pixel, a mosaic's
-interpolation and a lens together blur an edge by up to 1 px of standard deviation, of which 2 px leave a fortieth."""
+"""Largest distance of the samples from the edge to both sides, and the distance from which on samples give the light of
+either side. A pixel, a mosaic's interpolation and a lens together blur an edge by up to 1 px of standard deviation;
+beyond 2 px a fortieth of such a blur remains."""
 FARTHEST_PX = 1.5
-"""An edge farther from where it was looked for is another one's."""
+"""Largest distance of an edge from the searched position: an edge farther away belongs to something else."""
 COLOURED = 0.05
-"""Of the inner light: how far the outer one lies from its colour where a shade across both can be told from the edge.
-Gums come to 0.15, the dark of the mouth to less than 0.01."""
+"""Smallest distance of the outer light from the colour of the inner light, as a fraction of the inner light, with which
+shading across both sides can be separated from the edge. It is 0.15 for gums and less than 0.01 for the dark of the
+mouth."""
 DARKEST = 0.2
-"""Of both sides' light together: in a darker shade nothing is told."""
+"""Smallest shading, as a fraction of the light of both sides, in which an edge is located."""
 SAMPLES = np.arange(-HALF_PX, HALF_PX + STEP_PX / 2, STEP_PX)
 INNER, OUTER = SAMPLES <= -LEVEL_PX, SAMPLES >= LEVEL_PX
 
@@ -32,16 +35,20 @@ INNER, OUTER = SAMPLES <= -LEVEL_PX, SAMPLES >= LEVEL_PX
 def edges_in_light(
     image: NDArray[np.float32], pixels: Floats, outward: Floats, near_px: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Distances (N,) of edges from points, and whether there is one that can be told.
+    """Locate edges along lines through points of an outline.
 
     Args:
-        image: (H, W, C), linear in light.
-        pixels: (N, 2), pixel centres at half-integers.
-        outward: (N, 2), unit vectors across the edge, out of the tooth.
-        near_px: (N,) from the points along these, to where an edge is.
+        image: image (H, W, C), linear in light.
+        pixels: points (N, 2), pixel centres at half-integers.
+        outward: unit vectors (N, 2) across the edge, out of the tooth.
+        near_px: approximate distances (N,) of the edges from the points, outwards.
+
+    Returns:
+        Distances (N,) in px of the edges from the points, outwards, and a mask (N,) of the edges that could be located;
+        the others keep ``near_px``.
     """
     moved, is_told = _looked_at(image, pixels + near_px[:, None] * outward, outward)
-    # Once more from there: samples that lie unevenly about an edge lose more of its blur on one side.
+    # Repeat from the position found, because samples that are not centred on an edge miss more of its blur on one side.
     again, is_told_again = _looked_at(image, pixels + (near_px + moved)[:, None] * outward, outward)
     is_told &= is_told_again & (np.abs(moved + again) < FARTHEST_PX)
     return np.where(is_told, near_px + moved + again, near_px), is_told
@@ -60,7 +67,7 @@ def _looked_at(image: NDArray[np.float32], pixels: Floats, outward: Floats) -> t
 
 
 def _sampled(image: NDArray[np.float32], place: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    # Light (N, S, C) at places (N, S, 2), and which rows lie in the image.
+    # Return the light (N, S, C) at positions (N, S, 2), and a mask of the rows that lie in the image.
     import cv2
 
     height, width, channels = image.shape
@@ -72,11 +79,11 @@ def _sampled(image: NDArray[np.float32], place: Floats) -> tuple[Floats, NDArray
 
 
 def _share(seen: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    # A tooth darkens towards its rim, so its light is carried on along a line; what is behind it knows nothing of the
-    # rim.
+    # A tooth darkens towards its rim, so its light is extrapolated along a line; the light behind it does not depend on
+    # the rim and is taken as constant.
     line = np.stack([np.ones_like(SAMPLES), SAMPLES], axis=1)
     inside = np.einsum("sk,kt,ntc->nsc", line, np.linalg.pinv(line[INNER]), seen[:, INNER])
-    # The way from the outer light to the inner, along their difference at the edge.
+    # Project on the difference between inner and outer light at the edge.
     way = inside - outside[:, None]
     across = way[:, len(SAMPLES) // 2]
     whole = np.einsum("nsc,nc->ns", way, across)
@@ -86,7 +93,8 @@ def _share(seen: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _share_in_any_shade(seen: Floats, inside: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    # Light is so much of the inner and so much of the outer colour; a shade on both changes their sum alone.
+    # Write the light as a sum of the inner and the outer colour. Shading on both changes only the sum of the two
+    # amounts, not their ratio.
     colours = np.stack([inside, outside], axis=2)
     amounts = np.einsum("nkc,nsc->nsk", np.linalg.pinv(colours), seen)
     both = amounts.sum(axis=2)
@@ -95,7 +103,7 @@ def _share_in_any_shade(seen: Floats, inside: Floats, outside: Floats) -> tuple[
 
 
 def _away(inside: Floats, outside: Floats) -> Floats:
-    # Distance (N,) of the outer light from the inner one's colour, over the inner light.
+    # Return the distance (N,) of the outer light from the colour of the inner light, divided by the inner light.
     size = np.maximum((inside**2).sum(axis=1), np.finfo(np.float64).tiny)
     apart = outside - ((inside * outside).sum(axis=1) / size)[:, None] * inside
     return np.asarray(np.linalg.norm(apart, axis=1) / np.sqrt(size))

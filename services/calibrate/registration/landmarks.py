@@ -1,10 +1,10 @@
-"""First pose of a scan: clicked points in the scan and in photographs, over all cameras at once.
+"""First pose of a scan from points clicked in the scan and in photographs, over all cameras at once.
 
-Starts come from landmarks that several cameras see, whose lines of sight meet in the rig, and from one camera's points
-by perspective-n-point (Terzakis and Lourakis, "A Consistently Fast and Globally Optimal Solution to the
-Perspective-n-Point Problem", ECCV 2020); each from all points and from drawn few, so that a wrong click spoils only
-some starts. The starts that most clicks of all cameras agree with are refined by robust least squares over all, and the
-best of them is taken.
+Starting poses come from landmarks that several cameras see, by triangulation, and from the points of one camera by
+perspective-n-point (Terzakis and Lourakis, "A Consistently Fast and Globally Optimal Solution to the
+Perspective-n-Point Problem", ECCV 2020). Each kind uses all points and random subsets of a few, so that a wrong click
+spoils only some starts. The starts with the smallest errors, each click's error limited, are refined by robust least
+squares over all cameras, and the best pose is used.
 """
 
 from __future__ import annotations
@@ -19,53 +19,59 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
 
 CLICK_MM = 0.3
-"""Standard error of a click: people place the tip of a cusp, in a scan and in a photograph together, to about this."""
+"""Standard error of a click in mm: the accuracy with which people place the tip of a cusp, in a scan and in a
+photograph together."""
 FAR = 4.0
-"""Standard errors from which on a click counts as wrong: one in 3,000 good ones in two dimensions."""
+"""Error of a click in standard errors from which on it counts as wrong: one in 3,000 good clicks in two dimensions."""
 DRAWS = 60
-"""Triples: with a third of the clicks wrong, 60 hold a right one but for 1 in 10^9."""
+"""Number of random subsets for starting poses. With a third of the clicks wrong, 60 triples all contain a wrong click
+only once in 10^9 cases."""
 MIN_CLICKS = 4
-"""Clicks that are needed: three leave up to four poses, and no way to see a wrong one."""
+"""Smallest number of clicks: three leave up to four poses, and no way to recognise a wrong click."""
 MIN_POINTS = 3
-"""Landmarks in several cameras from which a start follows: three points fix a rigid pose."""
+"""Smallest number of landmarks in several cameras for a starting pose: three points determine a rigid pose."""
 PARALLEL = 1e4
-"""Condition of the normal equations of lines of sight above which they are too parallel to meet anywhere."""
+"""Condition number of the normal equations of lines of sight above which they are too parallel for triangulation."""
 FLAT = 1e-3
-"""Spread of points across their line, relative to that along it and squared, below which the turn about it is open."""
+"""Squared ratio of the points' spread across a line to that along it, below which the rotation about the line is
+undetermined."""
 TRIED = 12
-"""Starts that are refined over all cameras."""
+"""Number of starting poses that are refined over all cameras."""
 MAX_WRONG_SHARE = 1 / 3
-"""Of the clicks; with more of them wrong, another pose may have as many that agree."""
+"""Largest fraction of wrong clicks: with more of them, another pose may agree with as many clicks."""
 ROUNDS = 30
+"""Largest number of Gauss–Newton steps of a refinement."""
 CONVERGED = 1e-9
+"""Size of a step's largest component, in rad or mm, below which a refinement ends."""
 
 
 @dataclass(frozen=True)
 class Click:
-    """One point of the scan, and where one camera sees it."""
+    """One point of the scan, and its position in one camera's photograph."""
 
     name: str
     """Tooth and point, such as ``11 mesial edge``."""
     camera: str
     point_mm: Floats
-    """(3,) in the scan."""
+    """Position in the scan (3,)."""
     pixel: Floats
-    """(2,), pixel centres at half-integers."""
+    """Position in the photograph (2,), pixel centres at half-integers."""
 
 
 def pose_from_landmarks(
     cameras: Mapping[str, Camera], clicks: Sequence[Click], centre_mm: Floats, click_mm: float = CLICK_MM
 ) -> PoseStep:
-    """The pose that clicked points agree on, wrong ones left out.
+    """Fit the scan's pose to the clicked points, without the wrong ones.
 
     Args:
-        cameras: by name.
-        clicks: of all cameras.
-        centre_mm: of the teeth in the scan (3,), about which the covariance turns.
+        cameras: cameras by name.
+        clicks: clicks of all cameras.
+        centre_mm: centre of the teeth in the scan (3,), about which the covariance's rotations are.
         click_mm: standard error of a click at the teeth.
 
     Raises:
-        CaptureInputError: too few clicks, or so many that contradict each other that no pose is to be believed.
+        CaptureInputError: the clicks are too few, lie on one line, or contradict each other so much that the pose is
+            not plausible.
     """
     step, contradiction = fit_landmarks(cameras, clicks, centre_mm, click_mm)
     if contradiction is not None:
@@ -76,10 +82,14 @@ def pose_from_landmarks(
 def fit_landmarks(
     cameras: Mapping[str, Camera], clicks: Sequence[Click], centre_mm: Floats, click_mm: float = CLICK_MM
 ) -> tuple[PoseStep, str | None]:
-    """The same with a sentence where the pose is not to be believed, so that a picture of it can be shown.
+    """Fit the scan's pose as ``pose_from_landmarks`` does, but return an implausible pose too, so that a picture of it
+    can be shown.
+
+    Returns:
+        The pose, and a sentence that says why it is not plausible; None where it is plausible.
 
     Raises:
-        CaptureInputError: too few clicks for any pose.
+        CaptureInputError: the clicks are too few for any pose, or lie on one line.
     """
     most = max((sum(one.camera == name for one in clicks) for name in cameras), default=0)
     if most < MIN_CLICKS:
@@ -93,15 +103,15 @@ def fit_landmarks(
             "The landmarks lie in one line or at one place, which leaves the scan's pose open; spread them over the"
             " arch."
         )
-    # Far cameras see little perspective, so that a start may lean to the wrong side; refined over all cameras, it
-    # shows.
+    # Distant cameras see little perspective, so a start may be tilted to the wrong side. The refinement over all
+    # cameras reveals this.
     best = _best(cameras, clicks, starts, click_mm, TRIED)
     refined = [_refined(cameras, clicks, start, centre_mm, click_mm)[0] for start in best]
     (best_start,) = _best(cameras, clicks, [*best, *refined], click_mm, 1)
     kept = np.ones(len(clicks), dtype=bool)
     pose, covariance = best_start, np.eye(6)
     for _ in range(len(clicks)):
-        # The robust fit first shows which clicks are far off; then the others are fitted alone.
+        # Fit all clicks robustly in the first round, then only those within the limit, until the same clicks remain.
         pose, covariance = _refined(
             cameras, [one for one, good in zip(clicks, kept, strict=True) if good], best_start, centre_mm, click_mm
         )
@@ -137,14 +147,15 @@ def fit_landmarks(
 def _best(
     cameras: Mapping[str, Camera], clicks: Sequence[Click], poses: Sequence[RigidPose], click_mm: float, count: int
 ) -> list[RigidPose]:
-    # Those that most clicks agree with; a click that is far off counts the same however far.
+    # Sort the poses by the sum of squared errors, each limited to FAR, so that a wrong click counts the same however
+    # far off it is.
     errors = [np.minimum(_errors(cameras, clicks, pose, click_mm), FAR) for pose in poses]
     return [poses[k] for k in np.argsort([float((error**2).sum()) for error in errors])[:count]]
 
 
 def _triangulated(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> tuple[Floats, Floats]:
-    # Landmarks (N, 3) that several cameras see: in the scan, and in the rig where their lines of sight come nearest to
-    # each other.
+    # Return the landmarks (N, 3) that several cameras see: their positions in the scan, and in the rig the points
+    # nearest to their lines of sight.
     scan, rig = [], []
     for name in dict.fromkeys(one.name for one in clicks):
         own = [one for one in clicks if one.name == name]
@@ -162,7 +173,7 @@ def _triangulated(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> tup
 
 
 def _starts_from_points(scan_mm: Floats, rig_mm: Floats) -> Iterator[RigidPose]:
-    # The rotation and move between points (Kabsch 1976), from all of them and from drawn triples.
+    # Fit rotation and translation between the points (Kabsch 1976), for all of them and for random triples.
     if len(scan_mm) < MIN_POINTS:
         return
     rng = np.random.default_rng(0)
@@ -203,7 +214,7 @@ def _starts(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> Iterator[
 
 
 def _errors(cameras: Mapping[str, Camera], clicks: Sequence[Click], pose: RigidPose, click_mm: float) -> Floats:
-    # Distance (N,) of each click from its prediction in standard errors; infinite behind a camera.
+    # Return the distance (N,) of each click from its prediction in standard errors; infinite behind a camera.
     errors = np.empty(len(clicks))
     for k, one in enumerate(clicks):
         point = pose.apply(one.point_mm[None])
@@ -220,7 +231,7 @@ def _offset_px(cameras: Mapping[str, Camera], one: Click, pose: RigidPose) -> fl
 def _refined(
     cameras: Mapping[str, Camera], clicks: Sequence[Click], start: RigidPose, centre_mm: Floats, click_mm: float
 ) -> tuple[RigidPose, Floats]:
-    # Gauss-Newton on Huber-weighted distances, with the inverse of the normal equations as covariance.
+    # Minimise the Huber-weighted distances by Gauss-Newton steps; the covariance is the inverse of the normal matrix.
     pose, normal = start, np.eye(6)
     for _ in range(ROUNDS):
         centre = pose.apply(centre_mm[None])[0]
@@ -241,7 +252,7 @@ def _refined(
 
 
 def _contradiction(cameras: Mapping[str, Camera], clicks: Sequence[Click], pose: RigidPose, kept: np.ndarray) -> str:
-    # The wrong click, and the landmark whose place it is at, where it is at one's.
+    # Say how many clicks are wrong, and name the one that is farthest from its prediction.
     wrong = [one for one, good in zip(clicks, kept, strict=True) if not good]
     worst = max(wrong, key=lambda one: _offset_px(cameras, one, pose))
     said = (

@@ -1,9 +1,9 @@
-"""The pose at which a scan's outlines meet those in the photographs.
+"""Refinement of a scan's pose on the outlines of its teeth in the photographs.
 
-Each round draws the outlines at the present pose, looks for the photograph's own along the line across each of their
-points (Harris, "Tracking with rigid models", 1992), and moves the pose so that the distances across vanish, far ones
-counting less. A tooth's border to gums, lips or the dark is where likeness to tooth falls; that to another tooth is a
-dark line.
+Each round computes the outlines at the present pose, searches the photograph's edge along the line across each outline
+point (Harris, "Tracking with rigid models", 1992), and changes the pose to reduce the distances across, large ones with
+less weight. The edge of a tooth beside gums, lips or the dark of the mouth is where the likeness to tooth falls; the
+edge between two teeth is a dark line.
 """
 
 from __future__ import annotations
@@ -22,55 +22,59 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Mesh
 
 NARROW_PX = 3.0
-"""How far an outline is looked for at last; edges so near are then told by their light."""
+"""Distance to which edges are searched in the last rounds, in which their position is then refined in the light."""
 STEP_PX = 0.5
-"""Between samples across an outline."""
+"""Distance between samples across an outline."""
 POINTS = 1500
-"""Of each camera that are looked at: neighbouring ones tell the same."""
+"""Largest number of outline points per camera: neighbouring points give the same information."""
 CLEAR = 0.25
-"""Share of the strong edges' strength (their 90th percentile) that an edge needs to be taken for one."""
+"""Smallest strength of an edge, as a fraction of the 90th percentile of the edges' strengths."""
 TUKEY = 2.5
-"""Standard errors beyond which a point counts nothing (Tukey's biweight). The usual 4.7 would save a fifth of the
-variance of clean edges, but lips, whose edges cross the outlines, lie nearer than that: with 4.7 they turned drawn
-phantoms by 0.12° in place of 0.08°."""
+"""Distance in standard errors beyond which a point has no weight (Tukey's biweight). The usual 4.7 would save a fifth
+of the variance of clean edges, but the edges of lips, which cross the outlines, lie nearer than that: with 4.7 they
+rotated drawn phantoms by 0.12° in place of 0.08°."""
 MIN_SPREAD_PX = 0.15
+"""Smallest standard error of the points of one photograph."""
 OTHER_TOOTH = 0.5
-"""Likeness to tooth beyond an outline from which on another tooth is taken to be there."""
+"""Likeness to tooth at the outer end of the search from which on another tooth is assumed there."""
 BETWEEN_WEIGHT = 0.25
-"""Of a border between teeth: its dark line lies beside either tooth's edge by a width that nobody knows."""
+"""Weight of a point between two teeth: the dark line lies at an unknown distance from either tooth's edge."""
 ROUNDS = 12
+"""Largest number of rounds."""
 MIN_FOUND = 0.3
-"""Share of the outlines' points that must find an edge; lips and retractor hide some."""
+"""Smallest fraction of the outline points for which an edge must be found; lips and retractor hide some."""
 SECTORS = 6
-"""Parts of a tooth's outline whose errors are taken to be of one piece, for the covariance."""
+"""Number of parts of a tooth's outline within which errors are taken as fully correlated, for the covariance."""
 SHIFT_PX = (0.15, 0.1, 0.5)
-"""Standard errors of what all outlines beside the same thing, nothing, gums and another tooth, are shifted by in all
-photographs: a rim that darkens, or a dark line between teeth, which lies behind the nearer one's edge. They are
-unknowns of the pose's equations; where outlines lie on both sides of a tooth they tell them. On phantoms at their true
-pose the medians were, as rms, 0.09 to 0.2, 0.01 to 0.1 and 0.1 to 0.8 px."""
+"""Prior standard errors of the shifts that all outlines beside background, beside gums and beside another tooth have in
+common in all photographs. Their causes are rims that darken, and the dark line between teeth, which lies behind the
+edge of the nearer tooth. The shifts are unknowns of the pose's equations; outlines on both sides of a tooth determine
+them. On phantoms at their true pose the medians were, as rms, 0.09 to 0.2, 0.01 to 0.1 and 0.1 to 0.8 px."""
 
 SIDE_PX = 0.1
-"""The same of one side of all teeth in one photograph beyond that, for the covariance: by the light that falls on it.
-On the same phantoms 0.03 to 0.12 px beside nothing and gums."""
+"""Standard error of a further shift that one side of all teeth has in common in one photograph, because of the light
+that falls on it; only the covariance contains it. On the same phantoms it was 0.03 to 0.12 px beside background and
+gums."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera's photograph, cut out around the teeth and made small."""
+    """One camera's photograph, cropped to the teeth and reduced in size, and the camera of this image."""
 
     camera: Camera
     image: NDArray[np.float32]
-    """(H, W, C), 0 at black."""
+    """Linear image (H, W, C), 0 at black."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What the outlines of one view meet in its photograph."""
+    """Edges of a photograph that were found for the outline points of its view."""
 
     contour: Contour
     offset_px: Floats
-    """(N,) from the predicted outline to the photograph's, outwards."""
+    """Distances (N,) from the predicted outline to the photograph's edge, outwards."""
     is_found: NDArray[np.bool_]
+    """True where an edge was found (N,)."""
 
 
 def pose_from_outlines(
@@ -81,25 +85,25 @@ def pose_from_outlines(
     centre_mm: Floats,
     reach_px: float = 14.0,
 ) -> PoseStep:
-    """Refine a pose.
+    """Refine a pose on the outlines of all teeth in all photographs.
 
     Args:
-        views: of all cameras.
+        views: photographs of all cameras.
         teeth: solids of the scan, in the scan's frame.
-        occluders: of the scan, that hide teeth: gums.
-        start: with its covariance, which counts as a measurement.
-        centre_mm: of the teeth in the scan (3,).
-        reach_px: how far an outline is looked for in the first rounds.
+        occluders: solids of the scan that hide teeth, such as gums.
+        start: first pose; it and its covariance are a prior.
+        centre_mm: centre of the teeth in the scan (3,).
+        reach_px: distance to which edges are searched in the first round.
 
     Raises:
-        CaptureInputError: most outlines have no edge in the photographs.
+        CaptureInputError: fewer than ``MIN_FOUND`` of the outline points have an edge in the photographs.
     """
     pose, prior = start.pose, np.asarray(np.linalg.inv(start.covariance), dtype=np.float64)
     appearances: list[Appearance] = []
     found: list[Found] = []
     normal, spread, shifts_px = _with_shifts(prior), {}, np.zeros(len(SHIFT_PX))
     for number in range(ROUNDS):
-        # The search narrows from all that the start leaves open to a few pixels.
+        # Narrow the search from the uncertainty of the start to a few pixels.
         reach = max(reach_px * 0.75**number, NARROW_PX)
         moved = [_placed(mesh, pose) for mesh in teeth]
         hidden = [_placed(mesh, pose) for mesh in occluders]
@@ -153,10 +157,11 @@ def pose_from_outlines(
 def outline_misfit_mm(
     views: Sequence[View], teeth: Sequence[Mesh], occluders: Sequence[Mesh], pose: RigidPose, reach_mm: float = 1.2
 ) -> float:
-    """Median distance at the teeth between their outlines, as drawn at a pose, and the photographs'.
+    """Return the median distance in mm at the teeth between their outlines at a pose and the photographs' edges.
 
-    The nearest edges of a narrow search always lie close, whoever's teeth are seen; so the strongest one within a wide
-    reach counts here, and a point without a clear one counts as the reach. Borders between teeth are left out.
+    In a narrow search some edge is always close, even for another person's teeth. So the strongest edge within a wide
+    reach counts here, and a point without a clear edge counts with the reach as distance. Outlines between teeth are
+    left out.
     """
     distances = []
     for view in views:
@@ -189,7 +194,7 @@ def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Foun
 
     if len(contour.pixels) == 0:
         return Found(contour, np.zeros(0), np.zeros(0, dtype=bool))
-    # Samples along each point's line, some more at both ends for the differences.
+    # Sample along the line across each point, with additional samples at both ends for the differences.
     steps = np.arange(-np.ceil(reach_px / STEP_PX), np.ceil(reach_px / STEP_PX) + 1) * STEP_PX
     padded = np.concatenate([steps[0] - STEP_PX * np.arange(4, 0, -1), steps, steps[-1] + STEP_PX * np.arange(1, 5)])
     place = contour.pixels[:, None] + padded[None, :, None] * contour.outward[:, None] - 0.5
@@ -205,7 +210,7 @@ def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Foun
     outside = (x < 1) | (y < 1) | (x > width - 2) | (y > height - 2)
     near = np.exp(-(steps**2) / (2 * (0.6 * reach_px) ** 2))
     offset, is_found = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
-    # A tooth that the scan does not have, of the other jaw or behind the scan's last, may be on the other side.
+    # On the other side there may be a tooth that the scan does not have, of the other jaw or behind the scan's last.
     contour = replace(contour, between=contour.between | (likeness[:, -1] > OTHER_TOOTH))
     for between, strength in ((False, fall), (True, valley)):
         own = np.flatnonzero(contour.between == between)
@@ -222,7 +227,7 @@ def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Foun
 
 
 def _in_light(found: Found, image: NDArray[np.float32]) -> Found:
-    # A dark line between teeth has no two sides of different light, and stays where it looks darkest.
+    # A dark line between teeth has the same light on both sides, so its position remains that of the darkest sample.
     contour, offset, is_found = found.contour, found.offset_px.copy(), found.is_found.copy()
     own = np.flatnonzero(is_found & ~contour.between)
     if len(own) == 0:
@@ -232,7 +237,7 @@ def _in_light(found: Found, image: NDArray[np.float32]) -> Found:
 
 
 def _vertex(strength: Floats, best: NDArray[np.int64]) -> Floats:
-    # Of the parabola through three samples, in samples.
+    # Return the offset in samples of the vertex of the parabola through three samples.
     left, middle, right = (np.take_along_axis(strength, best[:, None] + k, axis=1)[:, 0] for k in (-1, 0, 1))
     bend = left - 2 * middle + right
     return np.asarray(np.clip(np.where(bend < 0, (left - right) / np.where(bend < 0, 2 * bend, 1.0), 0.0), -1, 1))
@@ -254,12 +259,12 @@ def _equations(
 
 
 def _beside(contour: Contour) -> NDArray[np.int64]:
-    # In the order of ``SHIFT_PX``.
+    # Return the index (N,) into ``SHIFT_PX`` of the kind of neighbour of each point.
     return np.where(contour.between, 2, contour.gums.astype(np.int64))
 
 
 def _with_shifts(prior: Floats) -> Floats:
-    # What is known before of a twist and of the outlines' common shifts.
+    # Join the prior's inverse covariances of the twist and of the outlines' common shifts.
     shifts = np.diag(1 / np.square(SHIFT_PX))
     return np.block([[prior, np.zeros((len(prior), len(shifts)))], [np.zeros((len(shifts), len(prior))), shifts]])
 
@@ -273,8 +278,9 @@ def _sandwich(
     normal: Floats,
     prior: Floats,
 ) -> Floats:
-    # Errors along one part of an outline go together in all cameras, so scores are summed over it before they are
-    # squared (cluster-robust); so do those of one side of all teeth in one camera, by the light that falls on it.
+    # Errors along one part of an outline are correlated in all cameras, so scores are summed over this part before they
+    # are squared (cluster-robust covariance). Errors of one side of all teeth in one camera are correlated too, because
+    # of the light that falls on it.
     scores, sides = np.zeros((teeth * SECTORS, len(normal))), []
     for view, one in zip(views, found, strict=True):
         jacobian, residual, weight, _ = _equations(view.camera, one, centre_mm, shifts_px)

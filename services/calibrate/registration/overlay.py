@@ -1,4 +1,4 @@
-"""Pictures that show where a pose puts the teeth in the photographs, and a page of them."""
+"""Pictures of the teeth's outlines at a pose drawn over the photographs, and a page of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from services.core.store import write_atomic
 BRIGHT_PERCENT = 99.0
 GAMMA = 2.2
 COLOURS = {"landmarks": (255, 140, 0), "outlines": (80, 230, 80)}
-"""Blue, green, red, by step."""
+"""Colour of the outlines after each step: blue, green, red, 0 to 255."""
 CLICKED, PREDICTED = (60, 60, 230), (230, 60, 230)
 
 
@@ -32,8 +32,8 @@ def write_overlay(
     steps: Sequence[PoseStep],
     clicks: Sequence[Click],
 ) -> None:
-    """Write a PNG: outlines after each step, clicks as rings, and where the last step has them as dots joined to
-    them.
+    """Write a PNG of the outlines after each step, the clicks as rings, and the clicks' positions predicted by the last
+    step as dots, each joined to its click.
     """
     import cv2
 
@@ -55,7 +55,7 @@ def write_overlay(
 
 
 def report_page(record: Registration) -> str:
-    """An HTML page of the record and its pictures, which lie beside it."""
+    """Return an HTML page of the record and its pictures, which lie beside the page."""
     rows = [
         {
             "name": step.name,
@@ -88,7 +88,9 @@ def _placed(meshes: Sequence[Mesh], pose: RigidPose) -> list[Mesh]:
 
 
 def displayed(image: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Blue, green and red (H, W, 3) of the first three channels of linear radiance, or grey, for the eye."""
+    """Return a picture (H, W, 3) of linear radiance for display: blue, green and red from its first three channels, or
+    grey where it has fewer, with a gamma of 2.2.
+    """
     bright = max(float(np.percentile(image, BRIGHT_PERCENT)), 1e-12)
     shown = np.clip(image[..., :3] / bright, 0, 1) ** (1 / GAMMA)
     colours = shown[..., ::-1] if shown.shape[-1] == 3 else np.repeat(shown[..., :1], 3, axis=-1)

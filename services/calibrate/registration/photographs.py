@@ -1,4 +1,4 @@
-"""What registration looks at in a raw folder: one photograph a camera, without lens distortion, and clicks on it."""
+"""Input of registration from a raw folder: one photograph per camera, without lens distortion, and the clicks in it."""
 
 from __future__ import annotations
 
@@ -22,21 +22,23 @@ from services.core.raw.mosaic import binned
 from services.core.raw.records import RawCamera, RawFolder, RawFrame
 
 WIDEST_PX = 2400
-"""Photographs are made smaller than this before anything else: a pixel is then some 0.05 mm at the teeth."""
+"""Largest width of a photograph; wider ones are reduced first. A pixel is then some 0.05 mm at the teeth."""
 CUT_PX = 700
-"""Width of the part around the teeth in which outlines are looked for: 0.1 mm a pixel, and edges are found to a
-fraction of it."""
+"""Largest width of the part around the teeth in which outlines are searched: a pixel is then 0.1 mm, and edges are
+located to a fraction of it."""
 MARGIN_MM = 4.0
-"""Around the teeth in that part."""
+"""Margin around the teeth in that part."""
 MAX_LIGHTS = 12
-"""Frames of single lights that are averaged where no frame has all of them on."""
+"""Largest number of frames of single lights that are averaged where no frame has all lights on."""
 
 
 def photographs(root: Path, folder: RawFolder, calibration: Calibration) -> dict[str, View]:
-    """The teeth under all lights, or under the mean of some, by camera.
+    """Return photographs of the teeth by camera, without lens distortion: under all lights, or the mean over some
+    lights.
 
     Raises:
-        CaptureInputError: a camera is not calibrated, or has no frame of the teeth.
+        CaptureInputError: a camera is not calibrated, is calibrated for another image size, or has no frame of the
+            teeth.
     """
     views = {}
     for raw in folder.camera:
@@ -46,17 +48,20 @@ def photographs(root: Path, folder: RawFolder, calibration: Calibration) -> dict
 
 
 def mean_photograph(root: Path, folder: RawFolder, name: str, black: float | None = None) -> NDArray[np.float32]:
-    """One camera's teeth under all lights, or under the mean of some, as its lens shows them.
+    """Return one camera's photograph of the teeth under all lights, or the mean over some lights, with lens distortion.
 
     Args:
-        name: of the camera.
+        root: folder of ``raw.toml``.
+        folder: content of ``raw.toml``.
+        name: name of the camera.
         black: its black level in counts; None to read it from a black frame.
 
     Returns:
-        Counts above black a second (H, W, C); of half the size for a mosaic with more pixels than are looked at.
+        Counts above black, divided by exposure in seconds and gain (H, W, C); of half the size for a mosaic of at least
+        twice ``WIDEST_PX``.
 
     Raises:
-        CaptureInputError: it has no frame of the teeth.
+        CaptureInputError: the camera has no frame of the teeth.
     """
     frames = folder.frames_of(name, "tracking")[:1] or _some(folder.frames_of(name, "light"))
     if not frames:
@@ -69,7 +74,7 @@ def mean_photograph(root: Path, folder: RawFolder, name: str, black: float | Non
 
 
 def clicks_of(folder: RawFolder, calibration: Calibration, views: Mapping[str, View]) -> list[Click]:
-    """Landmarks of a raw folder, their pixels in the views: without distortion, and as small as these were made."""
+    """Return the clicks of a raw folder's landmarks, with pixels of the undistorted and reduced images of the views."""
     clicks = []
     for landmark in folder.landmark:
         for seen in landmark.pixels:
@@ -82,10 +87,10 @@ def clicks_of(folder: RawFolder, calibration: Calibration, views: Mapping[str, V
 
 
 def cut_out(view: View, points_mm: Floats) -> View:
-    """The part of a photograph around points of the rig (N, 3), made small.
+    """Crop a photograph to points of the rig (N, 3) with a margin, and reduce it to at most ``CUT_PX`` in width.
 
     Raises:
-        CaptureInputError: the points are not in the photograph.
+        CaptureInputError: the points do not lie in the photograph.
     """
     import cv2
 
@@ -114,8 +119,14 @@ def cut_out(view: View, points_mm: Floats) -> View:
 def require_facing(cameras: Sequence[Camera], pose: RigidPose, arch_from_scan: Floats, centre_mm: Floats) -> None:
     """Refuse a pose in which no camera sees the front or the chewing side of the teeth.
 
+    Args:
+        cameras: all cameras.
+        pose: pose of the scan in the rig.
+        arch_from_scan: transform (4, 4) from the scan to the dental arch's axes.
+        centre_mm: centre of the teeth in the scan (3,).
+
     Raises:
-        CaptureInputError: says so.
+        CaptureInputError: no camera sees the front or the chewing side.
     """
     centre, axes = pose.apply(centre_mm[None])[0], arch_from_scan[:3, :3] @ pose.rotation.T
     for camera in cameras:
@@ -169,7 +180,7 @@ def _image(root: Path, folder: RawFolder, frame: RawFrame, black: float) -> NDAr
 
 
 def _colours(counts: NDArray[Any], camera: RawCamera) -> NDArray[np.float32]:
-    """A mosaic's image (H, W, 3), interpolated; of half the size where that leaves as many pixels as are looked at."""
+    """Return a mosaic's interpolated image (H, W, 3), or one of half the size where its width is ``WIDEST_PX`` then."""
     import cv2
 
     if camera.size[0] >= 2 * WIDEST_PX:
@@ -180,7 +191,7 @@ def _colours(counts: NDArray[Any], camera: RawCamera) -> NDArray[np.float32]:
 def _undistorted(image: NDArray[np.float32], camera: CalibratedCamera) -> View:
     import cv2
 
-    # Made small first.
+    # Reduce the size before the distortion is removed.
     scale = min(image.shape[1], WIDEST_PX) / image.shape[1]
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     small = image if scale == 1 else _with_channels(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
@@ -188,7 +199,7 @@ def _undistorted(image: NDArray[np.float32], camera: CalibratedCamera) -> View:
     (fx, skew, cx), (_, fy, cy), last = camera.K
     K = ((fx * by[0], skew * by[0], cx * by[0]), (0.0, fy * by[1], cy * by[1]), last)
     if camera.distortion is not None:
-        # OpenCV's pixel centres are whole numbers.
+        # OpenCV's pixel centres lie at integers.
         own = np.array(K)
         own[:2, 2] -= HALF_PIXEL
         small = _with_channels(cv2.undistort(small, own, np.array(camera.distortion)))
@@ -200,5 +211,5 @@ def _with_channels(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def cameras_of(views: Mapping[str, View]) -> dict[str, Camera]:
-    """Cameras of photographs, by name."""
+    """Return the cameras of photographs, by name."""
     return {name: view.camera for name, view in views.items()}

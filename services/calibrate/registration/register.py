@@ -1,4 +1,4 @@
-"""From a raw folder with a scan and landmarks to teeth in the rig's frame: what ``dentine register`` does."""
+"""Registration of a raw folder's scan: the work of ``dentine register``, from landmarks to teeth in the rig's frame."""
 
 from __future__ import annotations
 
@@ -30,19 +30,27 @@ from services.core.store import read_record, write_atomic, write_record
 
 PICTURES, PAGE = "registration", "registration.html"
 FARTHEST_LANDMARK_MM = 2.0
-"""Of a landmark from its tooth's nearest vertex: clicks lie on the surface, and vertices some tenths of a millimetre
-apart."""
+"""Largest distance of a landmark from its tooth's nearest vertex: clicks lie on the surface, and vertices are some
+tenths of a millimetre apart."""
 REACH_MM = 1.5
-"""How far outlines are looked for at first: clicks leave a pose open by less."""
+"""Distance to which edges are searched in the first round: the error of a pose from clicks is smaller."""
 MAX_MISFIT_MM = 0.10
-"""Median distance of outlines beyond which a scan is not believed to be of these teeth. Phantoms' own scans come to
-0.05 mm in a calibrated rig, those of others to 0.13 mm and more; photographs by an uncalibrated telephone come to 0.16
-to 0.3 mm."""
+"""Largest median distance between outlines and edges with which a scan is accepted as one of these teeth. In a
+calibrated rig phantoms' own scans have 0.05 mm, those of other phantoms 0.13 mm and more; photographs by an
+uncalibrated telephone have 0.16 to 0.3 mm."""
 
 
 @dataclass(frozen=True)
 class ScannedTeeth:
-    """Solids of a scan in the scan's own frame, in mm."""
+    """Solids of a scan in the scan's own frame, in mm.
+
+    Attributes:
+        fdi: FDI numbers of the teeth.
+        teeth: solids of the teeth, in the same order.
+        gums: solid of the gums.
+        arch_from_scan: transform (4, 4) from the scan to the dental arch's axes.
+        repairs: sentences that say how the scan was repaired and its teeth separated.
+    """
 
     fdi: tuple[int, ...]
     teeth: tuple[Mesh, ...]
@@ -67,14 +75,15 @@ def register_folder(
 
     Args:
         root: the folder of ``raw.toml``.
-        calibration_file: in place of the one that ``raw.toml`` names.
-        out: where to write; the raw folder itself by default, whose teeth they then are.
-        max_misfit_mm: median distance of outlines beyond which the scan is refused.
-        refused: where pictures of a refusal are written; beside the others by default.
+        calibration_file: calibration to use in place of the one that ``raw.toml`` names.
+        out: folder to write to; by default the raw folder itself, which then contains the teeth.
+        max_misfit_mm: largest median distance between outlines and edges; beyond it the scan is refused.
+        refused: folder for the pictures of a refusal; by default that of the other pictures.
 
     Raises:
-        CaptureInputError: something is missing or contradicts, or the pose is not to be believed; where a picture shows
-            why, the message names it. MeshError: the scan cannot be made solid.
+        CaptureInputError: an input is missing or contradicts another one, or the pose is not plausible; where pictures
+            show why, the message names them.
+        MeshError: the scan cannot be made solid.
     """
     folder, out = read_raw_folder(root), root if out is None else out
     if (out / "teeth").exists():
@@ -108,10 +117,11 @@ def register_folder(
 
 
 def scanned_teeth(root: Path, folder: RawFolder) -> ScannedTeeth:
-    """Solids of the scan of a raw folder.
+    """Return the solids of a raw folder's scan.
 
     Raises:
-        CaptureInputError: it has none, or it cannot be used. MeshError: it cannot be made solid.
+        CaptureInputError: the folder names no scan, or the scan cannot be used.
+        MeshError: the scan cannot be made solid.
     """
     scan = folder.scan
     if scan is None:
@@ -179,10 +189,10 @@ def _calibration(root: Path, folder: RawFolder, given: Path | None) -> tuple[Pat
 
 
 def require_on_their_teeth(clicks: Sequence[Click], scanned: ScannedTeeth) -> None:
-    """Refuse landmarks of teeth that the scan does not have, or that lie elsewhere.
+    """Refuse landmarks of teeth that the scan does not have, and landmarks that do not lie on their tooth.
 
     Raises:
-        CaptureInputError: names the first one.
+        CaptureInputError: names the first such landmark.
     """
     for one in clicks:
         if int(one.name.split()[0]) not in scanned.fdi:
@@ -200,7 +210,7 @@ def require_on_their_teeth(clicks: Sequence[Click], scanned: ScannedTeeth) -> No
 
 
 def _in_view(clicks: Sequence[Click], views: Mapping[str, View], cut: View) -> list[Click]:
-    # Pixels of the whole photograph in the part of it.
+    # Transform the clicks' pixels from the whole photograph to the cropped one.
     whole, part = np.asarray(views[cut.camera.name].camera.K), np.asarray(cut.camera.K)
     part_from_whole = part @ np.linalg.inv(whole)
     return [

@@ -1,4 +1,4 @@
-"""Which tooth each pixel of a camera sees: a z-buffer of triangles, as coarse and as small as its camera is."""
+"""Visibility of teeth in a camera's image: a z-buffer of triangles at the image's resolution."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from services.core.geometry import Camera, Mesh
 
 NOTHING = -1
 SAMPLES_AT_ONCE = 2_000_000
-"""Pairs of a triangle and a pixel that are held at once: some 100 MB."""
+"""Number of pairs of a triangle and a pixel that are held in memory at once: some 100 MB."""
 ROUNDING = -1e-9
-"""Barycentric coordinates above it count as inside, so that neighbouring triangles leave no gap."""
+"""Smallest barycentric coordinate that counts as inside; below 0, so that rounding leaves no gap between neighbouring
+triangles."""
 
 
 def seen_surfaces(camera: Camera, meshes: Sequence[Mesh]) -> tuple[NDArray[np.int16], Floats]:
-    """Number (H, W) of the mesh that each pixel's centre sees, -1 for none, and its depth in mm, infinite for none.
+    """Return the number (H, W) of the mesh that is visible at each pixel's centre, -1 for none, and its depth in mm,
+    infinite for none.
 
-    Triangles that turn their back to the camera are left out: meshes are solids.
+    Triangles that face away from the camera are skipped, because the meshes are closed solids. A mesh with a vertex
+    behind the camera is skipped as a whole.
     """
     width, height = camera.size
     inverse = np.zeros(width * height)
@@ -35,7 +38,7 @@ def seen_surfaces(camera: Camera, meshes: Sequence[Mesh]) -> tuple[NDArray[np.in
         low = np.maximum(np.ceil(corners.min(axis=1)), 0).astype(np.int64)
         high = np.minimum(np.floor(corners.max(axis=1)), [width - 1, height - 1]).astype(np.int64)
         span = np.maximum(high - low + 1, 0)
-        # The image's y axis points down, so that triangles that face the camera have negative areas.
+        # The image's y axis points down, so triangles that face the camera have negative areas.
         count = np.where(area < 0, span[:, 0] * span[:, 1], 0)
         kept = np.flatnonzero(count)
         parts = np.flatnonzero(np.diff(np.cumsum(count[kept]) // SAMPLES_AT_ONCE)) + 1
@@ -48,7 +51,8 @@ def seen_surfaces(camera: Camera, meshes: Sequence[Mesh]) -> tuple[NDArray[np.in
             b2 = (one[triangle, 0] * offset[:, 1] - one[triangle, 1] * offset[:, 0]) / area[triangle]
             share = np.stack([1 - b1 - b2, b1, b2], axis=1)
             inside = (share >= ROUNDING).all(axis=1)
-            # The inverse of depth is linear in the image; of several hits the nearest is written last.
+            # Interpolate the inverse of depth, which is linear in the image. Among several hits of a pixel write the
+            # nearest last.
             nearness = (share[inside] / depth[mesh.faces[triangle[inside]]]).sum(axis=1)
             sample = (y * width + x)[inside]
             nearer = np.flatnonzero(nearness > inverse[sample])
