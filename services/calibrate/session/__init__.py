@@ -1,1 +1,1 @@
-"""A raw folder's calibration frames, step by step, to a calibration record."""
+"""Calibration of a rig from the calibration frames of a raw folder: the steps, the record and the report."""

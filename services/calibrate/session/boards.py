@@ -1,4 +1,4 @@
-"""The cameras' step: boards in photographs to lenses, poses and their covariance."""
+"""Step of the cameras: from boards in photographs to lenses, poses and their covariance."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CamerasStep:
-    """What boards say of the cameras.
+    """Calibration of the cameras from boards.
 
     Attributes:
-        names: of the cameras, in the order of ``raw.toml``.
+        names: names of the cameras, in the order of ``raw.toml``.
         fit: lenses, poses and covariance.
-        choices: how each camera's distortion model was chosen.
+        choices: choice of each camera's distortion model, by the camera's name.
         views: the boards that were found, in the order of the fit's corners.
-        missed: files in which no board was found, each with why.
+        missed: files in which no board was found, each with the reason.
     """
 
     names: tuple[str, ...]
@@ -42,13 +42,13 @@ class CamerasStep:
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
-        """The cameras."""
+        """The calibrated cameras."""
         rig = self.fit.rig
         return tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
 
     @property
     def camera_covariance(self) -> Floats:
-        """Of lens values and pose of each camera in turn."""
+        """Covariance (C, C) of the lens values and pose of each camera in turn."""
         layout = self.fit.layout
         columns = np.concatenate(
             [np.concatenate([layout.lens_columns(k), layout.camera_columns(k)]) for k in range(len(self.names))]
@@ -67,7 +67,7 @@ def calibrate_cameras(photos: Photos) -> CamerasStep:
     """Find all boards, choose each camera's distortion model, and adjust the rig.
 
     Raises:
-        CaptureInputError: too few boards, or cameras that share none.
+        CaptureInputError: there are too few boards, or a camera shares no board with the others.
     """
     folder = photos.folder
     names = tuple(camera.name for camera in folder.camera)
@@ -84,13 +84,13 @@ def adjust_cameras(
     """Choose each camera's distortion model, and adjust the rig to the boards that were found.
 
     Args:
-        views: boards in photographs; place 0 is to be the world's frame.
-        sizes: of the images by the cameras' names, in the order of their numbers.
-        first: what place 0 is called, for messages.
-        missed: files in which no board was found, each with why.
+        views: boards in photographs; the board at place 0 defines the world frame.
+        sizes: width and height of the images by the cameras' names, in the order of their numbers.
+        first: name of place 0, for messages.
+        missed: files in which no board was found, each with the reason.
 
     Raises:
-        CaptureInputError: too few boards, or cameras that share none.
+        CaptureInputError: there are too few boards, or a camera shares no board with the others.
     """
     names, good = tuple(sizes), usable(views)
     if not good and missed:
@@ -130,18 +130,20 @@ def _find(
 
 
 def _place(frame: RawFrame) -> str:
-    """A board without a place was moved before every photograph."""
+    """Return the name of a frame's place; a frame without one is a place of its own, because the board was moved before
+    every such photograph.
+    """
     return frame.place if frame.place is not None else frame.file
 
 
 def _renumbered(views: Sequence[View]) -> list[View]:
-    """Views with places counted without gaps; the first stays the first."""
+    """Return the views with places renumbered without gaps; place 0 stays place 0."""
     numbers = sorted({view.place for view in views})
     return [replace(view, place=numbers.index(view.place)) for view in views]
 
 
 def model_told(choice: ModelChoice) -> str:
-    """How a lens' model was chosen, in words."""
+    """Return a phrase that says which distortion model was chosen and why."""
     if not choice.held_out_px:
         return f"{choice.lens.model}, held, as there are too few boards to leave any out"
     told = ", ".join(f"{name} {value:.3f} px" for name, value in choice.held_out_px.items())

@@ -1,4 +1,4 @@
-"""The colours' step: charts in photographs to each camera's matrix."""
+"""Step of the colours: from charts in photographs to each camera's transform to XYZ."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ from services.core.raw.records import RawFrame
 
 Floats = NDArray[np.float64]
 BETTER = 0.5
-"""Of the given order's mean ΔE2000: charts in a wrong order miss by 20 and more, in the right one by less than 6."""
+"""Largest ratio of another order's mean ΔE2000 to that of the given order with which the other order is reported. The
+mean ΔE2000 is 20 and more for charts in a wrong order and less than 6 in the right one."""
 
 
 @dataclass(frozen=True)
 class ColourStep:
-    """Colours of every camera that photographed a chart.
+    """Colour transforms of every camera that photographed a chart.
 
     Attributes:
-        fits: by camera.
-        rgb: patches over white (24, 3), by camera; those that cannot be used are NaN.
-        xyz: the chart's reference (24, 3).
-        between_cameras: mean ΔE2000 between the cameras' answers to the patches that all of them show, or None of one
-            camera.
+        fits: colour transform by camera.
+        rgb: patch means divided by those of a perfect diffuser (24, 3), by camera; NaN for unusable patches.
+        xyz: the chart's reference XYZ (24, 3).
+        between_cameras: mean ΔE2000 of the cameras' colours from their common mean, over the patches that all of them
+            show; None for a single camera.
     """
 
     fits: dict[str, ColourFit]
@@ -46,10 +47,11 @@ class ColourStep:
 
 
 def calibrate_colours(photos: Photos) -> ColourStep | None:
-    """Each camera's way from channels to XYZ; None without charts or without three channels.
+    """Fit each camera's transform from channels to XYZ; None without charts or without three channels.
 
     Raises:
-        CaptureInputError: a chart that is not found, too bright, or without a reference; frames of several charts.
+        CaptureInputError: a chart is not found, is too bright or has no usable reference, or the frames show several
+            charts.
     """
     frames = [frame for frame in photos.folder.frame if frame.kind == "chart"]
     if not frames or len(photos.folder.channels) != 3:
@@ -66,7 +68,7 @@ def calibrate_colours(photos: Photos) -> ColourStep | None:
         mine = [frame for frame in frames if frame.camera == camera]
         total = [_patches(photos, frame) for frame in mine]
         usable = np.logical_and.reduce([one.usable for one in total])
-        # Light adds up, so photographs light by light are summed.
+        # Sum photographs under single lights, because light is additive.
         summed = Patches(np.sum([one.means for one in total], axis=0), usable)
         patches = over_white(summed, xyz, camera)
         rgb[camera] = np.where(usable[:, None], patches, np.nan)
@@ -75,7 +77,9 @@ def calibrate_colours(photos: Photos) -> ColourStep | None:
 
 
 def better_order(step: ColourStep) -> dict[str, tuple[str, float, float]]:
-    """Cameras whose patches fit the reference far better in another order: what it is, and the mean ΔE2000 of both."""
+    """Return the cameras whose patches fit the reference far better in another order: for each camera that order in
+    words, and the mean ΔE2000 of this order and of the given one.
+    """
     numbers = np.arange(COLUMNS * ROWS).reshape(ROWS, COLUMNS)
     orders = {
         "turned by 180°": numbers[::-1, ::-1],

@@ -1,6 +1,7 @@
 """Drawings of a calibration's report as SVG: corners and their residuals, uncertainty over the image, lights, charts.
 
-Their colours are classes of the report's style, light or dark as the page is; a chart's are its own.
+Their colours are classes of the report's style sheet, so they follow its light or dark mode; a chart shows its own
+colours.
 """
 
 from __future__ import annotations
@@ -17,18 +18,16 @@ from services.calibrate.colour.cie import D50
 Floats = NDArray[np.float64]
 WIDTH = 360.0
 ARROW_PX = 12.0
-"""Length in the drawing of the largest residual that is drawn; longer ones are cut."""
+"""Length in the drawing of the arrow of a residual of 3 σ; arrows longer than twice this are shortened to it."""
 GRID = (16, 12)
 SRGB_FROM_XYZ_D50 = np.array(
     [[3.1338561, -1.6168667, -0.4906146], [-0.9787684, 1.9161415, 0.0334540], [0.0719453, -0.2289914, 1.4052427]]
 )
-"""Linear sRGB of XYZ under D50, by Bradford's adaptation (Lindbloom)."""
+"""Matrix from XYZ under D50 to linear sRGB, with Bradford's chromatic adaptation (Lindbloom)."""
 
 
 def corners_drawing(fit: BundleFit, camera: int) -> str:
-    """All corners of a camera with their residuals, as arrows of a common scale; those of corners that were left out
-    are marked.
-    """
+    """Draw the residuals of all corners of a camera as arrows of a common scale; those of outliers are marked."""
     size = fit.rig.lenses[camera].size
     scale = WIDTH / size[0]
     mine = fit.corners.camera == camera
@@ -45,7 +44,11 @@ def corners_drawing(fit: BundleFit, camera: int) -> str:
 
 
 def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tuple[str, float]:
-    """Uncertainty of projection over the image, faint at 0 and full at the largest, and that largest in px."""
+    """Draw the uncertainty of projection over the image.
+
+    Returns:
+        The drawing, transparent at 0 and opaque at the largest uncertainty, and this largest uncertainty in px.
+    """
     lens = fit.rig.lenses[camera]
     scale = WIDTH / lens.size[0]
     sigma = projection_sigma(fit, camera, image_grid(lens.size, *GRID), distance_mm)
@@ -61,7 +64,7 @@ def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tupl
 
 
 def lights_drawing(lights_mm: Floats, names: Sequence[str], cameras_mm: Floats, errors_mm: Floats | None) -> str:
-    """Lights and cameras from above (x, z) and from the side (y, z), lights with circles of 10 σ."""
+    """Draw lights and cameras from above (x, z) and from the side (y, z), lights as circles with a radius of 10 σ."""
     reach = np.zeros((len(lights_mm), 1)) if errors_mm is None else 10 * errors_mm[:, None]
     everything = np.concatenate([lights_mm - reach, lights_mm + reach, cameras_mm])
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -83,8 +86,8 @@ def lights_drawing(lights_mm: Floats, names: Sequence[str], cameras_mm: Floats, 
 
 
 def chart_drawing(reference: Floats, before: Floats, after: Floats) -> str:
-    """A chart's patches: around, the reference; in the middle, on the left as the sensor sees them and on the right
-    corrected.
+    """Draw a chart's patches: the reference as the frame of each patch; inside, on the left the colour as the sensor
+    sees it and on the right the corrected colour. All colours are linear sRGB (24, 3).
     """
     side, shapes = 44.0, []
     for patch in range(len(reference)):
@@ -100,7 +103,7 @@ def chart_drawing(reference: Floats, before: Floats, after: Floats) -> str:
 
 
 def srgb(xyz: Floats) -> Floats:
-    """Linear sRGB (N, 3) of XYZ (N, 3) under D50."""
+    """Return the linear sRGB (N, 3) of XYZ (N, 3) under D50, with white at 1."""
     return np.asarray(xyz @ SRGB_FROM_XYZ_D50.T / (D50 @ SRGB_FROM_XYZ_D50.T))
 
 

@@ -1,7 +1,7 @@
-"""What changed between two calibrations of one rig, each change over its ±.
+"""Changes between two calibrations of one rig, each with its standard error.
 
-Both have a world of their own, that of their first board, so only what no choice of world moves is compared: lenses,
-the lights' distances from their common middle, and their intensities.
+Each calibration has a world frame of its own, that of its first board. So only quantities that do not depend on the
+world frame are compared: lenses, the lights' distances from their common mean, and their intensities.
 """
 
 from __future__ import annotations
@@ -17,12 +17,20 @@ from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 CLEAR_SIGMAS = 4.0
-"""Of 400 values that did not change one passes 3 σ, and in forty comparisons one passes 4 σ."""
+"""Size of a change in standard errors beyond which it is significant. Of 400 values that did not change one exceeds
+3 σ, but only in one of forty such comparisons does one exceed 4 σ."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One quantity's change, new minus old, its standard error from both calibrations together, and their unit."""
+    """Change of one quantity.
+
+    Attributes:
+        what: name of the quantity.
+        change: new minus old value.
+        se: standard error of the change, from both calibrations together.
+        unit: unit of change and standard error.
+    """
 
     what: str
     change: float
@@ -31,7 +39,7 @@ class Change:
 
     @property
     def is_clear(self) -> bool:
-        """Whether it is beyond what both calibrations' errors explain."""
+        """Whether the change is larger than both calibrations' errors explain."""
         return abs(self.change) > CLEAR_SIGMAS * self.se
 
     @property
@@ -41,10 +49,11 @@ class Change:
 
 
 def changes(old: Calibration, new: Calibration) -> list[Change]:
-    """Changes of what both calibrations have with a ±, the clearest first.
+    """Return the changes of all quantities that both calibrations have with a standard error, the most significant
+    first.
 
     Raises:
-        CaptureInputError: they are of different channels.
+        CaptureInputError: the calibrations have different channels.
     """
     if old.channels != new.channels:
         raise CaptureInputError(
@@ -88,7 +97,9 @@ def _lights(old: Calibration, new: Calibration) -> Iterator[Change]:
 
 
 def _from_middle(places: Floats, number: int) -> tuple[float, Floats]:
-    """A light's distance from the mean of all, and its derivative to all their coordinates (3 L,)."""
+    """Return a light's distance in mm from the mean of all lights, and the derivative of this distance with respect to
+    the coordinates of all lights (3 L,).
+    """
     off = places[number] - places.mean(axis=0)
     distance = float(np.linalg.norm(off))
     towards = off / max(distance, 1e-12)
@@ -100,7 +111,17 @@ def _from_middle(places: Floats, number: int) -> tuple[float, Floats]:
 def _joint_se(
     old: Calibration, new: Calibration, old_names: Sequence[str], new_names: Sequence[str], back: Floats, forth: Floats
 ) -> float | None:
-    """Standard error of a difference of two independent calibrations' quantities; None where one does not state it."""
+    """Return the standard error of the difference of a quantity between two independent calibrations; None where one of
+    them does not state the quantity's uncertainty.
+
+    Args:
+        old: earlier calibration.
+        new: later calibration.
+        old_names: names of the earlier calibration's uncertain values on which the quantity depends.
+        new_names: the same of the later calibration.
+        back: derivative of the quantity with respect to the earlier values.
+        forth: derivative of the quantity with respect to the later values.
+    """
     total = 0.0
     for calibration, names, slope in ((old, old_names, back), (new, new_names, forth)):
         if calibration.uncertainty is None:

@@ -1,4 +1,4 @@
-"""The fall of light towards the corners of an image, from photographs of an even source."""
+"""Vignetting, the fall of light towards the corners of an image, from photographs of an even source."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
 CELLS = 48
-"""Means of so many cells across an image: noise is averaged, and the fall of light is smooth."""
+"""Number of cells across an image whose means are fitted: they average the noise, and vignetting is smooth."""
 MIN_LIGHT = 0.05
-"""Of the middle's light, below which an image's corner is no photograph of an even source through this lens."""
+"""Smallest light in an image's corner as a fraction of that in the middle: with less the photograph is not one of an
+even source."""
 
 
 def fall_of_light(photos: Photos, camera: str, principal_px: Floats) -> tuple[float, float, float] | None:
-    """a, b, c of 1 + a q + b q² + c q³ from a camera's flat frames; None without any.
+    """Fit the vignetting a, b, c of 1 + a q + b q² + c q³ to a camera's flat frames; None without any.
 
-    q is the squared distance from the principal point in units of half the image's diagonal. All channels share one
-    fall of light, each with a brightness of its own.
+    q is the squared distance from the principal point, with half the image's diagonal as unit of length. All channels
+    share one vignetting, each with a brightness of its own.
 
     Raises:
-        CaptureInputError: a flat frame is saturated or uneven beyond what a lens does.
+        CaptureInputError: a flat frame is saturated, or more uneven than a lens can make it.
     """
     frames = photos.folder.frames_of(camera, "flat")
     if not frames:
@@ -37,18 +38,19 @@ def fall_of_light(photos: Photos, camera: str, principal_px: Floats) -> tuple[fl
                 " expose the flat field less."
             )
         q, values = _cells(seen, size, principal_px)
-        # Cells over the middle's brightness, so that frames of different exposure and channels weigh alike.
+        # Divide by the brightness of the middle, so that all frames and channels have the same weight.
         rows += [(q, values[:, k] / np.median(values[q < np.quantile(q, 0.2), k])) for k in range(values.shape[1])]
     return fit_fall(rows, camera)
 
 
 def fit_fall(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, float, float]:
-    """a, b, c from pairs of q (N,) and brightness (N,), each pair with a factor of its own.
+    """Fit a, b, c to pairs of q (N,) and brightness (N,), each pair with a factor s of its own.
 
     Raises:
-        CaptureInputError: the fitted fall leaves no light in a corner.
+        CaptureInputError: the fitted vignetting leaves less than ``MIN_LIGHT`` in a corner.
     """
-    # brightness = s (1 + a q + b q² + c q³): linear in s and in the products; the mean over pairs weighs by s.
+    # Fit brightness = s (1 + a q + b q² + c q³), which is linear in s, s a, s b and s c, to each pair; then take the
+    # plain mean of a, b, c over the pairs.
     products = []
     for q, brightness in rows:
         answer = np.linalg.lstsq(np.stack([np.ones_like(q), q, q**2, q**3], axis=1), brightness, rcond=None)[0]
@@ -64,7 +66,7 @@ def fit_fall(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, flo
 
 
 def _cells(seen: Channels, size: tuple[int, int], principal_px: Floats) -> tuple[Floats, Floats]:
-    """For cells of an image q (N,), and their mean values (N, C)."""
+    """Return q (N,) and the mean values (N, C) of the cells of an image."""
     height, width, channels = seen.values.shape
     edge = max(width // CELLS, 1)
     rows, columns = height // edge, width // edge
@@ -75,5 +77,7 @@ def _cells(seen: Channels, size: tuple[int, int], principal_px: Floats) -> tuple
 
 
 def relative_square(pixels: Floats, size: tuple[int, int], principal_px: Floats) -> Floats:
-    """The q (N,) of pixels (N, 2): squared distance from the principal point in units of half the image's diagonal."""
+    """Return q (N,) of pixels (N, 2): the squared distance from the principal point, with half the image's diagonal as
+    unit of length.
+    """
     return np.asarray(((pixels - principal_px) ** 2).sum(axis=1) / ((size[0] ** 2 + size[1] ** 2) / 4))

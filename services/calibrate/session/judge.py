@@ -1,4 +1,4 @@
-"""Whether a calibration keeps its limits, what in it looks wrong, and what to photograph again."""
+"""Judgement of a calibration: whether it keeps its limits, what looks wrong, and what to photograph again."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ from services.core.raw.records import RawFolder
 
 Floats = NDArray[np.float64]
 GRID = (8, 6)
+"""Columns and rows of the cells into which an image is divided."""
 FEW_PLACES = 8
+"""Number of places of the board below which more are advised."""
 MAX_EMPTY = 0.3
-"""Share of an image's cells without a corner: a board in nine places leaves the corners alone empty."""
+"""Largest fraction of an image's cells without a board corner: a board in nine places leaves only the image's corners
+empty."""
 CHANNELS_OF_COLOUR = 3
-"""XYZ is fitted to three channels alone; a chart tells nothing of other numbers of them."""
+"""Number of channels for which XYZ is fitted to a chart."""
 AGAIN = {"boards": "boards", "spheres": "spheres, larger or further apart,", "chart": "the chart"}
 PLAN = {
     "boards": (
@@ -39,13 +42,19 @@ PLAN = {
     "chart": "take the chart sharp, evenly lit and not overexposed",
 }
 MAX_TIMES = 10
-"""Nobody takes ten times as many photographs."""
+"""Largest factor in the number of photographs that is advised: nobody takes ten times as many."""
 
 
 @dataclass(frozen=True)
 class Limit:
-    """One figure that a calibration must keep: what it is, its value, the limit, the unit, and what photographs would
-    mend it.
+    """One limit on a figure of a calibration.
+
+    Attributes:
+        what: name of the figure.
+        value: its value.
+        limit: largest value that keeps the limit.
+        unit: unit of value and limit.
+        mended_by: kind of photographs that would improve the figure.
     """
 
     what: str
@@ -62,7 +71,13 @@ class Limit:
 
 @dataclass(frozen=True)
 class Judgement:
-    """Limits, what looks wrong (each in a sentence with its remedy), and what to photograph again."""
+    """Judgement of a calibration.
+
+    Attributes:
+        limits: all limits, kept or not.
+        suspicions: sentences on what looks wrong, each with its remedy.
+        advice: sentence on what to photograph again.
+    """
 
     limits: tuple[Limit, ...]
     suspicions: tuple[str, ...]
@@ -70,12 +85,12 @@ class Judgement:
 
     @property
     def broken(self) -> tuple[Limit, ...]:
-        """Limits that are not kept."""
+        """The limits that are not kept."""
         return tuple(one for one in self.limits if not one.is_kept)
 
     @property
     def recorded(self) -> tuple[CalibrationLimit, ...]:
-        """The limits as the calibration's record keeps them, for whoever uses it."""
+        """The limits in the form of the calibration's record, for those who use the calibration."""
         return tuple(
             CalibrationLimit(
                 what=one.what, value=one.value if math.isfinite(one.value) else None, limit=one.limit, unit=one.unit
@@ -94,7 +109,7 @@ def judge(
     black: Mapping[str, Black] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> Judgement:
-    """Hold a calibration to its limits. They are those that keep a tooth's absorption within a few per cent."""
+    """Check a calibration against the limits that keep a tooth's absorption within a few per cent."""
     limits = list(_limits(cameras, lights, uncertainty, colours))
     wrong = tuple(suspicions(folder, cameras, lights, intensity, colours, black, inputs))
     return Judgement(tuple(limits), wrong, _advice(folder, limits, cameras, lights, intensity, colours, wrong))
@@ -127,8 +142,8 @@ def _limits(
 
 
 def uncertainty_at_the_boards(fit: BundleFit, camera: int, distance_mm: float) -> Floats:
-    """How far off in mm, one σ, a camera draws points at the boards' distance, on a grid over its image, inside of what
-    boards covered.
+    """Return the standard deviation (N,) in mm of a camera's projection of points at the boards' distance, for the N
+    cells of the image that boards covered; infinite where they covered none.
     """
     lens = fit.rig.lenses[camera]
     grid = image_grid(lens.size, *GRID)
@@ -139,7 +154,7 @@ def uncertainty_at_the_boards(fit: BundleFit, camera: int, distance_mm: float) -
 
 
 def covered_cells(fit: BundleFit, camera: int) -> NDArray[np.bool_]:
-    """Which cells of the grid hold a corner that was used (rows · columns,)."""
+    """Return a mask (rows · columns,) of the cells of the grid that contain an inlier corner."""
     columns, rows = GRID
     width, height = fit.rig.lenses[camera].size
     seen = fit.corners.pixels[fit.inliers & (fit.corners.camera == camera)]
@@ -158,8 +173,8 @@ def _advice(
     colours: ColourStep | None,
     wrong: tuple[str, ...],
 ) -> str:
-    """One sentence on what to photograph again, and what that would buy: errors fall with the root of the number of
-    photographs.
+    """Return a sentence on what to photograph again and what this would improve; errors fall with the square root of
+    the number of photographs.
     """
     worst = max(limits, key=lambda one: one.value / one.limit)
     if not worst.is_kept:
@@ -189,7 +204,7 @@ def _advice(
 
 
 def _again(worst: Limit, *, is_anything_wrong: bool) -> str:
-    """What would mend the limit that is kept least."""
+    """Return a sentence on what would improve the figure that exceeds its limit most."""
     thing = AGAIN[worst.mended_by]
     if not math.isfinite(worst.value):
         return (

@@ -1,4 +1,4 @@
-"""Why a board was not found in a photograph: the mistakes that are made most, tried one by one."""
+"""Reasons why a board was not found in a photograph: the most frequent mistakes, tried one by one."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from services.calibrate.cameras.boards import Detection, detect
 from services.core.raw.targets import Board
 
 ENOUGH = 6
-"""Corners: so many tell a board; fewer are a chance or a corner of one."""
+"""Number of corners that identify a board; fewer may be found by chance or belong to a small part of it."""
 
 
 def why_missed(image: NDArray[np.uint8], board: Board, found: Detection) -> str:
-    """What to do about a photograph in which a board shows too few corners, as the end of a sentence.
+    """Return cause and remedy for a photograph in which a board shows too few corners, as the end of a sentence.
 
     Args:
         image: the photograph, grey, 8 bit (H, W).
-        board: as raw.toml describes it.
-        found: the little that was found.
+        board: the board as raw.toml describes it.
+        found: the corners and markers that were found.
     """
     for tried, other, remedy in _other_readings(image, board):
         if len(detect(tried, other).ids) >= max(ENOUGH, 2 * len(found.ids)):
@@ -37,7 +37,7 @@ def why_missed(image: NDArray[np.uint8], board: Board, found: Detection) -> str:
 
 
 def _other_readings(image: NDArray[np.uint8], board: Board) -> Iterator[tuple[NDArray[np.uint8], Board, str]]:
-    """The photograph or the board otherwise, and the remedy where the board is found so."""
+    """Yield changed photographs or board descriptions, each with the remedy if the board is found with it."""
     mirrored = np.ascontiguousarray(image[:, ::-1])
     yield mirrored, board, "the image is mirrored; export it as the camera saw it"
     columns, rows = board.squares

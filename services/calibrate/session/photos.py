@@ -1,4 +1,4 @@
-"""Counts of a raw folder's calibration frames as light: black subtracted, divided by exposure, gain and level."""
+"""Calibration frames of a raw folder as linear light: counts above black, divided by exposure, gain and level."""
 
 from __future__ import annotations
 
@@ -17,19 +17,22 @@ Image = NDArray[np.float32]
 Part = tuple[slice, slice]
 WHOLE: Part = (slice(None), slice(None))
 FINDER_VALUES = 2_000_000
-"""Of a photograph: percentiles of every n-th are those of all, and sorting twenty million takes longer than reading
-them."""
+"""Approximate number of a photograph's values from which percentiles are taken: those of every n-th value are those of
+all, and sorting twenty million values takes longer than reading them."""
 ROUNDING = 1 / 12
-"""Variance of rounding to whole counts."""
+"""Variance in counts² of rounding to whole counts."""
 LOW_PERCENTILE, HIGH_PERCENTILE = 1.0, 99.5
-"""Of a photograph's grey values: what is drawn black and white for the finders of boards, so that a few glints do not
-darken it."""
+"""Percentiles of a photograph's grey values that become black and white for the detection of boards and charts, so that
+a few glints do not darken it."""
 
 
 @dataclass(frozen=True)
 class Black:
-    """A camera without light: mean counts over the image, and the scatter of a pixel from one frame to the next, before
-    rounding.
+    """Black level and noise of a camera without light.
+
+    Attributes:
+        counts: mean counts over the image.
+        noise: standard deviation in counts of a pixel from one frame to the next, without the effect of rounding.
     """
 
     counts: float
@@ -38,12 +41,12 @@ class Black:
 
 @dataclass(frozen=True)
 class Channels:
-    """Light by channel.
+    """Light by channel in a photograph or a part of it.
 
     Attributes:
-        values: counts above black over exposure, gain and level, (h, w, C).
-        pixel: edge of one value in pixels of the photograph: 1, or 2 of a mosaic.
-        saturated: where some channel is full (h, w).
+        values: counts above black, divided by exposure, gain and level (h, w, C).
+        pixel: width of one value in pixels of the photograph: 1, or 2 for a mosaic.
+        saturated: mask of the values with a saturated channel (h, w).
         first_px: column and row of the photograph at which the values begin.
     """
 
@@ -53,26 +56,28 @@ class Channels:
     first_px: tuple[int, int] = (0, 0)
 
     def centres(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Pixels (N, 2) of the photograph at the centres of values."""
+        """Return the positions (N, 2) in the photograph's pixels of the centres of values, given by rows (N,) and
+        columns (N,).
+        """
         return np.asarray(np.stack([columns + 0.5, rows + 0.5], axis=1) * self.pixel + np.array(self.first_px))
 
 
 class Photos:
-    """Reads frames one at a time; black levels are taken once."""
+    """Reader of a raw folder's frames, one at a time; black levels are measured once, at the start."""
 
     def __init__(self, root: Path, folder: RawFolder) -> None:
         self.root, self.folder = root, folder
         self.black = {camera.name: self._black(camera.name) for camera in folder.camera}
 
     def grey(self, frame: RawFrame, part: Part = WHOLE) -> Image:
-        """Brightness (h, w) above black over exposure, gain and level, of a part of a photograph; of a mosaic
-        interpolated.
+        """Return the brightness (h, w) of a part of a photograph: counts above black, divided by exposure, gain and
+        level, as the mean over the channels; a mosaic is interpolated.
 
         Parts of a mosaic begin at even rows and columns.
         """
         counts = self._above_black(frame, read_counts(self.root, self.folder, frame)[part])
         if counts.ndim == 3:
-            # Channel by channel: NumPy's mean over a short last axis takes five times as long.
+            # Add channel by channel, because NumPy's mean over a short last axis takes five times as long.
             total = counts[..., 0].copy()
             for channel in range(1, counts.shape[2]):
                 total += counts[..., channel]
@@ -86,7 +91,7 @@ class Photos:
         return np.asarray(drawn, dtype=np.float32) * np.float32(top / 65535)
 
     def channels(self, frame: RawFrame, part: Part = WHOLE) -> Channels:
-        """Light by channel of a part of a photograph; a mosaic at half its size, without interpolation."""
+        """Return the light by channel in a part of a photograph; a mosaic at half its size, without interpolation."""
         camera = self.folder.camera_named(frame.camera)
         counts = read_counts(self.root, self.folder, frame)[part]
         is_full = np.asarray(counts >= (np.inf if camera.full_counts is None else camera.full_counts))
@@ -111,11 +116,11 @@ class Photos:
 
 
 def black_of(frames: Iterable[NDArray[np.generic]]) -> Black:
-    """Black level and noise of all frames without light, one in memory at a time.
+    """Measure black level and noise from frames without light (H, W) or (H, W, C), one in memory at a time.
 
-    Of two or more frames the noise is each pixel's own scatter (Welford 1962), so that a sensor's fixed pattern is no
-    noise; of one it is the scatter over the image. Rounding to whole counts adds a variance of 1/12, which is taken
-    off.
+    For two or more frames the noise comes from each pixel's own variance over the frames (Welford 1962), so that a
+    sensor's fixed pattern does not count as noise. For a single frame it is the standard deviation over the image. The
+    variance of 1/12 from rounding to whole counts is subtracted.
     """
     mean = squares = np.zeros(())
     count = 0
@@ -129,7 +134,7 @@ def black_of(frames: Iterable[NDArray[np.generic]]) -> Black:
 
 
 def for_finders(grey: Image) -> NDArray[np.uint8]:
-    """A photograph (H, W) in 8 bits, stretched over its own range."""
+    """Return a photograph (H, W) in 8 bits, with its own range of brightness stretched to the full range."""
     step = max(round((grey.size / FINDER_VALUES) ** 0.5), 1)
     low, high = (float(one) for one in np.percentile(grey[::step, ::step], [LOW_PERCENTILE, HIGH_PERCENTILE]))
     drawn = (grey - low) * (255 / max(high - low, 1e-12))

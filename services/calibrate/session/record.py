@@ -1,4 +1,4 @@
-"""A session's results as a calibration record, with one covariance over all of them."""
+"""Calibration record of a session's results, with one joint covariance."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from services.core.raw.records import RawFolder
 
 Floats = NDArray[np.float64]
 REFLECTANCE_SE = 0.01
-"""Relative, of a white sphere's reflectance where raw.toml does not say it: a white standard is certified to about 1
-%."""
+"""Relative standard error of a white sphere's reflectance where raw.toml does not state it: a white standard is
+certified to about 1 %."""
 LIGHT_DRIFT = 1e-4
-"""Relative: a lamp's brightness changes by so much while it warms, whatever the fit says."""
+"""Relative standard error of a lamp's brightness beyond that of the fit: it changes by so much while the lamp warms
+up."""
 
 
 def record_of(
@@ -38,7 +39,7 @@ def record_of(
     valid_days: float,
     inputs: dict[str, str],
 ) -> Calibration:
-    """The record; lights that neither highlights nor a list place are left out."""
+    """Return the calibration record; lights whose position neither highlights nor a list gives are left out."""
     eyes = cameras.eyes if lights is None else lights.fit.eyes
     positions = light_positions(folder, lights)
     return Calibration(
@@ -79,8 +80,8 @@ def record_of(
 
 
 def light_positions(folder: RawFolder, lights: LightsStep | None) -> dict[int, Floats]:
-    """Positions (3,) by number of the light: from highlights, else from the list laid over them, else from the list as
-    it is.
+    """Return the positions (3,) in mm by number of the light: from highlights, else from the list aligned with them, or
+    from the list as it is where there are no mirror spheres.
     """
     found = {} if lights is None else dict(zip(lights.fit.lights.tolist(), lights.fit.positions_mm, strict=True))
     positions = {}
@@ -95,10 +96,11 @@ def light_positions(folder: RawFolder, lights: LightsStep | None) -> dict[int, F
 
 
 def twist_derivative(pose: Floats) -> Floats:
-    """Derivative (6, 6) of a camera's twist, about its own centre in world axes, to its pose camera_from_world.
+    """Return the derivative (6, 6) of a camera's twist, about its own centre in world axes, with respect to its pose
+    camera_from_world (6,).
 
-    The rotation R = exp(r) becomes R exp(−w) under the twist's rotation w, so w = −Rᵀ J dr; and the centre c = −Rᵀ t
-    moves by −Rᵀ dt + w × c.
+    A rotation w of the camera changes the matrix R = exp(r) to R exp(−w), so w = −Rᵀ J dr with the left Jacobian J of
+    r; the centre c = −Rᵀ t moves by −Rᵀ dt + w × c.
     """
     R = rotation_matrix(pose[:3])
     centre = -R.T @ pose[3:]
@@ -113,7 +115,9 @@ def twist_derivative(pose: Floats) -> Floats:
 def uncertainty_of(
     folder: RawFolder, cameras: CamerasStep, lights: LightsStep | None, intensity: IntensityStep | None
 ) -> CalibrationUncertainty:
-    """Covariance of cameras, lights and intensities together; what they share goes from the first to the last."""
+    """Return the joint covariance of cameras, lights and intensities; errors of the cameras are propagated to the
+    lights, and errors of the lights to the intensities.
+    """
     eyes = cameras.eyes if lights is None else lights.fit.eyes
     names, rows = _camera_rows(cameras.names, eyes)
     covariance = cameras.camera_covariance
@@ -130,8 +134,8 @@ def uncertainty_of(
         names += [f"light_gain.{folder.light[n].name}.{channel}" for n in seen for channel in folder.channels]
         moved = np.zeros((len(fit.covariance), covariance.shape[1]))
         if lights is not None:
-            # A light that is believed nearer than it is comes out dimmer: gains go with the positions that highlights
-            # found.
+            # A light whose position is estimated too near gets too low an intensity, so gains are correlated with the
+            # positions from highlights.
             for place, number in enumerate(lights.fit.lights):
                 moved[:, 3 * place : 3 * place + 3] = fit.by_positions[:, 3 * number : 3 * number + 3]
         rows = np.concatenate([rows, moved])
@@ -147,10 +151,10 @@ def uncertainty_of(
 
 
 def gain_covariance(intensity: IntensityStep) -> Floats:
-    """Of the brightness of all photographs together by channel, relative (C, C).
+    """Return the relative covariance (C, C) of the common brightness of all photographs by channel.
 
-    The white sphere's reflectance is wrong alike in all channels; the photographs' scatter is each channel's own. What
-    the lights' places add is hundredths of a per cent, so it is left out.
+    An error of the white sphere's reflectance is the same in all channels; the photographs' scatter is independent
+    between channels. The errors of the lights' positions would add hundredths of a per cent and are left out.
     """
     shared = REFLECTANCE_SE if intensity.reflectance_se is None else intensity.reflectance_se
     scatter = intensity.fit.sigma / len(intensity.photos) ** 0.5
@@ -158,7 +162,9 @@ def gain_covariance(intensity: IntensityStep) -> Floats:
 
 
 def _camera_rows(names: Sequence[str], eyes: Sequence[Eye]) -> tuple[list[str], Floats]:
-    """Names of the cameras' errors, and their derivative to lens values and pose of each camera in turn."""
+    """Return the names of the cameras' errors, and their derivative (10 K, C) with respect to the lens values and pose
+    of each camera in turn.
+    """
     told, blocks, width = [], [], sum(len(eye.lens.values) + 6 for eye in eyes)
     first = 0
     for name, eye in zip(names, eyes, strict=True):
@@ -198,7 +204,7 @@ def _light(
     channels: int,
     positions: Mapping[int, Floats],
 ) -> CalibratedLight:
-    """A light; one that no white sphere was lit by takes the mean intensity, 1."""
+    """Return the record of a light; one without a photograph of a white sphere gets the mean intensity, 1."""
     known = step is not None and bool(np.isfinite(step.fit.intensity[number, 0]))
     lobe = None
     if step is not None and step.fit.exponent > 0:

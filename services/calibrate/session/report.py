@@ -1,4 +1,4 @@
-"""A calibration's report: one HTML file that opens alone."""
+"""Report of a calibration: one HTML file that needs no other file."""
 
 from __future__ import annotations
 

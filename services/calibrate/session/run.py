@@ -1,4 +1,4 @@
-"""One raw folder's calibration frames to ``calibration.json``, its residuals and its report."""
+"""Calibration of a raw folder's frames, and its files ``calibration.json`` and ``residuals.json``."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from services.core.raw.folder import DESCRIPTION, read_raw_folder
 from services.core.store import write_atomic, write_record
 
 VALID_DAYS = 30.0
-"""A rig that stands in a practice is touched within a month."""
+"""Default validity of a calibration: a rig in a dental practice is touched within a month."""
 CALIBRATION, RESIDUALS = CALIBRATION_FILE, "residuals.json"
 
 
 @dataclass(frozen=True)
 class Session:
-    """All that a raw folder's calibration frames say."""
+    """Results of all steps of the calibration of a raw folder, and the judgement on them."""
 
     record: Calibration
     cameras: CamerasStep
@@ -45,8 +45,8 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
 
     Args:
         root: folder with ``raw.toml``.
-        tell: is told each step as it begins.
-        valid_days: for how many days the record says that it holds.
+        tell: called with a description of each step as it begins.
+        valid_days: validity in days that the record states.
 
     Raises:
         CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy.
@@ -94,7 +94,7 @@ def _is_used(kind: str) -> bool:
 
 
 def _residuals(session: Session) -> dict[str, Any]:
-    """What each step left over, by the photograph it comes from."""
+    """Return the residuals of each step, by photograph."""
     fit = session.cameras.fit
     told: dict[str, Any] = {
         "corners": [

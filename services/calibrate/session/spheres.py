@@ -1,4 +1,4 @@
-"""The lights' steps: mirror spheres to positions, white spheres to intensities."""
+"""Steps of the lights: positions from mirror spheres, intensities from white spheres."""
 
 from __future__ import annotations
 
@@ -25,19 +25,29 @@ from services.core.raw.records import FrameKind, RawFrame
 Floats = NDArray[np.float64]
 Fall = tuple[float, float, float]
 WHITE_PIXELS_ACROSS = 60
-"""A white sphere is sampled on a grid of about so many values across: more add no knowledge, as paint and lens limit
-it."""
+"""Approximate number of samples across a white sphere: more add no information, because paint and lens limit it."""
 
 
 LIGHTS_OF_AN_OUTLINE = 12
-"""So many light a sphere from all sides; every further photograph costs its reading a second time."""
+"""Largest number of photographs whose mean shows a sphere's outline: so many lights light it from all sides, and every
+further photograph would have to be read a second time."""
 MIN_UNSATURATED = 0.5
-"""Of a white sphere's pixels: a glint saturates a few, and too long an exposure the whole lit side."""
+"""Smallest fraction of unsaturated samples on a white sphere: a glint saturates a few, too long an exposure the whole
+lit side."""
 
 
 @dataclass(frozen=True)
 class LightsStep:
-    """Where lights are: the fit to highlights, and the list of ``raw.toml`` laid over it where there is one."""
+    """Positions of the lights.
+
+    Attributes:
+        fit: fit to highlights and outlines.
+        views: mirror spheres in photographs.
+        view_names: names of the views, for messages.
+        aligned: the list of ``raw.toml`` aligned with the fit; None where the list is missing or incomplete, or too few
+            lights were found.
+        no_highlight: files in which no highlight was found.
+    """
 
     fit: LightsFit
     views: tuple[SphereView, ...]
@@ -48,13 +58,14 @@ class LightsStep:
 
 @dataclass(frozen=True)
 class IntensityStep:
-    """How bright lights are.
+    """Intensities of the lights.
 
     Attributes:
-        fit: intensities and cameras.
-        photos: of white spheres.
-        middle_mm: mean place of the white spheres (3,), towards which intensities are told.
-        reflectance_se: relative, of the white spheres' reflectance; None where raw.toml does not say it.
+        fit: fitted intensities of the lights and sensitivities of the cameras.
+        photos: photographs of white spheres.
+        middle_mm: mean of the white spheres' centres (3,), towards which intensities are stated.
+        reflectance_se: relative standard error of the white spheres' reflectance; None where raw.toml does not state
+            it.
     """
 
     fit: IntensityFit
@@ -64,10 +75,16 @@ class IntensityStep:
 
 
 def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distance_mm: float) -> LightsStep | None:
-    """Positions of the lights from the folder's mirror spheres; None without any.
+    """Find the positions of the lights from the folder's mirror spheres; None without any.
+
+    Args:
+        photos: the folder's frames.
+        eyes: the calibrated cameras.
+        covariance: covariance (C, C) of the lens values and pose of each camera in turn.
+        distance_mm: approximate distance of the spheres from the cameras.
 
     Raises:
-        CaptureInputError: no sphere is found in a photograph, or its radius cannot be right.
+        CaptureInputError: no outline of the given radius is found in a photograph, or a light has only one highlight.
     """
     groups = _groups(photos, "mirror-sphere")
     if not groups:
@@ -107,19 +124,19 @@ def place_lights(
     listed_mm: Floats,
     missed: tuple[str, ...] = (),
 ) -> LightsStep:
-    """Positions of the lights from spheres that were found, and the list laid over them where it is whole.
+    """Fit the positions of the lights to the spheres that were found, and align the list with them if it is complete.
 
     Args:
         views: mirror spheres in photographs.
-        view_names: of the same, for people.
+        view_names: names of the views, for messages.
         eyes: the calibrated cameras.
-        lights: their names.
-        covariance: of lens values and pose of each camera in turn.
+        lights: names of the lights.
+        covariance: covariance (C, C) of the lens values and pose of each camera in turn.
         listed_mm: positions that raw.toml lists (L, 3), NaN where it lists none.
         missed: files in which no highlight was found.
 
     Raises:
-        CaptureInputError: a light that shows only once.
+        CaptureInputError: a light has only one highlight.
     """
     fit = fit_lights(views, eyes, lights, covariance)
     aligned = None
@@ -137,14 +154,18 @@ def measure_intensity(
     distance_mm: float,
     falls: Mapping[str, Fall] = MappingProxyType({}),
 ) -> IntensityStep | None:
-    """Intensities of the lights from the folder's white spheres; None without any.
+    """Measure the intensities of the lights from the folder's white spheres; None without any.
 
     Args:
-        photos: the folder.
+        photos: the folder's frames.
         eyes: calibrated cameras.
-        lights_mm: positions (L, 3), NaN where not known.
-        distance_mm: of the spheres, roughly.
-        falls: a, b, c of the fall of light by camera.
+        lights_mm: positions of the lights (L, 3), NaN where unknown.
+        distance_mm: approximate distance of the spheres from the cameras.
+        falls: vignetting a, b, c by camera.
+
+    Raises:
+        CaptureInputError: no outline is found in a photograph, a sphere is saturated or dark, or no photograph has
+            enough usable pixels.
     """
     groups = _groups(photos, "white-sphere")
     if not groups:
@@ -174,13 +195,13 @@ def measure_intensity(
     ]
     middle = np.mean([sphere.centre_mm for sphere in spheres], axis=0)
     told = [thing.reflectance_se for thing in thing_of.values()]
-    # Of several spheres the least certain counts, and one of which nothing is said leaves all unsaid.
+    # Among several spheres the largest standard error counts; if one sphere has none, there is none for all.
     se = None if None in told else max(one for one in told if one is not None)
     return IntensityStep(fit_intensity(found, eyes, spheres, lights_mm, lights), tuple(found), middle, se)
 
 
 def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFrame]]:
-    """Frames of spheres by camera and place; a sphere without a place stood at one."""
+    """Return the frames of spheres by camera and place; all frames of a sphere without a place are of one place."""
     groups: dict[tuple[str, str], list[RawFrame]] = defaultdict(list)
     for frame in photos.folder.frame:
         if frame.kind == kind:
@@ -189,7 +210,9 @@ def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFr
 
 
 def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: float, distance_mm: float) -> Outline:
-    """The outline in the mean of some lights from all around, as each alone leaves a part of it dark."""
+    """Find a sphere's outline in the mean of photographs under lights from all sides, because each light alone leaves a
+    part of the outline dark.
+    """
     chosen = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, LIGHTS_OF_AN_OUTLINE).astype(int))]
     total = photos.grey(chosen[0]).copy()
     for frame in chosen[1:]:
@@ -205,7 +228,7 @@ def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: fl
 
 
 def _sampled(photos: Photos, frame: RawFrame, outline: Outline) -> tuple[Floats, Floats]:
-    """Pixels (N, 2) and light by channel (N, C) on a grid over a sphere, saturated values left out."""
+    """Return pixels (N, 2) and light by channel (N, C) on a grid over a sphere, without saturated values."""
     width, height = photos.folder.camera_named(frame.camera).size
     channels = photos.channels(frame, about_outline(outline.points_px, (height, width)))
     points = outline.points_px - np.array(channels.first_px)

@@ -1,4 +1,4 @@
-"""What in a calibration session looks wrong, each in a sentence with its remedy."""
+"""Signs of mistakes in a calibration session, each as a sentence with its remedy."""
 
 from __future__ import annotations
 
@@ -18,26 +18,32 @@ from services.calibrate.session.spheres import IntensityStep, LightsStep
 from services.core.raw.records import RawFolder
 
 MAX_EDGE_SHIFT_PX = 1.0
-"""Edges are found to half a pixel; all of them further out or in means that the sphere's radius is not what was
-said."""
+"""Largest edge shift of a camera. Edges are located to half a pixel; if all of them lie further out or in, the sphere's
+radius is not the stated one."""
 MAX_BAD_SHARE = 0.5
-"""Of a view's corners: single ones are hidden or glare, most of them are another pose."""
+"""Largest fraction of outliers among a view's corners: single corners are outliers where they are hidden or glare, most
+of them only where the pose is wrong."""
 MAX_FOCAL_SE = 0.01
-"""Relative: ten tilted boards leave a thousandth, boards that all face the camera leave several per cent."""
+"""Largest relative standard error of a focal length: ten tilted boards give a thousandth, boards that all face the
+camera several per cent."""
 MIN_APART_MM = 1.0
-"""Two lamps are wider than that."""
+"""Smallest distance between two lights: lamps are wider than this."""
 MANY_SIGMAS = 6.0
-"""Of a photograph's robust scatter: a hundred photographs of three channels pass it by chance once in a million
-sessions."""
+"""Residual of a photograph in robust standard deviations beyond which it is suspect: among a hundred photographs of
+three channels one exceeds it by chance once in a million sessions."""
 MIN_OFF_SHARE = 0.03
-"""Paint, shadow and glare leave a per cent; another light or exposure is a step of more than three."""
+"""Smallest relative residual of a suspect photograph: paint, shadow and glare cause a per cent, another light or
+exposure more than three."""
 MIN_MOVE_PX = 1.0
+"""Smallest rms residual of an outline that counts as that of a moved sphere."""
 MOVED_TIMES = 4.0
-"""An outline's rms over that of all: where a sphere moved between photographs its outlines disagree by pixels."""
+"""Ratio of an outline's rms residual to the median of all beyond which the sphere has moved: where it moved between
+photographs, its outlines disagree by pixels."""
 MAX_BLACK_SHARE = 0.1
-"""Of the range: black levels are set to a few per cent of it."""
+"""Largest black level as a fraction of the range: cameras set it to a few per cent."""
 MAX_SCALE_ERROR = 0.03
-"""A list measured by hand is right to 10 mm in a metre; 3 % are another unit or another board."""
+"""Largest relative error of a list's scale: a list measured by hand is right to 10 mm in a metre, and 3 % mean another
+unit or another board."""
 
 
 def suspicions(
@@ -49,12 +55,15 @@ def suspicions(
     black: Mapping[str, Black] | None = None,
     inputs: Mapping[str, str] | None = None,
 ) -> Iterator[str]:
-    """Sentences on what looks wrong; none of a good session.
+    """Yield a sentence for everything that looks wrong; none for a good session.
 
     Args:
-        folder: names.
-        cameras, lights, intensity, colours: what the steps found.
-        black: by camera.
+        folder: the raw folder's description.
+        cameras: result of the cameras' step.
+        lights: result of the mirror spheres' step.
+        intensity: result of the white spheres' step.
+        colours: result of the colours' step.
+        black: black level by camera.
         inputs: SHA-256 of each file.
     """
     names = [light.name for light in folder.light]
@@ -121,7 +130,9 @@ def _about_boards(cameras: CamerasStep) -> Iterator[str]:
 
 
 def _of_a_bad_view(cameras: CamerasStep, number: int, name: str) -> str:
-    """Whether another place or another camera draws a view's corners where they are, or else that something moved."""
+    """Return a sentence that says whether a view with many outliers belongs to another place or to another camera, or
+    else that something moved.
+    """
     fit = cameras.fit
     corners = fit.corners.kept(fit.corners.view == number)
     limit = 10 * float(fit.sigma_px.max())
@@ -215,7 +226,7 @@ def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
 
 
 def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
-    """Two lights at one place are one light listed twice."""
+    """Yield a sentence for each pair of lights at one position, which are one light under two names."""
     positions = lights.fit.positions_mm
     for one in range(len(positions)):
         for two in range(one):
@@ -228,7 +239,7 @@ def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
 
 
 def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensityStep) -> Iterator[str]:
-    """Photographs of white spheres that are brighter or darker than all others allow."""
+    """Yield a sentence for each photograph of a white sphere whose brightness disagrees with the other photographs."""
     off = intensity.fit.residuals.mean(axis=1)
     scatter = 1.4826 * float(np.median(np.abs(off)))
     for number in np.flatnonzero(np.abs(off) > max(MANY_SIGMAS * scatter, MIN_OFF_SHARE)):
