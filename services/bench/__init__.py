@@ -1,4 +1,4 @@
-"""Run time against error, with peers in the same run. Every benchmark returns rows; see ``Row``."""
+"""Benchmarks of run time against error, with peers measured in the same run. Every benchmark returns rows (``Row``)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ class Row(Record):
 
     benchmark: str
     peer: str
-    """Who was measured; ``dentine`` is this engine."""
+    """Name of the program or method that was measured; ``dentine`` is this engine."""
     seconds: float
+    """Run time; the benchmark says whether it is processor time or time by the clock."""
     error: float
     """Relative standard error of the whole result, sqrt(sum of variances) / norm."""
     efficiency_ratio: float | None = None
-    """Our 1 / (variance x time) divided by the peer's; only in a peer's summary row."""
+    """This engine's 1 / (variance x time) divided by the peer's; only in a peer's summary row."""

@@ -1,4 +1,4 @@
-"""Pictures of benchmarks: error against run time, everyone measured in the same run in the same picture."""
+"""Pictures of benchmarks: error against run time, with all peers of one run in one picture."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ COLUMNS = 4
 PANEL_INCHES = (4.6, 3.9)
 OURS = "dentine"
 SUMMARY = "-summary"
-"""Ends the benchmark's name in rows that belong into the picture of the benchmark they summarise."""
+"""Suffix of the benchmark's name in summary rows, which are drawn in the panel of the benchmark that they summarise."""
 
 Rows = list[dict[str, Any]]
 
 
 def error_against_time(rows: Rows) -> Figure:
-    """One panel per benchmark, or per parameter of one, log-log, this engine first; ``rows`` are as ``Row.model_dump``
-    gives them.
+    """Draw a log-log panel for each benchmark, or for each parameter of a benchmark, with this engine first.
+
+    Args:
+        rows: rows as ``Row.model_dump`` returns them.
     """
     panels: dict[tuple[str, str], Rows] = {}
     for row in rows:
         panels.setdefault((row["benchmark"].removesuffix(SUMMARY), row.get("parameter") or ""), []).append(row)
-    # A summary over several panels has nothing to draw.
+    # Leave out panels that would contain summary rows only.
     panels = {
         name: drawn for name, drawn in panels.items() if any(not row["benchmark"].endswith(SUMMARY) for row in drawn)
     }
@@ -39,7 +41,7 @@ def error_against_time(rows: Rows) -> Figure:
 
 
 def grid(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels, none of it known to pyplot."""
+    """Return a figure with so many panels, which is not registered with pyplot."""
     columns = min(count, COLUMNS)
     lines = -(-count // columns)
     figure = Figure(figsize=(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * lines), layout="constrained")
@@ -47,12 +49,14 @@ def grid(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def draw_errors(axes: Axes, rows: Rows, *, by: str = "peer", lines: bool = True) -> None:
-    """Points of everyone measured; a peer's efficiency ratio stands in the legend.
+    """Draw the points of all peers; a peer's efficiency ratio is written in the legend.
 
     Args:
-        by: field that tells them apart.
-        lines: also draw for everyone what more or fewer paths give from the most efficient point, error = 1 /
-            sqrt(efficiency x time).
+        axes: panel to draw on.
+        rows: rows as ``Row.model_dump`` returns them.
+        by: field by which the rows are grouped.
+        lines: also draw, through the most efficient point of each group, the error that more or fewer paths would give:
+            error = 1 / sqrt(efficiency x time).
     """
     drawn = [row for row in rows if row["error"] > 0 and row["seconds"] > 0]
     for number, one in enumerate(sorted({row[by] for row in drawn}, key=lambda one: (one != OURS, one))):
@@ -69,7 +73,7 @@ def draw_errors(axes: Axes, rows: Rows, *, by: str = "peer", lines: bool = True)
 
 
 def finish(axes: Axes, x: str, y: str) -> None:
-    """Both axes logarithmic and at least a decade long, with names, grid and legend."""
+    """Make both axes logarithmic and at least about a decade long, and add their names, a grid and a legend."""
     axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
     axes.set(xlim=_a_decade(*axes.get_xlim()), ylim=_a_decade(*axes.get_ylim()))
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
@@ -86,5 +90,5 @@ def _a_decade(low: float, high: float) -> tuple[float, float]:
 
 
 def write_png(figure: Figure, path: Path | BinaryIO) -> None:
-    """Render without a display."""
+    """Write a figure as PNG without a display."""
     FigureCanvasAgg(figure).print_png(path)  # type: ignore[no-untyped-call]  # matplotlib has types, but none here

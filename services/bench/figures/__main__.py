@@ -1,7 +1,7 @@
 """Figures of teeth 2018 by this project's own fits: ``python -m services.bench.figures --out DIR``.
 
-Each figure is a PNG with its caption beside it, and ``index.html`` shows all that are there. Captures and fits are made
-once, by the command line, and kept below ``DIR/work``; what is finished is used again.
+Each figure is a PNG with a text file of its caption beside it, and ``index.html`` shows all figures in the folder.
+Captures and fits are made once, by the command line, and kept below ``DIR/work``; finished ones are used again.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ FIGURES: Mapping[str, Drawing] = MappingProxyType(
         "ambient": under_ambient_light,
     }
 )
-"""By name, numbered as in teeth 2018."""
+"""Functions that draw the figures, by the figure's name; numbers are those of teeth 2018."""
 
 
 def chosen_figures(names: str | None) -> tuple[str, ...]:
-    """Of a list of names with commas, in the order of the paper; all without one.
+    """Return the figures of a list of names with commas, in the order of the paper; all figures without a list.
 
     Raises:
-        InputError: there is no such figure.
+        InputError: a figure does not exist, or the list is empty.
     """
     asked = tuple(FIGURES) if names is None else tuple(filter(None, (name.strip() for name in names.split(","))))
     for name in asked:
@@ -63,7 +63,7 @@ def chosen_figures(names: str | None) -> tuple[str, ...]:
 
 
 def keep(folder: Path, name: str, drawn: Drawn) -> None:
-    """Write a figure and its caption, and the page of all that are there."""
+    """Write a figure and its caption, and the page of all figures in the folder."""
     write_atomic(folder / f"{name}.png", png_bytes(drawn.picture))
     write_atomic(folder / f"{name}.txt", (drawn.caption + "\n").encode())
     present = [
@@ -73,7 +73,7 @@ def keep(folder: Path, name: str, drawn: Drawn) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make figures; returns the exit status."""
+    """Make the figures that the command line's arguments name, and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m services.bench.figures", description=(__doc__ or "").split("\n\n", maxsplit=1)[0]
     )

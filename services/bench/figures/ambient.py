@@ -1,5 +1,5 @@
-"""How far light from all around, which the model of a capture does not know, moves what a fit finds (teeth 2018,
-section 7).
+"""Bias of a fit's parameters by ambient light from all around, which the model of a capture does not contain (teeth
+2018, section 7).
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ AMBIENT_SAMPLES = 256
 QUANTITIES = tuple(
     f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in ("sigma_s_reduced", "absorption_share")
 )
-"""Reduced scattering, per mm, and 1 - alpha'."""
+"""Quantities that are compared with the truth: reduced scattering, per mm, and 1 - alpha' of either tissue."""
 
 Row = dict[str, Any]
 
 
 def under_ambient_light(cast: Cast) -> Drawn:
-    """A fit of one view with constant light from all around added to its photographs."""
+    """Draw the results of fits of one view with constant light from all around added to its photographs."""
     rows = ambient_rows(cast)
     return Drawn(
         plot(rows),
@@ -46,11 +46,11 @@ def under_ambient_light(cast: Cast) -> Drawn:
 
 
 def ambient_rows(cast: Cast) -> list[Row]:
-    """A fit for each strength of ambient light, none first.
+    """Fit the photographs with each strength of ambient light, first without any.
 
     Returns:
-        Rows of ``fraction`` of the mean radiance of fitted photographs, ``fit_error``, ``held_out_error``, and
-        ``value``, ``se`` and ``truth`` by quantity.
+        Rows of ``fraction`` (strength as a fraction of the mean radiance of the fitted photographs), ``fit_error``,
+        ``held_out_error``, and for each quantity its ``value``, ``se`` and ``truth``.
     """
     case = cast.lone_view
     source = case.capture.rendered(cast.work)
@@ -67,7 +67,8 @@ def ambient_rows(cast: Cast) -> list[Row]:
 
 
 def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.float64]]:
-    # By camera, of the true media; kept beside the capture, as it serves every strength.
+    # Return the added radiance (H, W) by camera, rendered with the true media. The render is kept beside the capture,
+    # because it serves every strength.
     kept = source.with_name(f"{source.name}-around.npz")
     description = read_record(source / "capture.json", FolderCapture)
     if not kept.is_file():
@@ -97,7 +98,7 @@ def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.fl
     ]
     mean = float(np.concatenate([image[image > 0] for image in fitted]).mean())
     with np.load(kept) as stored:
-        # The surroundings themselves are seen beside the tooth and are masked in a capture.
+        # Keep the pixels of the tooth alone: those beside it show the surroundings, which are masked in a capture.
         on_tooth = {
             camera: np.where(_tooth_pixels(source, description, camera), stored[camera], 0.0) for camera in stored.files
         }
@@ -110,7 +111,7 @@ def _tooth_pixels(source: Path, description: FolderCapture, camera: str) -> NDAr
 
 
 def described(report: FitReport, media: Mapping[str, Mapping[str, float]]) -> Row:
-    """What a fit found of each quantity beside the truth."""
+    """Return a fit's estimate of each quantity, with the truth."""
     row: Row = {"fit_error": report.fit_error[CHANNEL], "held_out_error": report.held_out_error[CHANNEL]}
     for quantity in QUANTITIES:
         part, leaf = quantity.split(".")
@@ -124,14 +125,14 @@ def described(report: FitReport, media: Mapping[str, Mapping[str, float]]) -> Ro
 
 
 def found_over_true(row: Row, quantity: str) -> str:
-    """A quantity's ratio to the truth, with its standard error."""
+    """Return the ratio of a quantity to its truth, with its standard error, as text."""
     point = row[quantity]
     ratio = f"{point['value'] / point['truth']:.2f}"
     return ratio if point["se"] is None else f"{ratio} ± {point['se'] / point['truth']:.2f}"
 
 
 def sentence(rows: Sequence[Row]) -> str:
-    """What each fit found, over what is true."""
+    """Return a sentence with the ratios of all fits' estimates to the truth."""
     parts = []
     for row in rows:
         found = ", ".join(found_over_true(row, quantity) for quantity in QUANTITIES)
@@ -141,7 +142,7 @@ def sentence(rows: Sequence[Row]) -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The same as a table in Markdown, with errors and truth."""
+    """Return a Markdown table of the estimates of all fits, with standard errors and truth."""
     head = (
         "| ambient light | σs' enamel, per mm | 1 − α' enamel | σs' dentin, per mm | 1 − α' dentin | fit | held out"
         " |\n|---|---|---|---|---|---|---|\n"
@@ -159,7 +160,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def plot(rows: Sequence[Row]) -> NDArray[np.uint8]:
-    """Found over true, with standard errors, against the strength of the ambient light."""
+    """Draw the ratios of estimates to truth, with standard errors, against the strength of the ambient light."""
     from PIL import Image
 
     from services.bench.plots import grid, write_png

@@ -1,4 +1,4 @@
-"""The captures and fits behind the figures, made once by ``dentine phantom`` and ``dentine run`` and kept below one
+"""Captures and fits that the figures show, made once by ``dentine phantom`` and ``dentine run`` and kept below one
 folder.
 """
 
@@ -29,20 +29,22 @@ JOB = "job.toml"
 
 @dataclass(frozen=True)
 class Capture:
-    """A virtual capture; its folder's name holds its options, so that others are never taken for it."""
+    """A virtual capture. Its folder's name contains a fingerprint of its options, so that a capture with other options
+    is never used in its place.
+    """
 
     name: str
     options: Mapping[str, Any]
-    """Of ``dentine phantom``, without their dashes; True for a switch."""
+    """Options of ``dentine phantom`` without their leading dashes; True for a switch."""
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """As the command line takes them."""
+        """The options as arguments of the command line."""
         named = ((f"--{name}", value) for name, value in sorted(self.options.items()) if value is not False)
         return tuple(word for option, value in named for word in ((option,) if value is True else (option, str(value))))
 
     def rendered(self, work: Path) -> Path:
-        """Its folder, rendered unless that is done."""
+        """Return the capture's folder below ``work``, and render it if it does not exist."""
         folder = work / f"capture-{self.name}-{fingerprint(self.arguments)}"
         if not (folder / "capture.json").is_file():
             run_dentine("phantom", "--out", str(folder), *self.arguments)
@@ -56,23 +58,24 @@ class Case:
     name: str
     capture: Capture
     cameras: tuple[str, ...]
-    """Those that are kept at all."""
+    """Cameras whose images are kept, fitted or held out."""
     fitted_cameras: tuple[str, ...]
     fitted_lights: tuple[str, ...]
-    """Images of these cameras under these lights are fitted, all others are held out."""
+    """Images of the fitted cameras under these lights are fitted, all others are held out."""
     job: Mapping[str, Any] = field(default_factory=dict)
-    """Options beside the capture."""
+    """Options of the job other than the capture."""
 
     def fitted(self, work: Path) -> Path:
-        """The job's folder, fitted unless that is done."""
+        """Return the job's folder below ``work``, and run the fit if it is not finished."""
         return self.fitted_with(work, {})
 
     def fitted_with(self, work: Path, added: Mapping[str, Array], label: str = "") -> Path:
-        """The same with something added to the photographs.
+        """Return the folder of the job with radiance added to the photographs, and run the fit if it is not finished.
 
         Args:
+            work: folder of all captures and fits.
             added: radiance (H, W) by camera, added to each of its images.
-            label: tells such jobs apart.
+            label: part of the folder's name that distinguishes such jobs.
         """
         source = self.capture.rendered(work)
         options = {"capture": "capture", **self.job}
@@ -90,16 +93,23 @@ class Case:
 
 
 def job_of(folder: Path) -> tuple[Path, JobSpec]:
-    """The folder of the stages and the options of a case's fit."""
+    """Return the folder of the stages of a case's fit, and the fit's options."""
     return folder / "job", read_job(folder / JOB)
 
 
 def write_photographs(source: Path, target: Path, case: Case, added: Mapping[str, Array], seed: int = 1) -> None:
-    """Copy a capture's images of the case's cameras, with sensor noise and what else is added, marked as fitted or held
-    out.
+    """Copy a capture's images of the case's cameras, with sensor noise and added radiance, each marked as fitted or
+    held out.
+
+    Args:
+        source: folder of the capture.
+        target: folder to write, replaced if it exists.
+        case: the case.
+        added: radiance (H, W) by camera, added to each of its images.
+        seed: seed of the sensor noise.
 
     Raises:
-        InputError: the case names a camera or light that the capture lacks, or nothing is left to fit.
+        InputError: the case names a camera or light that the capture lacks, or holds all images out.
     """
     description = read_record(source / "capture.json", FolderCapture)
     for kind, wanted, known in (
@@ -134,15 +144,15 @@ def write_photographs(source: Path, target: Path, case: Case, added: Mapping[str
 
 
 def fingerprint(value: object) -> str:
-    """Eight digits that differ where a JSON value does."""
+    """Return eight hexadecimal digits of the hash of a JSON value."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def run_dentine(*arguments: str) -> None:
-    """Run the command in a process of its own, its output shown.
+    """Run ``dentine`` with these arguments in a process of its own, and show its output.
 
     Raises:
-        InputError: it failed; what it said stands above.
+        InputError: the command failed; the reason is in its output.
     """
     done = subprocess.run([sys.executable, "-m", "services", *arguments], check=False)  # noqa: S603 - our own command
     if done.returncode:

@@ -1,4 +1,4 @@
-"""Which captures and fits the figures show, at the size that is asked for."""
+"""Definitions of the captures and fits that the figures show, at full or reduced size."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from services.core.records import FolderCapture
 from services.core.store import read_record
 
 FRONT_LIGHTS = tuple(f"l{n}" for n in range(9))
-"""Of eighteen: up to 70 degrees from the front."""
+"""The nine of eighteen lights that lie up to 70 degrees from the front."""
 SIDE_LIGHTS = tuple(f"l{n}" for n in range(9, 18))
-"""From there to 108 degrees, a little from behind."""
+"""The other nine lights, from there to 108 degrees, a little from behind."""
 FIVE_LIGHTS, FIVE_OTHERS = ("l0", "l4", "l8", "l12", "l16"), ("l2", "l6", "l10", "l14", "l17")
 SPREAD_LIGHTS = tuple(f"l{n}" for n in range(12) if n % 4 != 3)
-"""Of twelve."""
+"""Nine of twelve lights, spread over all of them."""
 JAW_LIGHTS = tuple(f"l{n}" for n in range(5))
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How large captures and fits are, and how many paths the figures themselves take."""
+    """Sizes of the captures and fits, and numbers of paths of the figures' own renders."""
 
     tooth_mm: float
     lone_mm: float
     jaw_mm: float
     step: int
-    """Teeth are fitted to every so many pixels."""
+    """Edge in pixels of the squares to whose means teeth are fitted."""
     photo_samples: int
     jaw_photo_samples: int
     shown_samples: int
@@ -42,7 +42,7 @@ class Effort:
     environment_samples: int
     environment_px: int
     ambient: tuple[float, ...]
-    """Constant light from all around, as fractions of the photographs' mean radiance."""
+    """Strengths of the constant light from all around, as fractions of the photographs' mean radiance."""
 
 
 FULL = Effort(
@@ -62,21 +62,21 @@ QUICK = Effort(
 
 @dataclass(frozen=True)
 class Cast:
-    """All that figures are made of."""
+    """Captures and fits of all figures."""
 
     effort: Effort
     work: Path
-    """Where captures and fits are kept."""
+    """Folder in which captures and fits are kept."""
     scan: Path | None = None
-    """Folder capture of a scanned incisor whose meshes are used; None for the procedural one."""
+    """Folder capture of a scanned incisor whose meshes are used; None for the procedural incisor."""
 
     @property
     def tooth_name(self) -> str:
-        """In captions."""
+        """Name of the incisor in captions."""
         return "a procedural incisor" if self.scan is None else "a micro-CT incisor"
 
     def _incisor(self) -> dict[str, Any]:
-        # The scanned one turned upright, towards the cameras of its own capture.
+        # Turn the scanned incisor upright, with its front towards the cameras of its own capture.
         if self.scan is None:
             return {}
         files = {name: self.work / "incisor" / f"{name}.ply" for name in ("outer", "dentin")}
@@ -93,7 +93,7 @@ class Cast:
     def _isolated(
         self, name: str, cameras: tuple[str, ...], fitted: tuple[str, ...], lights: tuple[str, ...], channels: int = 1
     ) -> Case:
-        # A fit of an isolated tooth with known dentin, three cameras and eighteen lights.
+        # Return a fit of an isolated tooth with known dentin; its capture has three cameras and eighteen lights.
         capture = self._phantom(
             f"tooth{channels}",
             self.effort.tooth_mm,
@@ -114,23 +114,23 @@ class Cast:
 
     @property
     def front(self) -> Case:
-        """Fitted from the front, with front lights."""
+        """A fit of one camera under the front lights."""
         return self._isolated("front", ("c1", "c2"), ("c1",), FRONT_LIGHTS)
 
     @property
     def five_lights(self) -> Case:
-        """Fitted to three cameras and five lights, in colour."""
+        """A fit of three cameras under five lights, in colour."""
         cameras = ("c0", "c1", "c2")
         return self._isolated("five-lights", cameras, cameras, FIVE_LIGHTS, channels=3)
 
     @property
     def two_cameras(self) -> Case:
-        """Fitted to two cameras of three."""
+        """A fit of two of three cameras."""
         return self._isolated("two-cameras", ("c0", "c1", "c2"), ("c1", "c2"), FIVE_LIGHTS)
 
     @property
     def stained(self) -> Case:
-        """A stained incisor."""
+        """A fit of a stained incisor."""
         capture = self._phantom(
             "stained", self.effort.tooth_mm, 2 * self.effort.photo_samples, cameras=2, lights=12, stains=True, seed=4
         )
@@ -139,14 +139,16 @@ class Cast:
 
     @property
     def lone_view(self) -> Case:
-        """The procedural incisor from one side, nine lights of twelve fitted: small, for what takes many fits."""
+        """A fit of one view of the procedural incisor under nine of twelve lights; small, for figures that need many
+        fits.
+        """
         capture = self._phantom("lone-view", self.effort.lone_mm, 2 * self.effort.photo_samples, cameras=1, lights=12)
         return Case(
             "lone-view", capture, ("c0",), ("c0",), SPREAD_LIGHTS, {"dentin": "known"} | dict(self.effort.tooth_job)
         )
 
     def jaw(self, subject: int, fitted: tuple[str, ...] = ("c0", "c1", "c2")) -> Case:
-        """A whole jaw of a random subject."""
+        """Return a fit of a whole jaw of a random subject."""
         capture = self._phantom(
             f"jaw{subject}",
             self.effort.jaw_mm,

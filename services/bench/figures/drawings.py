@@ -20,14 +20,14 @@ DIFFERENCE = f"Differences are fit minus photograph, blue to orange within ±{10
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure and what is said below it."""
+    """A figure and the caption below it."""
 
     picture: Image8
     caption: str
 
 
 def front_and_side(cast: Cast) -> Drawn:
-    """Fig. 8: nine front lights fitted; a side view and nine side lights were not."""
+    """Draw fig. 8: nine front lights, which were fitted, and a side view and nine side lights, which were not."""
     comparisons = Fitted(cast.front.fitted(cast.work)).compared(cast.effort.shown_samples)
     groups = [("c1", FRONT_LIGHTS), ("c2", FRONT_LIGHTS), ("c1", SIDE_LIGHTS)]
     rows = [
@@ -49,7 +49,7 @@ def front_and_side(cast: Cast) -> Drawn:
 
 
 def stages(cast: Cast) -> Drawn:
-    """Fig. 9: a homogeneous tooth, both media, with stains, beside the photograph."""
+    """Draw fig. 9: a homogeneous tooth, a tooth of both media and one with stains, beside the photograph."""
     fitted = Fitted(cast.stained.fitted(cast.work))
     (channel,) = fitted.channels
     homogeneous = similar_tissue(fitted.stage_tissue(channel, "homogeneous"), SIMILAR_G)
@@ -96,7 +96,7 @@ def stages(cast: Cast) -> Drawn:
 
 
 def five_lights(cast: Cast) -> Drawn:
-    """Fig. 10: three cameras and five lights fitted, five lights unseen."""
+    """Draw fig. 10: three cameras under five lights, which were fitted, and under five others, which were not."""
     comparisons, cameras = (
         Fitted(cast.five_lights.fitted(cast.work)).compared(cast.effort.shown_samples),
         ("c0", "c1", "c2"),
@@ -123,7 +123,7 @@ def five_lights(cast: Cast) -> Drawn:
 
 
 def unseen_camera(cast: Cast) -> Drawn:
-    """Fig. 13: two cameras fitted, the third is shown."""
+    """Draw fig. 13: two cameras, which were fitted, and a third one, which was not."""
     comparisons = Fitted(cast.two_cameras.fitted(cast.work)).compared(cast.effort.shown_samples)
     rows = [
         [drawn for camera in ("c0", "c1", "c2") for drawn in _drawn(comparisons, (camera, light))]
@@ -147,7 +147,7 @@ def unseen_camera(cast: Cast) -> Drawn:
 
 
 def whole_jaw(cast: Cast, subject: int) -> Drawn:
-    """Figs. 11 and 12: all teeth of a jaw, three views."""
+    """Draw figs. 11 and 12: all teeth of a jaw in three views."""
     return _jaw(cast, cast.jaw(subject))
 
 
@@ -178,7 +178,11 @@ def _percent(error: float) -> str:
 
 
 def caption_page(captions: Iterable[tuple[str, str]]) -> str:
-    """A page of all figures: file name without its ending, and caption."""
+    """Return an HTML page of all figures.
+
+    Args:
+        captions: for each figure the name of its file without the suffix, and its caption.
+    """
     from html import escape
 
     parts = [

@@ -1,5 +1,5 @@
-"""Fitted teeth in other light than a dome's: under a photographed environment, with the highlights that a fit leaves
-out.
+"""Fitted teeth in light other than a dome's: under a photographed environment, with the highlights that a fit does not
+model.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ TURNS_DEGREES = (0.0, 120.0, 240.0)
 
 
 def memorial() -> Path | None:
-    """The environment, where this data lies beside the checkout."""
+    """Return the file of the environment; None where this data does not lie beside the checkout."""
     path = Path(__file__).resolve().parents[4] / MEMORIAL
     return path if path.is_file() else None
 
 
 def under_an_environment(cast: Cast) -> Drawn:
-    """The tooth of Fig. 10 under an environment from three sides, without and with its mirror image.
+    """Draw the tooth of fig. 10 under an environment in three orientations, without and with mirror reflection.
 
     Raises:
-        InputError: there is no environment.
+        InputError: the environment's file does not exist.
     """
     fitted = Fitted(cast.five_lights.fitted(cast.work))
     environment = read_environment(memorial() or MEMORIAL)
@@ -75,7 +75,7 @@ def under_an_environment(cast: Cast) -> Drawn:
 
 
 def finer(camera: Camera, height_px: int) -> Camera:
-    """The same camera with pixels so small that its image has about this height."""
+    """Return the camera with pixels of another size, so that its image has about this height."""
     factor = height_px / camera.size[1]
     size = (max(round(camera.size[0] * factor), 1), max(round(camera.size[1] * factor), 1))
     K = np.diag([factor, factor, 1.0]) @ np.asarray(camera.K)

@@ -1,4 +1,4 @@
-"""A finished fit, rendered anew beside its photographs."""
+"""A finished fit, rendered again and compared with its photographs."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from services.fit.transport.engine import Engine
 from services.fit.transport.scene.recipe import View
 
 Image = tuple[str, str]
-"""Camera and light."""
+"""Names of an image's camera and light."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """An image beside its photograph, and the sums of its error."""
+    """A rendered image beside its photograph, and the sums of its error."""
 
     picture: Picture
     sums: ErrorSums
@@ -45,13 +45,15 @@ Comparisons = Mapping[Image, Comparison]
 
 
 def error_of(comparisons: Comparisons, images: Iterable[Image]) -> float:
-    """Relative error over some images, both noises taken out; not below what the samples resolve."""
+    """Return the relative error over some images, without the noise of renders and photographs, and not below its own
+    Monte Carlo standard error.
+    """
     total = sum((comparisons[image].sums for image in images), ErrorSums())
     return total.resolved_error or 0.0
 
 
 def loss_of(comparisons: Comparisons, images: Iterable[Image]) -> float:
-    """Relative squared error over some images, the photographs' noise included."""
+    """Return the relative squared error over some images, with the photographs' noise included."""
     return sum((comparisons[image].sums for image in images), ErrorSums()).loss or 0.0
 
 
@@ -63,7 +65,9 @@ class Fitted:
 
     @cached_property
     def spec(self) -> JobSpec:
-        """Its options, with every pixel in place of every n-th: what is shown was not all fitted."""
+        """The fit's options, but with single pixels instead of means over squares of pixels, so that pictures have the
+        photographs' own resolution.
+        """
         return job_of(self.folder)[1].model_copy(update={"pixel_step": 1})
 
     @cached_property
@@ -72,12 +76,12 @@ class Fitted:
 
     @property
     def report(self) -> FitReport:
-        """What it found."""
+        """The fit's report."""
         return self._stage[1]
 
     @cached_property
     def observations(self) -> Observations:
-        """What it saw, a jaw's teeth with the dentin that was assumed."""
+        """The fit's observations; a jaw's teeth have the dentin that the fit assumed."""
         found = read_observations(job_of(self.folder)[0], self.spec)
         return (
             found
@@ -87,11 +91,11 @@ class Fitted:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Those that were fitted."""
+        """Names of the fitted channels."""
         return tuple(self.report.parameters)
 
     def optics(self, channel: str) -> Tissue | Mouth:
-        """As reported."""
+        """Return the reported media of a channel."""
         if self.spec.kind == "jaw":
             return mouth_of(self.report, channel)
         stains = kept_stains(self._stage[0])
@@ -99,7 +103,7 @@ class Fitted:
         return replace(tissue, shape=self.report.shape, stain=None if stains is None else stains.textures.get(channel))
 
     def stage_tissue(self, channel: str, stage: str) -> Tissue:
-        """A tooth's media as a stage ended."""
+        """Return a tooth's media at the end of a stage of the fit."""
         history = json.loads((self._stage[0] / "history.json").read_text())
         return replace(
             tissue_of(
@@ -109,14 +113,14 @@ class Fitted:
         )
 
     def dentins(self) -> list[DentinShape | None]:
-        """Of each tooth."""
+        """Return the dentin shape of each tooth, None for a tooth without dentin."""
         if self.spec.kind == "tooth":
             (tooth,) = self.observations.teeth
             return [dentin_shape(tooth, self.observations.manifest.cameras, self.spec)]
         return known_dentins(self.observations.teeth)
 
     def renderer(self, channel: str) -> Engine:
-        """The scene under all lights."""
+        """Return the engine of a channel's scene under all lights."""
         stains = kept_stains(self._stage[0])
         return Engine(
             channel_scene(
@@ -127,12 +131,12 @@ class Fitted:
     def compared(
         self, samples: int, optics: Mapping[str, Tissue | Mouth] | None = None, cameras: tuple[str, ...] | None = None
     ) -> dict[Image, Comparison]:
-        """Every image of some cameras under all lights beside its photograph.
+        """Render every image of some cameras under all lights and compare it with its photograph.
 
         Args:
             samples: paths per pixel of each of two renders; their mean is shown.
-            optics: by channel, instead of what was reported.
-            cameras: default all.
+            optics: media by channel; the reported ones by default.
+            cameras: names of the cameras; all by default.
         """
         channels = [
             self._channel(channel, samples, self.optics(channel) if optics is None else optics[channel], cameras)
@@ -175,7 +179,7 @@ def _comparison(
 
 
 def _merged(channels: list[Comparison]) -> Comparison:
-    # One picture of all channels.
+    # Join the channels into one picture.
     pictures = [one.picture for one in channels]
     photo, render = (
         np.concatenate([getattr(picture, name) for picture in pictures], axis=-1) for name in ("photo", "render")

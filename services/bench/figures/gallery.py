@@ -1,8 +1,9 @@
 """Pictures of a tooth in an ordinary Mitsuba scene, by the ``dentine`` integrator.
 
-``python -m services.bench.figures.gallery --out DIR`` stands an incisor on a table and writes one PNG per view. Other
-teeth come with ``--outer`` and ``--dentin``, other surroundings with ``--environment``, and a scene of one's own with
-``--scene FILE.xml --enamel ID --core ID``: the shapes of these ids become a tooth, and every sensor gives a picture.
+``python -m services.bench.figures.gallery --out DIR`` puts an incisor on a table and writes one PNG per view. The
+options ``--outer`` and ``--dentin`` give another tooth and ``--environment`` other surroundings. With ``--scene
+FILE.xml --enamel ID --core ID`` the shapes of these ids in your own scene become a tooth, and every sensor gives a
+picture.
 """
 
 from __future__ import annotations
@@ -33,37 +34,40 @@ SceneDict = dict[str, Any]
 Image = NDArray[np.float64]
 
 COLUMNS = 120
-"""Of the procedural incisor: fine enough that its outline shows no corners."""
+"""Columns of the procedural incisor's mesh: enough for an outline without visible corners."""
 ROUGHNESS = 0.12
+"""GGX roughness of the enamel's surface."""
 TABLE_GAP_MM = 0.02
-"""A tooth that touches nothing has room for the distance grid of its own."""
+"""Gap between tooth and table: a tooth that touches nothing has room for its own distance grid."""
 SIMILAR_G = 0.25
-"""Mean cosine of the similar media that pictures are rendered with: 1 to 3 % darker here, equal noise for about a sixth
-of the cost."""
+"""Mean cosine of the similar media with which pictures are rendered. They are 1 to 3 % darker here, and cost about a
+sixth for equal noise."""
 PASS_SAMPLES = 32
+"""Paths per pixel of one pass of a render."""
 SIZE_PX = (320, 400)
+"""Default width and height of a picture."""
 SHOWN_MM = 13.6
-"""Height of tooth above the table; a longer root sinks into it."""
+"""Largest height of the tooth above the table; a longer root goes into the table."""
 
 
 @dataclass(frozen=True)
 class GalleryView:
-    """One picture: from where, and how it is lit.
+    """Camera and lighting of one picture.
 
-    Positions in mm; x mesial, y buccal, z occlusal, the tooth at the origin.
+    Positions are in mm, with x mesial, y buccal and z occlusal and the tooth at the origin.
     """
 
     eye_mm: tuple[float, float, float]
     lamp_mm: tuple[float, float, float]
     lamp_half_mm: float
-    """Half its width; it is square and faces the tooth."""
+    """Half width of the lamp, which is square and faces the tooth."""
     lamp_radiance: float
     sky: float
-    """Scale of the environment."""
+    """Scale factor of the environment's radiance."""
     table: float
-    """Reflectance."""
+    """Reflectance of the table."""
     white: float
-    """Radiance that is shown as white."""
+    """Radiance that is displayed as white."""
     target_mm: tuple[float, float, float] = (0.0, 0.0, -0.3)
     fov_degrees: float = 22.0
 
@@ -77,7 +81,9 @@ VIEWS = {
 
 
 def procedural_sky(height: int = 32) -> Image:
-    """An environment (H, 2 H, 3) for who has none: bright overhead, warm at the horizon, dim below."""
+    """Return an environment (H, 2 H, 3) for scenes without an environment file: bright overhead, warm at the horizon,
+    dim below.
+    """
     up = np.cos(np.pi * (np.arange(height) + 0.5) / height)[:, None, None]
     zenith, horizon, ground = (
         np.array(colour) for colour in ((0.55, 0.65, 0.80), (0.75, 0.70, 0.64), (0.16, 0.15, 0.14))
@@ -87,10 +93,16 @@ def procedural_sky(height: int = 32) -> Image:
 
 
 def gallery_scene(view: GalleryView, tooth: Path, environment: Path | None, size_px: tuple[int, int]) -> SceneDict:
-    """A table, a lamp and an environment around the tooth whose surfaces lie in a folder; for an RGB variant.
+    """Return a scene with a table, a lamp and an environment around a tooth, for an RGB variant of Mitsuba.
+
+    Args:
+        view: camera and lighting.
+        tooth: folder of the tooth's surfaces ``outer.ply`` and, if any, ``dentin.ply``.
+        environment: file of the environment; None for the procedural sky.
+        size_px: width and height of the picture.
 
     Raises:
-        InputError: there is no such environment file.
+        InputError: the environment's file does not exist.
     """
     import mitsuba as mi
 
@@ -137,12 +149,12 @@ def gallery_scene(view: GalleryView, tooth: Path, environment: Path | None, size
 
 
 def tooth_integrator(enamel: str, dentin: str | None, *, exact: bool) -> SceneDict:
-    """The integrator for a tooth of the virtual mouth's optics, glossy outside.
+    """Return the integrator for a tooth with the virtual mouth's optics and a glossy surface.
 
     Args:
-        enamel: ids of the shapes around it.
-        dentin: the same, if any.
-        exact: the media themselves instead of similar ones, which look alike and cost less.
+        enamel: ids of the shapes that bound the enamel.
+        dentin: ids of the shapes that bound the dentin, if any.
+        exact: use the media themselves instead of similar ones, which look alike and cost less.
     """
     from services.fit.plugin.integrator import medium_properties
 
@@ -157,17 +169,19 @@ def tooth_integrator(enamel: str, dentin: str | None, *, exact: bool) -> SceneDi
 
 
 def tooth_surfaces(outer: Path | None, dentin: Path | None, buccal: Vector3 | None) -> dict[str, Mesh]:
-    """``outer`` and perhaps ``dentin``, upright with the crown at the origin; the procedural incisor's where no file is
-    given.
+    """Return a tooth's surfaces ``outer`` and, if any, ``dentin``, upright with the crown at the origin; those of the
+    procedural incisor where no file is given.
 
     Args:
-        outer: enamel surface.
-        dentin: dentin surface.
-        buccal: direction in their coordinates from which the front is seen; None where z is occlusal and y buccal
+        outer: file of the enamel's surface.
+        dentin: file of the dentin's surface.
+        buccal: direction in the files' coordinates from which the front is seen; None where z is occlusal and y buccal
             already.
 
     Raises:
-        InputError: dentin alone. CaptureInputError: no such mesh. MeshError: it cannot bound a medium.
+        InputError: dentin is given without enamel, or the buccal direction is zero.
+        CaptureInputError: a mesh file cannot be read.
+        MeshError: a mesh cannot bound a medium.
     """
     if outer is None:
         if dentin is not None:
@@ -189,7 +203,11 @@ def tooth_surfaces(outer: Path | None, dentin: Path | None, buccal: Vector3 | No
 
 
 def render(scene: Any, integrator: SceneDict, samples: int, sensor: int = 0, seed: int = 1) -> Image:
-    """Linear radiance (H, W, 3) in passes of few samples, so that memory stays small."""
+    """Render linear radiance (H, W, 3), in passes of ``PASS_SAMPLES`` paths per pixel to limit memory.
+
+    Raises:
+        NonFiniteError: a value of the picture is NaN or infinite.
+    """
     import mitsuba as mi
 
     chosen, passes = mi.load_dict(integrator), max(1, samples // PASS_SAMPLES)
@@ -209,7 +227,7 @@ def render(scene: Any, integrator: SceneDict, samples: int, sensor: int = 0, see
 
 
 def table_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, float]]:
-    """Name, radiance and white level of each view of a tooth on a table."""
+    """Yield the name, the radiance and the white level of each view of a tooth on a table."""
     import mitsuba as mi
 
     with tempfile.TemporaryDirectory() as name:
@@ -224,10 +242,11 @@ def table_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, fl
 
 
 def own_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, float]]:
-    """The same of each sensor of somebody's own scene; white at the 99th percentile.
+    """Yield the name, the radiance and the white level of each sensor of the user's own scene; white is the 99th
+    percentile.
 
     Raises:
-        InputError: no such file, or no id of a tooth's shape.
+        InputError: the scene's file does not exist, or an id names no shape of the scene.
     """
     import mitsuba as mi
 
@@ -245,7 +264,7 @@ def own_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, floa
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the gallery; returns the exit status."""
+    """Write the gallery, and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m services.bench.figures.gallery", description=__doc__.split("\n\n")[0]
     )

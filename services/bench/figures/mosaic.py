@@ -1,4 +1,4 @@
-"""Pictures side by side with names, as one image."""
+"""Composition of pictures in rows and columns, with names, as one image."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from services.fit.export.pictures import Image8, Picture, signed_map, tone_map, 
 GAP_PX, HEAD_PX, LINE_PX = 6, 20, 16
 FONT_PX = 13
 RESIDUAL_LIMIT = 0.25
-"""End of a difference's colours, as a fraction of white."""
+"""Difference at the end of the colour scale, as a fraction of white."""
 PAPER = (255, 255, 255)
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column's name; ``starts_group`` leaves room before it."""
+    """Name of a column; with ``starts_group`` there is a wider gap before it."""
 
     name: str
     starts_group: bool = False
 
 
 def photo_and_fit(picture: Picture, *, difference: bool = True) -> list[Image8]:
-    """Photograph and fit in the photograph's tone, and fit minus photograph in blue and orange."""
+    """Return pictures of the photograph and of the fit with the photograph's white level, and of fit minus photograph
+    in blue and orange.
+    """
     white = white_level(picture.photo, picture.valid)
     drawn = [
         tone_map(np.where(picture.valid[..., None], image, 0.0), white) for image in (picture.photo, picture.render)
@@ -38,15 +40,17 @@ def photo_and_fit(picture: Picture, *, difference: bool = True) -> list[Image8]:
 def mosaic(
     rows: Sequence[Sequence[Image8 | None]], columns: Sequence[Column], names: Sequence[str] = (), *, scale: int = 3
 ) -> Image8:
-    """Rows of pictures (H, W, 3), each pixel ``scale`` pixels wide; smaller ones are centred in their cell.
+    """Join rows of pictures (H, W, 3) into one image; smaller pictures are centred in their cell.
 
     Args:
-        rows: None leaves a place empty.
-        columns: one for each picture of a row.
-        names: of the rows, if they have any.
+        rows: rows of pictures; None leaves a cell empty.
+        columns: one column for each picture of a row.
+        names: names of the rows; none by default.
+        scale: width in the image of one pixel of a picture, in px.
 
     Raises:
-        InputError: a row has another number of pictures than there are columns, or of rows and names.
+        InputError: there are no rows, a row has another number of pictures than there are columns, or there is another
+            number of names than of rows.
     """
     if not rows or any(len(row) != len(columns) for row in rows) or (names and len(names) != len(rows)):
         raise InputError(
@@ -82,7 +86,7 @@ def mosaic(
 
 
 def cropped(picture: Picture, margin_px: int = 1) -> Picture:
-    """The part around what is valid."""
+    """Return the part of a picture around its valid pixels."""
     rows, columns = (np.flatnonzero(picture.valid.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return picture

@@ -1,5 +1,5 @@
-"""A tooth of given media under light from all around, by the ``dentine`` integrator, one colour channel after the
-other.
+"""Renders of a tooth of given media under light from all around, by the ``dentine`` integrator, one colour channel at a
+time.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from services.fit.transport.platform import prepare_device
 
 Array = NDArray[np.float64]
 Surfaces = Mapping[str, Mesh]
-"""``outer``, and ``dentin`` where there is one."""
+"""Surfaces of a tooth by name: ``outer``, and ``dentin`` if there is dentin."""
 
 
 def read_environment(path: Path) -> Array:
-    """An image (H, W, 3) of linear radiance, scaled to a mean of 1 over the sphere that it is wrapped around.
+    """Read an equirectangular image (H, W, 3) of linear radiance, scaled to a mean of 1 over the sphere and channels.
 
     Raises:
-        InputError: no such file.
+        InputError: the file does not exist.
     """
     if not path.is_file():
         raise InputError(f"Environment image {path} does not exist; give an equirectangular EXR or HDR file.")
@@ -46,8 +46,8 @@ def read_environment(path: Path) -> Array:
 
 
 def environment_light(image: Array, turn_degrees: float) -> dict[str, Any]:
-    """An emitter of one channel (H, W) around a tooth whose z axis is occlusal, the top of the image towards the roots,
-    as a person sits.
+    """Return an emitter of one channel (H, W) around a tooth whose z axis is occlusal. The top of the image lies
+    towards the roots, as for the upper teeth of a person who sits upright.
     """
     prepare_device()
     import mitsuba as mi
@@ -68,11 +68,17 @@ def seen_under(
     ior: float,
     roughness: float | None,
 ) -> Array:
-    """Radiance (H, W) of one channel.
+    """Render the radiance (H, W) of one channel.
 
     Args:
-        light: an emitter's dictionary.
-        roughness: of the mirror image in the enamel; None for none.
+        light: Mitsuba dictionary of an emitter.
+        surfaces: surfaces of the tooth.
+        tissue: media of the tooth.
+        camera: the camera.
+        samples: paths per pixel.
+        boundary: name of the boundary model.
+        ior: index of refraction of the tooth.
+        roughness: GGX roughness of the mirror reflection on the enamel; None for no reflection.
     """
     prepare_device()
     from services.fit.plugin.integrator import medium_properties, register_integrator
