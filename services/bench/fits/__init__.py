@@ -1,1 +1,1 @@
-"""Fits of teeth and jaws, timed against their error."""
+"""Benchmarks of the fits of teeth and jaws: error against processor time."""

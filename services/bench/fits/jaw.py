@@ -1,10 +1,11 @@
-"""A jaw's fit: errors of images and of media against processor time, stage by stage.
+"""Benchmark of a jaw's fit: errors of images and of media against processor time, stage by stage.
 
 The jaw is the procedural one of subject 1 (14 teeth with gums and wall), photographed by stock Mitsuba with sensor
 noise: three views, five lights to fit and two held out. The fit runs in this process on one thread, and seconds are its
-processor time, scenes and kernels included. After every joint step the whole mouth is judged, off the clock: exact
-media, two renders of this engine, sensor noise and the renderer's taken out. No renderer but ours gives derivatives of
-a whole mouth's scene in hours, so there is no peer.
+processor time, including the construction of scenes and the compilation of kernels. After every joint step the error of
+the whole mouth is measured, which does not count as time of the fit: with exact media, from two renders of this engine,
+without the noise of sensor and renderer. No other renderer gives derivatives of a whole mouth's scene within hours, so
+there is no peer.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ QUANTITIES = tuple((part, leaf) for part in ("enamel", "dentin") for leaf in ("s
 
 @dataclass(frozen=True)
 class Case:
-    """How large the jaw and its fit are."""
+    """Size of the jaw's capture and effort of its fit."""
 
     pixel_mm: float
     photograph_samples: int
     judge_samples: int
     options: Mapping[str, Any]
-    """Of the job."""
+    """Options of the job."""
 
 
 FULL = Case(1.0, 512, 64, {"max_samples_per_pixel": 256})
@@ -54,25 +55,27 @@ QUICK = Case(
 
 
 class JawRow(Row):
-    """Where a jaw's fit stood after so many seconds of processor time.
+    """State of a jaw's fit after so many seconds of processor time.
 
     ``error`` is the relative error on the held-out images.
     """
 
     error_se: float
-    """By the judge's own samples."""
+    """Standard error of ``error`` by the Monte Carlo noise of its measurement."""
     fitted_error: float
+    """Relative error on the fitted images."""
     stage: str
     step: int
     off: dict[str, dict[str, float]]
-    """By FDI number: relative errors of ``enamel.sigma_s_reduced`` and so on, of alpha' those of 1 - alpha'."""
+    """Relative errors of ``enamel.sigma_s_reduced`` and so on, by FDI number; for alpha' the relative error of
+    1 - alpha'."""
     peak_memory_mb: float
-    """Of this process so far, the judge included."""
+    """Peak memory of this process so far, including the measurement of errors."""
 
 
 @dataclass
 class Judge:
-    """Turns mouths into rows and passes on all rows so far."""
+    """Measures the error of a mouth, makes a row of it and passes on all rows so far."""
 
     case: PreparedTooth
     truth: Mouth
@@ -81,7 +84,7 @@ class Judge:
     rows: list[JawRow] = field(default_factory=list)
 
     def row(self, seconds: float, mouth: Mouth, stage: str, step: int) -> None:
-        """Judge and keep one point."""
+        """Measure the error of a mouth and keep the row."""
         fitted, held_out = self.case.errors(mouth, samples=self.samples, seed=11)
         fdi = [str(tooth.fdi) for tooth in self.case.observations.teeth]
         row = JawRow(
@@ -98,7 +101,7 @@ class Judge:
 
 
 def tooth_off(found: Tissue, true: Tissue) -> dict[str, float]:
-    """Relative errors of reduced scattering and of 1 - alpha' of both media."""
+    """Return the relative errors of reduced scattering and of 1 - alpha' of both media."""
 
     def measure(tissue: Tissue, part: str, leaf: str) -> float:
         value = float(getattr(tissue.medium(part), leaf))
@@ -108,7 +111,12 @@ def tooth_off(found: Tissue, true: Tissue) -> dict[str, float]:
 
 
 def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None] = lambda _: None) -> list[dict[str, Any]]:
-    """One row per joint step and one for the end."""
+    """Return one row per joint step and one for the end of the fit.
+
+    Args:
+        quick: take the smaller case.
+        keep: called with all rows so far after every new one.
+    """
     from services.phantom.jaw import jaw_surfaces, known_mouth
 
     prepare_device(threads=1)
@@ -126,7 +134,7 @@ def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None] = lambda _:
 
 
 def write_photographs(folder: Path, case: Case) -> None:
-    """Let stock Mitsuba render the jaw, and add sensor noise."""
+    """Render the jaw with stock Mitsuba, and add sensor noise."""
     from services.phantom.jaw import write_jaw_phantom
 
     write_jaw_phantom(
@@ -146,8 +154,8 @@ def write_photographs(folder: Path, case: Case) -> None:
 
 
 def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
-    """Prepare a jaw's capture below ``job``, unless that is done, and build its scene; its views tell what each pixel
-    shows.
+    """Prepare a jaw's capture below ``job`` if it is not prepared, and build its scene; its views are labelled with
+    what each pixel shows.
     """
     from services.fit.inputs.observations import channel_scene, read_channel, read_observations
     from services.fit.jaw.driver import jaw_dentins
@@ -165,7 +173,7 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
 
 
 def timed_fit(judge: Judge) -> FitReport:
-    """The product's own fit stage in this process, judged after every joint step and at its end."""
+    """Run the product's own fit stage in this process, and measure its error after every joint step and at its end."""
     from services.fit.execution.attempt import Attempt
     from services.fit.jaw.driver import JawDriver
     from services.fit.stage import ENGINE
@@ -191,10 +199,11 @@ def timed_fit(judge: Judge) -> FitReport:
 
 
 def mouth_of(values: Mapping[str, float], like: Mouth) -> Mouth:
-    """The mouth of a fit's parameters; a tooth without dentin is enamel throughout.
+    """Return the mouth of a fit's parameters; a tooth without dentin is enamel throughout.
 
     Args:
-        like: a mouth of the same parts.
+        values: parameters by name.
+        like: a mouth with the same parts.
     """
     one = Medium(1.0, 0.5)
     shapes = [
@@ -213,7 +222,7 @@ def mouth_of(values: Mapping[str, float], like: Mouth) -> Mouth:
 
 
 def reported_mouth(report: FitReport, like: Mouth) -> Mouth:
-    """The mouth of a jaw's report, whose teeth are in the order of the capture."""
+    """Return the mouth of a jaw's report, whose teeth are in the order of the capture."""
     tables = {f"{k}.": tooth.parameters[CHANNEL] for k, tooth in enumerate(report.teeth.values())} | {
         "": report.parameters[CHANNEL]
     }
@@ -223,8 +232,8 @@ def reported_mouth(report: FitReport, like: Mouth) -> Mouth:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Errors of images, and the median tooth's errors of its media, against processor time; what ends a stage is
-    ringed.
+    """Draw the errors of the images, and the median over teeth of the errors of the media, against processor time; the
+    last point of each stage is marked by a ring.
     """
     from services.bench.plots import finish, grid
 

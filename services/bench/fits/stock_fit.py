@@ -1,8 +1,8 @@
 """The peer of a tooth's fit: stock ``prbvolpath`` and ``mitsuba.ad.Adam`` on the same meshes and photographs.
 
-What its tutorials do: a loss over linear images under each light, backward through each render, one step of Adam per
-round of all lights. Extinction and albedo of both media are free, in the same unbounded domain as ours, with equal
-rates for all; g is held at the same value.
+It follows Mitsuba's tutorials: a loss over linear images under each light, a backward pass through each render, one
+step of Adam per round of all lights. Extinction and albedo of both media are free, in the same unbounded domain as in
+our fit, with equal learning rates for all; g is held fixed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from services.fit.optics.domain import LN10, to_dual, to_natural
 from services.fit.optics.parameters import Medium, Tissue
 
 START = Medium(6.0, 0.99, g1=0.8)
-"""Of both media."""
+"""Medium of enamel and dentin at the start."""
 SAMPLES = 16
 """Paths per pixel of an image and of its derivative."""
 NAMES = ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")
@@ -27,12 +27,12 @@ LEAVES = {"sigma": "sigma_t.value.value", "alpha": "albedo.value.value"}
 
 
 class StockFit:
-    """One fit at one learning rate, resumable step by step."""
+    """One fit at one learning rate, which can be continued step by step."""
 
     def __init__(
         self, case: PreparedTooth, folder: Path, rate: float, samples: int = SAMPLES, start: Medium = START
     ) -> None:
-        """Load one scene per fitted light; the clock runs from here."""
+        """Load one scene per fitted light; this counts as time of the fit."""
         import drjit as dr
         import mitsuba as mi
 
@@ -68,7 +68,7 @@ class StockFit:
         self.seconds += time.process_time() - begun
 
     def step(self) -> None:
-        """All fitted lights once, then a step of Adam."""
+        """Render all fitted lights once, then take a step of Adam."""
         import drjit as dr
         import mitsuba as mi
 
@@ -89,6 +89,6 @@ class StockFit:
         self.seconds += time.process_time() - begun
 
     def tissue(self) -> Tissue:
-        """Where it stands."""
+        """Return the present estimate of the media."""
         values = {name: to_natural(name.split(".")[1], float(self._optimizer[name][0])) for name in NAMES}
         return self._start.with_values(values)

@@ -1,15 +1,17 @@
-"""A tooth's fit: held-out error against processor time, ours and the stock recipe, on the smallest real case.
+"""Benchmark of a tooth's fit: held-out error against processor time, for this fit and for the recipe of stock Mitsuba,
+on the smallest real case.
 
-Everyone fits the same noisy photographs of five lights, from nothing to parameters: extinction and albedo of enamel and
-dentin, the peer with g held, the product as it is. Scenes are loaded and kernels compiled on the clock. At marks along
-the way everyone's parameters are judged alike, off the clock: three held-out lights, exact media, 1,024 paths per pixel
-and two seeds of this engine, sensor noise and the truth's Monte Carlo noise taken out.
+Both fit the same noisy photographs under five lights, from no knowledge to parameters: extinction and albedo of enamel
+and dentin, the peer with g held fixed, the product as it is. Loading scenes and compiling kernels counts as time. At
+several times of each fit its error is measured in the same way, which does not count as time: on three held-out lights,
+with exact media, 1,024 paths per pixel and two seeds of this engine, without sensor noise and the truth's Monte Carlo
+noise.
 
-Everyone has one thread, and seconds are its processor time, which other jobs on the machine hardly move. The peer
-chooses one of three learning rates, five minutes each, by its error on the fitted images; the best one goes on until 40
-minutes, of which those five count. Its ratio is its time to the target over ours; the target is our last error times
-``MARGIN``, or what the photographs' noise resolves where that is more. A peer that never got there has a lower bound
-there, and beside it the ratio at the error that it ended with.
+Each has one thread, and seconds are its processor time, which other jobs on the machine change little. The peer tries
+three learning rates for five minutes each and takes that of the smallest error on the fitted images; this fit goes on
+until 40 minutes, of which those five count. The peer's ratio is its time to the target divided by ours. The target is
+our last error times ``MARGIN``, or the error that the photographs' noise resolves if that is larger. A peer that does
+not reach the target gets a lower bound of the ratio, and another row with the ratio at the error that it ended with.
 """
 
 from __future__ import annotations
@@ -34,11 +36,12 @@ if TYPE_CHECKING:
 
 OURS, OUR_ADAM, PEER = "dentine", "dentine-adam", "mitsuba-prbvolpath-adam"
 RATES = (0.02, 0.05, 0.15)
-"""Of Adam in the unbounded domain."""
+"""Learning rates of Adam in the unbounded domain."""
 CHOICE_S, LIMIT_S = 300.0, 2400.0
+"""Processor time of each learning rate's trial, and of the whole fit with the best one."""
 QUICK_CHOICE_S, QUICK_LIMIT_S = 20.0, 60.0
 MARK_GROWTH = 1.12
-"""From one mark of a peer to the next, in time."""
+"""Ratio of the times of two successive measurements of a peer's error."""
 MARGIN = 1.1
 JUDGE_SAMPLES = 1024
 
@@ -47,25 +50,26 @@ Keep = Callable[[list[dict[str, Any]]], None]
 
 
 class ToothRow(Row):
-    """Where a fit stood after so many seconds of processor time.
+    """State of a fit after so many seconds of processor time.
 
     ``error`` is the relative error on the held-out images.
     """
 
     error_se: float
-    """By the judge's own samples."""
+    """Standard error of ``error`` by the Monte Carlo noise of its measurement."""
     fitted_error: float
+    """Relative error on the fitted images."""
     stage: str
     parameters: dict[str, float]
     rate: float | None = None
-    """Learning rate."""
+    """Learning rate of Adam; None for the product."""
     lower_bound: bool = False
     """Whether ``efficiency_ratio``, here the ratio of times to one held-out error, is only a bound."""
 
 
 @dataclass
 class Judge:
-    """Turns parameters into rows and passes on all rows so far."""
+    """Measures the error of a tooth's parameters, makes a row of it and passes on all rows so far."""
 
     case: PreparedTooth
     keep: Keep
@@ -73,7 +77,7 @@ class Judge:
     rows: list[ToothRow] = field(default_factory=list)
 
     def row(self, peer: str, seconds: float, tissue: Tissue, stage: str, **more: Any) -> ToothRow:
-        """Judge and keep one point."""
+        """Measure the error of a tooth's media and keep the row."""
         fitted, held_out = self.case.errors(tissue, samples=self.samples, seed=11)
         values = {
             f"{part}.{leaf}": getattr(getattr(tissue, part), leaf)
@@ -91,9 +95,10 @@ class Judge:
 
 
 def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> list[dict[str, Any]]:
-    """Rows of everyone's way down and, at the end, the peers' summaries.
+    """Return the rows of all fits and, at the end, the peers' summaries.
 
     Args:
+        quick: take fewer pixels, less time and fewer samples.
         case: ``scale`` measures a full-resolution tooth on one and on two workers instead.
         keep: called with all rows so far after every new one.
     """
@@ -121,7 +126,9 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
 
 
 def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothRow]:
-    """The product's own fit stage in this process, judged after every step of its solver and at its end."""
+    """Run the product's own fit stage in this process, and measure its error after every step of its solver and at its
+    end.
+    """
     from services.core.store import StageWriter
     from services.fit.execution.attempt import Attempt
     from services.fit.stage import ENGINE
@@ -151,7 +158,7 @@ def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothR
 
 
 def stock_fit(judge: Judge, folder: Path, choice_s: float, limit_s: float) -> list[ToothRow]:
-    """The peer at its best learning rate, until ``limit_s``."""
+    """Run the peer at its best learning rate until ``limit_s``, after a trial of ``choice_s`` for each rate."""
     tried: list[tuple[StockFit, list[ToothRow]]] = []
     for rate in RATES:
         tried.append((StockFit(judge.case, folder, rate), []))
@@ -171,10 +178,11 @@ def _descend(judge: Judge, fit: StockFit, rows: list[ToothRow], until_s: float) 
 
 
 def summary(ours: list[ToothRow], peer: list[ToothRow], target: float, name: str = "tooth-summary") -> ToothRow:
-    """The peer's time to the target over ours; of its last point, and a lower bound, where it never got there.
+    """Return a row with the ratio of the peer's time to the target to ours; where the peer does not reach the target,
+    its last time counts and the ratio is a lower bound.
 
-    The peer is there when it first shows the target; we are when no later point, of another start say, is above it by
-    more than the judge's error.
+    The peer reaches the target at its first error that is not above it. We reach it only when no later error, for
+    instance of another start, is above it by more than one standard error.
     """
     above = [k for k, row in enumerate(ours) if row.error - row.error_se > target]
     settled = ours[min(above[-1] + 1, len(ours) - 1) if above else 0]
@@ -185,7 +193,7 @@ def summary(ours: list[ToothRow], peer: list[ToothRow], target: float, name: str
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Held-out error against processor time; of the scale case, workers against time."""
+    """Draw held-out error against processor time; for the scale case against run time, by number of workers."""
     from services.bench.plots import draw_errors, finish, grid
 
     if rows and rows[0]["benchmark"].startswith("tooth-scale"):

@@ -1,4 +1,4 @@
-"""Prepared captures of one tooth for benchmarks of its fit, and the judge of what everyone makes of them."""
+"""Prepared captures of one tooth for benchmarks of its fit, and the measurement of a fit's error on them."""
 
 from __future__ import annotations
 
@@ -21,28 +21,29 @@ from services.fit.transport.engine import Engine
 from services.fit.transport.scene.recipe import View, single_tooth
 
 REAL_TOOTH = Path("shared") / "data" / "tooth-ur1-truth"
-"""A scanned incisor, where this data lies beside the checkout; elsewhere a phantom takes its place."""
+"""Capture of a scanned incisor; a phantom replaces it where this data does not lie beside the checkout."""
 CAMERA, CHANNEL = "c0", "green"
 NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002
-"""Sensor noise: of the value, and of the image's maximum."""
+"""Standard deviations of the two parts of the sensor noise, as fractions of the pixel's value and of the image's
+maximum."""
 PHANTOM_SAMPLES = 256
 
 
 def real_tooth() -> Path | None:
-    """The scanned incisor's capture, if this machine has it."""
+    """Return the folder of the scanned incisor's capture; None where this data does not lie beside the checkout."""
     folder = Path(__file__).resolve().parents[4] / REAL_TOOTH
     return folder if folder.is_dir() else None
 
 
 def sensor_noise(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Variance that a camera adds; none off the tooth."""
+    """Return the variance of the sensor noise, which is 0 beside the tooth."""
     return np.where(image > 0, (NOISE_RELATIVE * image) ** 2 + (NOISE_FLOOR * image.max()) ** 2, 0.0)
 
 
 def photograph(
     mean: NDArray[np.float64], variance: NDArray[np.float64], random: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A rendered image with a camera's noise added, and its variance with that noise's, both as stored."""
+    """Return a rendered image with sensor noise added, and its variance including that of the noise, both as stored."""
     added = sensor_noise(mean)
     return (mean + np.sqrt(added) * random.standard_normal(mean.shape)).astype(np.float32), (variance + added).astype(
         np.float32
@@ -56,10 +57,14 @@ def write_photograph(
     random: np.random.Generator,
     added: NDArray[np.float64] | float = 0.0,
 ) -> None:
-    """Store a rendered image, with something added, as a camera's photograph, and its variance beside it.
+    """Store a rendered image with sensor noise as a photograph, and its variance beside it.
 
     Args:
+        source: folder of the rendered image.
+        target: folder to write to.
         files: names of image and variance, equal in both folders.
+        random: generator of the noise.
+        added: radiance that is added to the image before the noise.
     """
     mean, variance = (np.load(source / file).astype(np.float64) for file in files)
     for file, values in zip(files, photograph(mean + added, variance, random), strict=True):
@@ -80,8 +85,8 @@ def write_noisy(source: Path, target: Path, seed: int, camera: str = CAMERA) -> 
 
 @dataclass(frozen=True)
 class PreparedTooth:
-    """A prepared capture in one channel, of a tooth or a jaw, and what judges a fit of it: exact media, the same for
-    everyone measured.
+    """A prepared capture of a tooth or a jaw in one channel, and the engine that measures the error of a fit on it,
+    with exact media and equally for all peers.
     """
 
     job: Path
@@ -92,7 +97,7 @@ class PreparedTooth:
     engine: Engine
 
     def errors(self, tissue: Tissue | Mouth, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:
-        """On fitted and on held-out images, by two renders of so many paths per pixel."""
+        """Return the error sums on fitted and on held-out images, from two renders of so many paths per pixel."""
         fitted, held_out = ErrorSums(), ErrorSums()
         for number, view in enumerate(self.views):
             seen = View(view.camera, view.pixels)
@@ -106,7 +111,7 @@ class PreparedTooth:
         return fitted, held_out
 
     def resolution(self, held_out: bool = True) -> float:
-        """The error that the photographs' own noise can look like, one standard deviation."""
+        """Return the error that the photographs' own noise may cause, as one standard deviation."""
         chosen = [view.valid & (view.held_out[:, None] == held_out) for view in self.views]
         reference, variance = (
             np.concatenate([getattr(view, name)[one] for view, one in zip(self.views, chosen, strict=True)])
@@ -116,14 +121,16 @@ class PreparedTooth:
 
 
 def prepare(job: Path, spec: JobSpec) -> None:
-    """The stage before the fit; benchmarks begin with a capture and so are the one place that knows two services."""
+    """Run the preparation, the stage before the fit. Benchmarks begin with a capture, so they alone import two
+    services.
+    """
     from services.preprocess.stage import run
 
     run(spec, LocalContext(job))
 
 
 def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> PreparedTooth:
-    """Prepare a capture below ``job``, unless that is done, and build its scene."""
+    """Prepare a capture below ``job`` if it is not prepared, and build its scene."""
     from services.fit.tooth.driver import dentin_shape
     from services.fit.transport.platform import prepare_device
 
@@ -145,8 +152,8 @@ def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> Prepared
 
 
 def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> PreparedTooth:
-    """Write and prepare the smallest real case below ``folder``: one view, five lights to fit and those its capture
-    holds out.
+    """Write and prepare the smallest real case below ``folder``: one view, with five lights to fit and those that the
+    capture holds out.
     """
     source = real_tooth()
     if source is None:
@@ -166,7 +173,7 @@ def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> Prepar
 
 
 def tissue_of(values: Mapping[str, float]) -> Tissue:
-    """Of the parameters that a fit reports; a tooth without dentin is enamel throughout."""
+    """Return the media of the parameters that a fit reports; a tooth without dentin is enamel throughout."""
 
     def medium(part: str) -> Medium:
         sigma, alpha, beta, g1, g2 = (values[f"{part}.{leaf}"] for leaf in MEDIUM_FIELDS)

@@ -1,9 +1,10 @@
-"""A single tooth as captured, three views under 54 lights at 0.064 mm, about 28,000 pixels per view, fitted on one and
-on two workers.
+"""Benchmark of a single tooth at the size of a real capture, fitted on one and on two workers: three views under 54
+lights with pixels of 0.064 mm, about 28,000 pixels per view.
 
-The photographs are this engine's own, as no peer renders 162 of them in hours; they are kept in ``.cache`` below the
-working directory for the next run. Seconds are those of a clock, as two workers share two cores: run it on an idle
-machine. ``error`` is the held-out error. The answers of both runs must agree to the last bit, with one thread each.
+The photographs are this engine's own, because no peer renders 162 of them within hours; they are kept in ``.cache``
+below the working directory for the next run. Seconds are by the clock, because two workers share two cores, so the
+machine must be idle. ``error`` is the held-out error. The results of both runs must agree to the last bit, with one
+thread each.
 """
 
 from __future__ import annotations
@@ -30,23 +31,28 @@ QUICK_PIXEL_MM, QUICK_LIGHTS = 0.5, 8
 
 
 class ScaleRow(Row):
-    """Preparation and fit of one capture."""
+    """Preparation and fit of one capture on so many workers."""
 
     workers: int
     fit_seconds: float
-    """Of the stage alone."""
+    """Time of the fit stage alone."""
     pixels_per_view: int
     images: int
     idle_cores: float
-    """Of this machine's, by its load before the run; fewer than ``workers`` spoil the measurement."""
+    """Number of idle cores by the machine's load before the run; fewer than ``workers`` invalidate the measurement."""
     identical: bool | None = None
-    """Whether the answer is that of the first run, to the last bit."""
+    """Whether the result equals that of the first run to the last bit."""
     scaling: float | None = None
-    """Time on one worker over the time on all, per worker."""
+    """Fit time on one worker, divided by the fit time on all workers and by their number."""
 
 
 def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None]) -> list[dict[str, Any]]:
-    """One row per number of workers."""
+    """Return one row per number of workers.
+
+    Args:
+        quick: take the smaller capture.
+        keep: called with all rows so far after every new one.
+    """
     rows: list[ScaleRow] = []
     capture = _capture(quick)
     reports: list[FitReport] = []
@@ -102,7 +108,7 @@ def _measure(capture: Path, workers: int) -> tuple[FitReport, ScaleRow]:
 
 
 def _stages(spec: JobSpec, root: Path) -> None:
-    # Runs on a worker; the fit spreads its passes from there.
+    # This runs on a worker; from there the fit distributes its passes to all workers.
     from services.fit.stage import run as fit
 
     prepare(root, spec)
@@ -110,7 +116,7 @@ def _stages(spec: JobSpec, root: Path) -> None:
 
 
 def _size(capture: Path) -> tuple[int, int]:
-    # Lit pixels of the first image, and the number of images.
+    # Return the number of lit pixels of the first image, and the number of images.
     import numpy as np
 
     from services.core.records import FolderCapture

@@ -1,1 +1,1 @@
-"""The virtual laboratory measured: from its raw frames to a tooth's optics, and how far that is from the truth."""
+"""Measurement of a tooth's optics from the raw frames of a virtual laboratory, and comparison with the truth."""

@@ -1,9 +1,9 @@
-"""From the raw frames of a virtual laboratory to a measured tooth, by what a real laboratory's commands do; no truth is
-read here.
+"""Chain from the raw frames of a virtual laboratory to a measured tooth, with the functions behind a real laboratory's
+commands. The truth is not read here.
 
-LAB/calibration/    what ``dentine calibrate LAB/session --out LAB/calibration`` writes
+LAB/calibration/    files that ``dentine calibrate LAB/session --out LAB/calibration`` writes
 LAB/mouth/          gets teeth, gums and registration.json, as by ``dentine register LAB/mouth``
-LAB/job/            what ``dentine run JOB.toml --out LAB/job`` writes, with the options of ``job_of``
+LAB/job/            files that ``dentine run JOB.toml --out LAB/job`` writes, with the options of ``job_of``
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ COARSE: Mapping[str, Any] = MappingProxyType(
         "search_candidates": 2000,
     }
 )
-"""Options of a first look."""
+"""Options of the job for a first, coarse result."""
 PIXELS_MM = 0.5
-"""Edge of the squares of pixels that are fitted: what a tooth's light spreads over anyway."""
+"""Edge at the teeth of the squares of pixels whose means are fitted: light spreads in a tooth at least as far."""
 
 
 def calibrated(root: Path, tell: Callable[[str], None]) -> None:
-    """Calibrate the rig from the session's frames, unless that is done."""
+    """Calibrate the rig from the session's frames if it is not calibrated."""
     out = root / CALIBRATION
     if (out / CALIBRATION_FILE).is_file():
         return
     session = calibrate(root / SESSION, tell)
     out.mkdir(parents=True, exist_ok=True)
-    # The record is written last: where it is, all is.
+    # The record is written last, so where it exists all files do.
     write_report(session, out)
     write_session(session, out)
     for limit in session.judgement.broken:
@@ -53,25 +53,29 @@ def calibrated(root: Path, tell: Callable[[str], None]) -> None:
 
 
 def registered(root: Path, pixel_mm: float, tell: Callable[[str], None]) -> Registration:
-    """Find where the scan's teeth stand, unless that is done; outlines of coarse pixels may lie as far off as one of
-    them.
+    """Register the scan if it is not registered; its outlines may be off by up to one pixel where pixels are coarse.
+
+    Args:
+        root: folder of the laboratory.
+        pixel_mm: edge of a photograph's pixel at the teeth.
+        tell: called with a description of the step as it begins.
     """
     folder = root / MOUTH
     if (folder / REGISTRATION).is_file():
         return read_record(folder / REGISTRATION, Registration)
-    # Teeth without a record are those of an attempt that was ended.
+    # Teeth without a record come from an attempt that did not finish.
     shutil.rmtree(folder / "teeth", ignore_errors=True)
     tell("registration: landmarks, outlines")
     return register_folder(folder, max_misfit_mm=max(MAX_MISFIT_MM, pixel_mm))
 
 
 def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpec:
-    """The job that measures the tooth.
+    """Return the job that measures the tooth.
 
     Args:
         capture: raw folder with its teeth.
         pixel_mm: edge of a photograph's pixel at the teeth.
-        options: of the job, that are others than here.
+        options: options of the job that replace the ones here.
     """
     told = {
         "capture": capture.resolve(),
@@ -81,14 +85,14 @@ def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpe
         "channels": ("green",),
         "pixel_step": max(round(PIXELS_MM / pixel_mm), 1),
         "advise": False,
-        # So small a rig's images leave the lights' distances open to a centimetre, which their light at the teeth
-        # hardly shows.
+        # The images of so small a rig determine the lights' distances only to a centimetre, which hardly changes their
+        # light at the teeth.
         "accept_calibration": True,
     }
     return JobSpec.model_validate(told | dict(options))
 
 
 def forget(root: Path) -> None:
-    """Remove all that was made of other frames."""
+    """Remove the calibration, the job and the comparisons, which were made from other frames."""
     for name in (CALIBRATION, JOB, COMPARISON):
         shutil.rmtree(root / name, ignore_errors=True)

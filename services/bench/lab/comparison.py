@@ -1,5 +1,5 @@
-"""What the chain measured, beside what perfect calibration and pose give and beside the truth: the only place that
-reads it.
+"""Comparison of the chain's result with the truth and with the result of perfect calibration and pose. Only this module
+and ``known`` read the truth.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from services.phantom.lab.make import CALIBRATION, CALIBRATION_FILE, LAB_RECORD,
 Floats = NDArray[np.float64]
 QUANTITIES = tuple(f"{part}.{name}" for part in ("enamel", "dentin") for name in ("sigma_s_reduced", "sigma_a"))
 MAX_ERROR_RATIO, MAX_Z, MAX_SE_RATIO = 1.3, 3.0, 3.0
-"""Of held-out errors, of a value's distance from the truth over its ±, and of the ±, to those with perfect calibration
-and pose."""
+"""Limits of the chain: of the ratio of its held-out error to that with perfect calibration and pose, of a value's
+distance from the truth in standard errors, and of the ratio of a standard error to that with perfect calibration and
+pose."""
 
 
 class Measured(Record):
-    """One quantity of one medium."""
+    """Estimate of one quantity of one medium, with its standard error and its truth."""
 
     value: float
     se: float
@@ -36,12 +37,12 @@ class Measured(Record):
 
     @property
     def z(self) -> float:
-        """Distance from the truth over the ±."""
+        """Signed distance from the truth in standard errors."""
         return (self.value - self.truth) / self.se
 
 
 class Outcome(Record):
-    """What a fit ended with: errors on held-out and on fitted images, and the media by quantity, per mm."""
+    """Result of a fit: relative errors on held-out and on fitted images, and the quantities of the media, per mm."""
 
     held_out_error: float
     fit_error: float
@@ -50,23 +51,24 @@ class Outcome(Record):
 
 
 class StepErrors(Record):
-    """How far each step of the chain ended from the truth."""
+    """Errors of calibration and registration against the truth."""
 
     teeth_mm: float
-    """Of the teeth's centre, all cameras taken for what was found."""
+    """Error of the teeth's centre in the frame of the calibration session."""
     teeth_deg: float
+    """Error of the teeth's rotation."""
     lights_mm: float
-    """Root mean square over the lights."""
+    """Root mean square over the lights of the error of the position."""
     lights_deg: float
-    """Of their direction, seen from the teeth."""
+    """Root mean square over the lights of the error of the direction, seen from the teeth."""
     intensity: float
-    """Root mean square, relative, of the fitted channels' lights."""
+    """Root mean square over lights and channels of the relative error of the intensity."""
     radiance: float
-    """The same of cameras: radiance per count."""
+    """Root mean square over cameras and channels of the relative error of the radiance per count."""
 
 
 def outcome(root: Path, job: Path, channel: str = "green") -> Outcome:
-    """What a job has measured, beside the truth of a laboratory."""
+    """Return the result of a job, with the truth of its laboratory."""
     truth = read_record(root / TRUTH / LAB_RECORD, LabRecord).media[channel]
     table = json.loads((job / "parameters.json").read_text())[channel]
     errors = json.loads((job / "errors.json").read_text())
@@ -83,7 +85,7 @@ def outcome(root: Path, job: Path, channel: str = "green") -> Outcome:
 
 
 def step_errors(root: Path) -> StepErrors:
-    """How far calibration and pose are from the truth, in the session's frame."""
+    """Return the errors of calibration and pose against the truth, in the frame of the calibration session."""
     found, true = read_record(root / CALIBRATION / CALIBRATION_FILE, Calibration), true_calibration(root)
     registration = read_record(root / MOUTH / REGISTRATION, Registration)
     pose, actual = np.array(registration.rig_from_scan), session_from_scan(root)
@@ -112,7 +114,7 @@ def step_errors(root: Path) -> StepErrors:
 
 
 def verdict(chain: Outcome, perfect: Outcome) -> dict[str, tuple[float, float, bool]]:
-    """What is asked of the chain: figure, limit, and whether it is kept."""
+    """Return the requirements on the chain by name: value, limit, and whether the limit is kept."""
     found = {
         "held-out error over that with perfect calibration and pose": (
             chain.held_out_error / perfect.held_out_error,
@@ -129,7 +131,12 @@ def verdict(chain: Outcome, perfect: Outcome) -> dict[str, tuple[float, float, b
 
 
 def summary(root: Path, jobs: Mapping[str, Path]) -> dict[str, Any]:
-    """Everything that is known of a chain, as plain values; ``jobs`` are those of the variants that were run."""
+    """Return all results of a chain as plain values.
+
+    Args:
+        root: folder of the laboratory.
+        jobs: folders of the jobs of the variants that were run, by the variant's name.
+    """
     chain = outcome(root, root / JOB)
     told: dict[str, Any] = {"chain": _plain(chain), "steps": step_errors(root).model_dump()}
     told["variants"] = {name: _plain(outcome(root, job)) for name, job in jobs.items()}

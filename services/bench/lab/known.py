@@ -1,6 +1,8 @@
-"""The same photographs with a part of the truth given: which step of the chain brings how much of the error.
+"""Variants of the chain with a part of the truth given, on the same photographs: they show how much of the error each
+step of the chain causes.
 
-All stays in the frame of the calibration session, so that a true part fits to what the chain found of the others.
+All variants use the frame of the calibration session, so that a true part is consistent with the estimates of the
+others.
 """
 
 from __future__ import annotations
@@ -29,12 +31,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Known:
-    """What of the truth is given.
+    """Parts of the truth that are given.
 
     Attributes:
-        cameras, lights, radiometry: of the rig; radiometry is the lights' intensities and the cameras' radiance per
-            count.
-        pose: of the teeth.
+        cameras: lenses and poses of the cameras.
+        lights: positions of the lights.
+        radiometry: intensities and lobes of the lights, radiance per count and vignetting of the cameras.
+        pose: pose of the teeth.
     """
 
     cameras: bool = False
@@ -55,29 +58,29 @@ VARIANTS = {
     "true lights": Known(lights=True),
     "true radiometry": Known(radiometry=True),
 }
-"""What may be compared, by name; the first is what the chain is held to."""
+"""Variants of the chain by name; the limits of the chain refer to the first one."""
 
 
 def true_calibration(root: Path) -> Calibration:
-    """The true rig in the frame of the session's first board."""
+    """Return the true rig in the frame of the session's first board."""
     told = read_record(root / TRUTH / LAB_RECORD, LabRecord)
     rig = read_record(root / TRUTH / CALIBRATION_FILE, Calibration)
     return in_session_frame(rig, np.array(told.world_from_session))
 
 
 def session_from_scan(root: Path) -> Floats:
-    """Where the scan truly lies (4, 4) in the session's frame."""
+    """Return the true transform session_from_scan (4, 4)."""
     told = read_record(root / TRUTH / LAB_RECORD, LabRecord)
     return np.asarray(np.linalg.inv(np.array(told.world_from_session)) @ np.array(told.world_from_scan))
 
 
 def write_variant(root: Path, out: Path, known: Known) -> Path:
-    """Write a raw folder of the same frames with a part of the truth; returns its path.
+    """Write a raw folder of the same frames with a part of the truth, and return its path.
 
     Args:
-        root: the laboratory, calibrated and registered.
-        out: folder to fill; one that is there is replaced.
-        known: what is given.
+        root: folder of the laboratory, calibrated and registered.
+        out: folder to write; an existing one is replaced.
+        known: parts of the truth that are given.
     """
     shutil.rmtree(out, ignore_errors=True)
     mouth, (found, true) = (

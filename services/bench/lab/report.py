@@ -1,4 +1,4 @@
-"""The page of a virtual laboratory: what was measured, what is asked of it, and where the pages of its steps are."""
+"""Report of a virtual laboratory: its results, the requirements on them, and links to the reports of its steps."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write_summary(root: Path, told: Mapping[str, Any]) -> None:
 
 
 def lines(told: Mapping[str, Any]) -> list[str]:
-    """The same in a few lines for a terminal."""
+    """Return the summary as a few lines for a terminal."""
     found = []
     for name, one in {"chain": told["chain"], **told["variants"]}.items():
         row = _row(name, one)

@@ -1,4 +1,4 @@
-"""The whole of ``dentine lab-demo`` behind its frames: the chain, then the comparisons."""
+"""The part of ``dentine lab-demo`` after the frames are made: the chain, then the comparisons."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def measured(
     *,
     coarse: bool = False,
 ) -> dict[str, Any]:
-    """Run the chain, then the comparisons, and say what came out; what is done already is not done again.
+    """Run the chain, then the comparisons, and return the summary of their results; finished steps are not repeated.
 
     Args:
-        root: a laboratory whose frames are there.
+        root: folder of a laboratory whose frames exist.
         pixel_mm: edge of a photograph's pixel at the teeth.
         compare: names of ``VARIANTS``.
-        workers: processes of each job; None for the job's own number.
-        tell: is told each step as it begins.
-        coarse: take the options of a first look.
+        workers: number of processes of each job; None for the job's own number.
+        tell: called with a description of each step as it begins.
+        coarse: use the options for a first, coarse result.
     """
     options = COARSE if coarse else {}
     calibrated(root, tell)
