@@ -1,1 +1,1 @@
-"""Preparation: speed of each step beside the bare library calls that it is made of."""
+"""Benchmarks of the preparation: speed of each step beside the bare library calls that do its arithmetic."""

@@ -1,8 +1,8 @@
-"""Speed of preparing one synthetic image, step by step, beside the bare library calls that each step is made of.
+"""Speed of preparing one synthetic image, step by step, beside the bare library calls that do each step's arithmetic.
 
-Both sides run in one process on one thread, in turns, and the fastest of some turns counts, in seconds of processor
-time: other work on the machine then changes little. A step's bare calls do its arithmetic and nothing else: no checks,
-no masks, results into buffers that are there.
+Both sides run alternately in one process on one thread, and the fastest of ``TURNS`` runs counts, in seconds of
+processor time, which other work on the machine changes little. A step's bare calls do its arithmetic and nothing else:
+no checks, no masks, and results written into preallocated buffers.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ Work = Callable[[], object]
 
 
 def run(quick: bool = False) -> list[dict[str, Any]]:
-    """Rows: step, megapixels, seconds and megapixels a second of it and of its bare calls, their ratio; then the sum
-    and the peak memory.
+    """Return a row for each step, with its megapixels, its seconds and megapixels per second, the same of its bare
+    calls, and the ratio of their times; then a row of the sums and one of the peak memory.
     """
     import cv2
     import numcodecs.blosc
@@ -51,7 +51,7 @@ def run(quick: bool = False) -> list[dict[str, Any]]:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Seconds of each step and of its bare calls."""
+    """Draw the seconds of each step and of its bare calls."""
     from services.bench.plots import grid
 
     drawn = [row for row in rows if "seconds" in row][::-1]
@@ -66,7 +66,7 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
 
 
 def _row(name: str, size: tuple[int, int], ours: Work, bare: Work | None) -> dict[str, Any]:
-    """Time both in turns."""
+    """Time a step and its bare calls alternately, and return their row."""
     megapixels, times = size[0] * size[1] / 1e6, [[np.inf], [np.inf]]
     for _ in range(TURNS):
         for work, own in zip((ours, bare), times, strict=True):
@@ -87,7 +87,7 @@ def _row(name: str, size: tuple[int, int], ours: Work, bare: Work | None) -> dic
 
 
 def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
-    """Each step and its bare calls, and the peak memory in GiB of one image from counts to files."""
+    """Return each step with its bare calls, and the peak memory in GiB of preparing one image from counts to files."""
     from services.core.records import JobSpec
     from services.core.store import StageWriter
     from services.preprocess.masking.masks import HandMasks
@@ -135,7 +135,7 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
 
 
 def _store(writer: Any, image: Any, bits: NDArray[np.uint16]) -> None:
-    """Write an image as if for the first time, and sum up its files."""
+    """Write an image as if for the first time, and compute the checksums of its files."""
     for name in ("radiance", "variance", "valid", "motion"):
         shutil.rmtree(writer.files.folder / "prepared.zarr" / name / "c", ignore_errors=True)
     writer.store_masked(LIGHT, image, bits)
@@ -143,7 +143,9 @@ def _store(writer: Any, image: Any, bits: NDArray[np.uint16]) -> None:
 
 
 class BareImage:
-    """Decode a frame, subtract black, scale, square for the variance, and sample both where the pixels have gone."""
+    """Bare calls of an image: decode a frame, subtract black, scale, square for the variance, and sample radiance and
+    variance at the moved positions of the pixels.
+    """
 
     def __init__(self, folder: Path, window: NDArray[np.uint16]) -> None:
         import numcodecs
@@ -158,7 +160,7 @@ class BareImage:
         self._places = x + np.float32(0.3), y + np.float32(0.4)
 
     def __call__(self) -> None:
-        """Into buffers that are there."""
+        """Make the calls once, with results in preallocated buffers."""
         import cv2
 
         self._codec.decode(self._path.read_bytes(), self._counts)
@@ -173,9 +175,7 @@ class BareImage:
 
 
 class BareMask:
-    """The products with fixed vectors, quotients, roots, comparisons and the growing of regions that a mask of
-    highlights is made of.
-    """
+    """Bare calls of a highlight mask: products with fixed vectors, quotients, roots, comparisons and region growing."""
 
     def __init__(
         self, radiance: NDArray[np.float32], variance: NDArray[np.float32], normal: NDArray[np.float32]
@@ -186,8 +186,8 @@ class BareMask:
         ]
 
     def __call__(self) -> None:
-        """Light and its part along the chroma, three variances, four products of the normal; then a quotient a pixel
-        for each of six estimates.
+        """Compute the light and its part along the chroma, three variances and four products of the normal; then one
+        quotient per pixel for each of six estimates.
         """
         import cv2
 
@@ -207,7 +207,7 @@ class BareMask:
 
 
 class BareStore:
-    """Compress and write what an image is stored as, and its checksums."""
+    """Bare calls of storing an image: compress its arrays, write them and compute their checksums."""
 
     def __init__(self, folder: Path, *arrays: NDArray[Any]) -> None:
         import numcodecs
@@ -216,7 +216,7 @@ class BareStore:
         self._path, self._arrays = folder / "bare-store", arrays
 
     def __call__(self) -> None:
-        """One file after the other."""
+        """Store one file after the other."""
         for array in self._arrays:
             packed = self._codec.encode(array)
             self._path.write_bytes(packed)
@@ -224,13 +224,13 @@ class BareStore:
 
 
 class BareFlow:
-    """OpenCV's dense flow at its medium setting, of two frames in 8 bits at full size."""
+    """Bare call of the flow: OpenCV's DIS flow at its medium setting between two frames in 8 bits at full size."""
 
     def __init__(self, first: NDArray[np.uint16], second: NDArray[np.uint16]) -> None:
         self._pair = [(frame // 16).astype(np.uint8) for frame in (first, second)]
 
     def __call__(self) -> None:
-        """Once."""
+        """Compute the flow once."""
         import cv2
 
         cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*self._pair, None)

@@ -1,8 +1,9 @@
-"""Whole preparations: how time grows with images, what a second worker gains, and what the tooth's region alone gains.
+"""Whole preparations: growth of the time with the number of images, gain by a second worker, and gain by preparing only
+the tooth's region.
 
-Every preparation is the stage itself, from a published capture to a published store, and runs in processes of its own.
-Seconds are of their processor time, as other work on the machine changes that little; what a second worker gains shows
-in seconds of the clock alone, so measure that on an idle machine.
+Every preparation runs the stage itself, from a published capture to a published store, in processes of its own.
+Seconds are of processor time, which other work on the machine changes little. The gain by a second worker appears only
+in seconds by the clock, so it must be measured on an idle machine.
 """
 
 from __future__ import annotations
@@ -27,25 +28,31 @@ if TYPE_CHECKING:
 SIZES = {True: (1280, 960), False: (5120, 3840)}
 """Width and height by ``quick``."""
 LIGHTS = 54
-"""Images of one slice, as many as a camera of the rig takes; capture and store take 15 GB of the disk meanwhile."""
+"""Number of images of one slice, as many as one camera of the rig takes. Capture and store of a slice take 15 GB of
+disk."""
 SLICES = 3
+"""Number of slices, as many as the rig has cameras."""
 FEWER = (6, 18)
+"""Numbers of images of the two smaller captures."""
 SHARES = (0.2, SHARE_OF_HEIGHT, 1.5)
-"""Height of the tooth by that of the image; at 1.5 it fills the image, so that nothing is left out."""
+"""Ratios of the tooth's height to the image's; at 1.5 the tooth fills the image, so that no region is left out."""
 TURNS = 2
+"""Number of runs with each number of workers."""
 Row = dict[str, Any]
 Keep = Callable[[list[Row]], object]
 
 
 def run(quick: bool = False, case: str = "images", keep: Keep = lambda _rows: None) -> list[Row]:
-    """Rows of one case.
+    """Return the rows of one case.
 
     Args:
-        case: ``images``: 6, 18, then three times 54 to 162. ``workers``: 18 by one and by two, in turns. ``region``: 6
-            of teeth of several sizes.
+        quick: take small images.
+        case: ``images``: 6 and 18 images, then three slices of 54, together 162. ``workers``: 18 images by one and by
+            two workers, alternately. ``region``: 6 images of teeth of several sizes.
+        keep: called with all rows so far after every new one.
 
     Raises:
-        InputError: an unknown case.
+        InputError: the case is unknown.
     """
     cases = {"images": _images, "workers": _workers, "region": _region}
     if case not in cases:
@@ -58,7 +65,7 @@ def run(quick: bool = False, case: str = "images", keep: Keep = lambda _rows: No
 
 
 def picture(rows: list[Row]) -> Figure:
-    """Seconds of each row, of the processor where they were measured, else by the clock."""
+    """Draw the seconds of each row: processor time where it was measured, else time by the clock."""
     from services.bench.plots import grid
 
     figure, (axes,) = grid(1)
@@ -72,7 +79,7 @@ def picture(rows: list[Row]) -> Figure:
 
 
 def _images(size: tuple[int, int]) -> Iterator[Row]:
-    """Each slice is another capture; the last row is all slices together."""
+    """Yield a row for each capture, of which each slice is another one; the last row sums up all slices."""
     slices = []
     for number, lights in enumerate((*FEWER, *[LIGHTS] * SLICES)):
         with _captured(size, lights, seed=number + 1) as root:
@@ -85,7 +92,7 @@ def _images(size: tuple[int, int]) -> Iterator[Row]:
 
 
 def _workers(size: tuple[int, int]) -> Iterator[Row]:
-    """The same capture each time."""
+    """Yield a row for each run, all with the same capture."""
     with _captured(size, FEWER[1]) as root:
         for _ in range(TURNS):
             for workers in (1, 2):
@@ -116,7 +123,7 @@ def _captured(size: tuple[int, int], lights: int, seed: int = 1, share: float = 
 
 
 def _prepared_apart(root: Path) -> tuple[float, float, float]:
-    """Processor seconds, peak memory in GiB and seconds by the clock of a preparation in a process of its own."""
+    """Return processor seconds, peak memory in GiB and clock seconds of a preparation in a process of its own."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as apart:
         return apart.submit(_prepare, root).result()
 
@@ -137,7 +144,9 @@ def _prepare(root: Path) -> tuple[float, float, float]:
 
 
 def _prepared_on(root: Path, workers: int) -> float:
-    """Seconds by the clock of a preparation as a task of a cluster; the workers have imported all before."""
+    """Return the seconds by the clock of a preparation as a task of a cluster whose workers have imported all modules
+    before.
+    """
     import dask
     from distributed import Client, LocalCluster
 

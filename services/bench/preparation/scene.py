@@ -1,4 +1,4 @@
-"""One camera's frames of a tooth that fills most of its height, made in place: no file is needed and none is left."""
+"""Synthetic frames of one camera that show a tooth over most of the image's height; no input file is needed."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ SHARE_OF_HEIGHT = 0.8
 BLACK, BITS = 64, 12
 CHANNELS = ("red", "green", "blue")
 COLOUR = (3000.0, 2700.0, 2200.0)
-"""Counts of a surface that faces the light."""
+"""Counts of the channels above black; 0.8 of them are those of a surface that faces the light."""
 MOVED_PX = (1.3, 0.7)
-"""By how much the tooth moves from the first frame in light to the last."""
+"""Movement of the tooth in x and y from the first lit frame to the last."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,9 @@ class Scene:
     """A published capture of one camera.
 
     Attributes:
-        root: the job's folder. counts: (H, W, C) of a light frame.
+        root: folder of the job.
+        manifest: the published manifest.
+        counts: counts (H, W, C) of the last frame.
     """
 
     root: Path
@@ -41,10 +43,15 @@ class Scene:
 def make_scene(
     root: Path, size: tuple[int, int], lights: int, tracking: int = 4, seed: int = 1, share: float = SHARE_OF_HEIGHT
 ) -> Scene:
-    """Publish a capture of ``size`` (width, height): black frames, tracking frames and one frame a light.
+    """Publish a capture with one black frame, tracking frames and one frame per light.
 
     Args:
-        share: height of the tooth by that of the image.
+        root: folder of the job.
+        size: width and height of the frames in pixels.
+        lights: number of lights.
+        tracking: number of tracking frames.
+        seed: seed of the frames' grain.
+        share: ratio of the tooth's height to the image's.
     """
     width, height = size
     focal_px = share / 2 * height / HALF_AXES_MM[1] * DISTANCE_MM
@@ -57,7 +64,7 @@ def make_scene(
     lamps = tuple(
         Light(name=f"l{k}", position_mm=(200.0 + 5 * k, -300.0, -700.0), intensity=(1e6,) * 3) for k in range(lights)
     )
-    # Tracking frames at even intervals among the lights, one at either end, so that no light's motion is extrapolated
+    # Put tracking frames at even intervals among the lights, one at either end, so that no motion is extrapolated.
     kinds = ["light"] * lights
     for place in np.linspace(lights, 0, tracking).round().astype(int).tolist():
         kinds.insert(place, "tracking")
@@ -109,7 +116,8 @@ def make_scene(
 def _photograph(
     counts: NDArray[np.uint16], grain: NDArray[np.float32], focal_px: float, moved: float, *, lit: bool
 ) -> None:
-    # A shaded ellipse in parallel projection, near enough for speed, with fixed grain so that no two runs differ
+    # Draw a shaded ellipse in parallel projection, which is similar enough for a measurement of speed, with fixed grain
+    # so that all runs have equal frames.
     height, width = grain.shape
     x = (np.arange(width, dtype=np.float32) - width / 2 - moved * MOVED_PX[0]) * (
         DISTANCE_MM / focal_px / HALF_AXES_MM[0]

@@ -1,1 +1,1 @@
-"""Slabs: how fast totals come, and how well a cell's images give back what made them."""
+"""Benchmarks of slabs: speed of total reflectance and transmittance, and recovery of a medium from images of a cell."""

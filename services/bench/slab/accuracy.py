@@ -1,8 +1,8 @@
-"""``dentine bench slab-map``: what a cell can tell over thickness, albedo and phase function (Gkioulekas et al. 2013,
-figure 6).
+"""``dentine bench slab-map``: attainable accuracy of a cell's measurement over thickness, albedo and phase function
+(Gkioulekas et al. 2013, figure 6).
 
-The bound is computed on a grid, at a fraction of a fit's cost each; real fits of images by plain photons stand on
-twelve points that are spread over it, so that the map is seen to be kept.
+The Cramér-Rao bound is computed on a grid, each point at a fraction of a fit's cost. Real fits of images by plain
+photons at twelve points spread over the grid check the map.
 """
 
 from __future__ import annotations
@@ -31,15 +31,18 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 THICKNESSES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0)
-"""sigma_t w."""
+"""Optical thicknesses sigma_t w of the grid."""
 ALBEDOS = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
+"""Albedos of the grid."""
 GOLDEN = 0.6180339887498949
-"""Steps by this share of a range fill it evenly at any number of points."""
+"""Fraction of the golden ratio: steps of this fraction of a range fill it evenly with any number of points."""
 FITS = 12
+"""Number of real fits."""
 FITTED_THICKNESSES, FITTED_ALBEDOS = (0.1, 10.0), (0.3, 1.0)
+"""Ranges of optical thickness and albedo of the real fits."""
 BOUND_PATHS = 2000
 PHOTONS = 1_000_000
-"""Of each image."""
+"""Number of photons of each image."""
 
 
 PHASES: dict[str, Callable[[Array], Array]] = {
@@ -51,7 +54,7 @@ PHASES: dict[str, Callable[[Array], Array]] = {
 
 
 class BoundRow(Row):
-    """One point of the grid. ``error`` is the bound of the phase function in L2."""
+    """One point of the grid. ``error`` is the relative bound of the phase function in L2."""
 
     thickness: float
     albedo: float
@@ -65,7 +68,7 @@ class BoundRow(Row):
 
 
 def bound_row(thickness: float, albedo: float, phase: str, seed: int = 1) -> BoundRow:
-    """The bound at one point."""
+    """Compute the bound at one point of the grid."""
     folder = near_beam_folder()
     per_mm = thickness / folder.cell.width_mm
     truth = Truth(phase, folder, albedo * per_mm, (1 - albedo) * per_mm, PHASES[phase])
@@ -89,7 +92,9 @@ def bound_row(thickness: float, albedo: float, phase: str, seed: int = 1) -> Bou
 
 
 def spread_truths() -> list[Truth]:
-    """The points of the real fits: thickness by its logarithm and albedo in golden steps, phase functions in turn."""
+    """Return the media of the real fits: optical thickness in equal steps of its logarithm, albedo in golden steps, and
+    the phase functions in rotation.
+    """
     folder, every = near_beam_folder(), []
     (low, high), (least, most) = np.log(FITTED_THICKNESSES), FITTED_ALBEDOS
     for number, phase in zip(range(FITS), list(PHASES) * FITS, strict=False):
@@ -102,7 +107,13 @@ def spread_truths() -> list[Truth]:
 
 
 def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
-    """Rows of both kinds; ``case`` is "bounds" or "fits" alone."""
+    """Return the rows of bounds and of fits.
+
+    Args:
+        quick: compute a few points only.
+        case: "bounds" or "fits" for one kind of rows; both by default.
+        keep: called with all rows so far after every few new ones.
+    """
     if case not in (None, "bounds", "fits"):
         raise InputError(f"slab-map has no case {case}; known are bounds and fits.")
     rows: list[dict[str, Any]] = []
@@ -120,8 +131,8 @@ def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) ->
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Bounds as maps over albedo and thickness, the worst of the phase functions; the fits' errors as numbers on
-    them.
+    """Draw the bounds, the largest over the phase functions, as maps over albedo and thickness, and the fits' errors as
+    numbers on them.
     """
     from matplotlib.colors import LogNorm
 

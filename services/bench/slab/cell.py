@@ -1,4 +1,4 @@
-"""The cell of all slab benchmarks, as a folder that needs no files."""
+"""The cell of all slab benchmarks, as the description of a slab folder without its files."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from services.core.slab.folder import SlabFolder
 
 
 def near_beam_folder(**changes: Any) -> SlabFolder:
-    """A cell of 1 mm without glass: three lights, and three cameras a side, one of which looks 3 degrees beside a beam.
+    """Return a cell of 1 mm without glass, with three lights and three cameras per side, one of which looks 3 degrees
+    beside a beam.
 
     Args:
-        changes: top-level keys of ``slab.json`` to be replaced, but for the images, which are of every camera under
-            every light.
+        changes: top-level keys of ``slab.json`` to replace. Images cannot be replaced: there is one of every camera
+            under every light.
     """
     angles = {"f": (-5, -15, -25), "b": (8, 18, -15)}
     sides = {"f": "front", "b": "back"}

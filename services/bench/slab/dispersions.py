@@ -1,9 +1,9 @@
-"""``dentine bench slab-mie``: nano-dispersions of known size through the whole measurement (Gkioulekas et al. 2013,
+"""``dentine bench slab-mie``: the whole measurement of nano-dispersions of known particle size (Gkioulekas et al. 2013,
 6.3).
 
-Polystyrene spheres in water: Lorenz-Mie theory gives phase function and scattering cross-section, so the truth is
-physics. Each dispersion is diluted to sigma_t w near 2, where a cell tells most; three are also measured as they are,
-at 1 % by weight.
+The dispersions are polystyrene spheres in water, whose phase function and scattering cross-section Lorenz-Mie theory
+gives, so the truth comes from physics. Each dispersion is diluted to sigma_t w near 2, where a cell's images contain
+most information; three are also measured undiluted, at 1 % by weight.
 """
 
 from __future__ import annotations
@@ -31,29 +31,31 @@ COLOURS = {
     "G": (533.0, 1.59807, 1.33499),
     "B": (488.0, 1.60515, 1.33704),
 }
-"""Wavelength in nm and the indices of polystyrene and water there."""
+"""For each colour the wavelength in nm, and the refractive indices of polystyrene and water at it."""
 VOLUME_FRACTION = 0.01 / 1.05
-"""Of 1 % by weight, at polystyrene's density of 1.05 g/cm3."""
+"""Volume fraction of polystyrene at 1 % by weight, with its density of 1.05 g/cm3."""
 BEST_THICKNESS = 2.0
+"""Optical thickness sigma_t w to which dispersions are diluted."""
 DILUTIONS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02)
-"""Of the full strength, as a laboratory makes them."""
+"""Dilutions that a laboratory makes, as fractions of the full strength."""
 THICK = (("R", 200.0), ("G", 200.0), ("B", 200.0))
-"""Also measured undiluted: sigma_t w is 5 to 12."""
+"""Colours and diameters in nm of the dispersions that are also measured undiluted: sigma_t w is 5 to 12."""
 PHOTONS, QUICK_PHOTONS = 4_000_000, 200_000
-"""Of each image."""
+"""Number of photons of each image."""
 
 Keep = Callable[[list[dict[str, Any]]], None]
 
 
 def mie_truth(diameter_nm: float, colour: str, dilution: float, folder: SlabFolder) -> Truth:
-    """Spheres of one size in water."""
+    """Return the medium of spheres of one diameter in water by Lorenz-Mie theory."""
     import miepython
 
     wavelength_nm, sphere, water = COLOURS[colour]
     size = math.pi * diameter_nm * water / wavelength_nm
     relative = complex(sphere / water, 0.0)
     efficiency = float(np.ravel(miepython.efficiencies_mx(relative, size)[1])[0])
-    # Cross-section of a sphere times spheres per volume: 3/2 of the fraction, over the diameter.
+    # Scattering coefficient: the cross-section of a sphere times the number of spheres per volume, which is 3/2 of the
+    # efficiency times the volume fraction, divided by the diameter.
     full_per_mm = 1.5 * efficiency * VOLUME_FRACTION / (diameter_nm * 1e-6)
 
     def phase(angles_rad: Array) -> Array:
@@ -64,7 +66,7 @@ def mie_truth(diameter_nm: float, colour: str, dilution: float, folder: SlabFold
 
 
 def truths() -> list[Truth]:
-    """All nine at the dilution nearest to the best thickness, and the thick ones."""
+    """Return all nine dispersions at the dilution nearest to the best thickness, and the undiluted ones."""
     folder = near_beam_folder()
     every = []
     for diameter_nm in DIAMETERS_NM:
@@ -75,7 +77,7 @@ def truths() -> list[Truth]:
 
 
 def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
-    """One row per dispersion; ``case`` is the beginning of its name, such as "500 nm G"."""
+    """Return one row per dispersion; ``case`` selects those whose name begins with it, such as "500 nm G"."""
     chosen = [one for one in truths() if case is None or one.name.startswith(case)]
     if not chosen:
         raise InputError(f"No dispersion is named {case}; known are {', '.join(one.name for one in truths())}.")
@@ -88,7 +90,7 @@ def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) ->
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Errors of sigma_s and of the phase function beside their bounds."""
+    """Draw the errors of sigma_s and of the phase function beside their bounds."""
     from services.bench.plots import grid
 
     figure, (scattering, phase) = grid(2)

@@ -1,4 +1,6 @@
-"""Slab totals and derivatives: how the error falls with run time. No peer renders infinite slabs, so none is timed."""
+"""Benchmark of slab totals and their derivatives: error against run time. No peer renders infinite slabs, so none is
+timed.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ CASES = {
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
-    """Rows for falling requested errors, totals and derivatives; kernels are compiled before the clock starts."""
+    """Return rows of totals and of derivatives for decreasing requested errors; the compilation of kernels does not
+    count as run time.
+    """
     rows = []
     for name, (layer, ior) in CASES.items():
         for gradient in (False, True):

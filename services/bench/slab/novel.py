@@ -1,8 +1,9 @@
-"""``dentine bench slab-novel``: what a fit says of cells and angles that it has not seen (Gkioulekas et al. 2013, 6.4).
+"""``dentine bench slab-novel``: prediction of images of cells and angles that a fit has not seen (Gkioulekas et al.
+2013, 6.4).
 
 A dispersion is measured in one cell by images of plain photons. Images of other cells under other beams are then
-predicted from what was found, and compared with those of what is true. Both come from the fit's own walk, which is held
-to others elsewhere: so what differs is the medium.
+predicted from the fitted medium and compared with images of the true medium. Both come from the fit's own random walk,
+which other benchmarks compare with independent ones, so the images differ only by the medium.
 """
 
 from __future__ import annotations
@@ -27,27 +28,30 @@ from services.fit.slab.results.result import SlabFit
 Array = NDArray[np.float64]
 
 DIAMETER_NM, COLOUR, DILUTION = 500.0, "G", 0.05
-"""sigma_t w is 1.6 in the cell that is measured, and 8 in the widest that is predicted."""
+"""The dispersion: sigma_t w is 1.6 in the measured cell, and 8 in the widest predicted cell."""
 PHOTONS, QUICK_PHOTONS = 1_000_000, 50_000
-"""Of each image that is fitted."""
+"""Number of photons of each fitted image."""
 ANGLES_DEG = (10.0, 20.0)
-"""Of the beams; those that are fitted have 5, 15 and 25."""
+"""Angles of the predicted beams; the fitted beams have 5, 15 and 25."""
 WIDTHS_MM = (1.0, 2.5, 5.0)
 BATCHES, PATHS, QUICK_PATHS = 8, 25_000, 1000
 
 
 class NovelRow(Row):
-    """One cell. ``error`` is the relative L2 difference of its images, noise taken out, 0 where that is negative."""
+    """One cell. ``error`` is the relative L2 difference of its images without their noise, and 0 where its estimated
+    square is negative.
+    """
 
     width_mm: float
     lights: str
     squared: float
-    """Square of the error, which noise may take below zero."""
+    """Estimated square of the error, which noise may make negative."""
     squared_se: float
+    """Standard error of ``squared``."""
 
 
 def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
-    """A row for the cell that was fitted, and one for each that was not."""
+    """Return a row for the fitted cell, and one for each predicted cell."""
     truth = mie_truth(DIAMETER_NM, COLOUR, DILUTION, near_beam_folder())
     images, variances = photographed(truth, QUICK_PHOTONS if quick else PHOTONS, seed=301)
     begun = time.process_time()
@@ -73,19 +77,19 @@ def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
 
 
 def novel_folder(width_mm: float) -> SlabFolder:
-    """The benchmarks' cell with another width and other beams."""
+    """Return the benchmarks' cell with another width and other beams."""
     lights = [{"name": f"n{k}", "side": "front", "angle_deg": angle} for k, angle in enumerate(ANGLES_DEG)]
     return near_beam_folder(cell={"width_mm": width_mm, "index": 1.33}, lights=lights)
 
 
 def medium_of_fit(fit: SlabFit) -> Material:
-    """The medium that a fit tells of."""
+    """Return the medium of a fit's result."""
     known = fit.parameters
     return Material(known.sigma_s.value * np.array(fit.phase.value_per_sr), known.sigma_a.value)
 
 
 def squared_error(folder: SlabFolder, found: Material, true: Material, paths: int) -> tuple[float, float]:
-    """Squared difference of all images as a share of their squares, and its standard error."""
+    """Return the squared difference of all images divided by the sum of their squares, and its standard error."""
     rig = rig_of(folder, folder.wavelengths_nm[0])
     ours, theirs = (
         render(rig, medium, seed=seed, step=0, batches=BATCHES, paths=paths, scores=False).images.reshape(BATCHES, -1)

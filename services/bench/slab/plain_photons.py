@@ -1,10 +1,11 @@
-"""Images of a cell by the plainest walk of photons: a truth for the slab's fit that shares no code with its kernel.
+"""Images of a cell by a simple random walk of photons: a truth for the slab's fit that shares no code with its kernel.
 
-Every photon starts in the beam's profile, is refracted at the face, flies exponential distances, is reflected inside by
-chance as Fresnel says, and turns by a finely tabulated phase function. From every collision it sends to its camera what
-would reach it directly and after up to three internal reflections; a fourth would add less than 1e-5 at an index of
-1.5. Nothing is forced, split, scored or done by quadrature. Every image has photons of its own, so that its noise is
-its own as well: photons that reach all cameras of a light err alike in all of them, as no measurement does.
+Every photon starts in the beam's profile, is refracted at the face, flies exponential distances, is reflected inside
+with the probability of Fresnel's equations, and changes its direction by a finely tabulated phase function. Every
+collision adds to the camera's image the light that reaches the camera directly and after up to three internal
+reflections; a fourth would add less than 1e-5 at an index of 1.5. There is no forced collision, splitting, score
+estimate or quadrature. Every image has photons of its own, so that its noise is independent: photons that contribute to
+all cameras of a light would give errors that are correlated between the cameras, unlike in a measurement.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from services.core.slab.folder import Light, SlabFolder
 Array = NDArray[np.float64]
 
 NODES = 7201
-"""Of the phase function's table: one each 0.025 degrees."""
+"""Number of nodes of the phase function's table: one every 0.025 degrees."""
 MIN_WEIGHT = 1e-4
-"""Below, a photon goes on with one chance in ten and tenfold weight."""
+"""Weight below which a photon continues with a probability of one in ten and tenfold weight (Russian roulette)."""
 BATCHES = 16
-"""Independent ones, whose spread gives the variance."""
+"""Number of independent batches, whose scatter gives the variance."""
 
 
 def plain_images(
@@ -39,11 +40,15 @@ def plain_images(
     photons: int,
     seed: int,
 ) -> tuple[Array, Array]:
-    """Images in the folder's order and the variances of their means (images, rows, columns).
+    """Return images in the folder's order and the variances of their means, both (images, rows, columns).
 
     Args:
-        phase_per_sr: of the scattering angle in rad; its scale is free.
-        photons: of each image, in all.
+        folder: description of the cell, its lights, cameras and images.
+        extinction_per_mm: extinction coefficient of the medium.
+        albedo: single-scattering albedo of the medium.
+        phase_per_sr: phase function of the scattering angle in rad; its scale is arbitrary.
+        photons: number of photons of each image, in all batches together.
+        seed: seed of the random numbers.
     """
     angles = np.linspace(0.0, math.pi, NODES)
     phase, cosines = _normalised(phase_per_sr(angles), angles)
@@ -78,7 +83,7 @@ def plain_images(
 
 
 def _normalised(phase: Array, angles: Array) -> tuple[Array, Array]:
-    """The phase function per sr at the nodes, and the cosine at equal steps of its cumulative distribution."""
+    """Return the phase function per sr at the nodes, and the cosines at equal steps of its cumulative distribution."""
     density = phase * np.sin(angles)
     steps = 0.5 * (density[1:] + density[:-1]) * np.diff(angles)
     total = float(steps.sum())
@@ -88,8 +93,8 @@ def _normalised(phase: Array, angles: Array) -> tuple[Array, Array]:
 
 
 def _arriving(folder: SlabFolder, light: Light, index: float) -> tuple[float, ...]:
-    """Sine in the medium, sign of z, face's depth, footprint in x and y as standard deviation or radius, and whether it
-    is a disc.
+    """Return the beam's sine in the medium, its sign of z, the depth of its face in mm, its footprint in x and y in mm
+    as standard deviation or radius, and 1 for a disc or 0 for a Gaussian.
     """
     slant = math.cos(math.radians(light.angle_deg))
     front = light.side == "front"
@@ -100,13 +105,15 @@ def _arriving(folder: SlabFolder, light: Light, index: float) -> tuple[float, ..
 
 
 def _leaving(camera: Any, index: float) -> tuple[float, float]:
-    """Sine in the medium of light that reaches the camera, and the sign of its z."""
+    """Return the sine in the medium of light that reaches the camera, and the sign of its z."""
     return math.sin(math.radians(camera.angle_deg)) / index, -1.0 if camera.side == "front" else 1.0
 
 
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _reflectance(cosine: float, index: float) -> float:
-    """Of unpolarised light from inside a medium of relative index ``index``, at the cosine inside."""
+    """Return the Fresnel reflectance of unpolarised light from inside a medium of relative index ``index``, at the
+    cosine inside.
+    """
     if index == 1.0:
         return 0.0
     outside = index * index * (1 - cosine * cosine)
@@ -123,15 +130,16 @@ def _send(
     image: Array, sine: float, sign: float, odd: int, x: float, y: float, z: float, power_per_sr: float,
     sigma_t: float, width: float, index: float, grid: tuple[float, float, float, float, int, int],
 ) -> None:  # fmt: skip
-    """Add what a collision sends to one camera: straight and after two reflections, or, where odd, after one and three.
+    """Add a collision's light to one camera's image: directly and after two reflections, or, where ``odd`` is 1, after
+    one and three reflections.
 
-    ``sine`` and ``sign`` (of z) are those of the end of the flight; after an odd number of reflections it began the
-    other way.
+    ``sine`` and ``sign`` (of z) describe the direction at the end of the flight; with an odd number of reflections the
+    flight begins in the other direction of z.
     """
     x_from, x_to, y_from, y_to, columns, rows = grid
     cosine = math.sqrt(1 - sine * sine)
     reflectance = _reflectance(cosine, index)
-    # Outside, radiance is power per area of the face and per solid angle, both seen from there: cosines outside cancel.
+    # Outside, radiance is power per projected area of the face and per solid angle; the cosines outside cancel.
     area = (x_to - x_from) * (y_to - y_from) / (columns * rows)
     share = power_per_sr * (1 - reflectance) / (index * index * cosine * area)
     onward = sign > 0 if odd == 0 else sign < 0
@@ -154,7 +162,7 @@ def _trace(
     sigma_t: float, albedo: float, phase: Array, cosines: Array, width: float, index: float,
     grid: tuple[float, float, float, float, int, int], images: Array,
 ) -> None:  # fmt: skip
-    """Trace photons and add what they send (cameras, rows, columns)."""
+    """Trace photons and add their contributions to ``images`` (cameras, rows, columns)."""
     beam_sine, beam_sign, face, size_x, size_y, disc = beam
     beam_cosine = math.sqrt(1 - beam_sine * beam_sine)
     entered = 1 - _reflectance(beam_cosine, index)
@@ -167,7 +175,7 @@ def _trace(
             x, y = size_x * random.standard_normal(), size_y * random.standard_normal()
         z, u, v, w, weight = face, beam_sine, 0.0, beam_sign * beam_cosine, entered
         while True:
-            # Fly to the next collision; a face on the way reflects by chance or lets the photon go.
+            # Fly to the next collision. A face on the way either reflects the photon or lets it leave, at random.
             flight = -math.log(1 - random.random()) / sigma_t
             gone = False
             while True:
@@ -196,7 +204,7 @@ def _trace(
                         images[camera], sine, sign, odd, x, y, z, weight * density, sigma_t, width, index, grid
                     )  # fmt: skip
 
-            # Turn by a drawn angle around a drawn azimuth.
+            # Rotate the direction by a random scattering angle and a random azimuth.
             cosine = cosines[int(random.random() * len(cosines))]
             turned, azimuth = math.sqrt(max(0.0, 1 - cosine * cosine)), 2 * math.pi * random.random()
             a, b = turned * math.cos(azimuth), turned * math.sin(azimuth)

@@ -1,4 +1,4 @@
-"""A known material through noisy images and the fit: what came out beside what is true and what the images allow."""
+"""Recovery of a known material by the fit of noisy images, compared with the truth and the bound of its accuracy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from services.fit.slab.solve.uncertainty import slopes
 Array = NDArray[np.float64]
 
 NOISE = 0.01
-"""Poisson noise of a pixel that has its image's mean."""
+"""Relative Poisson noise of a pixel that has its image's mean."""
 FINE_RAD: Array = np.radians(np.arange(0, 180.25, 0.5))
 """Angles at which phase functions are compared."""
 
@@ -40,27 +40,27 @@ class Truth:
     scattering_per_mm: float
     absorption_per_mm: float
     phase: Callable[[Array], Array]
-    """Of the scattering angle in rad; its scale is free."""
+    """Phase function of the scattering angle in rad; its scale is arbitrary."""
 
     @property
     def thickness(self) -> float:
-        """sigma_t w."""
+        """Optical thickness sigma_t w."""
         return (self.scattering_per_mm + self.absorption_per_mm) * self.folder.cell.width_mm
 
     def material(self) -> Material:
-        """The medium as a mixture of the dictionary's tents."""
+        """Return the medium as a mixture of the dictionary's tent functions."""
         shape = self.phase(ANGLES_RAD)
         return Material(self.scattering_per_mm * shape / float(shape @ tent_solid_angles()), self.absorption_per_mm)
 
     def phase_per_sr(self) -> Array:
-        """The phase function at the fine angles, normalised there."""
+        """Return the phase function, per sr, at the angles ``FINE_RAD``, normalised by quadrature over them."""
         values = self.phase(FINE_RAD)
         total = 2 * math.pi * float(np.trapezoid(values * np.sin(FINE_RAD), FINE_RAD))
         return np.asarray(values / total)
 
 
 class Recovered(Record):
-    """One number of a fit."""
+    """One quantity of a fit: its truth, estimate, standard error and bound, and whether the fit determined it."""
 
     truth: float
     value: float
@@ -70,7 +70,9 @@ class Recovered(Record):
 
 
 class Recovery(Row):
-    """One truth, one seed. ``error`` is that of the phase function, in L2 over equal steps of the angle."""
+    """Result for one truth and one seed. ``error`` is the relative L2 error of the phase function over equal steps of
+    the angle.
+    """
 
     thickness: float
     albedo: float
@@ -78,21 +80,21 @@ class Recovery(Row):
     numbers: dict[str, Recovered]
     phase_bound: float
     phase_error_by_sine: float
-    """The same weighted by the sine of the angle."""
+    """Relative L2 error of the phase function, weighted by the sine of the angle."""
     phase_flagged: float
-    """Share of the phase function's values that the fit calls not determined."""
+    """Fraction of the phase function's values that the fit reports as undetermined."""
     fit_error: float
     converged: bool
 
 
 def photographed(truth: Truth, photons: int, seed: int) -> tuple[Array, Array]:
-    """Images by plain photons with shot noise, and their variances (images, rows, columns)."""
+    """Return images by plain photons with shot noise, and their variances, both (images, rows, columns)."""
     extinction = truth.scattering_per_mm + truth.absorption_per_mm
     images, variances = plain_images(
         truth.folder, extinction, truth.scattering_per_mm / extinction, truth.phase, photons, seed
     )
-    # A pixel's own variance is drawn with its value, so the walk's noise is told as one that is proportional to the
-    # image.
+    # A pixel's estimated variance is correlated with its value, so the variance of the walk is stated as proportional
+    # to the image.
     shares = variances.sum(axis=(1, 2)) / images.sum(axis=(1, 2))
     means = images.mean(axis=(1, 2), keepdims=True)
     total = (NOISE**2 * means + shares[:, None, None]) * np.maximum(images, 0.01 * means)
@@ -101,7 +103,7 @@ def photographed(truth: Truth, photons: int, seed: int) -> tuple[Array, Array]:
 
 
 def fitted(truth: Truth, images: Array, variances: Array, seed: int) -> SlabFit:
-    """Fit images of a truth's folder."""
+    """Fit images (images, rows, columns) of a truth's folder."""
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         (root / "slab.json").write_text(truth.folder.model_dump_json())
@@ -114,10 +116,10 @@ def fitted(truth: Truth, images: Array, variances: Array, seed: int) -> SlabFit:
 
 
 def recovered(truth: Truth, images: Array, variances: Array, seed: int) -> Recovery:
-    """Fit the images and compare."""
+    """Fit the images and compare the result with truth and bound."""
     fit = fitted(truth, images, variances, seed)
     rig = rig_of(truth.folder, fit.wavelength_nm)
-    # What the walk's noise adds to the shot noise of a measured value.
+    # Take the part of the variance that the walk adds to the shot noise.
     beside = variances - NOISE**2 * np.maximum(images, 0) * images.mean(axis=(1, 2), keepdims=True)
     if rig.grid.folded:
         beside = 0.25 * (beside[:, : rig.grid.rows][:, ::-1] + beside[:, rig.grid.rows :])
@@ -128,7 +130,7 @@ def recovered(truth: Truth, images: Array, variances: Array, seed: int) -> Recov
 
 
 def compared(truth: Truth, fit: SlabFit, bound: Bound, seed: int) -> Recovery:
-    """The row of one fit."""
+    """Return the row of one fit."""
     material = truth.material()
     g = material.mean_cosine
     true = {
@@ -166,9 +168,11 @@ def compared(truth: Truth, fit: SlabFit, bound: Bound, seed: int) -> Recovery:
 
 
 def squared_share(residuals: Array, squares: float) -> tuple[float, float]:
-    """Square of the mean of batches' residuals (B, values) as a share of ``squares``, and its standard error.
+    """Return the square of the mean over batches of residuals (B, values), divided by ``squares``, and its standard
+    error.
 
-    Products are of different batches alone, so that no noise is squared; the error comes from leaving each batch out.
+    Only products of different batches count, so that noise does not bias the square. The standard error is the
+    jackknife's, which leaves each batch out in turn.
     """
     products = residuals @ residuals.T / squares
     np.fill_diagonal(products, 0)

@@ -1,9 +1,9 @@
 """``dentine bench slab-solvers``: error against core-seconds for the default solver and the paper's, from the same
-start on the same walk.
+start and with the same random walk.
 
 The paper's projected gradient descent (Gkioulekas et al. 2013, Algorithms 1 and 2, corrected) is run at several rates,
-as its text gives none. The paper states 9,600 to 19,200 core-hours for a wavelength of its own measurements; the
-picture has them as a line.
+because its text gives none. The paper states 9,600 to 19,200 core-hours for a wavelength of its own measurements; the
+picture shows the smaller figure as a line.
 """
 
 from __future__ import annotations
@@ -36,29 +36,32 @@ Array = NDArray[np.float64]
 
 SCATTERING_PER_MM, ABSORPTION_PER_MM, PHASE = 1.0, 0.03, "HG 0.8"
 TRUTH_PATHS, QUICK_TRUTH_PATHS = 400_000, 20_000
-"""Of each light, eight times: their noise is a third of a pixel's 1 %."""
+"""Number of paths per light of the measured images, all eight batches together: their noise is a third of a pixel's
+1 %."""
 EFFORTS, QUICK_EFFORTS = (0.02, 0.1, 0.3, 1.0), (0.02,)
-"""Of the default solver, in units of its budget of paths."""
+"""Budgets of paths of the default solver, as fractions of its usual one."""
 ITERATIONS, QUICK_ITERATIONS = (20, 80, 320), (5,)
+"""Numbers of iterations of the paper's solver."""
 RATES = (1e-12, 1e-11, 1e-10)
-"""Of the paper's steps: five of the largest throw the weights about (error 0.11 to 0.70), five of 1e-11 hardly move
-them (0.115)."""
+"""Step sizes of the paper's solver: five steps of the largest make the weights unstable (error 0.11 to 0.70), five of
+1e-11 hardly change them (0.115)."""
 PAPERS_CORE_SECONDS = 9_600 * 3600.0
+"""Smallest time that the paper states for one wavelength."""
 PAPER = "projected descent"
 
 
 class SolverRow(Row):
-    """One run of one solver. ``error`` is that of the phase function, in L2 over equal steps of the angle."""
+    """One run of one solver. ``error`` is the relative L2 error of the phase function over equal steps of the angle."""
 
     setting: str
     scattering_error: float
-    """Relative, of sigma_s."""
+    """Relative error of sigma_s."""
     reduced_error: float
-    """Relative, of sigma_s'."""
+    """Relative error of sigma_s'."""
 
 
 def measurements_of(truth: Truth, rig: Rig, paths: int, seed: int) -> Measurements:
-    """Images by the walk itself with shot noise of 1 %."""
+    """Return images by the solvers' own walk with shot noise of 1 %."""
     image = render(rig, truth.material(), seed=seed, step=0, batches=8, paths=paths // 8, scores=False).mean
     variances = np.stack([shot_noise(one, NOISE) for one in image]) / (2 if rig.grid.folded else 1)
     values = image + np.sqrt(variances) * np.random.default_rng(seed).normal(size=image.shape)
@@ -67,7 +70,7 @@ def measurements_of(truth: Truth, rig: Rig, paths: int, seed: int) -> Measuremen
 
 
 def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
-    """Rows of both solvers; ``case`` is "default" or "paper" alone."""
+    """Return the rows of both solvers, or of one where ``case`` is "default" or "paper"."""
     if case not in {None, "default", "paper"}:
         raise InputError(f"slab-solvers has no case {case}; known are default and paper.")
     folder = near_beam_folder()
@@ -99,7 +102,7 @@ def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) ->
 def compared(
     truth: Truth, found: Material, peer: str, setting: str, seconds: float, benchmark: str = "slab-solvers"
 ) -> SolverRow:
-    """The row of one solution."""
+    """Return the row of one solution."""
     phase, true = truth.phase_per_sr(), truth.material()
     difference = np.interp(FINE_RAD, ANGLES_RAD, found.phase_per_sr) - phase
     reduced, true_reduced = (one.scattering_per_mm * (1 - one.mean_cosine) for one in (found, true))
@@ -115,7 +118,9 @@ def compared(
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Errors of the phase function and of sigma_s against core-seconds, and what the paper states for a wavelength."""
+    """Draw the errors of the phase function and of sigma_s against core-seconds, and the time that the paper states for
+    one wavelength.
+    """
     from services.bench.plots import draw_errors, finish, grid
 
     figure, panels = grid(2)

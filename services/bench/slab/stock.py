@@ -1,9 +1,10 @@
 """``dentine bench slab-stock``: an index-matched cell measured by the default solver and by stock Mitsuba.
 
-Stock Mitsuba cannot light a cell through smooth glass, so the boundary is matched (``stock_cell``). Images are those of
-plain photons, and both begin at the same medium. By gradients of Mitsuba, Adam moves the logarithms of the weights of
-HG lobes, one ``tabphase`` with values D w, and of the absorption: a smooth dictionary, which holds the true lobes
-themselves or neighbours of them, spares it the prior that the default's 200 knots need.
+Stock Mitsuba cannot light a cell through smooth glass, so the boundary is matched (``stock_cell``). The images are
+those of plain photons, and both solvers begin at the same medium. With gradients of Mitsuba, Adam changes the
+logarithms of the absorption and of the weights of HG lobes, which form one ``tabphase`` with values D w. This smooth
+dictionary contains the true lobes or close neighbours of them, so it does not need the prior that the default's 200
+knots need.
 """
 
 from __future__ import annotations
@@ -35,19 +36,19 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 PHASE = "two lobes"
-"""Unlike the start's one lobe."""
+"""Phase function of the truth; it differs from the single lobe of the start."""
 PHOTONS, QUICK_PHOTONS = 500_000, 20_000
-"""Of each image."""
+"""Number of photons of each image."""
 RATES, QUICK_RATES = (0.05, 0.2), (0.2,)
-"""Of Adam, in the logarithms of weights."""
+"""Learning rates of Adam for the logarithms."""
 ITERATIONS, QUICK_ITERATIONS = (5, 10, 20), (1,)
-"""After which its medium is told."""
+"""Numbers of iterations after which the medium is reported."""
 SAMPLES = 64
-"""Of a pixel in a render and in its gradient."""
+"""Paths per pixel of a render and of its gradient."""
 MEAN_DECAY, SQUARE_DECAY, SMALL = 0.9, 0.999, 1e-8
-"""Adam's own (Kingma and Ba 2015)."""
+"""Adam's beta1, beta2 and epsilon (Kingma and Ba 2015)."""
 SMALLEST_PER_MM = 1e-4
-"""Of an absorption whose logarithm is taken."""
+"""Smallest absorption of the start, because its logarithm is taken."""
 STOCK = "stock Mitsuba"
 EXTINCTION, ALBEDO, VALUES = (
     f"cell.interior_medium.{name}" for name in ("sigma_t.value.value", "albedo.value.value", "phase_function.values")
@@ -55,7 +56,7 @@ EXTINCTION, ALBEDO, VALUES = (
 
 
 def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
-    """Rows of both."""
+    """Return the rows of both solvers."""
     folder = matched_folder()
     truth = Truth(PHASE, folder, SCATTERING_PER_MM, ABSORPTION_PER_MM, PHASES[PHASE])
     images, variances = photographed(truth, QUICK_PHOTONS if quick else PHOTONS, seed=61)
@@ -87,10 +88,18 @@ def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
 def descend(
     truth: Truth, guess: Material, images: Array, variances: Array, rate: float, *, quick: bool
 ) -> Iterator[tuple[int, Material, float]]:
-    """Iterations, the medium after them and processor seconds, by Adam on gradients of stock Mitsuba.
+    """Fit the medium by Adam on gradients of stock Mitsuba.
 
     Args:
-        images: measured (images, rows, columns), and their variances.
+        truth: the true medium in its cell.
+        guess: medium at the start.
+        images: measured images (images, rows, columns).
+        variances: variances of the images (images, rows, columns).
+        rate: learning rate.
+        quick: stop after one iteration.
+
+    Yields:
+        Number of iterations, the medium after them and processor seconds so far.
     """
     from services.fit.transport.platform import prepare_device
 
@@ -127,7 +136,9 @@ def descend(
 
 
 def _slope(scene: Any, params: Any, image: Array, variance: Array, known: Array, tables: Array, *, seed: int) -> Array:
-    """Derivative of half the misfit of one image by the logarithms of weights and absorption, which are ``known``."""
+    """Return the derivative of half the squared, weighted residuals of one image with respect to the logarithms of the
+    weights and the absorption; ``known`` are the weights and, last, the absorption themselves.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -136,7 +147,7 @@ def _slope(scene: Any, params: Any, image: Array, variance: Array, known: Array,
     for name in (EXTINCTION, ALBEDO, VALUES):
         dr.enable_grad(params[name])
     params.update()
-    # The image and its derivative have streams of their own, so that their product is not biased.
+    # The image and its derivative have independent random numbers, so that their product is unbiased.
     rendered = mi.render(scene, params, spp=SAMPLES, seed=seed, seed_grad=seed + 1)
     measured, own = (mi.TensorXf(np.ascontiguousarray(one[..., None], dtype=np.float32)) for one in (image, variance))
     dr.backward(0.5 * dr.sum(dr.square(rendered - measured) / own, axis=None))
@@ -145,13 +156,15 @@ def _slope(scene: Any, params: Any, image: Array, variance: Array, known: Array,
 
 
 def medium_numbers(known: Array, tables: Array) -> tuple[float, float, Array]:
-    """Extinction, albedo and the table of the phase function, from weights and the absorption."""
+    """Return extinction, albedo and the table of the phase function from the weights and, last, the absorption."""
     extinction = float(known.sum())
     return extinction, float(known[:-1].sum()) / extinction, tables @ known[:-1]
 
 
 def chained(by_extinction: float, by_albedo: float, by_values: Array, known: Array, tables: Array) -> Array:
-    """Derivative by the logarithms of what is ``known`` from those by ``medium_numbers``."""
+    """Return the derivative with respect to the logarithms of ``known`` by the chain rule, from the derivatives with
+    respect to the results of ``medium_numbers``.
+    """
     extinction = float(known.sum())
     by_weights = by_extinction + by_albedo * known[-1] / extinction**2 + tables.T @ by_values
     by_absorption = by_extinction - by_albedo * (extinction - known[-1]) / extinction**2
@@ -159,9 +172,10 @@ def chained(by_extinction: float, by_albedo: float, by_values: Array, known: Arr
 
 
 def times_faster(rows: list[dict[str, Any]]) -> float | None:
-    """How many times as long stock Mitsuba took to its nearest medium as the default to one that is no further off.
+    """Return the ratio of stock Mitsuba's time to its best medium to the default's time to one at least as good.
 
-    Neither in sigma_s nor in the phase function, by which the nearest is chosen; None where the default came to none.
+    The best medium has the smallest error of the phase function; the default's must have no larger error of the phase
+    function nor of sigma_s. None where the default has no such medium.
     """
     nearest = min((row for row in rows if row["peer"] == STOCK), key=lambda row: row["error"])
     as_near = [
@@ -173,7 +187,7 @@ def times_faster(rows: list[dict[str, Any]]) -> float | None:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Errors of the phase function and of sigma_s against core-seconds."""
+    """Draw the errors of the phase function and of sigma_s against core-seconds."""
     from services.bench.plots import draw_errors, finish, grid
 
     figure, panels = grid(2)

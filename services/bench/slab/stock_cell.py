@@ -1,8 +1,8 @@
 """Images of an index-matched cell by stock Mitsuba, which share no code with the slab's kernel.
 
-Stock Mitsuba has no narrow beam that a path from a camera can be connected to. A directional light through a black
-plate whose opacity is one minus the beam's profile is one: its integrators multiply what a plate lets through into
-every connection.
+Stock Mitsuba has no narrow beam to which a path from a camera can be connected. A directional light through a black
+plate whose opacity is one minus the beam's profile serves as such a beam, because Mitsuba's integrators multiply every
+connection by the plate's transmittance.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ from services.core.slab.folder import Light, SlabCamera, SlabFolder
 Array = NDArray[np.float64]
 
 HALF_CELL_MM = 12.0
-"""The cell's lateral half edge, twice that of the pixels: what leaves there comes back to no pixel."""
+"""Half edge of the cell across, twice that of the pixels: light that leaves there would not return to a pixel."""
 HALF_PLATE_MM, PLATE_NODES, PLATE_AWAY_MM = 14.0, 2048, 60.0
-"""The plate shades the whole cell, its nodes are a 70th of the beam's size, and it stands behind all cameras."""
+"""Half edge of the plate, its number of nodes and its distance from the cell. The plate shades the whole cell, the
+distance of its nodes is a 70th of the beam's size, and it stands behind all cameras."""
 COSINES = 20_001
-"""Nodes of the phase function's table."""
+"""Number of nodes of the phase function's table."""
 MAX_ORDER = 256
 RENDERS = 8
-"""Independent renders of an image, whose spread gives its variance."""
+"""Number of independent renders of an image, whose scatter gives its variance."""
 
 
 def matched_folder() -> SlabFolder:
-    """The benchmarks' cell with a matched boundary, under a beam of 1 mm.
+    """Return the benchmarks' cell with a matched boundary, under a beam of 1 mm.
 
-    That is as broad as stock Mitsuba can light well, as a connection from outside of it brings nothing.
+    The beam has to be this broad for stock Mitsuba, because a connection from a point outside the beam contributes
+    nothing.
     """
     return near_beam_folder(
         cell={"width_mm": 1.0, "index": None, "boundary": "matched"},
@@ -45,12 +47,14 @@ def matched_folder() -> SlabFolder:
 def stock_images(
     folder: SlabFolder, medium: dict[str, Any], samples: int, seed: int, done: Callable[[int], None] | None = None
 ) -> tuple[Array, Array]:
-    """Images in the folder's order and the variances of their means (images, rows, columns).
+    """Return images in the folder's order and the variances of their means, both (images, rows, columns).
 
     Args:
-        medium: as ``medium_of`` gives it.
-        samples: paths a pixel, in all.
-        done: told of each image's number.
+        folder: description of the cell, its lights, cameras and images.
+        medium: Mitsuba dictionary of the medium, as ``medium_of`` returns it.
+        samples: paths per pixel, in all renders of an image together.
+        seed: seed of the first render.
+        done: called with the number of each finished image.
     """
     from services.fit.transport.platform import prepare_device
 
@@ -73,7 +77,7 @@ def stock_images(
 
 
 def scenes(folder: SlabFolder, medium: dict[str, Any], integrator: str) -> Iterator[tuple[Any, bool]]:
-    """A scene for each of the folder's images, and whether its camera is in front."""
+    """Yield a scene for each of the folder's images, and whether its camera is in front."""
     import mitsuba as mi
 
     lights = {light.name: light for light in folder.lights}
@@ -85,18 +89,20 @@ def scenes(folder: SlabFolder, medium: dict[str, Any], integrator: str) -> Itera
 
 
 def turned(image: Array, *, front: bool) -> Array:
-    """A film (rows, columns) as a folder's image, or the other way.
+    """Convert a film (rows, columns) to a folder's image, or a folder's image to a film.
 
-    A film's rows go down, and those of a camera in front run against x.
+    A film's rows run downwards, and the columns of a camera in front run against x.
     """
     return image[::-1, ::-1] if front else image[::-1]
 
 
 def medium_of(extinction_per_mm: float, albedo: float, phase_per_sr: Callable[[Array], Array]) -> dict[str, Any]:
-    """A homogeneous medium with a tabulated phase function.
+    """Return the Mitsuba dictionary of a homogeneous medium with a tabulated phase function.
 
     Args:
-        phase_per_sr: of the scattering angle in rad; its scale is free.
+        extinction_per_mm: extinction coefficient.
+        albedo: single-scattering albedo.
+        phase_per_sr: phase function of the scattering angle in rad; its scale is arbitrary.
     """
     values = phase_per_sr(node_angles())
     return {
@@ -108,19 +114,19 @@ def medium_of(extinction_per_mm: float, albedo: float, phase_per_sr: Callable[[A
 
 
 def node_angles() -> Array:
-    """Scattering angles of the phase function's table, rad (COSINES,)."""
+    """Return the scattering angles (COSINES,) in rad of the phase function's table."""
     return np.asarray(np.arccos(np.linspace(-1.0, 1.0, COSINES)))
 
 
 def _plate(folder: SlabFolder) -> Array:
-    """Opacity of the plate (PLATE_NODES, PLATE_NODES)."""
+    """Return the opacity of the plate (PLATE_NODES, PLATE_NODES)."""
     across = (np.arange(PLATE_NODES) + 0.5) / PLATE_NODES * 2 * HALF_PLATE_MM - HALF_PLATE_MM
     squared = across[:, None] ** 2 + across[None] ** 2
     return 1 - np.exp(-squared / (2 * folder.beam.size_mm**2))
 
 
 def _direction(side: str, angle_deg: float, *, arriving: bool) -> Array:
-    """Travelling direction of a beam that arrives at a face, or of light that leaves it."""
+    """Return the direction of propagation of a beam that arrives at a face, or of light that leaves it."""
     forward = 1.0 if (side == "front") == arriving else -1.0
     return np.array([math.sin(math.radians(angle_deg)), 0.0, forward * math.cos(math.radians(angle_deg))])
 

@@ -1,9 +1,9 @@
 """``dentine bench slab-surface``: the error of images over all mixtures of three phase functions (Gkioulekas et al.
 2013, figure 5).
 
-The problem is not convex, so the paper looks at it: if the surface has one minimum, at the truth, a descent cannot be
-caught elsewhere. Images of every mixture are compared with those of the true one; two independent renders each keep the
-walk's noise out of the error's mean.
+The problem is not convex, so the paper examines the surface of the error: if it has a single minimum, at the truth, a
+descent cannot end in another one. Images of every mixture are compared with those of the true mixture. Products of
+different, independent batches keep the noise of the mixture's images from biasing the squared error.
 """
 
 from __future__ import annotations
@@ -30,45 +30,48 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 COSINES = (0.8, 0.0, -0.5)
-"""Of the three HG phase functions, which span forward, even and backward scattering."""
+"""Mean cosines of the three HG phase functions: forward, isotropic and backward scattering."""
 EXTINCTIONS_PER_MM = (0.5, 2.0, 8.0)
 ALBEDO = 0.98
 TRUTHS = ((6, 2, 2), (2, 4, 4))
-"""Weights of the true mixtures, in steps of the grid."""
+"""Weights of the true mixtures, in tenths."""
 STEPS, QUICK_STEPS = 10, 5
+"""Number of steps of the grid along each edge of the triangle of weights."""
 BATCHES, PATHS = 8, 1000
-"""Of each mixture; the truth's images have sixteen times as many paths."""
+"""Number of batches of each mixture, and paths of each; the truth's images have sixteen times as many paths."""
 
 
 class SurfaceRow(Row):
     """One mixture.
 
-    ``error`` is the relative L2 difference of its images, with the walk's noise taken out, 0 where it is negative.
+    ``error`` is the relative L2 difference of its images without the walk's noise, and 0 where its estimated square is
+    negative.
     """
 
     extinction_per_mm: float
     truth: tuple[float, ...]
     weights: tuple[float, ...]
     squared: float
-    """Square of the error, which noise may take below zero."""
+    """Estimated square of the error, which noise may make negative."""
     squared_se: float
+    """Standard error of ``squared``."""
 
 
 def mixture_of(weights: tuple[float, ...], extinction_per_mm: float) -> Material:
-    """The medium of weights that add up to one."""
+    """Return the medium of weights that add up to one."""
     phase = unit_atoms(np.stack([hg_values(g) for g in COSINES], axis=1)) @ np.array(weights)
     return Material(ALBEDO * extinction_per_mm * phase, (1 - ALBEDO) * extinction_per_mm)
 
 
 def mixtures(steps: int) -> list[tuple[int, int, int]]:
-    """All points of the simplex, in steps."""
+    """Return all points of the grid on the simplex, as numbers of steps that add up to ``steps``."""
     return [
         (first, second, steps - first - second) for first in range(steps + 1) for second in range(steps + 1 - first)
     ]
 
 
 def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
-    """One row per truth, extinction and mixture."""
+    """Return one row per truth, extinction and mixture."""
     folder, steps = near_beam_folder(), QUICK_STEPS if quick else STEPS
     rig = rig_of(folder, folder.wavelengths_nm[0])
     rows: list[dict[str, Any]] = []
@@ -104,8 +107,8 @@ def _render(rig: Rig, material: Material, *, step: int, paths: int) -> Array:
 
 
 def other_minima(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mixtures of one surface, but for the lowest, with no neighbour that is lower by more than their noise
-    explains.
+    """Return the mixtures of one surface, except the lowest one, whose neighbours are all higher by more than three
+    standard errors.
     """
     at = {row["weights"]: row for row in rows}
     lowest = min(rows, key=lambda row: row["squared"])
@@ -125,7 +128,7 @@ def other_minima(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """A triangle for each truth and extinction, with contours of the error and a cross at the truth."""
+    """Draw a triangle for each truth and extinction, with contours of the error and a cross at the truth."""
     from services.bench.plots import grid
 
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
