@@ -1,1 +1,1 @@
-"""Numerical stability at the corners of the parameters and in difficult scenes."""
+"""Benchmarks of numerical stability at extreme parameters and in difficult scenes."""

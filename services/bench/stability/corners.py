@@ -1,4 +1,4 @@
-"""Random parameter sets from the corners of what a medium and a slab can be."""
+"""Random parameter sets from the extremes of the parameters of media and slabs."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 from services.fit.optics.parameters import Medium
 
 SIGMA = (1e-4, 1e4)
-"""Extinction, per mm."""
+"""Range of extinction, per mm."""
 MIN_ABSORBED = 1e-7
-"""Of 1 - alpha, beside 0 itself."""
+"""Smallest 1 - alpha other than 0."""
 NARROWEST = 1e-4
-"""Of 1 - |g|."""
+"""Smallest 1 - |g|."""
 WIDTH_MM = (1e-3, 10.0)
+"""Range of a layer's thickness."""
 IOR = (1.0, 4.0)
+"""Range of the index of refraction."""
 MATCHED, THIN, SMOOTH = 0, 1, 2
+"""Codes of the boundary models."""
 
 REGIONS = (
     "anywhere",
@@ -36,7 +39,7 @@ REGIONS = (
 
 @dataclass(frozen=True)
 class Corners:
-    """N sets of two layers. Arrays of layers are (2, N), all others (N,)."""
+    """N parameter sets of slabs with two layers. Arrays of both layers are (2, N), all others (N,)."""
 
     region: NDArray[np.int64]
     """Index into REGIONS."""
@@ -48,15 +51,16 @@ class Corners:
     g2: NDArray[np.float64]
     width_mm: NDArray[np.float64]
     boundary: NDArray[np.int64]
-    """MATCHED, THIN or SMOOTH."""
+    """Boundary model: MATCHED, THIN or SMOOTH."""
     ior: NDArray[np.float64]
     diffuse: NDArray[np.bool_]
+    """True for diffuse incident light, False for light at normal incidence."""
 
     def __len__(self) -> int:
         return len(self.region)
 
     def media(self) -> list[list[Medium]]:
-        """The media of either layer, one per set."""
+        """Return the media of the first and of the second layer, one per set."""
         fields = (self.sigma, 1 - self.absorbed, self.beta, self.g1, self.g2)
         return [
             [Medium(*values) for values in zip(*(field[k].tolist() for field in fields), strict=True)] for k in range(2)
@@ -64,8 +68,8 @@ class Corners:
 
 
 def draw(count: int, seed: int) -> Corners:
-    """``count`` sets, the regions in turn: what a region does not push into its corner lies anywhere in the whole
-    range.
+    """Draw ``count`` sets, the regions in rotation; parameters that a region does not make extreme lie anywhere in
+    their whole range.
     """
     rng = np.random.default_rng(seed)
     region = np.arange(count) % len(REGIONS)

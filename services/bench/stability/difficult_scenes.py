@@ -1,5 +1,5 @@
-"""Small teeth that strain the geometry: slivers, rays along a face, enamel as thin as allowed, lights very near and
-very far.
+"""Small scenes with difficult geometry: sliver triangles, rays along a face, enamel as thin as allowed, lights very
+near and very far.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ PIXELS = 8
 DIRECTIONS = np.array(
     [[0.16, 0.98, 0.08], [0.84, 0.5, 0.17], [-0.87, 0.35, -0.35], [0, -0.99, 0.16], [0.08, 0.16, 0.98]]
 )
-"""Towards the lights."""
+"""Directions towards the lights (L, 3), not normalised."""
 TISSUE = Tissue(Medium(3, 0.99, 0.9, 0.8, -0.2), Medium(8, 0.98, g1=0.7))
 LARGEST_Z = 4.5
+"""Number of standard errors below zero from which on an image counts as negative."""
 SPLIT = 1e-9
-"""Where slivers part an edge, as a fraction of its length."""
+"""Position at which slivers split an edge, as a fraction of its length."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene, and one whose images must look the same within their errors, if there is one."""
+    """A scene and, if there is one, another scene whose images must be equal within their standard errors."""
 
     name: str
     recipe: SceneRecipe
@@ -44,21 +45,22 @@ class Scene:
 
 @dataclass(frozen=True)
 class Seen:
-    """What came of a scene."""
+    """Result of rendering a scene."""
 
     numbers: int
-    """Pixels x lights, as many for every derivative."""
+    """Number of computed values: one per pixel and light for the images, and as many for every derivative."""
     negative: int
-    """Lights whose image, summed, is below zero by more than ``LARGEST_Z`` standard errors; one pixel's estimate may be
-    negative."""
+    """Number of lights whose image, summed over pixels, is below zero by more than ``LARGEST_Z`` standard errors; the
+    estimate of a single pixel may be negative."""
     error: float
-    """Relative standard error of the image of all pixels and lights."""
+    """Relative standard error of the images over all pixels and lights."""
     z: float | None
-    """The largest difference of a light's total from the scene that must look alike, in standard errors."""
+    """Largest difference, over lights, of a light's total from that of the scene that must be equal, in standard
+    errors; None without such a scene."""
 
 
 def scenes() -> Iterator[Scene]:
-    """All of them, the same each time."""
+    """Yield all scenes, which are equal in every run."""
     outer, dentin = ellipsoid(SEMI_AXES_MM), ellipsoid(SEMI_AXES_MM - 0.3)
     plain = _recipe(outer, dentin)
     yield Scene("slivers", _recipe(with_slivers(outer), with_slivers(dentin)), TISSUE, plain, TISSUE)
@@ -91,10 +93,10 @@ def scenes() -> Iterator[Scene]:
 
 
 def look(scene: Scene, *, samples: int, seed: int) -> Seen:
-    """Images and all derivatives of a scene, seen along the upper face of the box.
+    """Render the images and all derivatives of a scene, seen along the upper face of the box.
 
     Raises:
-        NonFiniteError: a value came out NaN or infinite.
+        NonFiniteError: a value is NaN or infinite.
     """
     parts = ("enamel",) if scene.recipe.teeth[0].dentin is None else ("enamel", "dentin")
     names = tuple(f"{part}.{field}" for part in parts for field in MEDIUM_FIELDS)
@@ -104,7 +106,7 @@ def look(scene: Scene, *, samples: int, seed: int) -> Seen:
     z = None
     if scene.like is not None and scene.like_tissue is not None:
         other = Engine(scene.like).images(scene.like_tissue, view, samples=samples, seed=seed + 2)
-        # Pixels are independent; the lights of one pixel share its paths.
+        # Sum over pixels for each light: pixels are independent, but the lights of one pixel share its paths.
         spread = np.sqrt(image.variance.sum(axis=1) + other.variance.sum(axis=1))
         z = float(np.max(np.abs(image.mean.sum(axis=1) - other.mean.sum(axis=1)) / spread))
     negative = int(np.count_nonzero(image.mean.sum(axis=1) < -LARGEST_Z * np.sqrt(image.variance.sum(axis=1))))
@@ -113,14 +115,14 @@ def look(scene: Scene, *, samples: int, seed: int) -> Seen:
 
 
 def ellipsoid(semi_axes_mm: NDArray[np.float64]) -> Mesh:
-    """An ellipsoid about the origin."""
+    """Return an ellipsoid about the origin."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     return Mesh(np.asarray(ball.vertices) * semi_axes_mm, np.asarray(ball.faces, dtype=np.int32))
 
 
 def with_slivers(mesh: Mesh) -> Mesh:
-    """The same surface with edges parted ``SPLIT`` of their length from one end, both triangles of the edge with
-    them.
+    """Return the same surface with edges split at ``SPLIT`` of their length, which splits both triangles of such an
+    edge.
     """
     vertices, faces = list(mesh.vertices_mm), [list(face) for face in mesh.faces.tolist()]
     beside: dict[tuple[int, int], list[int]] = {}
@@ -155,7 +157,7 @@ def _towards_lights(distance_mm: float) -> NDArray[np.float64]:
 
 
 def _edge_on() -> View:
-    """A camera on the y axis at the height of the box's upper face, 9 mm across."""
+    """Return the view of a camera on the y axis at the height of the box's upper face, with a field of 9 mm."""
     focal = DISTANCE_MM * PIXELS / 9
     camera = Camera(
         name="edge-on",

@@ -1,5 +1,5 @@
-"""The kernels' formulas in single precision, and the fit's domains in double, against independent forms in NumPy
-float64.
+"""Errors of the kernels' formulas in single precision, and of the fit's coordinates in double precision, against
+independent forms in NumPy float64.
 """
 
 from __future__ import annotations
@@ -23,55 +23,58 @@ Floats = NDArray[np.float64]
 ROUNDING = 2.0**-24
 """Half a unit in the last place of single precision."""
 DARK = 40.0
-"""Optical depth, and exponent of the albedos, past which nothing is left to compare."""
+"""Optical depth, and exponent of a power of the albedo, beyond which the result is too small to compare."""
 
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula, how its error is measured, and how large it may be."""
+    """A formula with the measurement of its error and the error's bound."""
 
     name: str
     relative_error: Callable[[Corners, np.random.Generator], Floats]
-    """(N,) for the sets, each at one random argument."""
+    """Function that returns the relative errors (N,) for the sets, each at one random argument."""
     bound: float
+    """Largest allowed relative error."""
     reason: str
-    """Where the bound comes from."""
+    """Origin of the bound."""
 
 
 def kernel(function: Callable[..., Any], *columns: Floats) -> Floats:
-    """Values of a kernel function; the arguments must be representable in single precision."""
+    """Return the values of a kernel function; its arguments must be representable in single precision."""
     return np.array(function(*(mi.Float(column.astype(np.float32)) for column in columns)), dtype=np.float64)
 
 
 def single(values: Floats) -> Floats:
-    """Rounded to single precision, what a kernel is given."""
+    """Round values to single precision, as a kernel's arguments are."""
     return values.astype(np.float32).astype(np.float64)
 
 
 def _deviations(corners: Corners, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Mean cosine of the first layer's first lobe, and deviations 1 - sign(g) cos(theta) from its tip to straight
-    behind.
+    """Return the mean cosine g of the first layer's first lobe, and random deviations 1 - sign(g) cos(theta), from the
+    peak of the lobe to the opposite direction.
     """
     g = single(corners.g1[0])
     return g, single(np.minimum((1 - np.abs(g)) ** 2 * 10.0 ** rng.uniform(-3, 9, len(g)), 2.0))
 
 
 def _lobe(g: Floats, m: Floats) -> tuple[Floats, Floats, Floats]:
-    """|g|, 1 + g^2 - 2 |g| (1 - m) and the Henyey-Greenstein value there."""
+    """Return |g|, 1 + g^2 - 2 |g| (1 - m) and the Henyey-Greenstein phase function at deviation m."""
     a = np.abs(g)
     d = (1 - a) ** 2 + 2 * a * m
     return a, d, (1 - a**2) / (4 * np.pi * d**1.5)
 
 
 def phase_density(corners: Corners, rng: np.random.Generator) -> Floats:
-    """Relative to the value."""
+    """Return the relative errors of the phase function's density."""
     g, m = _deviations(corners, rng)
     truth = _lobe(g, m)[2]
     return np.abs(kernel(phase.density, g, m) / truth - 1)
 
 
 def phase_score(corners: Corners, rng: np.random.Generator) -> Floats:
-    """Relative to the size of the two terms, whose difference passes through zero."""
+    """Return the errors of the derivative of the density's logarithm with respect to g, relative to the size of its two
+    terms, because their difference passes through zero.
+    """
     g, m = _deviations(corners, rng)
     a, d, _ = _lobe(g, m)
     truth = np.copysign(1.0, g) * (-2 * a / (1 - a**2) + 3 * (1 - a - m) / d)
@@ -80,7 +83,7 @@ def phase_score(corners: Corners, rng: np.random.Generator) -> Floats:
 
 
 def phase_sampling(corners: Corners, rng: np.random.Generator) -> Floats:
-    """Of the sampled deviation, through the distribution that it should invert."""
+    """Return the relative errors of the sampled deviation, by way of the cumulative distribution that it inverts."""
     g = single(corners.g1[0])
     u = single(np.where(rng.random(len(g)) < 0.5, rng.random(len(g)), 1 - 10.0 ** rng.uniform(-7, 0, len(g))))
     u = np.minimum(u, 1 - ROUNDING)
@@ -92,7 +95,9 @@ def phase_sampling(corners: Corners, rng: np.random.Generator) -> Floats:
 
 
 def fresnel_reflectance(corners: Corners, rng: np.random.Generator) -> Floats:
-    """Relative; next to the critical angle, to what one rounding of the index changes."""
+    """Return the errors of the Fresnel reflectance, relative to its value plus its change by one rounding of the index,
+    which is large next to the critical angle.
+    """
     eta = single(np.where(corners.boundary == SMOOTH, 1 / corners.ior, corners.ior))
     cosine = single(np.where(rng.random(len(eta)) < 0.5, rng.random(len(eta)), 10.0 ** rng.uniform(-6, 0, len(eta))))
 
@@ -110,25 +115,27 @@ def fresnel_reflectance(corners: Corners, rng: np.random.Generator) -> Floats:
 
 
 def _depths(corners: Corners) -> Floats:
-    """Optical depths of the first layer."""
+    """Return the optical depths (N,) of the first layer."""
     return single(corners.sigma[0] * corners.width_mm[0])
 
 
 def collision(corners: Corners, rng: np.random.Generator) -> Floats:  # noqa: ARG001 - all formulas are called alike
-    """1 - exp(-depth), relative."""
+    """Return the relative errors of 1 - exp(-depth), the probability of a collision."""
     depth = _depths(corners)
     return np.abs(kernel(one_minus_exp, depth) / -np.expm1(-depth) - 1)
 
 
 def free_flight(corners: Corners, rng: np.random.Generator) -> Floats:
-    """Optical depth flown before a collision that is forced to happen within the layer, relative."""
+    """Return the relative errors of the optical depth to a collision that is forced to happen within the layer."""
     chance = single(-np.expm1(-_depths(corners)) * single(rng.random(len(corners))))
     chance = np.clip(chance, 1e-30, 1 - ROUNDING)
     return np.abs(kernel(minus_log1m, chance) / -np.log1p(-chance) - 1)
 
 
 def transmittance(corners: Corners, rng: np.random.Generator) -> Floats:
-    """Through both layers, relative; rays deeper than ``DARK`` are ended."""
+    """Return the relative errors of the transmittance through both layers; 0 where the optical depth exceeds ``DARK``,
+    because such rays are ended.
+    """
     lengths = [single(width / rng.uniform(0.01, 1, len(corners))) for width in corners.width_mm]
     sigma = [single(values) for values in corners.sigma]
     depth = sigma[0] * lengths[0] + sigma[1] * lengths[1]
@@ -137,8 +144,8 @@ def transmittance(corners: Corners, rng: np.random.Generator) -> Floats:
 
 
 def albedo_power(corners: Corners, rng: np.random.Generator) -> Floats:
-    """What absorption leaves after 1 to 1e7 scatterings, relative; no path is kept that carries less than
-    exp(-``DARK``).
+    """Return the relative errors of alpha^n after n = 1 to 1e7 scatterings; 0 where it is below exp(-``DARK``), because
+    no path continues with so little weight.
     """
     count = np.floor(10.0 ** rng.uniform(0, 7, len(corners)))
     log_alpha = Media(corners.media()).log_alpha[0]
@@ -149,8 +156,8 @@ def albedo_power(corners: Corners, rng: np.random.Generator) -> Floats:
 
 
 def dual_domain(corners: Corners, rng: np.random.Generator) -> Floats:  # noqa: ARG001 - all formulas are called alike
-    """Fit coordinates there and back, and their chain-rule factors, relative; values outside the fit's bounds are
-    clipped to them.
+    """Return the largest relative errors of the conversion to fit coordinates and back, and of the chain-rule factors;
+    values outside the fit's bounds are clipped to them.
     """
     worst = np.zeros(len(corners))
     values = {"sigma": corners.sigma[0], "alpha": 1 - corners.absorbed[0], "g1": corners.g1[0], "beta": corners.beta[0]}
@@ -167,7 +174,9 @@ def dual_domain(corners: Corners, rng: np.random.Generator) -> Floats:  # noqa: 
 
 
 def _dual_truth(kind: str, x: Floats) -> tuple[Floats, Floats]:
-    """Natural values and their derivatives to x, written without the hyperbolic and logistic functions."""
+    """Return natural values and their derivatives with respect to x, computed without the hyperbolic and logistic
+    functions.
+    """
     small = np.exp(-(2 if kind == "g1" else 1) * np.abs(x))
     if kind == "sigma":
         return np.exp(x), np.exp(x)
@@ -208,7 +217,9 @@ FORMULAS = (
 
 
 def worst_by_region(corners: Corners, seed: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Worst relative errors of the finite values, and how many values are not finite, both (formulas, regions)."""
+    """Return the largest relative errors of the finite values, and the numbers of values that are not finite, both
+    (formulas, regions).
+    """
     rng = np.random.default_rng(seed)
     worst, broken = np.zeros((len(FORMULAS), len(REGIONS))), np.zeros((len(FORMULAS), len(REGIONS)), dtype=np.int64)
     for row, formula in enumerate(FORMULAS):

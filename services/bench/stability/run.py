@@ -1,8 +1,8 @@
-"""Numerical stress: parameter sets from the corners as lanes of one kernel, formulas against float64, and difficult
-scenes.
+"""Benchmark of numerical stability: extreme parameter sets as lanes of one kernel, formulas against float64, and
+difficult scenes.
 
-Every set is a slab of two layers with its own media, thicknesses, faces and source, traced with all derivatives on.
-Paths end after so many flights; what they still carried is reported.
+Every set is a slab of two layers with its own media, thicknesses, faces and source, traced with all derivatives. Paths
+are cut after a largest number of flights; the energy that they still carry is reported.
 """
 
 from __future__ import annotations
@@ -36,36 +36,37 @@ if TYPE_CHECKING:
 
 PATHS = 64
 WHITE = "alpha = 1"
-"""The sets without any absorption, whose light must all come back; they are among those of other regions too."""
+"""Name of the sets without any absorption, from which all light must come back; they also belong to other regions."""
 
 
 class StabilityRow(Row):
     """One region of parameter space, or one scene.
 
-    ``error`` is a formula's worst relative error, else the relative standard error of the result.
+    ``error`` is a formula's largest relative error, else the relative standard error of the result.
     """
 
     region: str
     quantity: str
     sets: int
     non_finite: int
-    """Numbers that came out NaN or infinite."""
+    """Number of values that are NaN or infinite."""
     bound: float | None = None
-    """What ``error`` may be."""
+    """Largest allowed ``error``."""
     cut: float | None = None
-    """Share of the light that enters which was still under way when paths were cut short."""
+    """Fraction of the entering light that was still on its way when paths were cut."""
     gain: float | None = None
-    """R + T + cut less what entered, per incident flux; never above zero but for its error, and zero in white sets."""
+    """R + T + cut minus the entering light, per incident flux; within its error never above zero, and zero in white
+    sets."""
     gain_error: float | None = None
     """Standard error of ``gain``."""
     negative: int | None = None
-    """Lights whose image is below zero beyond its error."""
+    """Number of lights whose image is significantly below zero."""
     z: float | None = None
-    """Difference of a scene from one that must look alike, in standard errors."""
+    """Difference of a scene from one that must have equal images, in standard errors."""
 
 
 class LaneStart(SlabStart):
-    """Walks into slabs that differ from lane to lane in source and faces."""
+    """Starts of random walks in slabs whose source and faces differ from lane to lane."""
 
     def __init__(self, corners: Corners, seed: int) -> None:
         self.lanes, self.seed = len(corners), dr.opaque(mi.UInt32, seed)
@@ -74,7 +75,7 @@ class LaneStart(SlabStart):
         self.bends = mi.Bool(corners.boundary == SMOOTH)
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
-        """As ``SlabStart``."""
+        """Begin a walk, as ``SlabStart`` does."""
         rng = stream(self.seed, lane, sample)
         cosine = dr.select(self.normal, 1, dr.sqrt(1 - rng.next_float32()))
         inside = dr.select(self.bends, dr.sqrt(1 - (1 - dr.square(cosine)) / dr.square(self.ior)), cosine)
@@ -84,13 +85,15 @@ class LaneStart(SlabStart):
 
 @dataclass(frozen=True)
 class LaneTotals:
-    """Per incident flux: (N, 3) reflected, transmitted and cut short; (F, N, 2) derivatives of the first two."""
+    """Results per incident flux: ``totals`` (N, 3) of reflected, transmitted and cut light, and ``derivatives``
+    (F, N, 2) of the first two.
+    """
 
     totals: NDArray[np.float64]
     derivatives: NDArray[np.float64]
 
     def non_finite(self) -> NDArray[np.int64]:
-        """Numbers of each set that are NaN or infinite, (N,)."""
+        """Return for each set the number (N,) of values that are NaN or infinite."""
         return np.asarray(
             np.count_nonzero(~np.isfinite(self.totals), axis=1)
             + np.count_nonzero(~np.isfinite(self.derivatives), axis=(0, 2))
@@ -98,13 +101,13 @@ class LaneTotals:
 
 
 def stress_plan(most_steps: int, *, gradient: bool = True) -> Plan:
-    """Everything a slab kernel can have: all scores of both layers, the moving border, faces."""
+    """Return the plan with all features of a slab kernel: all scores of both layers, the moving border, faces."""
     scores = tuple(Score(k, field) for k in (1, 2) for field in MEDIUM_FIELDS) if gradient else ()
     return Plan(scores=scores, shape=0 if gradient else None, faces=True, most_steps=most_steps)
 
 
 def trace(corners: Corners, *, paths: int, most_steps: int, seed: int, gradient: bool = True) -> LaneTotals:
-    """All sets at once, one lane each."""
+    """Trace all sets at once, one lane each, with at most ``most_steps`` flights per path."""
     geometry = SlabGeometry(tuple(corners.width_mm), moving_border=True)
     walk = Walk(
         geometry,
@@ -114,7 +117,7 @@ def trace(corners: Corners, *, paths: int, most_steps: int, seed: int, gradient:
         stress_plan(most_steps, gradient=gradient),
         1.0,
     )
-    # A smooth face seen from within is a face of index 1 / n: so one kernel serves all three kinds.
+    # A smooth face seen from inside is a face of index 1 / n, so one kernel serves all three boundary models.
     ior = mi.Float(corners.ior.astype(np.float32))
     walk.ior = dr.select(mi.Bool(corners.boundary == SMOOTH), dr.rcp(ior), ior)
     totals, derivatives = walk.run(paths).arrays()
@@ -122,7 +125,9 @@ def trace(corners: Corners, *, paths: int, most_steps: int, seed: int, gradient:
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
-    """Rows of formulas by region, of the walk by region, and of difficult scenes; the tables go to standard error."""
+    """Return rows of formulas by region, of the walk by region, and of difficult scenes, and print their tables to
+    standard error.
+    """
     prepare_device()
     corners = draw(2200 if quick else 12_100, seed=1)
     rows = (
@@ -135,8 +140,8 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Every formula's error in every region with its bound; errors of regions and scenes against run time, without
-    lines, as they are different things.
+    """Draw every formula's errors in all regions with its bound, and the errors of regions and of scenes against run
+    time, without lines because the points are different cases.
     """
     from services.bench.plots import draw_errors, grid
 
@@ -159,7 +164,7 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
 
 
 def formula_rows(corners: Corners, seed: int = 2) -> list[StabilityRow]:
-    """Worst relative error of every formula in every region."""
+    """Return the rows of the largest relative error of every formula in every region."""
     begun = time.perf_counter()
     worst, broken = worst_by_region(corners, seed)
     seconds = (time.perf_counter() - begun) / worst.size
@@ -174,7 +179,7 @@ def formula_rows(corners: Corners, seed: int = 2) -> list[StabilityRow]:
 
 
 def walk_rows(corners: Corners, *, most_steps: int, seed: int = 3) -> list[StabilityRow]:
-    """Energy, cut energy and broken numbers of the walk in every region, white sets also by themselves."""
+    """Return the rows of energy, cut energy and non-finite values of the walk by region, and in the white sets."""
     begun = time.perf_counter()
     lanes = trace(corners, paths=PATHS, most_steps=most_steps, seed=seed)
     seconds = time.perf_counter() - begun
@@ -199,8 +204,10 @@ def walk_rows(corners: Corners, *, most_steps: int, seed: int = 3) -> list[Stabi
 
 
 def scene_rows(*, samples: int, seed: int = 4) -> list[StabilityRow]:
-    """Images and derivatives of difficult scenes; a value that is not finite ends the benchmark with the engine's own
-    sentence.
+    """Return the rows of images and derivatives of difficult scenes.
+
+    Raises:
+        NonFiniteError: a value is NaN or infinite.
     """
     rows = []
     for scene in scenes():
@@ -222,7 +229,9 @@ def _parts(corners: Corners) -> list[tuple[str, NDArray[np.bool_]]]:
 
 
 def as_table(rows: list[StabilityRow]) -> str:
-    """Three tables: worst relative error by region and formula, what the walk did in each region, and the scenes."""
+    """Return three tables in Markdown: the largest relative error by region and formula, the walk's results by region,
+    and the scenes.
+    """
     formulas, walks, views = (
         [row for row in rows if row.benchmark == f"stability-{part}"] for part in ("formula", "walk", "scene")
     )

@@ -1,1 +1,1 @@
-"""The engine's images and derivatives, timed against stock Mitsuba and plain walks."""
+"""Benchmarks of the engine's images and derivatives against stock Mitsuba and plain walks."""

@@ -1,18 +1,20 @@
-"""Gradients of an L2 loss over the images of an incisor under all lights of a dome, against the best that is at hand
-without this engine.
+"""Benchmark of the gradients of an L2 loss over the images of an incisor under all lights of a dome, against the best
+available alternatives to this engine.
 
-Media: 1/2 sum (C - reference)^2 to sigma, alpha, g and the lobes' weight of enamel and dentin. Ours is J'(C -
-reference) from a few Jacobian passes, each one's derivatives with the images of the others, so that the two always have
-independent seeds. The peer is stock ``prbvolpath``, an image and backward, light by light on a few of the lights,
-scaled to all. Shape and stains: see ``shape_gradient`` and ``stain_gradient``.
+The loss for the media is 1/2 sum (C - reference)^2, differentiated with respect to sigma, alpha, g and the weight of
+the lobes of enamel and dentin. This engine's gradient is J'(C - reference) from a few Jacobian passes: the derivatives
+of each pass are combined with the images of the others, so that the two have independent seeds. The peer is stock
+``prbvolpath``, an image and a backward pass for each of a few lights, scaled to all lights. For shape and stains see
+``shape_gradient`` and ``stain_gradient``.
 
-Noise of the images times noise of the derivatives falls as 1 / paths squared and rules short runs on both sides, so
-they are compared at nearly equal error: the peer at its largest count, ours at the count whose error is nearest.
+The product of the images' noise and the derivatives' noise falls as 1 / paths squared and dominates short runs of both,
+so they are compared at nearly equal error: the peer at its largest number of paths, this engine at the number whose
+error is nearest.
 
-Efficiency is 1 / (variance x time). Time is processor time of all threads, after everything is compiled: it is the same
-measure for either side on equal threads, and other jobs on the machine move it less than they move a clock. Variances
-come from independent repeats; pixels (ours) and lights (the peer's) have random numbers of their own, so a gradient's
-variance is the sum of theirs.
+Efficiency is 1 / (variance x time). Time is processor time of all threads, after all compilation: it is the same
+measure for both on equal numbers of threads, and other jobs on the machine change it less than time by the clock.
+Variances come from independent repeats. Pixels (of this engine) and lights (of the peer) have independent random
+numbers, so a gradient's variance is the sum of theirs.
 """
 
 from __future__ import annotations
@@ -37,20 +39,23 @@ from services.fit.transport.scene.recipe import View
 Array = NDArray[np.float64]
 
 OTHER_TISSUE = Tissue(Medium(3.8, 0.996, 0.9, 0.8, -0.1), Medium(13.5, 0.9925, 1.0, 0.72))
-"""Shown by the reference images: about 10 % from ``TISSUE``'s."""
+"""Media of the reference images: about 10 % from those of ``TISSUE``."""
 
 PASSES = 4
-"""Jacobian passes of one gradient of ours: of their pairs, one in four would not be independent and is left out."""
+"""Number of Jacobian passes of one gradient of this engine: of the pairs of passes, one in four pairs a pass with
+itself, so that it would not be independent, and is left out."""
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
-    """Rows by parameter of this engine and of the peers, and the peers' summary rows."""
+    """Return the rows by parameter of this engine and of the peers, and the peers' summary rows."""
     return [row.model_dump() for row in [*media_rows(quick=quick), *shape_rows(quick=quick), *stain_rows(quick=quick)]]
 
 
 def media_rows(*, quick: bool) -> list[GradientRow]:
-    """Gradient to the media against ``prbvolpath``: either side's rows at growing sample counts, the peer's summary by
-    parameter and over all.
+    """Compare the gradient with respect to the media with that of ``prbvolpath``.
+
+    Returns:
+        Rows of both at increasing numbers of paths, and the peer's summary rows by parameter and over all parameters.
     """
     stack = incisor_stack(18 if quick else 54)
     engine, names = Engine(stack.recipe()), shared_names(TISSUE)
@@ -91,11 +96,17 @@ def our_gradient(
     samples: int,
     repeats: int,
 ) -> tuple[Estimate, Estimate]:
-    """The gradient over all lights, and over the chosen ones alone (its time is that of all).
+    """Return this engine's gradient over all lights, and over the chosen lights alone, with the time of all lights.
 
     Args:
-        reference: (L, N).
+        engine: engine of the scene.
+        tissue: media at which the gradient is taken.
+        view: pixels of the images.
+        reference: reference images (L, N).
+        names: names of the F parameters.
+        chosen: indices of the chosen lights.
         samples: paths per pixel of all passes together, a multiple of ``PASSES``.
+        repeats: number of independent repeats.
     """
 
     def once(repeat: int) -> Array:
@@ -103,7 +114,8 @@ def our_gradient(
             engine.jacobian(tissue, view, names, samples=samples // PASSES, seed=repeat * PASSES + k, batches=1)
             for k in range(PASSES)
         ]
-        # The mean over all pairs of two passes: the product of the means less each pass's product with itself.
+        # Take the mean over all pairs of two different passes: the product of the sums minus each pass's product with
+        # itself.
         residuals = [one.mean - reference for one in passes]
         alone = sum(one.jacobian * residual for one, residual in zip(passes, residuals, strict=True))
         together = sum(one.jacobian for one in passes) * sum(residuals)
@@ -162,7 +174,7 @@ def _summary(
     few, known = pairs[-1][1], pairs[-1][0].mean
     whole = min((ours for ours, _ in pairs), key=lambda ours: abs(np.mean(np.log(scaled.variance / ours.variance))))
     z = (peer.mean - few.mean) / np.sqrt(peer.mean_variance + few.mean_variance)
-    # The size of the gradient is common to both and drops out.
+    # The gradient's own size is common to both and cancels in the ratio.
     ratios = scaled.variance * scaled.seconds / (whole.variance * whole.seconds)
     errors = np.sqrt(scaled.variance) / np.abs(known)
     common: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""What the benchmarks of gradients share: an estimate with its noise and its price, and how it is written down."""
+"""Records that the benchmarks of gradients share: an estimate with its noise and its time, and its row."""
 
 from __future__ import annotations
 
@@ -13,22 +13,31 @@ Array = NDArray[np.float64]
 
 
 class GradientRow(Row):
-    """A row of the gradient to one parameter, or of all of them: then ``error`` is the geometric mean of theirs."""
+    """Row of the gradient with respect to one parameter, or over all parameters; then ``error`` is the geometric mean
+    of theirs.
+    """
 
     parameter: str | None = None
+    """Name of the parameter; None in a row over all parameters."""
     samples: int | None = None
-    """Paths per pixel and light of the peer's image and of its backward pass; of all our Jacobian passes together."""
+    """Paths per pixel and light of the peer's image and of its backward pass; for this engine paths per pixel of all
+    Jacobian passes together."""
     gradient: float | None = None
-    """To the natural parameter; the row's ``error`` is relative to it."""
+    """Derivative with respect to the natural parameter; the row's ``error`` is relative to it."""
     z: float | None = None
-    """In a peer's summary row: its gradient less ours under the same lights, in standard errors; in the one over all
-    parameters the rms of theirs."""
+    """In a peer's summary row its gradient minus this engine's under the same lights, in standard errors; in the row
+    over all parameters the rms of these."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A gradient (F,), the variance of a single such estimate, the variance of ``mean``, and the time a single one
-    takes.
+    """Estimate of a gradient.
+
+    Attributes:
+        mean: gradient (F,), the mean over repeats.
+        variance: variance (F,) of a single repeat.
+        mean_variance: variance (F,) of ``mean``.
+        seconds: time of a single repeat.
     """
 
     mean: Array
@@ -38,6 +47,6 @@ class Estimate:
 
 
 def of_parts(repeats: Array, seconds: float) -> Estimate:
-    """From repeats of a sum over parts with random numbers of their own, (R, F, parts)."""
+    """Return the estimate from repeats (R, F, parts) of a sum over parts that have independent random numbers."""
     variance = repeats.var(axis=0, ddof=1).sum(axis=-1)
     return Estimate(repeats.mean(axis=0).sum(axis=-1), variance, variance / len(repeats), seconds)

@@ -1,5 +1,5 @@
-"""What the transport benchmarks share: a procedural incisor under the lights of a dome, for this engine and for stock
-Mitsuba.
+"""Scene that the transport benchmarks share: a procedural incisor under the lights of a dome, for this engine and for
+stock Mitsuba.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ class IncisorStack:
     dentin: Mesh
     camera: Camera
     light_positions_mm: NDArray[np.float64]
-    """(L, 3)"""
+    """Positions of the lights (L, 3)."""
     light_intensities: NDArray[np.float64]
-    """(L,)"""
+    """Radiant intensities of the lights (L,)."""
 
     def recipe(self, dentin: DentinShape | None = None) -> SceneRecipe:
-        """The scene for this engine, with the tooth's own dentin unless told otherwise; faces do not reflect."""
+        """Return the scene for this engine, by default with the tooth's own dentin; its faces do not reflect."""
         known = DentinShape.known(self.dentin)
         return single_tooth(self.outer, dentin or known, self.light_positions_mm, self.light_intensities)
 
     def tooth_view(self, engine: Engine, tissue: Tissue) -> View:
-        """The pixels in which some light shows the tooth."""
+        """Return the pixels that show the tooth under at least one light."""
         width, height = self.camera.size
         y, x = np.mgrid[0:height, 0:width]
         everything = View(self.camera, np.stack([x.ravel(), y.ravel()], axis=1).astype(np.int32))
@@ -50,11 +50,11 @@ class IncisorStack:
         return View(self.camera, everything.pixels[seen])
 
     def some_lights(self, count: int) -> NDArray[np.int64]:
-        """Indices of lights for a peer that is too dear for all of them."""
+        """Return the indices of some lights, for a peer that is too slow for all of them."""
         return np.linspace(0, len(self.light_positions_mm) - 1, count).astype(np.int64)
 
     def stock_scene(self, folder: Path, tissue: Tissue, light: int, samples: int = 16) -> Any:
-        """The same under one light as a stock Mitsuba scene; its meshes are written into ``folder``."""
+        """Return the scene under one light for stock Mitsuba; its meshes are written into ``folder``."""
         from services.fit.export.mitsuba_scene import load_scene, nested_scene
 
         files = folder / "outer.ply", folder / "dentin.ply"
@@ -70,7 +70,7 @@ class IncisorStack:
 
 
 def incisor_stack(lights: int) -> IncisorStack:
-    """The tooth under so many lights of a dome, the same each time."""
+    """Return the tooth under so many lights of a dome, which are equal in every run."""
     incisor = build_incisor()
     (camera,) = dome_cameras(1, PIXEL_MM, (incisor.outer,))
     rig = dome_lights(lights, ("green",), seed=1)

@@ -1,11 +1,11 @@
-"""What lights and pixels cost: an incisor under 1 to 155 lights of a dome, and one view of it at 1 to 64 times as many
-pixels.
+"""Benchmark of the cost of lights and pixels: an incisor under 1 to 155 lights of a dome, and one view of it with 1 to
+64 times as many pixels.
 
-The cost of a stack is variance x time, variance = sum of the pixels' variances / sum of their squares over all its
-images. The peer renders one light at a time: each of the six alone, and what they cost on average times the number of
-lights. Rounds are interleaved, times are medians over them of the processor time of all threads, which other jobs on
-the machine move less than they move a clock; the scene is built, its light maps traced and kernels compiled before.
-Lights that a view does not list are in none of its kernels (see ``transport-skip``).
+The cost of a stack of images is variance x time, with variance = sum of the pixels' variances / sum of their squares
+over all images. The peer renders one light at a time: six lights are rendered alone, and their mean cost is multiplied
+by the number of lights. Rounds are interleaved, and times are medians over rounds of the processor time of all threads,
+which other jobs on the machine change less than time by the clock. The scene is built, its light maps are traced and
+kernels are compiled before. Lights that a view does not list are in none of its kernels (see ``transport-skip``).
 """
 
 from __future__ import annotations
@@ -28,34 +28,35 @@ if TYPE_CHECKING:
 LIGHTS = (6, 18, 54, 155)
 PIXEL_LIGHTS = 54
 SHARES = (64, 16, 4, 1)
-"""Of the pixels of the finest view, one in so many."""
+"""Divisors of the number of pixels: a view has one in so many of the finest view's pixels."""
 PEER = "one light at a time"
 
 
 class LightsRow(Row):
-    """A row with the size of what was rendered."""
+    """A row with the numbers of lights, pixels and paths per pixel of the render."""
 
     lights: int
     pixels: int
     samples: int
     seconds_per_path: float
     relative_cost: float | None = None
-    """Variance x time of the whole stack by that of one light's image."""
+    """Variance x time of the whole stack, divided by that of one light's image."""
 
 
 @dataclass
 class Case:
-    """Views that are rendered one after the other for one result, and what that took in each round."""
+    """Views that are rendered one after the other for one result, and their times and errors in each round."""
 
     engine: Engine
     views: list[View]
     samples: int
     seconds: list[float] = field(default_factory=list)
-    """For one view."""
+    """Mean time of one view, by round."""
     squared_errors: list[float] = field(default_factory=list)
+    """Squared relative errors of all views together, by round."""
 
     def measure(self, seed: int) -> None:
-        """One round."""
+        """Measure one round."""
         begun = time.process_time()
         estimates = [self.engine.images(TISSUE, view, samples=self.samples, seed=seed) for view in self.views]
         self.seconds.append((time.process_time() - begun) / len(estimates))
@@ -69,7 +70,7 @@ class Case:
         return float(np.mean(self.squared_errors) * np.median(self.seconds))
 
     def row(self, benchmark: str, one: Case | None = None) -> LightsRow:
-        """As measured; costs are relative to case ``one``."""
+        """Return the row of the measured rounds; its cost is relative to that of case ``one``."""
         seconds, view = float(np.median(self.seconds)), self.views[0]
         return LightsRow(
             benchmark=benchmark, peer="dentine", seconds=seconds, error=float(np.sqrt(np.mean(self.squared_errors))),
@@ -80,7 +81,7 @@ class Case:
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
-    """Rows by number of lights, with the peer's summary rows, then by number of pixels."""
+    """Return rows by number of lights, with the peer's summary rows, then rows by number of pixels."""
     stack = incisor_stack(LIGHTS[-1])
     engine = Engine(stack.recipe())
     rounds, counts = (2, (32, 64)) if quick else (5, (64, 256))
@@ -91,7 +92,7 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 
 def light_rows(engine: Engine, view: View, counts: tuple[int, ...], rounds: int) -> list[LightsRow]:
-    """At every sample count; costs are those of the largest."""
+    """Return rows by number of lights for every number of paths per pixel; costs are given for the largest one."""
     alone = [replace(view, lights=(light,)) for light in spread_lights(LIGHTS[0])]
     groups = [alone, *([replace(view, lights=spread_lights(lights))] for lights in LIGHTS)]
     cases = [[Case(engine, views, samples) for samples in counts] for views in groups]
@@ -114,8 +115,8 @@ def light_rows(engine: Engine, view: View, counts: tuple[int, ...], rounds: int)
 
 
 def pixel_rows(engine: Engine, view: View, samples: int, rounds: int) -> list[LightsRow]:
-    """The same tooth at the same paths per pixel; fewer pixels are a random choice of them, so that each choice sees
-    all of the tooth.
+    """Return rows by number of pixels at equal paths per pixel. Smaller numbers are random choices of the finest view's
+    pixels, so that each covers the whole tooth.
     """
     order = np.random.default_rng(1).permutation(len(view))
     choices = [order[: len(view) // share] for share in SHARES]
@@ -128,12 +129,12 @@ def pixel_rows(engine: Engine, view: View, samples: int, rounds: int) -> list[Li
 
 
 def spread_lights(count: int) -> tuple[int, ...]:
-    """So many of the dome's lights, from its front to its rim."""
+    """Return the indices of so many of the dome's lights, evenly spread from its front to its rim."""
     return tuple(((np.arange(count) + 0.5) * LIGHTS[-1] / count).astype(int).tolist())
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Error against run time, cost against lights, and time against pixels."""
+    """Draw error against run time, cost against number of lights, and time against number of pixels."""
     from services.bench.plots import draw_errors, finish, grid
 
     figure, (errors, by_lights, by_pixels) = grid(3)

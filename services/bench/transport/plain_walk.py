@@ -1,9 +1,7 @@
-"""The walk as it would be had it never learnt anything but the plainest tooth: one medium of one lobe, index-matched,
-images only.
+"""The random walk specialised by hand to the simplest tooth: one medium of one lobe, index-matched, images only.
 
-Starts, ray tracing, connections to lights and sums are the engine's own; what happens to a path from step to step is
-written out here without a choice left to make. The engine's kernel for such a scene must be no larger, and its images
-the same bits.
+Starts, ray tracing, connections to lights and sums are the engine's own; the steps of a path are written here without
+any options. The engine's kernel for such a scene must be no larger than this one, and its images equal to the last bit.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from services.fit.transport.scene.media import Media, PhaseFunction
 
 
 class PlainEngine(Engine):
-    """An engine whose images come from the plain walk; only for scenes that need no more."""
+    """An engine whose images come from the plain walk; only for scenes of the simplest kind."""
 
     def _walk(self, media: Media, lights: PointLights, start: CameraStart, plan: Plan) -> Walk:
         assert media.count == 1
@@ -34,12 +32,12 @@ class PlainEngine(Engine):
 
 
 class PlainWalk(Walk):
-    """Free flights, crossings, connections, turns and roulette; of a walker's state only what these need is ever
-    touched.
+    """Walk of free flights, crossings of the surface, connections to lights, scattering and Russian roulette; it uses
+    only the part of a walker's state that these need.
     """
 
     def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
-        # Fly to a scattering or to the surface.
+        # Fly to the next scattering or to the surface.
         geometry = self.geometry
         medium = walker.place & 1
         sigma = dr.select(medium == 0, 0, self.media.sigma[0])
@@ -56,7 +54,7 @@ class PlainWalk(Walk):
         (count,) = walker.so_far.counts
         walker.so_far.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
 
-        # Connect to the lights, then turn.
+        # Connect to the lights, then sample a new direction.
         self._connect(
             walker, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False), mi.Bool(False)), tally
         )
@@ -65,7 +63,7 @@ class PlainWalk(Walk):
         )
         walker.omega = dr.select(scatters, onward, walker.omega)
 
-        # Faint paths survive in proportion to what they carry.
+        # Russian roulette: paths of low weight survive with a probability in proportion to their weight.
         share = (
             walker.weight
             * dr.exp(mi.Float(walker.so_far.counts[0]) * self.media.log_alpha[0])

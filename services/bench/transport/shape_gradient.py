@@ -1,15 +1,16 @@
-"""The derivative to the dentin's shape against central differences with the engine itself.
+"""Derivative with respect to the dentin's shape, compared with central differences by the engine itself.
 
-The derivative is that of the images projected on one picture, sum w C, where w is the residual that an L2 loss would
-show for dentin of another shape. Ours is one ``shape_gradient`` for all modes, photons and camera walks included. One
-Jacobian pass (both border terms), for all modes too, stands beside it as a row of its own. The peer is two image passes
-per mode with common random numbers, the surfaces already in place.
+The derivative is that of the images projected on one picture, sum w C, where w is the residual of an L2 loss for dentin
+of another shape. This engine's method is one ``shape_gradient`` for all modes, with photons and camera walks. One
+Jacobian pass for all modes (with both border terms) has a row of its own. The peer is two image passes per mode with
+common random numbers; the time to move the surfaces does not count.
 
-Differences have a bias, which grows as the square of their step and is measured in the same run: D(h) = D(0) + k h^2,
-fitted to all steps. Asked for an error e, a step h needs variance(h) / (e^2 - bias(h)^2) samples; the peer is given its
-best step. Ours has a bias too, of its series and its texels: the distance to the peer's D(0). On either side a bias
-counts once it is known from noise. Part of our variance falls as 1 / paths squared (photons times walks), so ours is
-taken at paths that come near the error asked for.
+Central differences have a bias that grows as the square of their step h. It is measured in the same run by a fit of
+D(h) = D(0) + k h^2 to all steps. For a wanted error e a step h needs variance(h) / (e^2 - bias(h)^2) samples, and the
+peer uses its best step. This engine's method has a bias too, of its series and its texels: its difference from the
+peer's D(0). A bias counts, for either method, only where it is significant against the noise. A part of this engine's
+variance falls as 1 / paths squared (photons times walks), so its number of paths is chosen to come near the wanted
+error.
 """
 
 from __future__ import annotations
@@ -33,13 +34,15 @@ TISSUES = {"white": TISSUE, "dark": Tissue(Medium(2.0, 0.95, 0.93, 0.82, -0.1), 
 SHAPE, OTHER_SHAPE = (0.5, 0.5, 0.5), (0.8, 0.8, 0.8)
 STEPS = (0.05, 0.1, 0.2, 0.4)
 RESOLVED = 3.0
-"""Standard errors beyond which a bias is known from noise."""
+"""Number of standard errors beyond which a bias is significant."""
 WANTED_ERROR = 0.05
-"""Of the derivative: the common error at which the two are compared."""
+"""Relative error of the derivative at which the two methods are compared."""
 
 
 def shape_rows(*, quick: bool) -> list[GradientRow]:
-    """By tissue and mode: our row, the peer's at every step, and its summary at the best one."""
+    """Return for each tissue and mode this engine's rows, the peer's row at every step, and its summary at the best
+    step.
+    """
     stack = incisor_stack(18 if quick else 54)
     engine = Engine(stack.recipe(dentin_blend_shape(stack.outer)))
     samples, repeats = (32, 3) if quick else (64, 16)
@@ -61,7 +64,9 @@ def shape_rows(*, quick: bool) -> list[GradientRow]:
 def _gradients(
     engine: Engine, tissue: Tissue, view: View, picture: Array, samples: int, repeats: int
 ) -> list[Estimate]:
-    """The derivative to every mode by light and importance on the border; each is charged its share of the time."""
+    """Return the derivative with respect to every mode by ``shape_gradient``, from light and importance on the border;
+    the time is divided equally among the modes.
+    """
     engine.shape_gradient(tissue, view, picture, samples=16, seed=0)
     begun = time.process_time()
     found = np.stack(
@@ -75,7 +80,9 @@ def _gradients(
 
 
 def _scores(engine: Engine, tissue: Tissue, view: View, picture: Array, samples: int, repeats: int) -> list[Estimate]:
-    """The derivative to every mode; one pass serves them all, and each is charged its share of the time."""
+    """Return the derivative with respect to every mode by one Jacobian pass for all; the time is divided equally among
+    the modes.
+    """
     names = tuple(f"shape.{k}" for k in range(len(tissue.shape)))
     engine.jacobian(tissue, view, names, samples=samples, seed=0)
     begun = time.process_time()
@@ -90,7 +97,7 @@ def _scores(engine: Engine, tissue: Tissue, view: View, picture: Array, samples:
 def _differences(
     engine: Engine, tissue: Tissue, view: View, mode: int, step: float, picture: Array, samples: int, repeats: int
 ) -> Estimate:
-    # Random numbers are common to the two sides of a difference, and to no other step.
+    # The two sides of a difference have common random numbers; different steps have different ones.
     seconds, sides, first_seed = 0.0, [], 1000 + round(1000 * step)
     for sign in (1, -1):
         moved = tissue.with_values({f"shape.{mode}": tissue.shape[mode] + sign * step})
@@ -116,8 +123,7 @@ def _compare(
     scores: Estimate,
     differences: dict[float, Estimate],
 ) -> list[GradientRow]:
-    # Weighted least squares for the derivative D(0) and the curvature k of the differences' bias, from their own steps
-    # alone.
+    # Fit the peer's derivative D(0) and the curvature k of its bias to its differences, by weighted least squares.
     steps = np.array([*differences])
     values = np.array([d.mean[0] for d in differences.values()])
     spread = np.sqrt([d.mean_variance[0] for d in differences.values()])
@@ -158,5 +164,5 @@ def _compare(
 
 
 def _resolved(bias: float, variance: float) -> float:
-    """The square of a bias, less its own noise; 0 where it may be noise alone."""
+    """Return the square of a bias minus its variance; 0 where the bias is not significant."""
     return float(bias**2 - variance) if bias**2 > RESOLVED**2 * variance else 0.0

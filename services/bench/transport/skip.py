@@ -1,10 +1,10 @@
-"""What a scene lacks costs nothing: each feature switched off, against a scene that never had it and against itself
-switched on.
+"""Benchmark that features a scene does not use cost nothing: each feature switched off, against a scene without it and
+against the feature switched on.
 
-Of every case three calls are compared: ``off``, where the feature is there and not used; ``without``, where there is
-nothing to switch off; and ``on``. Operations are those of a call's largest kernel, by Dr.Jit's kernel history. Times
-are medians over interleaved pairs of ``off`` and ``without`` with equal seeds, each going first in every other pair;
-all kernels are compiled before.
+Every case compares three calls: ``off``, where the feature exists but is not used; ``without``, where it does not
+exist; and ``on``. Operations are those of a call's largest kernel, by Dr.Jit's kernel history. Times are medians over
+interleaved pairs of ``off`` and ``without`` with equal seeds, each of which goes first in every other pair; all kernels
+are compiled before.
 """
 
 from __future__ import annotations
@@ -42,22 +42,25 @@ TISSUE = Tissue(ONE_LOBE, replace(ONE_LOBE, sigma=9.0), (0.5, 0.3, 0.4))
 ORDER_EDGES = np.array([0, 4, 16, 1 << 20])
 
 Call = Callable[[int, int], Any]
-"""(samples, seed) -> an estimate, of as many batches in every call."""
+"""Function (samples, seed) -> estimate, with the same number of batches in every call."""
 
 
 class SkipRow(Row):
-    """A row with the size of its kernel, and in a peer's summary row the comparison."""
+    """A row with the size of its kernel and, in a peer's summary row, the comparison."""
 
     operations: int
+    """Number of operations of the largest kernel."""
     time_ratio: float | None = None
-    """Median over the pairs of our time, feature off, by the time without it."""
+    """Median over the pairs of the time with the feature off, divided by the time without it."""
     operations_on: int | None = None
+    """Number of operations of the largest kernel with the feature on."""
     seconds_on: float | None = None
+    """Time with the feature on."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One feature."""
+    """One feature and its three calls."""
 
     name: str
     off: Call
@@ -66,15 +69,15 @@ class Case:
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
-    """Per feature a row of this engine with the feature off, a row of the peer without it, and the peer's summary
-    row.
+    """Return for each feature a row of this engine with the feature off, a row of the peer without it, and the peer's
+    summary row.
     """
     samples = 32 if quick else 128
     return [row.model_dump() for case in cases() for row in _compare(case, samples)]
 
 
 def cases() -> list[Case]:
-    """Everything that a kernel is specialised for, on a procedural incisor."""
+    """Return a case for every feature for which kernels are specialised, on a procedural incisor."""
     from services.bench.transport.plain_walk import PlainEngine
 
     incisor = build_incisor()
@@ -145,11 +148,11 @@ def cases() -> list[Case]:
 
 
 def kernel_operations(call: Call, samples: int) -> int:
-    """Operations of the largest kernel that a call launches."""
+    """Return the number of operations of the largest kernel that a call launches."""
     import drjit as dr
 
-    # Equal expressions are traced once while the first is alive; what a finished trace left behind must not stand in
-    # for operations of this one.
+    # Equal expressions are traced only once while the first one is alive. Collect the remains of finished traces, so
+    # that they do not replace operations of this one.
     gc.collect()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
@@ -171,7 +174,7 @@ def _compare(case: Case, samples: int) -> list[SkipRow]:
     case.on(samples, 1)
     seconds_on = time.perf_counter() - begun
 
-    # One image's error, from the variances of all of them.
+    # Estimate the error of one image from the mean variance of all.
     errors = [
         np.sqrt(np.mean([(e.variance.sum() / np.sum(e.mean**2)) for w, e in estimates if w == which]))
         for which in (0, 1)
@@ -193,7 +196,7 @@ def _compare(case: Case, samples: int) -> list[SkipRow]:
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Times relative to a kernel that never had the feature, and the kernels' operations, feature off and on."""
+    """Draw times relative to a kernel without the feature, and the kernels' operations, with the feature off and on."""
     from services.bench.plots import grid
 
     compared = [row for row in rows if row["time_ratio"] is not None][::-1]
@@ -221,7 +224,7 @@ def _view(camera: Camera) -> View:
 
 
 def _crop(camera: Camera) -> tuple[View, Camera]:
-    """The middle quarter of an image: as the list of pixels that a mask leaves, and as a camera that has no others."""
+    """Return the middle quarter of an image, as the pixels that a mask leaves and as a camera of these pixels alone."""
     size = (camera.size[0] // 2, camera.size[1] // 2)
     corner = np.array([size[0] // 2, size[1] // 2])
     smaller = np.array(camera.K)

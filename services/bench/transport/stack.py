@@ -1,7 +1,8 @@
-"""An incisor under all lights of a dome: one walk for all of them against stock ``prbvolpath`` light by light.
+"""Benchmark of an incisor's images under all lights of a dome: one walk for all lights against stock ``prbvolpath``
+light by light.
 
 Efficiency is 1 / (variance x time) with variance = sum of the pixels' variances / sum of their squares, both measured
-in this run on this machine with the same threads. The peer renders a few of the lights and its time is scaled to all.
+in the same run with equal numbers of threads. The peer renders some of the lights, and its time is scaled to all.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from services.fit.transport.scene.recipe import View
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
-    """Rows of this engine and of the peer at growing sample counts, and the peer's summary row."""
+    """Return rows of this engine and of the peer at increasing paths per pixel, and the peer's summary row."""
     stack, peer_lights = incisor_stack(18 if quick else 54), 2 if quick else 6
     engine = Engine(stack.recipe())
     view = stack.tooth_view(engine, TISSUE)

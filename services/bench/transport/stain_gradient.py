@@ -1,10 +1,10 @@
-"""The derivative to the texels of a stain against central differences with the engine itself.
+"""Derivative with respect to the texels of a stain, compared with central differences by the engine itself.
 
-The derivative is that of the images projected on one picture, the residual that an L2 loss would show for a clean
-tooth. Ours is one pass for all texels; the peer is two image passes per texel with common random numbers. Nearly every
-path crosses two faces, so images are quadratic in a texel and differences have no bias: the peer is given the widest
-step that the texture's bounds allow. It is measured on some of the texels that the camera sees; ours is charged for
-each of them its share of the pass that makes them all.
+The derivative is that of the images projected on one picture, the residual of an L2 loss for a clean tooth. This
+engine's method is one pass for all texels; the peer is two image passes per texel with common random numbers. Nearly
+every path crosses two faces, so images are quadratic in a texel and differences have no bias: the peer uses the widest
+step that the texture's bounds allow. It is measured on some of the texels that the camera sees; the time of this
+engine's pass is divided equally among all texels that the camera sees.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Array = NDArray[np.float64]
 
 MIDDLE, STEP = 0.6, 0.4
 SEEN = 0.05
-"""Texels count whose derivative is at least this share of the largest."""
+"""Smallest derivative of a visible texel, as a fraction of the largest."""
 PEER = "central differences, step 0.4"
 
 
 def stain_rows(*, quick: bool) -> list[GradientRow]:
-    """By texel: our row, the peer's, and its summary; then the summary over all of them."""
+    """Return for each texel this engine's row, the peer's row and its summary; then the summary over all texels."""
     stack = incisor_stack(18 if quick else 54)
     size, samples, repeats, count = ((8, 8), 32, 3, 2) if quick else ((24, 20), 64, 4, 6)
     engine = Engine(_with_coordinates(stack))
@@ -98,7 +98,7 @@ def stain_rows(*, quick: bool) -> list[GradientRow]:
 
 
 def _with_coordinates(stack: IncisorStack) -> SceneRecipe:
-    """The tooth's scene with texture coordinates: seen from the front, across and up."""
+    """Return the tooth's scene with texture coordinates that run across and up as seen from the front."""
     scene = stack.recipe()
     vertices = stack.outer.vertices_mm[:, [0, 2]]
     low, high = vertices.min(axis=0), vertices.max(axis=0)

@@ -1,6 +1,6 @@
-"""The peer of our gradients: stock ``prbvolpath``, backward through the images of one light.
+"""The peer of this engine's gradients: stock ``prbvolpath`` with a backward pass through the image of one light.
 
-It is an oracle for sigma, alpha, g and the lobes' weight alone (its dentin surface gives no derivative).
+It gives derivatives with respect to sigma, alpha, g and the lobes' weight only, not with respect to its dentin surface.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from services.fit.transport.scene.recipe import View
 
 
 def shared_names(tissue: Tissue) -> tuple[str, ...]:
-    """Parameters that both have: those of a second lobe only where there is one."""
+    """Return the names of the parameters that both engines have; those of a second lobe only where there is one."""
     media = {"enamel": tissue.enamel, "dentin": tissue.dentin}
     fields = {
         part: ("sigma", "alpha", "beta", "g1", "g2") if medium.beta < 1 else ("sigma", "alpha", "g1")
@@ -25,9 +25,7 @@ def shared_names(tissue: Tissue) -> tuple[str, ...]:
 
 
 class StockGradient:
-    """Gradient of 1/2 sum (C - reference)^2 over a view's pixels under the light of a
-    ``mitsuba_scene.nested_scene``.
-    """
+    """Gradient of 1/2 sum (C - reference)^2 over a view's pixels, under the light of the scene of ``nested_scene``."""
 
     def __init__(self, scene: Any, tissue: Tissue, view: View) -> None:
         import drjit as dr
@@ -42,11 +40,13 @@ class StockGradient:
             dr.enable_grad(self._params[key])
 
     def __call__(self, reference: NDArray[np.float64], *, samples: int, seed: int) -> NDArray[np.float64]:
-        """Gradient (F,) in the order of ``names``, from one image and, with an independent seed, one backward pass.
+        """Return the gradient (F,) in the order of ``names``, from one image and, with an independent seed, one
+        backward pass.
 
         Args:
-            reference: (N,) radiance of the view's pixels.
-            samples: paths per pixel of either pass.
+            reference: radiance (N,) of the view's pixels.
+            samples: paths per pixel of each of the two passes.
+            seed: seed from which those of both passes are derived.
         """
         import drjit as dr
         import mitsuba as mi
@@ -62,7 +62,7 @@ class StockGradient:
             self._scene, self._params, mi.TensorXf(residual), seed=2 * seed + 1, spp=samples
         )
         gradients = [float(dr.grad(self._params[key])[0]) for key in self._keys]
-        # Mitsuba's weight is that of the second lobe.
+        # Mitsuba's weight is that of the second lobe, so the derivative with respect to beta has the opposite sign.
         return np.array([-g if name.endswith(".beta") else g for name, g in zip(self.names, gradients, strict=True)])
 
 
