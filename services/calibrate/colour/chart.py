@@ -14,7 +14,7 @@ from services.core.errors import CaptureInputError
 Floats = NDArray[np.float64]
 COLUMNS, ROWS = 6, 4
 NEUTRALS = slice(18, 24)
-"""Patches 19 to 24, from white to black, have the same reflectance in all channels to a few per cent."""
+"""The neutral patches 19 to 24, from white to black, whose reflectance is equal in all channels to a few per cent."""
 PATCH_SHARE = 0.25
 """Half width of the averaged square of a patch, as a fraction of the distance between patch centres: the square spans
 half of it."""

@@ -24,12 +24,15 @@ RAYS = 180
 BANDS = (0.12, 0.04, 0.02)
 """Half widths of the bands in which the edge is searched around the last outline, as fractions of the radius."""
 MIN_BAND_PX = 4.0
+"""Smallest half width of a band."""
 SMOOTHING_PX = 1.0
+"""Width of the Gaussian that smooths the image before edges are searched."""
 OUTLIER_SIGMAS = 3.5
+"""Distance from the fitted outline, in robust standard deviations, beyond which an edge point is an outlier."""
 MIN_EDGES = RAYS // 3
 """Smallest number of edge points of an outline: a third of the outline determines the sphere."""
 INSIDE = 0.97
-"""Fraction of the radius within which highlights are searched: closer to the outline they are drawn out to lines."""
+"""Fraction of the radius within which highlights are searched: closer to the outline they are elongated to lines."""
 HALF = 0.5
 """Fraction of the peak above which a pixel belongs to the highlight."""
 MIN_CONTRAST = 8.0

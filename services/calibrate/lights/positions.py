@@ -25,10 +25,16 @@ EDGE_SHIFT_SE_PX = 0.3
 """Standard deviation of the prior of a camera's edge shift: half a pixel of blur, against a background of another
 brightness."""
 HUBER_SIGMAS = 1.345
+"""Threshold of Huber's loss in σ: with it the estimate is 95 % as efficient as least squares where all errors are
+normal."""
 OUTLIER_SIGMAS = 5.0
+"""Residual in σ beyond which a highlight is an outlier."""
 SIGMA_FLOOR_PX = 1e-6
+"""Smallest σ of highlights and edges in px, for exact synthetic observations."""
 MAD_TO_SIGMA = 1.4826
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 ROBUST_ROUNDS = 3
+"""Number of robust fits, each followed by an estimate of σ."""
 STEP = 1e-4
 """Step of the central differences of positions in mm: a millionth of the distances, so the truncation error is 1e-12
 and the rounding error 1e-9 of the derivative."""
@@ -119,7 +125,7 @@ class _Weighted:
         )
 
     def by_own(self, values: Floats) -> Floats:
-        """Return the derivative of the residuals before the cameras' prior with respect to lights, centres and shifts.
+        """Return the derivative of all residuals with respect to lights, centres and edge shifts.
 
         Each residual depends on at most one light and one centre, so one axis of all lights, or of all centres, is
         changed at once.

@@ -48,7 +48,7 @@ class Problem:
     """Residuals of all views.
 
     The order of the unknowns is lights (3 each), spheres' centres by place (3 each), edge shifts by camera (1 each).
-    Those after them in a vector of values do not belong to this problem.
+    Further values in a vector of unknowns are ignored here.
     """
 
     def __init__(self, views: Sequence[SphereView], n_cameras: int, light_names: Sequence[str]) -> None:

@@ -27,7 +27,8 @@ DRAWS = 60
 """Number of random subsets for starting poses. With a third of the clicks wrong, 60 triples all contain a wrong click
 only once in 10^9 cases."""
 MIN_CLICKS = 4
-"""Smallest number of clicks: three leave up to four poses, and no way to recognise a wrong click."""
+"""Smallest number of clicks in at least one camera, and of right clicks in all cameras: three leave up to four poses,
+and no way to recognise a wrong click."""
 MIN_POINTS = 3
 """Smallest number of landmarks in several cameras for a starting pose: three points determine a rigid pose."""
 PARALLEL = 1e4

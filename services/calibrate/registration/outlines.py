@@ -59,7 +59,7 @@ gums."""
 
 @dataclass(frozen=True)
 class View:
-    """One camera's photograph, cropped to the teeth and reduced in size, and the camera of this image."""
+    """One camera's photograph without lens distortion, whole or cropped to the teeth, and the camera of this image."""
 
     camera: Camera
     image: NDArray[np.float32]

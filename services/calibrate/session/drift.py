@@ -44,7 +44,7 @@ class Change:
 
     @property
     def sentence(self) -> str:
-        """The change in words."""
+        """A clause that states the change and its standard error."""
         return f"{self.what} changed by {self.change:+.3g} {self.unit} (± {self.se:.2g})"
 
 
