@@ -1,3 +1,3 @@
-"""Figures of what a fit does, made from fits that the command line runs:
+"""Figures that compare fits with photographs, made from fits by the command line:
 ``python -m services.bench.figures --out DIR``.
 """

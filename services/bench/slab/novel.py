@@ -3,7 +3,7 @@
 
 A dispersion is measured in one cell by images of plain photons. Images of other cells under other beams are then
 predicted from the fitted medium and compared with images of the true medium. Both come from the fit's own random walk,
-which other benchmarks compare with independent ones, so the images differ only by the medium.
+which is compared with independent walks elsewhere, so the images differ only by the medium.
 """
 
 from __future__ import annotations
