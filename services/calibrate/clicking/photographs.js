@@ -75,7 +75,7 @@ class PhotographView {
     this.image = new Image();
     this.image.onload = () => this.draw();
     this.image.src = `data:image/jpeg;base64,${jpeg}`;
-    /** Canvas pixels per camera pixel, null until the photograph is first drawn; then its corner in canvas pixels. */
+    /** Canvas pixels per camera pixel (null until first drawn), and the photograph's corner in canvas pixels. */
     this.scale = null;
     this.corner = [0, 0];
     follow(canvas, {
