@@ -1,5 +1,5 @@
-"""What every kind of fit needs of its job: the checkpoint's folder, the journal, workers, progress and previews out,
-and the records it publishes.
+"""One attempt at a job's fit, whatever its kind: checkpoint folder, journal, workers, progress reports, previews and
+published records.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from services.fit.inputs.observations import ChannelFiles, Observations, ViewSta
 
 CHECKPOINT = "fit-checkpoint"
 NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", "store", *SLAB_OPTIONS})
-"""Options that the answer of a fit does not depend on; what the capture holds counts by its contents."""
+"""Options that do not change a fit's result; the capture's content enters the fingerprint by the digests of its files.
+"""
 ALWAYS_NAMED = frozenset(
     [
         "kind",
@@ -61,13 +62,13 @@ ALWAYS_NAMED = frozenset(
         "device",
     ]
 )
-"""Options of version 0.1, whose checkpoints name them all. A later one is named where it is not at its default, and so
-is to be added nowhere here: fits that were begun before there was such an option go on."""
+"""Options of version 0.1, which its checkpoints always name. A later option is named only where it differs from its
+default, so it must not be added here: fits that were begun before the option existed then continue."""
 PREVIEW_EVERY = 3
-"""A preview after the first step and after every so many."""
+"""Number of steps between two previews; the first follows the first step."""
 
 Views = Mapping[str, tuple[ViewStack, ...]]
-"""By channel."""
+"""Observed views by channel."""
 
 
 @dataclass
@@ -82,15 +83,15 @@ class Attempt:
 
     @property
     def inputs(self) -> Path:
-        """Where the fit's tasks find their files."""
+        """Folder of the fit's input files."""
         return self.context.root / CHECKPOINT / "inputs"
 
     def log(self, message: str) -> None:
-        """One sentence for whoever watches."""
+        """Report one sentence to the job's event log."""
         self.context.report(StageEvent(stage="fit", kind="log", message=message))
 
     def journal(self, files: Iterable[ChannelFiles]) -> Journal:
-        """The journal of a fit of these inputs, continued where an earlier attempt stopped."""
+        """Journal of a fit of these inputs, continued where an earlier attempt stopped."""
         folder = self.context.root / CHECKPOINT
         folder.mkdir(parents=True, exist_ok=True)
         journal = Journal(
@@ -107,7 +108,7 @@ class Attempt:
 
     @contextmanager
     def workers(self) -> Iterator[Executor]:
-        """Where tasks run, under keys of this attempt's own."""
+        """Executor of the fit's tasks; the tasks' keys begin with a prefix that is unique to this attempt."""
         place = self.context.root / CHECKPOINT
         prefix = hashlib.sha256(f"{place / 'journal.json'}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[
             :12
@@ -116,16 +117,19 @@ class Attempt:
             yield run_on
 
     def passes(self, run_on: Executor, files: ChannelFiles, scope: str) -> Passes:
-        """The passes of one fit; ``scope`` sets its seeds and keys apart from those of others."""
+        """Passes of one fit; ``scope`` separates its seeds and keys from those of other fits."""
         return Passes(run_on, files.coarse.blocks, files.recipe, Seeds(self.spec.seed, scope), self.trace.extend)
 
     def teller(
         self, observations: Observations, views: tuple[ViewStack, ...], journal: Journal, done: Callable[[int], float]
     ) -> Callable[[StepReport, Evaluation], None]:
-        """What reports the steps of one channel.
+        """Function that records and reports each step of one channel's fit, with a preview every few steps.
 
         Args:
-            done: fraction of the job that is done after so many steps of this channel.
+            observations: the fit's observations.
+            views: the channel's observed views.
+            journal: the journal that records the steps.
+            done: returns the fraction of the job that is done after a number of steps of this channel.
         """
 
         def tell(step: StepReport, evaluation: Evaluation) -> None:
@@ -157,12 +161,12 @@ def worst_error(fit: ChannelFit[Any]) -> float:
 
 
 def standard_errors(sums: Mapping[str, ErrorSums]) -> dict[str, float]:
-    """By channel, what the renders leave open of an image error; absent where there was nothing to compare with."""
+    """Monte Carlo standard error of the image error by channel; channels without compared pixels are absent."""
     return {channel: se for channel, own in sums.items() if (se := own.error_se) is not None}
 
 
 def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
-    """Whether a fit of these channels counts as converged, and what to do about it."""
+    """Whether the fits of these channels count as converged, and advice where they do not."""
     advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
     off = {c: worst_error(fit) for c, fit in fits.items()}
     unexplained = [c for c, error in off.items() if error > MAX_ERROR]
@@ -175,7 +179,7 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
 
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:
-    """Identifies everything a fit's answer depends on; a journal of another fit is not continued."""
+    """Digest of everything that determines a fit's result; a journal with another fingerprint is not continued."""
     asked = (ALWAYS_NAMED | spec.changed_options) - NOT_OF_THE_ANSWER
     parts = [numerics_name(), engine, spec.model_dump_json(include=set(asked))]
     for channel in files:

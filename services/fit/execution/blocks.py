@@ -1,7 +1,7 @@
-"""What a fit's tasks need, as small files that every worker reads: scene recipes and blocks of measurements.
+"""Input files of a fit's tasks, small enough for every worker to read: scene recipes and blocks of measurements.
 
-No pickles. A job writes them once, at its start; they fix the block partition and the order of summation for the life
-of the job.
+The files hold no pickles. A job writes them once, at its start; they fix the block partition and the order of summation
+for the life of the job.
 """
 
 from __future__ import annotations
@@ -27,27 +27,28 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 Array = NDArray[np.float64]
 
 BLOCK_BYTES = 4 * 2**20
-"""Largest residual block that travels between tasks: mean and variance, float64."""
+"""Largest residual block that travels between tasks, in bytes: mean and variance, float64."""
 BLOCK_PIXELS = 4096
-"""Largest block: long enough to fill a kernel, short enough that a lost worker costs little."""
+"""Largest number of pixels in a block: enough to fill a kernel, and few enough that a lost worker costs little."""
 MIN_BLOCKS = 4
-"""Blocks of all views at least, so that two workers have enough to do, where there are pixels enough."""
+"""Least number of blocks of all views together, so that two workers have enough to do; fewer where there are too few
+pixels."""
 MIN_BLOCK_PIXELS = 128
-"""No block is made smaller to have more of them: it would not fill a kernel."""
+"""Least number of pixels for which a block is split: a smaller block would not fill a kernel."""
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file named by its content."""
+    """A file that is named by its content."""
 
     path: Path
     digest: str
 
     def load(self) -> dict[str, NDArray[np.generic]]:
-        """The arrays in it.
+        """The arrays in the file.
 
         Raises:
-            CorruptStoreError: absent or altered.
+            CorruptStoreError: the file is missing or altered.
         """
         content = self.path.read_bytes() if self.path.is_file() else b""
         if _digest(content) != self.digest:
@@ -59,12 +60,12 @@ class StoredFile:
 
 
 GUMS, CAVITY = -1, -2
-"""What else than a tooth a pixel may show."""
+"""Codes of pixels that show no tooth but gums or oral cavity."""
 
 
 @dataclass(frozen=True)
 class PixelParts:
-    """What the pixels of a jaw show; arrays (N,)."""
+    """Part of a jaw that each pixel shows; arrays (N,)."""
 
     shown: NDArray[np.int16]
     """Position of the tooth among the scene's, or GUMS or CAVITY."""
@@ -72,20 +73,20 @@ class PixelParts:
     """Position of the nearest tooth: the one that is shown, if any is."""
 
     def of(self, pixels: NDArray[Any]) -> PixelParts:
-        """Those of some pixels, by index or mask."""
+        """The parts of some pixels, by index or mask."""
         return PixelParts(self.shown[pixels], self.tooth[pixels])
 
 
 @dataclass(frozen=True)
 class BlockInstrument:
-    """Which errors of the instrument act on a block's photographs, by name."""
+    """Names of the instrument's errors that act on a block's photographs."""
 
     gain: str
     lights: tuple[str, ...]
-    """Of each of its lights."""
+    """One error for each of the block's lights."""
     flare: str
     brightest: float
-    """Greatest radiance among the camera's valid pixels in this channel, which a flare is a share of."""
+    """Largest radiance among the camera's valid pixels in this channel; a flare is given as a share of it."""
 
 
 @dataclass(frozen=True)
@@ -98,22 +99,22 @@ class Block:
     fit_weight: Array
     """Weight in the fitted loss, 1/variance units; 0 where masked or held out."""
     held_out: NDArray[np.bool_]
-    """Valid and kept from the fit."""
+    """Mask (L, N) of valid measurements that are held out of the fit."""
     parts: PixelParts | None = None
-    """None where the scene is one tooth."""
+    """Parts of a jaw that the pixels show; None where the scene is one tooth."""
     cell: NDArray[np.int32] | None = None
-    """Number (N,) of the cell that each pixel lies in, within which losses are compared as means; None where pixels
-    stand alone."""
+    """Index (N,) of the cell of each pixel, within which losses are compared as means; None where each pixel stands
+    alone."""
     instrument: BlockInstrument | None = None
-    """None where the instrument counts as perfect."""
+    """The instrument's errors; None where the instrument counts as exact."""
 
     @property
     def fitted_view(self) -> View:
-        """The view without lights under which no pixel is fitted: those are not rendered."""
+        """The view without the lights under which no pixel is fitted; these are not rendered."""
         return self.view_under(np.any(self.fit_weight > 0, axis=1))
 
     def view_under(self, lights: NDArray[np.bool_]) -> View:
-        """The view under some of the lights, (L,); under all where that leaves none."""
+        """The view under the lights of the mask (L,); under all lights where the mask is empty."""
         return (
             replace(self.view, lights=tuple(np.flatnonzero(lights).tolist()))
             if lights.any() and not lights.all()
@@ -123,7 +124,7 @@ class Block:
 
 @dataclass(frozen=True)
 class BlockTask:
-    """What every task on a block is told."""
+    """Common arguments of every task on a block."""
 
     block: StoredFile
     index: int
@@ -132,19 +133,19 @@ class BlockTask:
     tissue: Tissue | Mouth
     samples: int
     errors: tuple[tuple[str, float], ...] = ()
-    """Errors of the instrument, by name, through which renders are seen before they are compared."""
+    """Errors of the instrument, by name, which are applied to renders before they are compared."""
 
 
 def pixels_per_block(lights: int) -> int:
-    """Pixels whose residuals under all lights stay within BLOCK_BYTES."""
+    """Number of pixels whose residuals under all lights stay within ``BLOCK_BYTES``."""
     return max(1, min(BLOCK_PIXELS, BLOCK_BYTES // (16 * lights)))
 
 
 def split_pixels(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDArray[np.int64]]:
-    """Pixels of a view parted into blocks, each of which one worker renders at a time.
+    """Pixels of a view split into blocks, each of which one worker renders at a time.
 
-    Enough of them for two workers, none too small to fill a kernel, none too large to travel; the same however many
-    workers there are.
+    There are enough blocks for two workers, none too small to fill a kernel and none too large to travel; the partition
+    does not depend on the number of workers.
     """
     wanted = min(-(-MIN_BLOCKS // views), max(1, len(pixels) // MIN_BLOCK_PIXELS))
     return np.array_split(pixels, max(wanted, -(-len(pixels) // pixels_per_block(lights))))
@@ -261,7 +262,7 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
 
 
 def _write(folder: Path, stem: str, **arrays: NDArray[Any]) -> StoredFile:
-    # Written by value, so that writing it again changes nothing.
+    # The file's name follows from its content, so that writing it again changes nothing.
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **arrays)
     content = stream.getvalue()

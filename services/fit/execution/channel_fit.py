@@ -1,5 +1,5 @@
-"""What the stages of every fit share: the solver's loop through the journal, a report after each step, the errors and
-curvature at the end.
+"""Common parts of the stages of every fit: the solver's loop with its journal, a report after each step, and the errors
+and curvature at the end.
 """
 
 from __future__ import annotations
@@ -31,34 +31,36 @@ from services.fit.solve.normal_equations import NormalEquations
 Array = NDArray[np.float64]
 
 SIMILAR_TOLERANCE = 0.02
-"""What the option ``image_tolerance`` is for exact media: a stage in similar ones has converged when its next step is
-within Monte Carlo noise, and that noise in its parameters changes the images by no more, relative."""
+"""Relative change of the images at which a stage in similar media has converged: its next step is within Monte Carlo
+noise, and that noise in its parameters changes the images by no more. For exact media the option ``image_tolerance``
+takes this place."""
 SLOPE_ERROR = 0.5
-"""Relative error of what Jacobians of similar media promise for one tooth's exact images, however short the step;
-several are wrong independently."""
+"""Relative error of the change that Jacobians of similar media predict for one tooth's exact images, however short the
+step; the errors of several teeth are independent."""
 CLOSING_SHARE = 2
-"""The closing measurement has so many times fewer paths: it joins what all exact steps know."""
+"""Divisor of the paths for the closing measurement, which is combined with all equations of the exact steps."""
 CLOSING_TRIALS = 2
-"""Lengths tried of the step after the closing measurement."""
+"""Number of lengths that are tried for the step after the closing measurement."""
 CLOSING_MIN_SHARE = 0.1
-"""No step is tried that is shorter than so much of the one before."""
+"""Shortest length that is tried, as a share of the one before."""
 AGAIN = "again"
-"""The stage of a fit that goes on where its first end has put the answer far from it."""
+"""Name of the stage that continues a fit from its first solution, where the prior of the instrument's errors moved that
+solution far."""
 MIN_SAMPLES = 4
-"""Paths per pixel, however many pixels there are."""
+"""Least number of paths per pixel, however many pixels there are."""
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """One step, for whoever watches."""
+    """Report of one step."""
 
     channel: str
     stage: str
     step: int
     stage_step: int
     loss: float
-    """Relative squared error on fitted images, sensor noise included; dimensionless. This and the errors are not below
-    what the step's samples resolve."""
+    """Relative squared error on fitted images, sensor noise included; dimensionless. The loss and the errors are not
+    reported below the precision of the step's samples."""
     fit_error: float | None
     held_out_error: float | None
     held_out_se: float | None
@@ -67,26 +69,25 @@ class StepReport:
     samples: int
     verdict: str
     tooth: int | None = None
-    """FDI number, while a jaw's fit looks at one tooth alone."""
+    """FDI number of the tooth, while a jaw's fit treats one tooth alone."""
 
 
 def told_place(channel: str, tooth: int | None) -> str:
-    """What a fit's sentences begin with: the channel, and the tooth while a jaw's fit looks at one alone."""
+    """Start of a fit's messages: the channel, and the tooth while a jaw's fit treats one tooth alone."""
     return channel if tooth is None else f"{channel}, tooth {tooth}"
 
 
 def history_key(channel: str, step: int) -> str:
-    """The journal's key of a step's report."""
+    """Key of a step's report in the journal."""
     return f"{channel}/history/{step}"
 
 
 def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_count: int, samples: int) -> Array:
-    """The step from x (F,) by the closing measurement, or a shorter one; zeros where it promises no more than noise
-    does, or is not better.
+    """The step (F,) from x by the closing measurement, possibly shortened; zeros where its predicted gain is within
+    noise or no length is better.
 
     Args:
-        part_count: how many things the fit is about that images tell apart; what one of them promises is wrong
-            independently of the others.
+        part_count: number of objects that the images tell apart; the errors of their predicted changes are independent.
         samples: paths per pixel of a comparison.
     """
     step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
@@ -101,7 +102,7 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
             return step
         if not (judged.is_worse or judged.contradicted):
             break
-        # Least on the parabola of slope and comparison (Nocedal and Wright 2006, section 3.5).
+        # Go to the minimum of the parabola through slope and comparison (Nocedal and Wright 2006, section 3.5).
         slope = model.slope(step)
         step = max(0.5 * slope / (slope - max(change, 0.0)), CLOSING_MIN_SHARE) * step
     return np.zeros(len(x))
@@ -109,7 +110,7 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
 
 @dataclass(frozen=True)
 class ChannelFit(Generic[Optics]):
-    """A channel's result."""
+    """Result of one channel's fit."""
 
     tissue: Optics
     domain: Domain
@@ -121,15 +122,15 @@ class ChannelFit(Generic[Optics]):
     steps: int
     evaluation: Evaluation
     problem: StackProblem[Optics]
-    """At the solution."""
+    """The least-squares problem at the solution."""
     samples: int
     """Paths per pixel of the last measurement."""
 
 
 @dataclass(kw_only=True)
 class Stages(ABC, Generic[Optics]):
-    """Runs stages of one channel's fit; everything costly goes through the journal, under keys that begin with the
-    seeds' channel.
+    """Stages of one channel's fit; everything costly goes through the journal, under keys that begin with the seeds'
+    channel.
     """
 
     files: ChannelFiles
@@ -138,49 +139,49 @@ class Stages(ABC, Generic[Optics]):
     journal: Journal
     report: Callable[[StepReport, Evaluation], None]
     say: Callable[[str], None]
-    """Tells whoever watches one sentence."""
+    """Reports one sentence to the job's event log."""
     pause: Callable[[], None]
     """Called between steps; raises when the job is cancelled."""
     shown: Shown = ()
     steps: int = 0
-    """Taken so far, those of earlier fits that are counted with this one included."""
+    """Number of steps so far, with those of earlier fits that count as part of this one."""
     tooth: int | None = None
-    """FDI number of the one tooth of a jaw that this fit is about."""
+    """FDI number of the tooth, where this is the fit of one tooth of a jaw."""
 
     @property
     @abstractmethod
     def media(self) -> tuple[str, ...]:
-        """Media that reports of steps list."""
+        """Media that the reports of steps list."""
 
     @abstractmethod
     def _others(self, tissue: Optics) -> dict[str, float]:
-        """What they list beside media."""
+        """Values, by name, that the reports of steps list beside the media."""
 
     def _told_name(self, name: str) -> str:
-        """How reports of steps call a parameter."""
+        """Name of a parameter in the reports of steps."""
         return name
 
     @abstractmethod
     def _held(self, domain: Domain) -> Held:
-        """Mean cosines that this domain holds, as the closing measurement takes them."""
+        """Mean cosines that this domain holds, as input of the closing measurement."""
 
     @property
     def part_count(self) -> int:
-        """How many things the fit is about that images tell apart, such as teeth."""
+        """Number of objects that the fit treats as separate in the images, such as teeth."""
         return 1
 
     @property
     def scope(self) -> str:
-        """Begins the journal's keys of this fit."""
+        """Start of this fit's journal keys."""
         return self.passes.seeds.channel
 
     @property
     def is_told(self) -> bool:
-        """Whether the step just taken is in the history; one that was cut off before its report is not."""
+        """Whether the last step is in the history; a step that was interrupted before its report is not."""
         return history_key(self.files.channel, self.steps) in self.journal.entries
 
     def options(self, level: Level) -> Options:
-        """Limits of a stage on images of this resolution; it has converged within ``image_tolerance``."""
+        """Solver limits of a stage on images of this resolution; it has converged within ``image_tolerance``."""
         most = self.spec.max_samples_per_pixel
         samples = self.fewer(most) if level is self.files.full else most
         return Options(
@@ -191,25 +192,25 @@ class Stages(ABC, Generic[Optics]):
         )
 
     def short(self, steps: int) -> Options:
-        """Limits of a stage that only prepares the next: so many steps, few samples."""
+        """Solver limits of a stage that only prepares the next: at most ``steps`` steps, with few samples."""
         options = self.options(self.files.coarse)
         samples = min(2 * self.spec.samples_per_pixel, options.max_samples)
         return replace(options, max_steps=min(steps, options.max_steps), max_samples=samples)
 
     def in_similar_media(self, options: Options) -> Options:
-        """Limits of a stage whose images are off by more than a few samples resolve: it only finds the
-        neighbourhood.
+        """Solver limits of a stage in similar media, which only finds the neighbourhood of the solution, because the
+        images' bias is larger than the noise of a few samples.
         """
         most = min(2 * self.spec.samples_per_pixel, options.max_samples)
         return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
 
     def at_full_resolution(self) -> Options:
-        """Go on with full images; returns the limits there."""
+        """Continue with images of full resolution; returns the solver limits there."""
         self.passes = replace(self.passes, blocks=self.files.full.blocks)
         return self.options(self.files.full)
 
     def fewer(self, samples: int) -> int:
-        """Paths per pixel of full images, for as many in all as ``samples`` are per pixel of coarse ones."""
+        """Paths per pixel of full images that cost as much in all as ``samples`` per pixel of coarse images."""
         return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), MIN_SAMPLES)
 
     def _iterate(
@@ -226,18 +227,18 @@ class Stages(ABC, Generic[Optics]):
         )
 
     def _start_of(self, problem: StackProblem[Optics]) -> Array:
-        # Where a stage begins: its tissue, and the instrument's errors as the last stage left them.
+        # Start of a stage: its tissue, and the instrument's errors as the last stage left them.
         return problem.domain.x_of(problem.base, dict(self.passes.errors))
 
     def _see(self, domain: Domain, x: Array) -> None:
-        # Later passes see photographs freed of the instrument's errors in x.
+        # Apply the instrument's errors in x to the renders of later passes.
         if domain.errors.names:
             self.passes = replace(self.passes, errors=domain.errors_at(x))
 
     def _run(
         self, solver: Any, kind: Any, problem: StackProblem[Optics], state: Any, burst: int = 1
     ) -> tuple[Optics, Solution]:
-        # A solver's loop from its first state; every ``burst`` steps are one journal entry, written and read by the
+        # Run a solver from its first state. Every ``burst`` steps are one journal entry, written and read by the
         # solver's module ``kind``, and one report.
         def advance(state: Any) -> Any:
             for _ in range(burst):
@@ -257,14 +258,13 @@ class Stages(ABC, Generic[Optics]):
         return problem.domain.tissue_at(solution.x, problem.base), solution
 
     def _finish(self, problem: StackProblem[Optics], solution: Solution) -> ChannelFit[Optics]:
-        # Curvature and noise around the solution, rendered anew only where the solver ended without them; and the
-        # errors that are reported.
+        # Uncertainty at the solution, and the errors that are reported.
         samples = max(
             solution.samples, self.fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel))
         )
         problem, solution, equations, known = self._close(problem, solution, samples)
         if not known.is_whole:
-            # Too far for one linear model: look again from there, once.
+            # The move is too long for one linear model: fit once more from its end.
             self._see(problem.domain, solution.x)
             again = replace(problem, passes=self.passes, stage=AGAIN)
             base, solution = self._iterate(again, self.options(self.files.full), samples)
@@ -290,8 +290,8 @@ class Stages(ABC, Generic[Optics]):
     def _close(
         self, problem: StackProblem[Optics], solution: Solution, samples: int
     ) -> tuple[StackProblem[Optics], Solution, NormalEquations, Uncertainty]:
-        # The uncertainty at a solution, moved where the instrument's errors use their prior in full; all of them where
-        # that puts the answer. Curvature and noise are rendered anew only where the solver ended without them.
+        # Uncertainty at a solution, moved where the instrument's errors use their prior in full. Curvature and noise
+        # are rendered anew only where the solver ended without them.
         again, equations = f".{AGAIN}" if problem.stage == AGAIN else "", solution.equations
         if equations is None:
             self.pause()
@@ -312,8 +312,8 @@ class Stages(ABC, Generic[Optics]):
     def _measured(
         self, key: str, problem: StackProblem[Optics], x: Array, equations: NormalEquations, samples: int
     ) -> Uncertainty:
-        # Where Jacobians were those of similar media, the response of the exact images is measured, and one more step
-        # made by it where it promises more than noise does, and is better by that promise and by images together.
+        # Measure the response of the exact images where Jacobians came from similar media. Make one more step with it
+        # where the predicted gain exceeds noise, and prediction and comparison combined are better.
         domain = problem.domain
         known, moves = whitening(domain, equations), self.files.moves
 
@@ -340,7 +340,7 @@ class Stages(ABC, Generic[Optics]):
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float
     ) -> tuple[Optics, Solution]:
-        # A stage in similar media.
+        # Fit a stage in similar media.
         problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
         return self._iterate(problem, self.in_similar_media(options), samples)
 
@@ -358,7 +358,7 @@ class Stages(ABC, Generic[Optics]):
     def _announce(
         self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None
     ) -> None:
-        # Evaluate what is shown, the tissue itself unless it is fitted through other media, and report.
+        # Evaluate ``shown``, which is the tissue itself unless it is fitted through other media, and report.
         evaluation = self._evaluate(
             f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel, self.files.coarse
         )

@@ -1,5 +1,5 @@
-"""The last measurement of a fit whose Jacobians were those of similar media (see ``solve.closing``): one task per
-block, on any worker.
+"""The closing measurement of a fit whose Jacobians came from similar media (see ``solve.closing``): one task per block,
+on any worker.
 """
 
 from __future__ import annotations
@@ -24,25 +24,27 @@ from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
 Held = Mapping[tuple[str, ...], tuple[float, float]]
-"""Media whose mean cosine was held and may be wrong alike, with the mean and standard deviation of its prior in the
-unbounded domain."""
+"""Media whose mean cosine was held, and the mean and standard deviation of its prior in the unbounded domain; the error
+of one entry's media is common to them."""
 
 MOVE_SAMPLES = 4
-"""Images of moved scans and domes have so many times fewer paths than the rest: there are thirteen."""
+"""Divisor of the paths for images of moved scans and domes, because there are thirteen of them."""
 SHIFT_SAMPLES = 2
-"""Images of changed media have so many times fewer paths: they enter a variance, not the answer."""
+"""Divisor of the paths for images of changed media, because they enter a variance only and not the solution."""
 
 
 def measure_closing(
     problem: StackProblem[Optics], x: Array, whiten: Array, held: Held, samples: int, moves: Sequence[Move] = ()
 ) -> ClosingSums:
-    """Sums at x, in block order.
+    """Closing sums of all blocks at x (F,), added in block order.
 
     Args:
+        problem: the stage's least-squares problem.
+        x: the solution (F,).
         whiten: T (F, F), x = T y.
-        held: each entry costs four images.
+        held: held mean cosines; each entry costs four images.
         samples: paths per pixel and seed.
-        moves: of scan and dome; each costs two images, and their changes follow those of what is held.
+        moves: moves of scan and dome; each costs two images, and their changes follow those of ``held`` in the sums.
     """
     run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
     tissue, similar, how = problem.jacobian_media(x)
@@ -71,8 +73,8 @@ def measure_closing(
 def _changes_by_moves(
     problem: StackProblem[Optics], tasks: Sequence[BlockTask], moves: Sequence[Move], label: str
 ) -> list[list[Any]]:
-    # By block and scene, what ``moves_task`` gives. All blocks of one scene before the next, as a worker keeps few
-    # scenes.
+    # Results of ``moves_task`` by block and scene. All blocks of one scene come before the next scene, because a worker
+    # keeps few scenes.
     seeds = problem.seed(0, "closing-moves-1"), problem.seed(0, "closing-moves-2")
     few = [replace(task, samples=max(task.samples // MOVE_SAMPLES, 1)) for task in tasks]
     by_moves = [
@@ -101,9 +103,9 @@ def closing_task(
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
     *changes: NDArray[np.float32],
 ) -> tuple[ClosingSums, TraceRow]:
-    """One block's share, with the changes by moves (K, 2, L, N) of each scene.
+    """One block's closing sums and trace, with the changes by moves (K, 2, L, N) of each scene.
 
-    Rows of ``slopes`` that are ``borrowed`` are those of the similar media's Jacobian instead.
+    Rows of ``slopes`` that are ``borrowed`` are copied from the similar media's Jacobian.
     """
     start, block = time.time(), read_block(task.block)
     view, errors = block.fitted_view, dict(task.errors)
@@ -144,8 +146,8 @@ def closing_task(
 
 
 def _borrowed(domain: Domain) -> NDArray[np.bool_]:
-    # Which derivatives (F,) exact images share with similar media: of the dentin's shape, as they are not rendered
-    # again, and of the instrument's errors.
+    # Mask (F,) of derivatives copied from the similar media: those of the dentin's shape, which are not rendered again,
+    # and those of the instrument's errors.
     shapes = [coordinate.kind == "shape" for coordinate in domain.coordinates]
     return np.array(shapes + [True] * len(domain.errors.names))
 

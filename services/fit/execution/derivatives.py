@@ -1,9 +1,10 @@
-"""How a stage's images are differentiated: by scores of the same walks, or as differences of images of changed media.
+"""Differentiation of a stage's images: by score functions along the same walks, or by differences of images of changed
+media.
 
-A difference costs two images for each coordinate, which a jaw has by the hundred. But a tooth changes what is seen of
-itself and of its neighbours, and hardly anything beyond: so the same coordinate of every third tooth is moved at once,
-and each one's derivative is read where its own tooth is the nearest of those moved (a sparse Jacobian by groups of
-columns: Curtis, Powell and Reid 1974).
+A difference costs two images for each coordinate, and a jaw has hundreds of coordinates. But a tooth changes the images
+of itself and of its neighbours and hardly any others. So the same coordinate of every third tooth is changed at once,
+and each tooth's derivative is read in the pixels where it is the nearest of the changed teeth (a sparse Jacobian by
+groups of columns: Curtis, Powell and Reid 1974).
 """
 
 from __future__ import annotations
@@ -25,15 +26,16 @@ from services.fit.transport.scene.recipe import JacobianEstimate, View
 Array = NDArray[np.float64]
 
 WITHOUT_SCORES = frozenset({"shape", "cosine"})
-"""Kinds of coordinates whose derivatives are always differences."""
+"""Kinds of coordinates whose derivatives are always computed as differences."""
 SCORES_SHARE = 4
-"""Scores that are left where others became differences are quiet: they get so many times fewer paths."""
+"""Divisor of the paths for scores where the derivatives to sigma are differences: the remaining scores have little
+noise."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """How far from a coordinate's value the images lie whose difference gives its derivative, and their share of a
-    task's paths, one part in so many.
+    """Distances below and above a coordinate's value, in the unbounded domain, at which the two images of a difference
+    are rendered, and the divisor of the task's paths for each image.
     """
 
     below: float
@@ -44,61 +46,63 @@ class Reach:
 REACH: Mapping[str, Reach] = MappingProxyType(
     {"shape": Reach(0.2, 0.2, 1), "sigma": Reach(0.7, 0.7, 4), "cosine": Reach(1.0, 0.0, 8)}
 )
-"""By kind of coordinate. The wider, the quieter, in proportion; the zero of J'Wr, and so the answer, hardly minds that
-a wide difference is no derivative."""
+"""Reach by kind of coordinate. The noise falls in proportion to the width. That a wide difference is not the exact
+derivative hardly changes the zero of J'Wr, and so the solution."""
 
 SLOPE_REACH = Reach(0.35, 0.35, 4)
-"""Of a cosine in the closing measurement, where the derivative itself is wanted."""
+"""Reach of a cosine in the closing measurement, which needs the derivative itself."""
 
 
 @dataclass(frozen=True)
 class Secant:
-    """The derivatives to one coordinate, or to several of teeth that stand apart, as a difference of two images:
-    quieter than border terms or scores.
+    """Derivative with respect to one coordinate, or to several of teeth that are far apart, as a difference of two
+    images; it has less noise than border terms or scores.
     """
 
     coordinates: tuple[int, ...]
     low: Tissue | Mouth
     high: Tissue | Mouth
     widths: tuple[float, ...]
-    """Of each coordinate, between both ends."""
+    """Width of the difference for each coordinate: the distance between both ends."""
     share: int
     teeth: tuple[int, ...] | None = None
-    """In whose pixels, and their neighbours', each coordinate's derivative is read; None where there is one coordinate,
-    for all pixels."""
+    """Teeth in whose pixels, and their neighbours' pixels, each coordinate's derivative is read; None where one
+    coordinate applies to all pixels."""
 
 
 @dataclass(frozen=True)
 class Differentiation:
-    """How a stage's images are differentiated: scores of some natural parameters, mapped to the coordinates, and
-    secants.
+    """Differentiation of a stage's images: scores of some natural parameters, mapped to the coordinates,
+    and secants.
     """
 
     parameters: tuple[str, ...]
     chain: Array
-    """d parameter / d x, (P, F)."""
+    """Chain rule d parameter / d x, (P, F)."""
     secants: tuple[Secant, ...] = ()
     share: int = 1
-    """Of the task's paths that scores get, one part in so many."""
+    """Divisor of the task's paths for scores."""
     neighbours: Neighbours | None = None
-    """Of a jaw's teeth."""
+    """Neighbourhood of a jaw's teeth; None for a single tooth."""
     errors: tuple[str, ...] = ()
-    """The instrument's errors: derivatives that follow these and are not rendered, see ``instrument.columns``."""
+    """The instrument's errors. Their derivatives follow from the images and are not rendered, see
+    ``instrument.columns``."""
 
     def render(
         self, host: EngineHost, task: BlockTask, view: View, seeds: Sequence[int], parts: PixelParts | None = None
     ) -> tuple[Array, ...]:
-        """Derivatives (F, L N) to the tissue's coordinates by each of the seeds; scores are of the task's media.
+        """Derivatives (F, L N) with respect to the tissue's coordinates, for each of the seeds; scores use the task's
+        media.
 
-        All seeds see a surface before it is moved again.
+        All seeds are rendered with a surface before it is moved again.
 
         Args:
-            parts: what the view's pixels show, of a jaw.
+            parts: for a jaw, the part of the scene that each pixel shows.
         """
         images: dict[tuple[int, int], list[Array]] = {}
 
         def rendered(tissue: Tissue | Mouth, samples: int) -> list[Array]:
-            # What several secants share is rendered once; (L, N) by seed.
+            # Images (L, N) by seed; an end that several secants share is rendered once.
             key = id(tissue), samples
             if key not in images:
                 stacks = [host.call("images", task.recipe, tissue, view, samples=samples, seed=seed) for seed in seeds]
@@ -134,7 +138,7 @@ class Differentiation:
         return tuple(every)
 
     def _seen(self, secant: Secant, parts: PixelParts | None) -> Sequence[NDArray[np.bool_] | float]:
-        # By coordinate, the pixels (N,) in which it is read.
+        # Mask (N,), by coordinate, of the pixels in which its derivative is read.
         if secant.teeth is None:
             return [1.0]
         assert self.neighbours is not None
@@ -145,15 +149,16 @@ class Differentiation:
 def differentiation(
     domain: Domain, x: Array, base: Optics, jacobian_g: float | None, neighbours: Neighbours | None = None
 ) -> Differentiation:
-    """How to differentiate a stage's images at x (F,).
+    """Differentiation of a stage's images at x (F,).
 
     Args:
-        jacobian_g: mean cosine of the similar media in which it is done; None for the images' own.
-        neighbours: of a jaw's teeth.
+        jacobian_g: mean cosine of the similar media in which derivatives are rendered; None for the images' own media.
+        neighbours: neighbourhood of a jaw's teeth.
     """
     x, tissue = x[: domain.tissue_count], domain.tissue_at(x, base)
-    # Scores of extinction are noisy, but in a jaw they are of all teeth at once; and the images' own media are the
-    # closing measurement's, which wants slopes.
+    # Scores of extinction are noisy, so a single tooth in similar media uses differences instead. A jaw keeps scores,
+    # because one pass gives those of all teeth, and so do the images' own media, because the closing measurement needs
+    # derivatives.
     differing = WITHOUT_SCORES if jacobian_g is None or isinstance(base, Mouth) else WITHOUT_SCORES | {"sigma"}
     is_secant = [c.kind in differing for c in domain.coordinates]
     own = tuple(
@@ -171,7 +176,7 @@ def differentiation(
 
 
 def slopes(domain: Domain, x: Array, base: Optics, neighbours: Neighbours | None = None) -> Differentiation:
-    """How to differentiate the images' own media at x (F,), except to blend weights."""
+    """Differentiation of the images in their own media at x (F,), without blend weights."""
     x = x[: domain.tissue_count]
     tissue, cosines = domain.tissue_at(x, base), [k for k, c in enumerate(domain.coordinates) if c.kind == "cosine"]
     scored = _scored_parameters(domain)
@@ -183,16 +188,17 @@ def slopes(domain: Domain, x: Array, base: Optics, neighbours: Neighbours | None
 
 
 def _scored_parameters(domain: Domain) -> tuple[str, ...]:
-    # Those whose derivatives can be scores.
+    # Parameters whose derivatives can be scores.
     return tuple(name for name in domain.parameters if kind_of(name) not in WITHOUT_SCORES)
 
 
 def _chain(domain: Domain, x: Array, base: Optics, names: tuple[str, ...], g: float | None) -> Array:
-    # Derivatives (P, F) of natural parameters to x, those of similar media of mean cosine g where it is given.
+    # Derivatives (P, F) of natural parameters with respect to x; of those of similar media where their mean cosine g is
+    # given.
     if g is None and not domain.cosines:
         return domain.chain(x)[[domain.parameters.index(name) for name in names]]
 
-    # The map is smooth and closed, so central differences of it are exact to rounding.
+    # The map is smooth and in closed form, so its central differences are accurate to rounding.
     def values(at: Array) -> Array:
         tissue = domain.tissue_at(at, base)
         seen = tissue if g is None else similar_tissue(tissue, g)
@@ -210,7 +216,8 @@ def _similar_parameters(name: str) -> tuple[str, ...]:
 def _groups(
     domain: Domain, chosen: Sequence[int] | NDArray[np.int_], neighbours: Neighbours | None
 ) -> list[tuple[int, ...]]:
-    # Coordinates that are moved at once: the same one of all teeth of one colour; any other alone.
+    # Groups of coordinates that are changed at once: the same coordinate of all teeth of one colour (graph colouring);
+    # any other coordinate alone.
     groups: dict[tuple[str, int], list[int]] = {}
     for k in chosen:
         tooth, leaf = _owner(domain, int(k))
@@ -224,7 +231,7 @@ def _groups(
 
 
 def _owner(domain: Domain, k: int) -> tuple[int | None, str]:
-    # The tooth of a jaw that a coordinate belongs to, None for any other, and the rest of its name.
+    # The tooth of a jaw that owns a coordinate, None where no tooth does, and the rest of the coordinate's name.
     coordinate = domain.coordinates[k]
     return coordinate.tooth, coordinate.targets[0].partition(".")[2]
 
@@ -238,7 +245,8 @@ def _secant(
     jacobian_g: float | None,
     reach: Reach,
 ) -> Secant:
-    # One-sided where a bound is near. A cosine's media are the images' own, as it is what similar media do not have.
+    # Difference that is one-sided near a bound. A cosine's ends use the images' own media, because similar media fix
+    # the cosine.
     own = list(group)
     kind, (lower, upper) = domain.coordinates[own[0]].kind, (bound[own] for bound in domain.bounds)
     low = np.clip(x[own] - reach.below, lower, upper)
@@ -250,7 +258,8 @@ def _secant(
         there = tissue if np.array_equal(moved, x) else domain.tissue_at(moved, base)
         return there if kind == "cosine" or jacobian_g is None else similar_tissue(there, jacobian_g)
 
-    # Images are linear in the cosine itself farther than in its coordinate.
+    # Measure a cosine's width in the cosine itself, in which images are linear over a longer range than in its
+    # coordinate.
     widths = high - low
     if kind == "cosine":
         natural = [

@@ -1,10 +1,10 @@
-"""Who owns the renderer: this process, or a child process of a Dask worker.
+"""Hosts of the rendering engine: this process, or a child process of a Dask worker.
 
-A kernel can hold the interpreter lock for seconds, and a worker that cannot answer its scheduler is taken for dead. So
-each worker keeps one child, a fresh interpreter that owns Mitsuba, the built scenes and the kernels. The worker's task
-only waits on a pipe. A child that dies (out of memory, kill) is started again and asked once more; a child whose worker
-dies sees its pipe close and ends itself, also in mid-kernel. While it waits, the task looks at the child's memory and
-at the job's cancel flag, and ends the child where it must; the worker stays.
+A kernel can hold the interpreter lock for seconds, and the scheduler takes a worker that does not answer for dead. So
+each worker keeps one child, a fresh interpreter that owns Mitsuba, the built scenes and the kernels, and the worker's
+task only waits on a pipe. A child that dies (out of memory, kill) is started again and gets the request once more. A
+child whose worker dies sees its pipe close and ends itself, even while a kernel runs. While it waits, the task checks
+the child's memory and the job's cancel flag, and ends the child if necessary; the worker lives on.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from services.fit.execution.blocks import StoredFile, read_recipe
 from services.fit.execution.engine_process import EngineProcess
 
 ENGINE = "services.fit.transport.engine:Engine"
-"""Default engine, as ``module:class``; imported only where it runs."""
+"""Default engine, as ``module:class``; imported only in the process that renders."""
 SCENES_KEPT = 4
 WATCH_S = 0.25
-"""How often a waiting task looks at the child's memory and at the cancel flag."""
+"""Interval in seconds at which a waiting task checks the child's memory and the cancel flag."""
 
 
 class EngineHost(Protocol):
-    """Answers calls to an engine whose scene is named by its recipe file."""
+    """Host that executes calls on an engine whose scene is given by its recipe file."""
 
     def call(self, method: str, recipe: StoredFile, *args: Any, **options: Any) -> Any:
         """``getattr(engine, method)(*args, **options)`` on the engine built from ``recipe``."""
@@ -45,7 +45,7 @@ class EngineHost(Protocol):
 
 
 class InProcessHost:
-    """The engine in this very process; keeps the last few scenes built."""
+    """Host with the engine in this process; keeps the scenes that were used last."""
 
     def __init__(self, factory: str = ENGINE, threads: int | None = None) -> None:
         self._factory, self._threads = factory, threads
@@ -64,15 +64,17 @@ class InProcessHost:
         return getattr(engine, method)(*args, **options)
 
     def close(self) -> None:
-        """Forget the scenes."""
+        """Release the scenes."""
         self._engines.clear()
 
 
 class ChildHost:
-    """The engine in one child process, started at the first call and again after it died.
+    """Host with the engine in one child process, started at the first call and again after it died.
 
     Args:
-        memory_bytes: how far the child may grow; None for as far as the system lets it.
+        factory: the engine, as ``module:class``.
+        threads: number of threads that the engine may use; None for its default.
+        memory_bytes: largest memory of the child; None for no limit but the system's.
     """
 
     def __init__(self, factory: str = ENGINE, threads: int | None = None, memory_bytes: int | None = None) -> None:
@@ -90,8 +92,8 @@ class ChildHost:
         """See EngineHost. One call at a time.
 
         Raises:
-            MemoryKillError: the child grew beyond its share, or the system killed it for memory. CrashError: it died
-                twice in this call.
+            MemoryKillError: the child grew beyond its limit, or the system killed it for lack of memory.
+            CrashError: the child died twice in this call.
             WorkerLostError: the host was closed meanwhile.
         """
         return self.call_until(lambda: False, method, recipe, *args, **options)
@@ -99,7 +101,7 @@ class ChildHost:
     def call_until(
         self, is_cancelled: Callable[[], bool], method: str, recipe: StoredFile, *args: Any, **options: Any
     ) -> Any:
-        """The same, but the child is ended in mid-kernel, and JobCancelledError raised, once ``is_cancelled()``."""
+        """Like ``call``, but once ``is_cancelled()`` the child is ended even while a kernel runs."""
         request = pickle.dumps((method, recipe, args, options))
         with self._lock:
             for is_last in (False, True):
@@ -133,9 +135,9 @@ class ChildHost:
         raise AssertionError
 
     def close(self) -> None:
-        """End the child, also in mid-kernel: whoever waits for its answer meets WorkerLostError.
+        """End the child, even while a kernel runs; a caller that waits for its result gets WorkerLostError.
 
-        There is no call after this.
+        No call may follow.
         """
         self._is_closed.set()
         with self._lock:
@@ -162,27 +164,27 @@ class ChildHost:
 
 @dataclass(frozen=True)
 class CancellableHost:
-    """A worker's child as the tasks of one job see it."""
+    """Host of one job's tasks: the worker's child process, with the job's cancel flag."""
 
     child: ChildHost
     flag: Path
-    """Exists once the job's cancel was asked for."""
+    """File that exists once the job was cancelled."""
 
     def call(self, method: str, recipe: StoredFile, *args: Any, **options: Any) -> Any:
         """See ChildHost."""
         return self.child.call_until(self.flag.exists, method, recipe, *args, **options)
 
     def close(self) -> None:
-        """The child belongs to its worker."""
+        """Do nothing, because the child belongs to its worker."""
 
 
 def serve(descriptor: int, factory: str, threads: int | None) -> None:
-    """Answer calls until the pipe closes. Runs in the child."""
+    """Execute calls until the pipe closes. Runs in the child process."""
     pipe: Connection[Any, Any] = Connection(descriptor)
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def listen() -> None:
-        # Ends the process the moment its worker is gone, whatever the main thread computes.
+        # End the process as soon as its worker is gone, whatever the main thread computes.
         while True:
             try:
                 requests.put(pipe.recv_bytes())
@@ -201,8 +203,8 @@ def serve(descriptor: int, factory: str, threads: int | None) -> None:
 
 
 def _portable(problem: Exception) -> Exception:
-    """An exception as it comes out at the other end of a pipe; one that would not, as it needs more than its arguments,
-    say, in words.
+    """An exception that survives a pipe: the original where it can be pickled, else a RuntimeError with its text.
+    Exceptions that need more than their arguments cannot be restored from a pickle.
     """
     try:
         if type(pickle.loads(pickle.dumps(problem))) is type(problem):  # noqa: S301 - made on the line itself

@@ -1,4 +1,4 @@
-"""A rendering process seen from outside: how large it is, and what it died of."""
+"""Handle of a rendering process: its memory use, and the reason why it ended."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ import psutil
 from services.core.errors import CrashError, Evidence, MemoryKillError, ResourceError
 
 OUT_OF_MEMORY_COUNTERS = (Path("/proc/vmstat"), Path("/sys/fs/cgroup/memory.events"))
-"""Files in which the system counts processes that it killed for memory."""
+"""Files in which the system counts the processes that it killed for lack of memory."""
 REMEDY = "lower samples_per_pixel, raise pixel_step or give the worker more memory"
 
 
 class EngineProcess:
-    """A child and the pipe to it.
+    """A child process and the pipe to it.
 
     Args:
-        memory_bytes: how far it may grow; None for as far as the system lets it.
+        process: the running child.
+        pipe: this end of the pipe to the child.
+        memory_bytes: largest resident memory of the child; None for no limit but the system's.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], pipe: Connection[Any, Any], memory_bytes: int | None) -> None:
@@ -37,10 +39,10 @@ class EngineProcess:
         return self._process.pid
 
     def check_memory(self) -> None:
-        """Look at the size of the process.
+        """Measure the resident memory of the process.
 
         Raises:
-            MemoryKillError: it has grown too far; end it.
+            MemoryKillError: it exceeds the limit; the caller has to end the process.
         """
         with suppress(psutil.NoSuchProcess):
             self._peak_bytes = max(self._peak_bytes, psutil.Process(self.pid).memory_info().rss)
@@ -51,7 +53,7 @@ class EngineProcess:
             )
 
     def end(self) -> None:
-        """Kill the process if it lives, and learn what ended it if it does not."""
+        """Kill the process if it still runs, and find out whether it died for lack of memory."""
         self.pipe.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(0.5)
@@ -78,7 +80,7 @@ class EngineProcess:
 
 
 def memory_kills() -> int:
-    """Processes that the system says it has killed for lack of memory."""
+    """Number of processes that the system has killed for lack of memory."""
     total = 0
     for path in OUT_OF_MEMORY_COUNTERS:
         with suppress(OSError):

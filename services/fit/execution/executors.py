@@ -1,6 +1,6 @@
-"""Where tasks run: here, one after the other, or on the workers of a Dask cluster.
+"""Executors of tasks: in this process, one after the other, or on the workers of a Dask cluster.
 
-A task is ``task(host, *args)``; arguments may be earlier results.
+A task is ``task(host, *args)``; its arguments may be results of earlier tasks.
 """
 
 from __future__ import annotations
@@ -21,33 +21,35 @@ from services.fit.execution.fair_shares import Board, Share
 
 Task = Callable[..., Any]
 Call = tuple[str, Task, tuple[Any, ...]]
-"""What ``submit`` takes: a key, a task and its arguments."""
+"""Arguments of ``submit``: a key, a task and its arguments."""
 TASKS_AHEAD = 2
-"""Tasks of a fit that are with the workers at once, for each of their threads: one that runs and one that follows at
-once."""
+"""Number of a fit's tasks that are with the workers at once, per worker thread: one runs, and the next follows without
+delay."""
 
 
 class Executor(Protocol):
     """Runs tasks."""
 
     def submit(self, key: str, task: Task, *args: Any) -> Any:
-        """Start ``task(host, *args)``; returns something that later submits and ``gather`` take."""
+        """Start ``task(host, *args)``; returns a handle that later submits and ``gather`` take."""
 
     def gather(self, pending: Sequence[Any]) -> list[Any]:
-        """Results in the order given. Raises what a task raised."""
+        """Results in the order of ``pending``. Raises what a task raised."""
 
     def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
-        """Run tasks that wait for no other, and give the result of each as soon as it is there.
+        """Run tasks that depend on no other task, and yield the result of each as soon as it has ended.
 
         Raises what a task raised.
         """
 
     def threads(self, expected: int = 1) -> int:
-        """How many tasks can run at once, where so many workers were asked for and some may still be starting."""
+        """Number of tasks that can run at once; on a cluster at least ``expected``, because some of the requested
+        workers may still be starting.
+        """
 
 
 class LocalExecutor:
-    """Runs each task when it is submitted, in this process or in a child of it."""
+    """Executor that runs each task when it is submitted, in this process or in a child of it."""
 
     def __init__(self, host: EngineHost) -> None:
         self._host = host
@@ -61,7 +63,7 @@ class LocalExecutor:
         return list(pending)
 
     def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
-        """See Executor; one after the other."""
+        """See Executor; runs one after the other."""
         for key, task, args in calls:
             yield self.submit(key, task, *args)
 
@@ -71,13 +73,17 @@ class LocalExecutor:
 
 
 class DaskExecutor:
-    """Runs tasks on any worker that has what they need; a worker's tasks share its one child process.
+    """Executor on any Dask worker that has the needed resources; all tasks of a worker share its one child process.
 
-    Few tasks are with the workers at a time, so that those of another fit come in between; see ``shares``.
+    Only a few tasks are with the workers at a time, so that tasks of another fit run in between; see ``fair_shares``.
 
     Args:
-        needs: Dask resources of a worker that may run the tasks.
-        share: what this fit has used of the workers.
+        client: connection to the scheduler.
+        factory: the engine, as ``module:class``.
+        prefix: begins the keys of this fit's tasks.
+        flag: file whose existence cancels the tasks.
+        needs: Dask resources that a worker must have to run the tasks.
+        share: worker time that this fit has used.
     """
 
     def __init__(
@@ -100,10 +106,11 @@ class DaskExecutor:
         self._ended = as_completed(loop=client.loop)
 
     def submit(self, key: str, task: Task, *args: Any) -> _Planned:
-        """See Executor. Dask answers for a key that it still knows with the old result, so each task has its own.
+        """See Executor. Every task gets a key of its own, because Dask returns the old result for a key that it still
+        knows.
 
-        A task whose worker dies runs again elsewhere; what a task raises is final, as the same seeds would raise it
-        again.
+        A task whose worker dies runs again elsewhere. An exception of a task is final, because the same seeds would
+        raise it again.
         """
         planned = _Planned(f"{self._prefix}-{next(self._submitted)}-{key}", task, args)
         self._waiting.append(planned)
@@ -121,7 +128,7 @@ class DaskExecutor:
             yield planned.timed.value
 
     def _ending(self, pending: Sequence[_Planned]) -> Iterator[_Planned]:
-        """Tasks as they end; meanwhile those that wait are sent."""
+        """Yield tasks as they end, and send waiting tasks meanwhile."""
         most, missing = TASKS_AHEAD * self.threads(), set(pending)
         while missing:
             while self._waiting and len(self._flying) < most:
@@ -138,11 +145,11 @@ class DaskExecutor:
                     yield planned
 
     def close(self) -> None:
-        """This fit needs the workers no more."""
+        """Release this fit's place among those that share the workers."""
         self._board.leave()
 
     def _send(self, planned: _Planned) -> None:
-        # What an earlier task returns goes from worker to worker.
+        # Pass futures as arguments, so that results of earlier tasks go from worker to worker.
         args = [arg.future if isinstance(arg, _Planned) else arg for arg in planned.args]
         options = {"resources": self._needs, "priority": self._share.begin(), "key": planned.key, "pure": False}
         planned.future = self._client.submit(run_on_worker, self._factory, self._flag, planned.task, *args, **options)
@@ -163,7 +170,7 @@ class DaskExecutor:
 
 @dataclass(eq=False)
 class _Planned:
-    """A task of a fit, before and after it has been given to the workers."""
+    """A task of a fit, from its submission to its result."""
 
     key: str
     task: Task
@@ -173,16 +180,17 @@ class _Planned:
 
 
 class Timed(NamedTuple):
-    """What a task returned, and the worker time that went into it."""
+    """Result of a task, and the worker time spent on it."""
 
     value: Any
     seconds: float
-    """Of this task and of those whose results it took that were not counted themselves."""
+    """Worker time in seconds of this task and of the earlier tasks whose results it took; these are counted here alone.
+    """
     tasks: int
 
 
 class _EnginePlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
-    """A worker's child process, made at its first task and ended with the worker."""
+    """Owner of a worker's child process, which starts at the worker's first task and ends with the worker."""
 
     def __init__(self, factory: str) -> None:
         self._factory = factory
@@ -197,8 +205,8 @@ class _EnginePlugin(WorkerPlugin):  # type: ignore[misc]  # distributed has no t
 
 
 async def _prepare_worker(worker: Any, factory: str) -> _EnginePlugin:
-    """The plugin of an engine, made on the worker's loop where it has none, so that tasks in several threads make
-    one.
+    """The engine's plugin of a worker, created on the worker's event loop where there is none, so that tasks in several
+    threads create only one.
     """
     name = f"dentine-{factory}"
     if name not in worker.plugins:
@@ -208,7 +216,7 @@ async def _prepare_worker(worker: Any, factory: str) -> _EnginePlugin:
 
 
 def run_on_worker(factory: str, flag: Path, task: Task, *args: Any) -> Timed:
-    """Run a task with its worker's child, until ``flag`` exists."""
+    """Run a task with its worker's child process, until ``flag`` exists."""
     from distributed import get_worker
     from distributed.utils import sync
 
@@ -222,11 +230,11 @@ def run_on_worker(factory: str, flag: Path, task: Task, *args: Any) -> Timed:
 
 
 class Surroundings(NamedTuple):
-    """The Dask task that this code runs in."""
+    """Key and resources of the Dask task in which this code runs."""
 
     key: str
     needs: Mapping[str, float]
-    """Resources of a worker that may run it."""
+    """Dask resources that a worker must have to run the task."""
 
 
 def _surroundings() -> Surroundings | None:
@@ -242,13 +250,16 @@ def _surroundings() -> Surroundings | None:
 
 @contextmanager
 def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: float = 1.0) -> Iterator[Executor]:
-    """The executor for where this code runs: inside a Dask task its cluster, holding no slot meanwhile; elsewhere this
-    process.
+    """Executor for the place where this code runs: inside a Dask task its cluster, without holding a slot meanwhile;
+    elsewhere this process.
 
-    On a cluster tasks run where this one may, and their keys begin with its own, which tells whose they are.
+    On a cluster, tasks need the resources of the enclosing task, and their keys begin with its key, which shows their
+    owner.
 
     Args:
-        flag: once it exists, what a worker renders is cut off.
+        flag: file whose existence cancels the rendering on the workers.
+        factory: the engine, as ``module:class``.
+        prefix: follows the enclosing task's key in the keys of the tasks.
         weight: share of the workers' time relative to other fits'.
     """
     surroundings = _surroundings()

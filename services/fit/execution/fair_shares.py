@@ -1,10 +1,10 @@
-"""How running fits share the workers: whoever has used less of them lately goes first.
+"""Fair sharing of the workers between running fits: the fit that used less worker time recently goes first.
 
 Decay-usage scheduling (J. Kay and P. Lauder, A Fair Share Scheduler, Communications of the ACM 31(1), 1988): each fit
-counts the worker time that its tasks took, old use fading away, and gives its next task a priority that is the lower
-the more it used. Priorities meet in the queues of the workers; no server has to tell a fit how many others there are.
-Each tells its level on the scheduler's board, and a newcomer begins at the lowest one there, or it would have the
-workers alone until it had caught up. A fit that is alone gets everything.
+sums the worker time of its tasks, with exponential decay, and gives its next task a priority that falls with this sum.
+Priorities are compared in the queues of the workers, so no server has to tell a fit how many others there are. Each fit
+publishes its level in the scheduler's metadata, and a new fit begins at the lowest published level, because otherwise
+it would have the workers alone until its use had caught up. A fit that is alone gets all workers.
 """
 
 from __future__ import annotations
@@ -16,19 +16,21 @@ from contextlib import suppress
 from typing import Any
 
 FADING_S = 120.0
-"""Use from so long ago counts 1/e. Long against a block, or shares would follow who has the longer blocks: a replay of
-two fits on two workers with blocks of 10 and 30 s gave 58 and 42 % with it, and 61 and 39 % with half of it. Short
-against a fit, or one that had nothing to do for a while would have the workers alone for long afterwards."""
+"""Time constant of the decay, in seconds: use from this long ago counts 1/e. It is long against a block, because
+otherwise the shares would depend on the duration of the fits' blocks: a replay of two fits on two workers with blocks
+of 10 and 30 s gave 58 and 42 % with it, and 61 and 39 % with half of it. It is short against a fit, because otherwise a
+fit that was idle for a while would have the workers alone for long afterwards."""
 BOARD = "dentine-shares"
 TELL_S = 5.0
-"""How often a fit that is busy tells its level."""
+"""Shortest time between two publications of a fit's level, in seconds."""
 
 
 class Share:
-    """The worker time that one fit has used lately.
+    """Worker time that one fit has used recently.
 
     Args:
-        weight: its share relative to other fits'.
+        weight: the fit's share relative to other fits'.
+        clock: returns a time in seconds that never goes back.
     """
 
     def __init__(self, weight: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
@@ -37,7 +39,9 @@ class Share:
         self._total_s, self._tasks, self._pending = 0.0, 0, 0
 
     def begin(self) -> float:
-        """The priority of a task that is about to be submitted; higher ones go first."""
+        """Priority of a task that is about to be submitted; higher priorities run first. Pending tasks count with the
+        mean time of the finished ones.
+        """
         self._fade()
         expected_s = self._pending * self._total_s / self._tasks if self._tasks else 0.0
         self._pending += 1
@@ -51,12 +55,12 @@ class Share:
 
     @property
     def level(self) -> float:
-        """Worker time used lately, per weight; fits of one level take turns."""
+        """Worker time used recently, in seconds per weight; fits of equal level take turns."""
         self._fade()
         return self._used_s / self._weight
 
     def begin_at(self, level: float) -> None:
-        """Count as if this much had been used."""
+        """Set the level, in seconds per weight."""
         self._fade()
         self._used_s = level * self._weight
 
@@ -67,11 +71,13 @@ class Share:
 
 
 class Board:
-    """What fits on one scheduler tell of their levels, in its metadata.
+    """Levels of the fits on one scheduler, published in its metadata.
 
     Args:
         client: connection to the scheduler.
-        name: of this fit.
+        name: name of this fit.
+        share: the worker time that this fit has used.
+        clock: returns the seconds since the epoch.
     """
 
     def __init__(self, client: Any, name: str, share: Share, clock: Callable[[], float] = time.time) -> None:
@@ -79,7 +85,7 @@ class Board:
         self._told_s = 0.0
 
     def join(self) -> None:
-        """Begin at the lowest level of those that are under way."""
+        """Set this fit's level to the lowest level of the running fits, decayed to the present."""
         now_s = self._clock()
         told: dict[str, tuple[float, float] | None] = self._client.get_metadata([BOARD], default={})
         levels = [
@@ -91,12 +97,12 @@ class Board:
         self.tell()
 
     def tell(self) -> None:
-        """Tell this fit's level, not too often."""
+        """Publish this fit's level, at most once in ``TELL_S`` seconds."""
         if self._clock() >= self._told_s + TELL_S:
             self._told_s = self._clock()
             self._client.set_metadata([BOARD, self._name], (self._share.level, self._told_s))
 
     def leave(self) -> None:
-        """Count no more; where the scheduler has gone away, nobody is left to count."""
+        """Withdraw this fit's level; a scheduler that is gone is no error."""
         with suppress(OSError, TimeoutError):
             self._client.set_metadata([BOARD, self._name], None)

@@ -1,18 +1,18 @@
-"""Durable execution: what a fit has done is written down, and a new attempt reads it instead of doing it again.
+"""Durable execution: the results of a fit are recorded, and a new attempt reads them instead of computing them again.
 
 The driver is a deterministic function. Each costly part runs as ``journal.once(key, compute)``; its JSON result is on
 disk before the next part starts. A later attempt runs the same function, gets the recorded results back in the same
-order, and goes on where the record ends. Every part depends only on recorded results and on seeds, so the answer of an
-interrupted fit is that of an undisturbed one.
+order, and continues where the record ends. Every part depends only on recorded results and on seeds, so an interrupted
+fit has the same result as an uninterrupted one.
 
 ::
 
     {"format": 2, "fingerprint": "..."}     first line
     {"key": "...", "value": ...}            one line a result, appended; a last line that was cut short is no result
 
-An attempt that adds to a journal first writes it anew under the same name, once, so that an older attempt which still
-runs cannot write into it. Format 1, one JSON object that was replaced with every result, is read and continued as
-format 2.
+An attempt that adds to a journal first replaces the file by a copy under the same name, once, so that an older attempt
+that still runs cannot write into it. Format 1, one JSON object that was rewritten with every result, is read and
+continued as format 2.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class Journal:
     """Results by key, in one file that grows by a line with every result.
 
     Attributes:
-        resumed: how many results an earlier attempt left.
-        set_aside: where a checkpoint that is not this fit's was moved, kept for its owner; None where there was none.
+        resumed: number of results that an earlier attempt left.
+        set_aside: path to which a checkpoint of another fit was moved, kept for its owner; None where there was none.
     """
 
     def __init__(self, path: Path, fingerprint: str, guard: Callable[[], None] = lambda: None) -> None:
-        """Open or begin a journal.
+        """Open the journal at ``path``, or begin one.
 
         Args:
-            path: of the file; one of format 1 beside it, with the suffix ``.json``, is continued.
-            fingerprint: identifies job, data and numerics; a journal of another one is set aside, neither continued nor
-                lost.
+            path: the journal's file; a file of format 1 beside it, with the suffix ``.json``, is continued.
+            fingerprint: identifies job, data and numerics; a journal with another fingerprint is kept under another
+                name and not continued.
             guard: called before every write; raises when this attempt has lost the right to write.
         """
         self.path, self._fingerprint, self._guard = path, fingerprint, guard
@@ -63,7 +63,7 @@ class Journal:
         self.resumed = len(self.entries)
 
     def once(self, key: str, compute: Callable[[], Any]) -> tuple[Any, bool]:
-        """The recorded result of ``key``, or compute, record and return it; the flag says whether it is new.
+        """The recorded result of ``key``; without a record, compute and record it. The flag says whether it is new.
 
         Floats survive exactly.
         """
@@ -84,7 +84,7 @@ class Journal:
         return value, True
 
     def _begin(self) -> None:
-        """Write what is recorded so far into a file of this attempt's own."""
+        """Write the recorded results into a new file of this attempt."""
         lines = [
             {"format": FORMAT_VERSION, "fingerprint": self._fingerprint},
             *({"key": key, "value": value} for key, value in self.entries.items()),
@@ -104,12 +104,12 @@ class Journal:
 
 
 def read_entries(path: Path) -> dict[str, Any]:
-    """The results that a journal holds, whosever it is; none where it is damaged."""
+    """Results in a journal, whatever its fingerprint; empty where the file is damaged."""
     return _read(path)[1]
 
 
 def _read(path: Path) -> tuple[str | None, dict[str, Any]]:
-    """Fingerprint and results. A file that is no journal belongs to no fit."""
+    """Fingerprint and results of a file; None and empty where it is no journal."""
     head, *lines = path.read_bytes().split(b"\n")
     try:
         first = json.loads(head)
@@ -117,7 +117,7 @@ def _read(path: Path) -> tuple[str | None, dict[str, Any]]:
             case {"format": 1, "fingerprint": str(owner), "entries": dict(entries)} if not any(lines):
                 return owner, entries
             case {"format": 2, "fingerprint": str(owner)} if lines:
-                # What follows the last line break was cut short.
+                # Ignore the text after the last line break: a line that was cut short.
                 results = [json.loads(line) for line in lines[:-1]]
                 return owner, {result["key"]: result["value"] for result in results}
     except (ValueError, KeyError, TypeError):

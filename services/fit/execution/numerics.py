@@ -1,14 +1,15 @@
-"""Which numbers a fit of the same seeds gives: what a checkpoint may be continued under."""
+"""Version of a fit's numerics; a checkpoint is continued only under the version that began it."""
 
 NUMERICS = 3
-"""Raise it with every change after which the same job, data and seeds give other numbers than rounding explains:
-estimators, random streams, solvers, schedules. A fit that was begun under another number starts anew.
-``tests/physics/test_numerics.py`` fails where it should have been raised and was not."""
+"""Version of everything that decides the numbers of a fit: estimators, random streams, solvers, schedules. Raise it
+with every change after which the same job, data and seeds give results that differ by more than rounding. A fit that
+was begun under another version starts anew. ``tests/physics/test_numerics.py`` fails where the version should have been
+raised and was not."""
 
 _NAME_OF_FIRST = "0.1.0"
-"""What version 0.1.0 wrote into its checkpoints, which are continued as long as the numerics are its own."""
+"""Name that version 0.1.0 wrote into its checkpoints; these are continued while ``NUMERICS`` is 1."""
 
 
 def numerics_name(number: int = NUMERICS) -> str:
-    """The part of a checkpoint's fingerprint that stands for the numerics."""
+    """Name of the numerics in a checkpoint's fingerprint."""
     return _NAME_OF_FIRST if number == 1 else f"numerics {number}"

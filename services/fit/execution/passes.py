@@ -1,12 +1,12 @@
-"""One step's tasks over blocks of pixels: images of some beside Jacobians of others, on any worker.
+"""Tasks of one step over blocks of pixels, on any worker: images of some blocks render beside Jacobians of others.
 
 ::
 
     image(block) ── residual, at most 4 MB ── jacobian(block) ── products ── ordered sum ── solve
 
 The Jacobian task renders its two seeds in one process and multiplies them there, by each other and by the residual. So
-Jacobians never leave their task, and what leaves a worker are residuals and sums over the block. A task whose worker
-dies runs again elsewhere from the same seeds, with the same result.
+Jacobians never leave their task; only residuals and sums over the block leave a worker. A task whose worker dies runs
+again elsewhere from the same seeds, with the same result.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from services.fit.transport.scene.recipe import StackEstimate
 
 Array = NDArray[np.float64]
 Near = tuple[tuple[int, ...], ...]
-"""For each tooth of a jaw, by its position, the coordinates that act on the pixels about it."""
+"""For each tooth of a jaw, by its position, the coordinates that act on the pixels near it."""
 Errors = tuple[tuple[str, float], ...]
-"""The instrument's, by name."""
+"""Errors of the instrument, by name."""
 
 
 @dataclass(frozen=True)
 class TraceRow:
-    """When and where one task ran."""
+    """Time and place of one finished task."""
 
     kind: str
     step: str
@@ -67,7 +67,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Products:
-    """A block's share of the normal equations and the trace of the tasks that made it."""
+    """One block's normal equations, and the trace of the tasks that made them."""
 
     equations: NormalEquations
     trace: tuple[TraceRow, ...]
@@ -119,7 +119,7 @@ def _regions(block: Block, near: Near) -> list[Region]:
 def gradient_task(
     host: EngineHost, task: BlockTask, similar: Tissue, how: Differentiation, seeds: tuple[int, int]
 ) -> tuple[Gradient, TraceRow]:
-    """A block's stochastic gradient: residual from one seed, derivatives from another."""
+    """One block's stochastic gradient: residual from one seed, derivatives from another."""
     start, block = time.time(), read_block(task.block)
     stack: StackEstimate = host.call(
         "images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0]
@@ -138,10 +138,14 @@ def compare_task(
     by_cells: bool = True,
     new_errors: Errors | None = None,
 ) -> tuple[LossChange, TraceRow]:
-    """Render a block at two points with the same two seeds and compare their losses, of cells' means or pixel by pixel.
+    """Render a block at two points with the same two seeds and compare their losses, by means of cells or pixel by
+    pixel.
 
     Args:
-        new_errors: the instrument's at the second point; None for those of the task.
+        new: tissue at the second point.
+        seeds: the two seeds.
+        by_cells: whether cells' means are compared.
+        new_errors: errors of the instrument at the second point; None for those of the task.
     """
     start, block = time.time(), read_block(task.block)
 
@@ -161,7 +165,7 @@ def compare_task(
 
 
 def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], seed: int) -> tuple[Array, TraceRow]:
-    """Render a block split by scattering order at albedo 1, (K, L, N)."""
+    """Images (K, L, N) of a block at albedo 1, split by scattering order, with their trace."""
     start, block = time.time(), read_block(task.block)
     orders = host.call(
         "order_images", task.recipe, task.tissue, block.fitted_view, bin_edges=edges, samples=task.samples, seed=seed
@@ -171,19 +175,20 @@ def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], see
 
 @dataclass(frozen=True)
 class Passes:
-    """One channel's blocks and where their tasks run."""
+    """Blocks of one channel, and the executor of their tasks."""
 
     executor: Executor
     blocks: tuple[StoredFile, ...]
     recipe: StoredFile
     seeds: Seeds
     record: Callable[[Sequence[TraceRow]], None]
-    """Takes the trace of finished tasks."""
+    """Receives the trace of finished tasks."""
     errors: Errors = ()
-    """Of the instrument, as the fit sees them now: renders are seen through an instrument with them."""
+    """Present estimates of the instrument's errors, which are applied to renders before they are compared with
+    photographs."""
 
     def run(self, label: str, tissue: Tissue | Mouth, samples: int, task: Callable[..., Any], *args: Any) -> list[Any]:
-        """One task per block, results in block order."""
+        """Run one task per block; results in block order."""
         return self.executor.gather(
             [self.executor.submit(f"{label}-{t.index}", task, t, *args) for t in self.tasks(label, tissue, samples)]
         )
@@ -193,27 +198,27 @@ class Passes:
         return [read_block(stored) for stored in self.blocks]
 
     def tasks(self, label: str, tissue: Tissue | Mouth, samples: int) -> list[BlockTask]:
-        """What the blocks' tasks are told, in block order."""
+        """Arguments of the blocks' tasks, in block order."""
         given = self.recipe, label, tissue, samples, self.errors
         return [BlockTask(block, k, *given) for k, block in enumerate(self.blocks)]
 
 
 @dataclass(frozen=True)
 class StackProblem(Generic[Optics]):
-    """The least-squares problem of one stage, as the solver sees it (``solve.gauss_newton.Problem``)."""
+    """Least-squares problem of one stage (implements ``solve.gauss_newton.Problem`` and ``solve.adam.Problem``)."""
 
     passes: Passes
     domain: Domain
     base: Optics
     stage: str
     jacobian_g: float | None = None
-    """Derivatives are rendered in similar media of this mean cosine; None for the media themselves. Only for sigma,
-    alpha and shape."""
+    """Mean cosine of the similar media in which derivatives to sigma, alpha and shape are rendered; None for the media
+    themselves."""
     image_g: float | None = None
-    """The same for images: a fit of similar media."""
+    """Mean cosine of the similar media in which images are rendered; None for the media themselves."""
     neighbours: Neighbours | None = None
-    """Of a jaw's teeth: coordinates between which the curvature's noise is known, and which of them are told apart when
-    moved at once."""
+    """Neighbourhood of a jaw's teeth: it limits the coordinates between which the curvature's noise is stored, and
+    selects those that are differentiated at once; None for a single tooth."""
 
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """See Problem: an image and a Jacobian task per block, summed in block order."""
@@ -272,7 +277,7 @@ class StackProblem(Generic[Optics]):
         return total
 
     def passes_at(self, x: Array) -> Passes:
-        """The passes through an instrument with the errors in x."""
+        """The passes with the instrument's errors of x (F,)."""
         return replace(self.passes, errors=self.domain.errors_at(x)) if self.domain.errors.names else self.passes
 
     def _image_media(self, x: Array) -> Optics:
@@ -280,7 +285,7 @@ class StackProblem(Generic[Optics]):
         return tissue if self.image_g is None else similar_tissue(tissue, self.image_g)
 
     def jacobian_media(self, x: Array) -> tuple[Optics, Optics, Differentiation]:
-        """Media of the image and of the derivatives, and how to differentiate."""
+        """Media of the images, media of the derivatives, and the differentiation."""
         tissue = self.domain.tissue_at(x, self.base)
         similar = tissue if self.jacobian_g is None else similar_tissue(tissue, self.jacobian_g)
         return (
@@ -290,7 +295,7 @@ class StackProblem(Generic[Optics]):
         )
 
     def slopes(self, x: Array) -> Differentiation:
-        """How to differentiate the images' own media, except to blend weights."""
+        """Differentiation of the images in their own media, without blend weights."""
         return slopes(self.domain, x, self.base, self.neighbours)
 
     @property
@@ -303,5 +308,5 @@ class StackProblem(Generic[Optics]):
 
 
 def trace_row(kind: str, task: BlockTask, start_s: float) -> TraceRow:
-    """The trace of a task that ends now, in this process."""
+    """Trace of a task that ends at this moment in this process."""
     return TraceRow(kind, task.step, task.index, f"{socket.gethostname()}:{os.getpid()}", start_s, time.time())

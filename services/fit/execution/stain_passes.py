@@ -1,13 +1,14 @@
-"""The stain stage of one channel, after its media are fitted: steps of the texture in turn with steps of the media,
-each a journal entry.
+"""The stain stage of one channel, after its media are fitted: steps of the texture alternate with steps of the media,
+and each step is a journal entry.
 
 ::
 
     images(block), seed 1 ── cotangents w C and w ref ── stain_gradient(block), seed 2, of both ── sum in block order ──
     step
 
-The common factor of a texture and the absorption of the media are nearly one parameter, so the first steps find the
-pattern up to a factor, media take that factor, and exact steps and media then end together.
+The common factor of a texture and the absorption of the media are nearly one parameter. So the first steps fit the
+pattern up to a factor, the media then take up that factor, and exact steps of the texture and refits of the media
+alternate to the end.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from services.fit.solve.stains import StainSolver, StainState, StainSums, clean
 from services.fit.transport.scene.recipe import StackEstimate, StainGradient
 
 RATIO_STEPS, PATTERN_STEPS = 2, 3
-"""Before the media's first turn."""
+"""Numbers of ratio and pattern steps before the media's first refit."""
 EXACT_STEPS = (3, 2)
-"""Before the media's second and third turn."""
+"""Numbers of exact steps before the media's second and third refit."""
 GRADIENT_G = 0.0
 """Mean cosine of the similar media in which gradients are rendered, as Jacobians are."""
 SURE_Z = 3.0
@@ -44,8 +45,8 @@ SURE_Z = 3.0
 def stain_task(
     host: EngineHost, task: BlockTask, similar: Tissue, seeds: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, TraceRow]:
-    """A block's derivatives of sum(w ref C) and of sum(w C1 C) to the texels (H, W), paths shared, and its sum of
-    squares.
+    """Derivatives of one block's sum(w ref C) and sum(w C1 C) with respect to the texels (H, W), from shared paths, and
+    the block's sum of weighted squared residuals without their Monte Carlo variance.
     """
     start, block = time.time(), read_block(task.block)
     view, weight = block.fitted_view, block.fit_weight
@@ -66,7 +67,7 @@ def stain_task(
 
 @dataclass
 class StainStage:
-    """Fits one tooth's texture in one channel."""
+    """Fit of one tooth's stain texture in one channel."""
 
     passes: Passes
     journal: Journal
@@ -75,16 +76,19 @@ class StainStage:
     """Paths per pixel of every pass."""
     pause: Callable[[], None]
     tell: Callable[[str, int, Tissue, str], None]
-    """Told of every step: stage, step in it, tissue and what happened."""
+    """Called after every step with the stage, the number of the step in it, the tissue and a sentence on the outcome.
+    """
 
     def run(self, tissue: Tissue, refit: Callable[[Tissue, int, bool], Tissue]) -> Tissue | None:
         """Fit the texture of a tooth whose media are fitted.
 
         Args:
-            refit: fits the media of a stained tissue: the tissue, which turn it is from 0, and whether it is the last.
+            tissue: the fitted tissue without stains.
+            refit: fits the media of a stained tissue; takes the tissue, the number of the refit from 0, and whether it
+                is the last.
 
         Returns:
-            The tissue with its stain, or None where a clean surface explains the images as well.
+            The tissue with its stain, or None where a clean surface explains the images equally well.
         """
         solver = StainSolver(self.layout.neighbours, len(self.layout.points_mm))
         state, stained = clean(solver.texels), tissue
@@ -101,7 +105,7 @@ class StainStage:
         return stained if self._is_better(tissue, stained, state) else None
 
     def sums(self, label: str, tissue: Tissue, seeds: tuple[int, int]) -> StainSums:
-        """Sums over all blocks at a stained tissue."""
+        """Sums over all blocks at a stained tissue, from an image seed and a gradient seed."""
         assert tissue.stain is not None
         parts = self.passes.run(
             f"{self.passes.seeds.channel}-{label}",
@@ -138,8 +142,8 @@ class StainStage:
         return replace(tissue, stain=self.layout.texture(state.depth))
 
     def _is_better(self, plain: Tissue, stained: Tissue, state: StainState) -> bool:
-        # A texture follows noise by half a unit of F per texel that it fits, so it has to gain a whole one (Akaike
-        # 1974).
+        # Fitted noise lowers F by half a unit per fitted texel, so the texture has to lower F by a whole unit per texel
+        # (Akaike 1974).
         def compute() -> dict[str, float]:
             seeds = self.passes.seeds("stain.compare", 1), self.passes.seeds("stain.compare", 2)
             parts = self.passes.run(

@@ -1,12 +1,12 @@
-"""Adam on stochastic gradients, the solver of teeth 2018 (section 6): init, step, terminate, finish; the outcome is a
-value.
+"""Adam on stochastic gradients, the solver of teeth 2018 (section 6), as init, step, terminate and finish; the outcome
+is a value.
 
-Each step takes one gradient J'W r in the unbounded domain, J and r from two independently seeded passes of the same
-number of paths per pixel (64 in the paper), and moves by Kingma and Ba's rule with their decay rates. Priors join the
-gradient; bounds are met by projection. The paper states neither its learning rate nor when it stops: here the rate is
-in units of the domain's step scale, constant, and a fit ends after ``max_steps``, or when two running means of x, over
-the last ``window`` steps and over three times as many, differ by less than ``still`` rates. Nothing here knows an
-error, so the standard errors that are reported come from normal equations rendered at the end.
+Each step renders one gradient J'W r in the unbounded domain, J and r from two independently seeded passes of the same
+number of paths per pixel (64 in the paper), and moves by Kingma and Ba's rule with their decay rates. Priors are added
+to the gradient; bounds are met by projection. The paper states neither its learning rate nor its stopping rule: here
+the rate is constant, in units of the domain's step scale, and a fit ends after ``max_steps``, or when two running means
+of x, over the last ``window`` steps and over three times as many, differ by less than ``still`` rates. The solver
+estimates no errors, so the reported standard errors come from normal equations that are rendered at the end.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ ADVICE_MORE_STEPS = "Adam still moved at its last step; raise adam_steps, or cho
 
 @dataclass(frozen=True)
 class Gradient:
-    """A stochastic gradient (F,) of the data's F = 1/2 sum w r^2, and F, both without the residual's Monte Carlo noise
-    on average.
+    """Stochastic gradient (F,) of the data's loss F = 1/2 sum w r^2, and the loss, both unbiased by the residual's
+    Monte Carlo noise.
     """
 
     gradient: Array
@@ -40,7 +40,7 @@ class Gradient:
 
 
 class Problem(Protocol):
-    """What is fitted. Equal arguments give equal answers."""
+    """Problem to fit. Equal arguments give equal results."""
 
     def gradient(self, x: Array, *, samples: int, step: int) -> Gradient:
         """Gradient of the data alone at x."""
@@ -48,23 +48,24 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class Options:
-    """Rates of Kingma and Ba (2014), and when to end."""
+    """Rates of Kingma and Ba (2014), and the stopping rule."""
 
     rate: float = 0.05
-    """Longest usual step of a coordinate, in the domain's step scales."""
+    """Learning rate: the usual longest step of a coordinate, in the domain's step scales."""
     mean_decay: float = 0.9
     square_decay: float = 0.999
     epsilon: float = 1e-8
-    """Relative to the largest gradient seen, because the loss has no natural unit."""
+    """Kingma and Ba's epsilon, relative to the largest running gradient, because the loss has no natural unit."""
     max_steps: int = 300
     window: int = 40
     still: float = 2.0
-    """Steady progress would part the two means by 2 ``window`` rates."""
+    """Largest difference of the two running means of x, in rates, at which the fit has converged. Steady progress would
+    separate them by twice ``window`` rates."""
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything a step needs of the past."""
+    """State of the solver between steps."""
 
     x: Array
     samples: int
@@ -73,7 +74,7 @@ class State:
     lately: Array
     """Running mean of x over the last ``window`` steps, (F,)."""
     before: Array
-    """Over three times as many."""
+    """Running mean of x over three times as many steps, (F,)."""
     step: int = 0
     loss: float = 0.0
     result: Result = Result.RUNNING
@@ -94,7 +95,7 @@ def state_from(record: dict[str, Any]) -> State:
 
 @dataclass(frozen=True)
 class Adam:
-    """Solver for one domain; stateless, the state goes in and out."""
+    """Solver for one domain; stateless: states are passed in and returned."""
 
     domain: Domain
     options: Options = Options()
@@ -106,7 +107,7 @@ class Adam:
         return State(start, samples, zero, zero, start, start)
 
     def terminate(self, state: State) -> bool:
-        """Whether nothing is left to do."""
+        """Whether the fit has ended."""
         return state.result is not Result.RUNNING
 
     def finish(self, state: State) -> Solution:
@@ -115,7 +116,7 @@ class Adam:
         return Solution(state.x, state.result, advice, state.step, state.samples, None)
 
     def step(self, problem: Problem, state: State) -> State:
-        """One gradient, one move.
+        """One gradient and one move.
 
         Raises:
             NonFiniteError: the problem returned NaN or infinity.
@@ -128,7 +129,7 @@ class Adam:
                 f"The gradient is not finite at step {number}; check the capture for invalid radiance."
             )
 
-        # In step scales, so that one rate fits all coordinates.
+        # Convert the gradient to step scales, so that one rate fits all coordinates.
         scale = self.domain.scale
         gradient = scale * (found.gradient + precision * (x - prior_mean))
         mean = options.mean_decay * state.mean + (1 - options.mean_decay) * gradient
@@ -140,8 +141,8 @@ class Adam:
         low, high = self.domain.bounds
         new = np.clip(x - scale * move, low, high)
 
-        # Single iterates wander by about the rate for ever; running means tell drift from wandering, once both have
-        # left the start behind.
+        # Single iterates fluctuate by about the rate for ever. Two running means distinguish drift from fluctuation,
+        # once both have forgotten the start.
         lately, before = (
             old + (new - old) / span
             for old, span in ((state.lately, options.window), (state.before, 3 * options.window))

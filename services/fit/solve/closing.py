@@ -1,14 +1,15 @@
-"""What is measured once, where a fit ends: how its answer really responds, and what holding g cost it.
+"""The closing measurement, made once where a fit ends: the solution's true response to the data, and the error that
+held mean cosines g cause.
 
 A fit with Jacobians J~ of similar media solves J~'W r(x) + Lambda (x - m) = 0, an estimating equation whose instruments
-J~ are not the derivatives J of its images. Its answer moves with the data by M^-1 J~'W, M = J~'W J + Lambda, and not by
-the inverse of J~'W J~ + Lambda (generalised method of moments, Hansen 1982). And with another mean cosine of the media,
-at equal reduced scattering and absorption, images change by dC and the answer by M^-1 J~'W dC.
+J~ are not the derivatives J of its images. Its solution responds to the data by M^-1 J~'W, M = J~'W J + Lambda, and not
+by the inverse of J~'W J~ + Lambda (generalised method of moments, Hansen 1982). With another mean cosine of the media,
+at equal reduced scattering and absorption, images change by dC and the solution by M^-1 J~'W dC.
 
-All sums are in coordinates y, x = T y, in which the curvature that is believed is the identity. There M = 1 + E. Exact
-derivatives are noisy, and the inverse of a noisy matrix is worthless long before the matrix is, so E is shrunk to what
-stands out of its noise: with entries of variance tau^2 about 0, and noise v, E tau^2 / (tau^2 + v) (Efron and Morris
-1973), tau^2 such that sum E^2 / (tau^2 + v) is its expectation (Paule and Mandel 1982).
+All sums are in whitened coordinates y, x = T y, in which the usable curvature is the identity. There M = 1 + E. Exact
+derivatives are noisy, and inverting a matrix amplifies its noise, so E is shrunk to the part that exceeds its noise:
+with entries of variance tau^2 about 0, and noise variance v, E becomes E tau^2 / (tau^2 + v) (Efron and Morris 1973),
+with tau^2 such that sum E^2 / (tau^2 + v) equals its expectation (Paule and Mandel 1982).
 """
 
 from __future__ import annotations
@@ -27,31 +28,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ClosingSums:
-    """Sums over measurements in whitened coordinates y (F,); blocks add."""
+    """Sums over measurements in whitened coordinates y (F,); the sums of blocks add."""
 
     gradient: Array
-    """(F,)"""
+    """Gradient J~'W r (F,) of the data."""
     gradient_noise: Array
-    """Its Monte Carlo covariance, (F, F)."""
+    """Monte Carlo covariance (F, F) of the gradient."""
     response: Array
     """J~'W J, (F, F)."""
     response_variance: Array
     """Monte Carlo variance of each entry, (F, F)."""
     shifts: Array
-    """J~'W dC for K changes of the media, each by one standard deviation of what is held, (K, F)."""
+    """J~'W dC (K, F) for K changes of the media or the setup, each by one standard deviation of the held quantity."""
     shift_noise: Array
-    """Monte Carlo covariance of each, (K, F, F)."""
+    """Monte Carlo covariance (K, F, F) of each shift."""
 
     def __add__(self, other: ClosingSums) -> ClosingSums:
         return ClosingSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     def record(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The sums as JSON values."""
         return {f.name: getattr(self, f.name).tolist() for f in fields(self)}
 
     @staticmethod
     def of(record: dict[str, Any]) -> ClosingSums:
-        """From ``record``."""
+        """Sums from the JSON values of ``record``."""
         sums = ClosingSums(**{name: np.array(value, dtype=np.float64) for name, value in record.items()})
         count = len(sums.gradient)
         return replace(
@@ -60,13 +61,13 @@ class ClosingSums:
 
     @property
     def shift_covariance(self) -> Array:
-        """Covariance (F, F) of the gradient by the changes, sum of b b', each shortened to the length that it has
-        without noise.
+        """Covariance (F, F) of the gradient by the changes: sum of b b' over the shifts b, each shortened to its
+        expected length without noise.
         """
         return self.shifts_of(range(len(self.shifts)))
 
     def shifts_of(self, chosen: Iterable[int]) -> Array:
-        """The same of some of the changes alone."""
+        """The same covariance for the chosen changes alone."""
         total = np.zeros_like(self.response)
         for k in chosen:
             shift, square = self.shifts[k], float(self.shifts[k] @ self.shifts[k])
@@ -85,18 +86,19 @@ def closing_sums(
     lights: int,
     errors: int = 0,
 ) -> ClosingSums:
-    """Sum one block of measurements, M = lights x pixels.
+    """Closing sums of one block of measurements, M = lights x pixels.
 
     Args:
         whiten: T (F, F).
         similar: J~ (F, M) from two seeds.
-        exact: J (F, M) from two more.
-        borrowed: rows of J (F,) that are not rendered and taken from J~.
-        residuals: render minus reference (M,) from two more.
-        moved: changes of the render (K, 2, M), by change and seed.
-        weight: (M,)
-        errors: so many of the last derivatives are those to the instrument's errors, of the renders of the residuals,
-            as in ``normal_equations``.
+        exact: J (F, M) from two further seeds.
+        borrowed: mask (F,) of the rows of J that are not rendered but copied from J~.
+        residuals: render minus reference (M,) from two further seeds.
+        moved: changes dC of the render (K, 2, M), by change and seed.
+        weight: weights (M,) of the measurements.
+        lights: number of lights.
+        errors: number of coordinates, the last of all, that are instrument errors; their derivatives come from the
+            renders of the residuals, as in ``normal_equations``.
     """
     mean, spread = 0.5 * (similar[0] + similar[1]), 0.5 * (similar[0] - similar[1])
     true, true_spread = 0.5 * (exact[0] + exact[1]), 0.5 * (exact[0] - exact[1])
@@ -104,11 +106,12 @@ def closing_sums(
     own = np.where(borrowed[:, None], spread, 0.0)
     m, d, e, f, o = (whiten.T @ rows for rows in (mean, spread, true, true_spread, own))
 
-    # Derivatives to errors share the noise of the residuals' renders, all others have noise of their own.
+    # Derivatives with respect to errors share the noise of the residuals' renders; all others have independent noise.
     is_error = np.arange(len(mean)) >= len(mean) - errors
     apart, shared = (whiten.T @ np.where(chosen[:, None], spread, 0.0) for chosen in (~is_error, is_error))
 
-    # Sums of J~ with something, and their noise by pixels, as in the normal equations.
+    # Products of J~ with a pair of renders summed over measurements, with their noise by pixels, as in the normal
+    # equations.
     def with_noise(pair: tuple[Array, Array], is_residual: bool = False) -> tuple[Array, Array]:
         value, half = weight * 0.5 * (pair[0] + pair[1]), weight * 0.5 * (pair[0] - pair[1])
         common = shared if is_residual else np.zeros_like(shared)
@@ -120,8 +123,8 @@ def closing_sums(
     gradient, gradient_noise = with_noise(residuals, is_residual=True)
     shifts = [with_noise((change[0], change[1])) for change in moved]
 
-    # Response; where J is borrowed both sides share their noise, which is taken off the value and makes their errors go
-    # together.
+    # The response. Where J is copied from J~, both factors share their noise: its square is subtracted from the value,
+    # and the variance counts both together.
     response = (weight * m) @ e.T - (weight * d) @ o.T
     variance = np.zeros_like(response)
     rendered = f - o
@@ -140,24 +143,27 @@ def closing_sums(
 
 @dataclass(frozen=True)
 class Response:
-    """M = 1 + E in whitened coordinates: its inverse (F, F) and the variance (F, F) that is left in each entry of M."""
+    """Response M = 1 + E in whitened coordinates: its inverse (F, F), and the variance (F, F) that remains in each
+    entry of M.
+    """
 
     inverse: Array
     variance: Array
     excess: Array
-    """E (F, F), shrunk."""
+    """E (F, F) after shrinkage."""
 
 
 def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
-    """Shrink the measured response towards the believed curvature.
+    """Shrink the measured response towards the identity, which is the response that the usable curvature implies.
 
-    Derivatives J~ of the tissue have no part along those of the instrument's errors, from which y is freed, so M = [1 +
-    E, 0; G, 1]: errors follow the tissue by G, and the tissue's answer is what it would be without them.
+    Derivatives J~ of the tissue have no component along those of the instrument's errors, which y eliminates, so M = [1
+    + E, 0; G, 1]: errors follow the tissue by G, and the tissue's solution is as it would be without them.
 
     Args:
-        prior: whitened precision T' Lambda T, which joins the measured data.
-        relation: kind of each entry (F, F); entries of one kind are thought to scatter alike.
-        errors: so many of the last coordinates are the instrument's errors.
+        sums: the closing measurement.
+        prior: whitened precision T' Lambda T, which is added to the measured data.
+        relation: kind of each entry (F, F); entries of one kind are assumed to have one variance tau^2.
+        errors: number of coordinates, the last of all, that are instrument errors.
     """
     size = len(prior)
     tissue = size - errors
@@ -170,7 +176,7 @@ def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors
         between[alike] = _between_variance(excess[alike], noise[alike])
     shrunk, left = excess * between / (between + noise), noise * between / (between + noise)
 
-    # A singular value that noise could have made is not believed to be smaller than noise.
+    # Singular values are raised to the noise level, because noise alone could have made smaller ones.
     own = np.eye(tissue) + shrunk[:tissue, :tissue]
     u, values, v = np.linalg.svd(own)
     floor = 2 * np.sqrt(tissue * float(left[:tissue, :tissue].mean()))
@@ -181,7 +187,7 @@ def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors
 
 
 def _between_variance(values: Array, noise: Array) -> float:
-    # Root of sum values^2 / (tau^2 + noise) = count, which falls with tau^2.
+    # Root tau^2 of sum values^2 / (tau^2 + noise) = count, which falls with tau^2, by bisection.
     def excess(between: float) -> float:
         return float((values**2 / (between + noise)).sum()) - values.size
 

@@ -1,6 +1,6 @@
-"""What data fix, and how well: sandwich covariance, undetermined directions, derived quantities by the delta method.
+"""Uncertainty of a solution: sandwich covariance, undetermined directions, derived quantities by the delta method.
 
-In coordinates y, x = T y, in which the believed curvature J~'WJ~ + Lambda is the identity,
+In whitened coordinates y, x = T y, in which the usable curvature J~'WJ~ + Lambda is the identity,
 
     Cov(y) = M^-1 (s D + C + Lambda + S + N) M^-T + r r'
 
@@ -14,7 +14,8 @@ N        what noise in M does to steps p that were taken by it, diag(sum_b var(M
 r        what is left of the step to the minimum, where the fit ended short of it: M^-1 (gradient + Lambda (x - mean))
 =======  ===============================================================================================================
 
-Where the instrument's errors are coordinates their prior is then used in full (``solve.recombination``), which moves x.
+Where the instrument's errors are coordinates, their prior is then used in full (``solve.recombination``), which moves
+x.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ from services.fit.solve.sandwich import Sandwich, settle
 
 Array = NDArray[np.float64]
 NOISE_FACTOR = 3.0
-"""An eigenvalue below so many of its own standard deviations is not told from zero."""
+"""An eigenvalue below this many of its own standard deviations is not distinguished from zero."""
 MIN_DATA_SHARE = 0.5
-"""A parameter is determined where data, not prior, give at least this part of the information."""
+"""Share of the information that the data, not the prior, must give for a parameter to be determined."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (F, F) of x, and the scaled directions (F, K) that the data leave open."""
+    """Solution x (F,), its covariance (F, F), and the scaled directions (F, K) that the data leave undetermined."""
 
     domain: Domain
     x: Array
@@ -51,26 +52,27 @@ class Uncertainty:
     posterior: Array
     """(J'WJ + Lambda)^-1, (F, F)."""
     sandwich: Sandwich | None = None
-    """What the covariance is made of, but for r r'."""
+    """Factors of the covariance without the term r r'."""
     parts: Mapping[str, Array] = field(default_factory=dict)
     """Covariances (F, F) that add up to the whole, by their source (``results.Estimate``)."""
     faults: tuple[Fault, ...] = ()
-    """Errors of the instrument that the images put down to a fault of the calibration."""
+    """Instrument errors that the images show to be faults of the calibration."""
     is_whole: bool = True
-    """Whether the prior of the instrument's errors, used in full, moved x no farther than one model reaches."""
+    """Whether the full use of the prior of the instrument's errors moved x no farther than one linear model is valid.
+    """
 
     def standard_error(self, slope: Array) -> float:
-        """One standard error of a quantity with gradient ``slope`` (F,) to x."""
+        """Standard error of a quantity with gradient ``slope`` (F,) with respect to x."""
         return float(np.sqrt(max(float(slope @ self.covariance @ slope), 0.0)))
 
     def se_parts(self, slope: Array) -> dict[str, float]:
-        """That standard error by its sources, largest first; their squares add up to its square."""
+        """Parts of that standard error by source, largest first; their squares add up to its square."""
         found = {name: float(np.sqrt(max(float(slope @ part @ slope), 0.0))) for name, part in self.parts.items()}
         return {name: se for name, se in sorted(found.items(), key=lambda one: -one[1]) if se > 0}
 
     def is_determined(self, slope: Array) -> bool:
-        """Whether the data fix a quantity with gradient ``slope``: it avoids open directions and bounds, and the prior
-        knows less than half.
+        """Whether the data determine a quantity with gradient ``slope`` (F,): it avoids undetermined directions and
+        bounds, and the prior gives less than half of its information.
         """
         _, precision = self.domain.prior
         scaled = slope * self.domain.scale
@@ -93,8 +95,8 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Whitening:
-    """Coordinates y, x = T y, of unit curvature, each the nearest to one of x, and the scaled directions (F, K) whose
-    curvature drowns in its own noise.
+    """Whitened coordinates y, x = T y, of unit curvature, each as near as possible to one of x, and the scaled
+    directions (F, K) whose curvature lies below its noise.
     """
 
     transform: Array
@@ -102,9 +104,10 @@ class Whitening:
 
 
 def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
-    """Judge the curvature by its noise.
+    """Whitening coordinates of a curvature, with its undetermined directions.
 
-    Open directions keep only their noise level, so that they show a large error instead of a negative variance.
+    The curvature of an undetermined direction is set to its noise level, so that the direction has a large error and
+    not a negative variance.
     """
     count, errors = domain.tissue_count, len(domain.errors.names)
     precision, scale = domain.prior[1][:count], domain.scale[:count]
@@ -117,15 +120,15 @@ def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
     curvature, axes = np.linalg.eigh((vectors * believed) @ vectors.T + np.diag(precision * scale**2))
     tissue = scale[:, None] * ((axes / np.sqrt(np.maximum(curvature, tiny))) @ axes.T)
 
-    # Errors follow the tissue, and have a unit of their own besides; no direction of theirs is open, as their prior is
-    # proper.
+    # Instrument errors follow the tissue and have coordinates of their own. None of their directions is undetermined,
+    # because their prior is proper.
     own = np.concatenate([np.zeros((count, errors)), left.root])
     open_directions = np.concatenate([vectors[:, is_open], np.zeros((errors, int(is_open.sum())))])
     return Whitening(np.concatenate([left.lift @ tissue, own], axis=1), open_directions)
 
 
 def _of_errors(domain: Domain) -> Array:
-    # The prior's precision with that of the tissue left out: it joins after the curvature was judged by its noise.
+    # The prior's precision without the tissue's part, which is added after the curvature was compared with its noise.
     precision = domain.precision
     precision[: domain.tissue_count, : domain.tissue_count] = 0.0
     return precision
@@ -133,8 +136,8 @@ def _of_errors(domain: Domain) -> Array:
 
 @dataclass(frozen=True)
 class Pooled:
-    """Gradient of the data in whitened coordinates (F,), its Monte Carlo covariance (F, F), and how far (F,) it was
-    carried by an assumed response.
+    """Gradient of the data in whitened coordinates (F,), its Monte Carlo covariance (F, F), and the distance (F,) over
+    which it was carried by an assumed response.
     """
 
     gradient: Array
@@ -143,9 +146,9 @@ class Pooled:
 
 
 def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
-    # What the solver knew, carried on by the measured response instead of its own curvature, and the closing
-    # measurement, weighted by their noise. The difference of the two ways of carrying is as uncertain as it is large:
-    # images are linear over short distances only.
+    # Weight two gradients by their noise: the solver's pooled one, carried by the measured response instead of its own
+    # curvature, and that of the closing measurement. The difference of the two ways of carrying counts as error of its
+    # own size, because images are linear over short distances only.
     carried = np.asarray(np.linalg.solve(t, equations.carried + np.zeros(len(t))), dtype=np.float64)
     correction = solved.excess @ carried
     known, known_noise = (
@@ -163,8 +166,8 @@ def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Res
 
 @dataclass(frozen=True)
 class ClosingModel:
-    """What is known about a solution once its response was measured: M, and the gradient (F,) with its noise (F, F), in
-    whitened coordinates.
+    """Quadratic model at a solution after its response was measured: M^-1, and the gradient (F,) with its noise (F, F),
+    in whitened coordinates.
     """
 
     domain: Domain
@@ -175,11 +178,11 @@ class ClosingModel:
     noise: Array
 
     def step(self, part_count: int = 1) -> Array:
-        """The last Newton step (F,): along what is not open, no longer than one scale for each of so many things,
-        inside the bounds.
+        """The last Newton step (F,) along the determined directions, no longer than one scale for each of
+        ``part_count`` objects, inside the bounds.
 
-        The instrument's errors go where they are best for the tissue as the step leaves it, which is not where a whole
-        one would.
+        The instrument's errors move to their optimum for the tissue after this step, which differs from that after a
+        whole step.
         """
         domain, scaled, count = self.domain, self._whole_step(), self.domain.tissue_count
         low, high = domain.bounds
@@ -188,21 +191,23 @@ class ClosingModel:
         return np.asarray(np.concatenate([step[:count], self._errors_after(step[:count])]))
 
     def rest(self) -> Array:
-        """All that is left to the minimum (F,) along what is not open, with the errors that are best for the tissue.
+        """The whole remaining step to the minimum (F,) along the determined directions, with the errors at their
+        optimum for the tissue.
 
-        Errors that followed it along an open direction too would tell of a move that it does not make.
+        Errors that followed the tissue along an undetermined direction too would state a step that the tissue does not
+        make.
         """
         tissue = (self.domain.scale * self._whole_step())[: self.domain.tissue_count]
         return np.asarray(np.concatenate([tissue, self._errors_after(tissue)]))
 
     def _whole_step(self) -> Array:
-        # In scales.
+        # The Newton step (F,) in scales.
         scaled = -self.known.transform @ self.inverse @ self.gradient / self.domain.scale
         return np.asarray(scaled - self.known.open_directions @ (self.known.open_directions.T @ scaled))
 
     def _errors_after(self, tissue: Array) -> Array:
-        # Change of the errors (K,) at which F = g'z + z'z / 2, z = M y, is least after a step of the tissue, which
-        # alone moves its part of y.
+        # Change of the errors (K,) that minimises F = g'z + z'z / 2, z = M y, after a step of the tissue, which alone
+        # moves its part of y.
         count = len(tissue)
         if count == len(self.x):
             return np.zeros(0)
@@ -214,15 +219,16 @@ class ClosingModel:
         return np.asarray(np.clip(self.x[count:] + change, low, high) - self.x[count:])
 
     def slope(self, step: Array) -> float:
-        """Slope of F at x along a step, per length of the step; of a step that follows noise it is steeper by what
-        noise alone would give.
+        """Directional derivative g'z of F at x along a step (F,), not divided by its length. A step that follows noise
+        has a steeper one, by the part that noise alone causes.
         """
         return float(self.gradient @ self._moved(step))
 
     def promise(self, step: Array) -> tuple[float, float]:
-        """Change of F by a step and its standard error by noise; what noise alone would promise is taken off.
+        """Predicted change of F by a step (F,) and its standard error by noise; the part that noise alone predicts is
+        subtracted.
 
-        If the images' derivatives are J = J~ M as far as they matter, F changes by g'z + z'z / 2, z = M y.
+        Where J = J~ M describes the images' derivatives, F changes by g'z + z'z / 2, z = M y.
         """
         moved = self._moved(step)
         change = float(self.gradient @ moved + 0.5 * moved @ moved) + 0.5 * float(np.trace(self.noise))
@@ -233,7 +239,7 @@ class ClosingModel:
 
 
 def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> ClosingModel:
-    """All that is known at x, where the closing measurement was made."""
+    """Quadratic model at x, where the closing measurement was made."""
     known = whitening(domain, equations)
     t = known.transform
     solved = response(sums, t.T @ domain.precision @ t, domain.relation, len(domain.errors.names))
@@ -252,17 +258,17 @@ def uncertainty(
     moved: Sequence[str] = (),
     part_count: int = 1,
 ) -> Uncertainty:
-    """Uncertainty at a solution from the normal equations there.
+    """Uncertainty at a solution, from the normal equations there.
 
-    Its x is the solution, moved where errors of an instrument use their prior in full.
+    The returned x is the solution, moved where the prior of the instrument's errors is used in full.
 
     Args:
         sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where
             Jacobians are the images' own.
-        step: what the fit moved after it.
-        moved: what the last of the closing measurement's changes are of, ``teeth`` or ``dome`` each; the others are of
-            held mean cosines.
-        part_count: how many things the fit is about that images tell apart, such as the teeth of a jaw.
+        step: the step (F,) that the fit made after the closing measurement.
+        moved: kind, ``teeth`` or ``dome``, of each of the last changes of the closing measurement; the earlier changes
+            are those of held mean cosines.
+        part_count: number of objects that the fit treats as separate in the images, such as the teeth of a jaw.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
     known = whitening(domain, equations)
@@ -290,7 +296,7 @@ def uncertainty(
         meat = meat + rendered + sums.shift_covariance + unsure
         left = pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, gone) - prior @ gone
 
-    # What is left of the step counts as error along what is not open.
+    # Count the remaining step along the determined directions as error.
     rest = ClosingModel(domain, x, known, inverse, left, parts["rendering"]).rest()
     found = settle(domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(rest, rest), part_count)
     covariance = 0.5 * (found.covariance + found.covariance.T)
@@ -308,9 +314,9 @@ def uncertainty(
 
 
 def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
-    # The whitened prior by what it is of: the tissue, and each kind of the instrument's errors. Columns of a Cholesky
-    # factor are parts that add up and of which none is negative; what kinds that go together have in common counts for
-    # the first of them.
+    # The whitened prior, split into that of the tissue and of each kind of instrument error. The columns of a Cholesky
+    # factor give positive semidefinite parts that add up; where kinds are correlated, their common part counts for the
+    # first of them.
     count, precision = domain.tissue_count, domain.precision
     parts = {"prior": t[:count].T @ precision[:count, :count] @ t[:count]}
     kinds = np.array([kind_of_error(name) for name in domain.errors.names])
@@ -322,8 +328,8 @@ def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
 
 
 def positive_part(matrix: Array) -> Array:
-    """The matrix without its negative eigenvalues, which a covariance estimated from products of two seeds may have,
-    and a variance has not.
+    """The matrix without its negative eigenvalues, which a covariance estimated from products of two seeds may have
+    although no true covariance has them.
     """
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

@@ -1,9 +1,8 @@
-"""How noisy a curvature from Monte Carlo Jacobians is, kept where it matters: among coordinates that act on the same
-measurements.
+"""Noise of a curvature from Monte Carlo Jacobians, stored only among coordinates that act on the same measurements.
 
 The covariance of all entries of a curvature H (F, F) has F^4 numbers, gigabytes for the coordinates of a jaw. But a
-measurement near one tooth knows of few coordinates. So noise is a sum of parts, each the covariance of the entries of H
-among some coordinates, from measurements of its own.
+measurement near one tooth depends on few coordinates. So the noise is a sum of independent parts, each the covariance
+of the entries of H among some coordinates, by a set of measurements of its own.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ Array = NDArray[np.float64]
 
 
 def pairs_of(count: int, exact: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Which entries H_ab are noisy, as indices a and b (P,): pairs of the noisy coordinates, then each of them with
-    every exact one.
+    """Indices a and b (P,) of the noisy entries H_ab: pairs of the noisy coordinates, then each of them with every
+    exact one.
 
     Args:
-        count: coordinates whose derivatives are noisy; they come first.
-        exact: coordinates whose derivatives are known exactly, such as a gain's; entries between two of them have no
-            noise.
+        count: number of coordinates whose derivatives are noisy; they come first.
+        exact: number of coordinates whose derivatives are known exactly, such as a gain's; entries between two of them
+            have no noise.
     """
     first, second = np.triu_indices(count)
     noisy, known = np.divmod(np.arange(count * exact), max(exact, 1))
@@ -38,20 +37,20 @@ class NoisePart:
     """Covariance of the noisy entries H_ab of one set of measurements."""
 
     coordinates: tuple[int, ...]
-    """Whose derivatives are noisy."""
+    """Coordinates whose derivatives are noisy."""
     moments: Array
-    """(P, P), in the order of ``pairs_of``."""
+    """Covariance (P, P) of the entries, in the order of ``pairs_of``."""
     exact: tuple[int, ...] = ()
     """Coordinates whose derivatives are known exactly."""
 
     @property
     def own(self) -> list[int]:
-        """All its coordinates."""
+        """All coordinates of the part, the noisy ones first."""
         return [*self.coordinates, *self.exact]
 
     @property
     def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Places of each entry's two coordinates among ``own``."""
+        """Indices into ``own`` of the two coordinates of each entry."""
         return pairs_of(len(self.coordinates), len(self.exact))
 
     def product_with(self, vector: Array) -> Array:
@@ -102,8 +101,8 @@ class CurvatureNoise:
         return total
 
     def of_eliminated(self, inverse: Array) -> Array:
-        """The bias (F, F) that noise gives A S^-1 A', for the last K coordinates, all exact: sum_kl S^-1_kl Cov(A_ak,
-        A_bl).
+        """Bias (F, F) that noise gives A S^-1 A', where A (F, K) are the entries with the last K coordinates, all
+        exact: sum_kl S^-1_kl Cov(A_ak, A_bl).
 
         Args:
             inverse: S^-1 (K, K).
@@ -118,7 +117,7 @@ class CurvatureNoise:
         return total
 
     def record(self) -> list[dict[str, Any]]:
-        """As JSON values, numbers exact."""
+        """The parts as JSON values; numbers survive exactly."""
         return [
             {
                 "coordinates": part.coordinates,
@@ -130,7 +129,7 @@ class CurvatureNoise:
 
     @staticmethod
     def of(record: list[dict[str, Any]]) -> CurvatureNoise:
-        """From ``record``."""
+        """Noise from the JSON values of ``record``."""
         parts = []
         for entry in record:
             numbers = np.frombuffer(base64.b64decode(entry["moments"]), dtype=np.float64)
@@ -141,8 +140,8 @@ class CurvatureNoise:
 
 
 def per_pixel(terms: Array, lights: int) -> Array:
-    """Sums (F, N) over the lights of a pixel of terms (F, lights x N): what is of one pixel is of the same walks, what
-    is of two is independent.
+    """Sums (F, N) of terms (F, lights x N) over the lights of each pixel. Terms of one pixel come from the same walks;
+    those of different pixels are independent.
     """
     return np.asarray(terms.reshape(len(terms), lights, -1).sum(axis=1))
 
@@ -159,13 +158,13 @@ def curvature_noise(
     estimates of j.
 
     Args:
-        exact: further coordinates whose derivatives have no noise.
+        exact: further coordinates, whose derivatives have no noise.
     """
     m, d = mean[list(coordinates)], difference[list(coordinates)]
     first, second = np.triu_indices(len(m))
     entries = per_pixel(0.5 * (m[first] * d[second] + d[first] * m[second]) * weight, lights)
     if len(exact):
-        # One by one, as a capture may have a light's gain for each of hundreds of lights.
+        # One noisy coordinate at a time, to save memory: a capture may have a gain for each of hundreds of lights.
         cross = [per_pixel(0.5 * weight * own * mean[list(exact)], lights) for own in d]
         entries = np.concatenate([entries, *cross])
     return NoisePart(tuple(coordinates), entries @ entries.T, tuple(exact))

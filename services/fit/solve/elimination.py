@@ -1,15 +1,15 @@
-"""Normal equations of the tissue alone, where the instrument's errors follow it.
+"""Normal equations of the tissue's parameters, with the instrument's calibration errors eliminated.
 
-Images are exactly linear in the errors e, and their columns B have no Monte Carlo noise. So for any tissue x the best
-errors are known in closed form, and a step p of the tissue takes them along by -R p. What is left are equations of the
-tissue (variable projection, Golub and Pereyra 1973):
+Images are exactly linear in the errors e, and the columns B of their derivatives have no Monte Carlo noise. So for any
+tissue parameters x the optimal errors are known in closed form, and a step p of the tissue changes them by -R p. The
+reduced equations of the tissue are (variable projection, Golub and Pereyra 1973; a Schur complement):
 
     S = B'WB + P,   R = S^-1 B'WJ,   H = J'WJ - J'WB R,   g = J'Wr - R'(B'Wr + P e),
 
 with P the precision of the errors' prior.
 
-J'WB comes from noisy derivatives, so J'WB S^-1 B'WJ is too large by what its noise squares to, which its own covariance
-tells and which is taken off.
+J'WB comes from noisy derivatives, so J'WB S^-1 B'WJ is on average too large by the mean square of that noise. The
+covariance of J'WB gives this bias, and it is subtracted.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiftedNoise:
-    """Noise of the curvature that is left: that of the whole along the directions in which errors follow the tissue."""
+    """Noise of the reduced curvature: the noise of the whole curvature, along directions in which the errors follow the
+    tissue.
+    """
 
     whole: CurvatureNoise
     lift: Array
@@ -39,18 +41,20 @@ class LiftedNoise:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Equations of the tissue's coordinates (F,), and what the errors (K,) do meanwhile."""
+    """Reduced normal equations of the tissue's coordinates (F,), and the dependence of the K instrument errors
+    on them.
+    """
 
     hessian: Array
     gradient: Array
     noise: CurvatureNoise | LiftedNoise
     gradient_noise: Array
     lift: Array
-    """Step of all coordinates (F + K, F) by a step of the tissue."""
+    """Matrix (F + K, F) that turns a step of the tissue into the step of all coordinates."""
     settling: Array
-    """Step of all coordinates (F + K,) that brings the errors to their best for the tissue as it is."""
+    """Step (F + K,) of all coordinates that brings the errors to their optimum and leaves the tissue as it is."""
     root: Array
-    """S^-1/2, (K, K): one standard error of the errors where the tissue is known."""
+    """S^-1/2 (K, K), the square root of the errors' covariance where the tissue is known exactly."""
 
     def eigenvalue_noise(self, directions: Array) -> Array:
         """Standard deviation of u'Hu for each column u of ``directions`` (F, K)."""
@@ -63,12 +67,14 @@ class Eliminated:
 
 
 def eliminate(equations: NormalEquations, precision: Array, slope: Array, count: int) -> Eliminated:
-    """Leave the first ``count`` coordinates; without errors these are the equations themselves, the tissue's prior
-    included.
+    """Eliminate all but the first ``count`` coordinates.
+
+    Without instrument errors the result is the equations themselves, with the tissue's prior added.
 
     Args:
-        precision: of the prior of all coordinates, (F + K, F + K).
-        slope: of the prior's half square, (F + K,).
+        precision: precision matrix of the prior of all coordinates, (F + K, F + K).
+        slope: gradient (F + K,) of the prior's term of the objective, half its square.
+        count: number F of the tissue's coordinates, which come first.
     """
     hessian, gradient = equations.hessian + precision, equations.gradient + slope
     size = len(gradient)

@@ -1,4 +1,6 @@
-"""Parameters and quantities derived from them as they are reported: value, standard error, whether data fix it."""
+"""Reported estimates of the parameters and of quantities derived from them: value, standard error, and whether the data
+determine it.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +25,20 @@ DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
         "mean_cosine": ("1", lambda m: m.mean_cosine),
     }
 )
-"""Quantities of a medium that are reported beside its parameters: unit and formula."""
+"""Derived quantities of a medium that are reported beside its parameters: unit and formula."""
 
 
 def estimates(
     tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None
 ) -> dict[str, Estimate]:
-    """Every parameter of the named parts with unit, standard error and whether the data fix it, and the derived
-    quantities.
+    """Estimates of every parameter of the named parts, and of the derived quantities, by name: unit, standard error and
+    whether the data determine it.
 
     Args:
-        tissue: the solution.
-        parts: ``enamel``, ``dentin``, ``shape``, of a mouth ``3.enamel``, ``3.shape``, ``gums`` or ``cavity``.
-        known: uncertainty of the coordinates that were fitted; None where nothing was.
-        shape_known: uncertainty of the blend weights where another channel's fit gave them.
+        tissue: tissue parameters of the solution.
+        parts: names ``enamel``, ``dentin``, ``shape``, for a mouth ``3.enamel``, ``3.shape``, ``gums`` or ``cavity``.
+        known: uncertainty of the fitted coordinates; None where nothing was fitted.
+        shape_known: uncertainty of the blend weights where the fit of another channel determined them.
     """
     fitted = set(known.domain.parameters) if known is not None else set()
     out: dict[str, Estimate] = {}
@@ -62,7 +64,7 @@ def estimates(
 
 
 def _weights(tissue: Optics, part: str) -> tuple[float, ...]:
-    # Blend weights of a tooth, ``shape`` or ``3.shape``.
+    # Blend weights of the tooth that a part such as ``shape`` or ``3.shape`` names.
     return tissue.shape if isinstance(tissue, Tissue) else tissue.teeth[int(part.partition(".")[0])].shape
 
 
@@ -104,7 +106,9 @@ def _derived(
 
 
 def instrument_estimates(known: Uncertainty) -> dict[str, Estimate]:
-    """The instrument's errors by name; one is determined where the images tell it better than the calibration did."""
+    """Estimates of the instrument's errors by name; an error is determined where the images add more information than
+    the calibration gave.
+    """
     first, found = known.domain.tissue_count, {}
     for k, (name, before) in enumerate(zip(known.domain.errors.names, known.domain.errors.se.tolist(), strict=True)):
         slope = np.zeros(len(known.x))

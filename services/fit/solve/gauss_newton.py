@@ -1,23 +1,24 @@
-"""Gauss-Newton with Monte Carlo Jacobians: init, step, terminate, finish; the outcome is a value.
+"""Gauss-Newton with Monte Carlo Jacobians, as init, step, terminate and finish; the outcome is a value.
 
-The objective is F(x) = 1/2 sum w r(x)^2 + 1/2 sum precision (x - prior)^2 in the unbounded domain. Each step asks the
-problem for normal equations (curvature from two independent seeds, residual from a third), pools them with those of
-earlier steps carried to the present point, solves a trust-region subproblem that damps past the most negative
-curvature, and judges the proposal.
+The objective is F(x) = 1/2 sum w r(x)^2 + 1/2 sum precision (x - prior)^2 in the unbounded domain. Each step renders
+normal equations (curvature from two independent seeds, residual from a third), pools them with those of earlier steps
+carried to the present point, solves a trust-region subproblem that damps past the most negative curvature, and tests
+the proposed step.
 
-Two independent witnesses judge: the loss compared at both ends with common random numbers, from seeds that saw neither
-gradient nor curvature; and the change that the quadratic model promises, with the noise of its gradient and curvature
-and an allowance for its error that grows with the step. Far from the optimum the comparison decides, close to it, where
-losses hardly differ, the gradient knows more. With z = 3 standard errors:
+Two independent estimates of the change of F test a step. The comparison renders the loss at both ends with common
+random numbers, from seeds that neither gradient nor curvature used. The model's prediction comes from the quadratic
+model; its standard error covers the noise of gradient and curvature and a model error that grows with the step. Far
+from the optimum the comparison decides; close to it, where losses hardly differ, the prediction is the more precise.
+With z = 3 standard errors:
 
-* both together surely better, and not contradicting each other: taken;
-* surely worse, or less than promised: the model's curvature is at fault, the trust radius shrinks;
-* otherwise noise stops progress: samples double; at their limit the fit is as good as its noise and ends.
+* the two combined are significantly better and do not contradict each other: the step is accepted;
+* the comparison is significantly worse or contradicts the prediction: the curvature is wrong, the radius shrinks;
+* otherwise noise stops progress: the samples double; at their limit the fit ends, as good as its noise allows.
 
-A fit that ends so has stopped somewhere within a few standard errors, on the side it came from. A last step therefore
-settles it on the minimum of all that is known, along the directions whose curvature stands out of its noise, unless the
-comparison is surely against it, or, where derivatives are not the images' own, unless both witnesses together are not
-for it by one standard error; its error is then that of the pooled gradient, and unbiased.
+A fit that ends by noise lies within a few standard errors of the minimum, biased towards its start. So a last Newton
+step goes to the minimum of the pooled model, along the directions whose curvature exceeds its noise. It is refused
+where the comparison is significantly worse, or, where derivatives are not those of the images, where both estimates
+combined are not better by one standard error. The solution's error is then that of the pooled gradient, without bias.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Result(StrEnum):
 
     @property
     def converged(self) -> bool:
-        """Whether the optimum was reached to within what the samples can tell."""
+        """Whether the optimum was reached within the precision that the samples allow."""
         return self in {Result.CONVERGED, Result.NOISE_LIMITED}
 
 
@@ -67,14 +68,14 @@ ADVICE = {
 
 
 DETERMINED = 3.0
-"""A direction counts as determined when its curvature exceeds so many of its own standard deviations."""
+"""A direction counts as determined where its curvature exceeds this many of its own standard deviations."""
 LAST_STEP_Z = 1.0
-"""Standard errors by which both witnesses have to be for a fit's last step: nothing comes after it that a wrong one
-could mislead."""
+"""Standard errors by which both estimates combined must favour the last step; no step follows that an error could
+mislead."""
 
 
 class Problem(Protocol):
-    """What is fitted. Equal arguments give equal answers, so that a repeated step repeats its result."""
+    """Problem to fit. Equal arguments give equal results, so that a repeated step repeats its result."""
 
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """Normal equations of the data alone at x."""
@@ -90,25 +91,26 @@ class Options:
     max_steps: int = 12
     max_samples: int = 1024
     max_trials: int = 3
-    """Radii tried with one set of normal equations."""
+    """Largest number of trust radii tried with one set of normal equations."""
     sure_z: float = 3.0
-    """A change counts as real beyond so many standard errors: a worse step passes with probability at most 1.3e-3."""
+    """A change is significant beyond this many standard errors: a worse step passes with probability at most 1.3e-3."""
     model_error: float = 0.5
-    """Relative error of the promised change per unit of step length; at length 1 the promise counts little."""
+    """Relative error of the predicted change per unit of step length; at length 1 the prediction counts little."""
     slope_error: float = 0.0
-    """The same at any length, where derivatives are not those of the images: the comparison then always has a say."""
+    """Relative error of the prediction at any length, where derivatives are not the images' own: the comparison then
+    always has some weight."""
     tolerance: float = 0.0
-    """Converged when a further step promises no more than noise does, and noise is worth no more than this change of
-    F."""
+    """Converged where the gain predicted for a further step is at most the gain by noise alone, and that at most this
+    change of F."""
     least_radius: float = 1e-3
     parts: int = 1
-    """Lengths of steps are root mean squares over so many things that images tell apart, such as teeth: each may go as
-    far as one alone would."""
+    """Number of objects that the images tell apart, such as teeth. A step's length is the root mean square over them,
+    so that each may move as far as a single one would."""
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything a step needs of the past."""
+    """State of the solver between steps."""
 
     x: Array
     samples: int
@@ -117,10 +119,10 @@ class State:
     accepted: int = 0
     result: Result = Result.RUNNING
     memory: NormalEquations | None = None
-    """What earlier steps know, as a model around x."""
+    """Pooled normal equations of earlier steps, carried to x."""
     memory_samples: float = 0.0
     verdict: str = ""
-    """What happened in the last step, for the log."""
+    """Outcome of the last step, for the log."""
 
 
 def state_record(state: State) -> dict[str, Any]:
@@ -137,7 +139,7 @@ def state_from(record: dict[str, Any]) -> State:
 
 @dataclass(frozen=True)
 class Solution:
-    """End of a fit: where, how, and what to do about it."""
+    """Outcome of a fit: the solution, how the fit ended, and what to do about it."""
 
     x: Array
     result: Result
@@ -145,14 +147,14 @@ class Solution:
     steps: int
     samples: int
     equations: NormalEquations | None
-    """All that is known around x; None where the last step discarded it."""
+    """Pooled normal equations at x; None where the last step discarded them."""
     known_samples: float = 0.0
-    """Paths per pixel that it is worth."""
+    """Paths per pixel that ``equations`` are worth."""
 
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Solver for one domain; stateless, the state goes in and out."""
+    """Solver for one domain; stateless: states are passed in and returned."""
 
     domain: Domain
     options: Options = Options()
@@ -161,7 +163,7 @@ class GaussNewton:
         """State at a start, moved inside the bounds.
 
         Args:
-            before: an end at this very x for the same measurements; what it knew is not forgotten.
+            before: outcome of a fit of the same measurements that ended at this very x; its equations are reused.
         """
         low, high = self.domain.bounds
         state = State(np.clip(x, low, high), samples)
@@ -177,7 +179,7 @@ class GaussNewton:
         )
 
     def terminate(self, state: State) -> bool:
-        """Whether nothing is left to do."""
+        """Whether the fit has ended."""
         return state.result is not Result.RUNNING
 
     def finish(self, state: State) -> Solution:
@@ -198,14 +200,14 @@ class GaussNewton:
             fresh, known = pool(state.memory, state.memory_samples, fresh, known), state.memory_samples + known
         state = replace(state, step=state.step + 1, memory=fresh, memory_samples=known)
 
-        # The weak prior is exact: it joins curvature and gradient, never their noise. The instrument's errors follow
-        # the tissue.
+        # Add the weak prior, which is exact, to curvature and gradient but not to their noise, and eliminate the
+        # instrument's errors.
         equations = eliminate(fresh, self.domain.precision, self.domain.prior_slope(x), self.domain.tissue_count)
         best, settling = x + equations.settling, equations.settling
         noise_gain = gain_by_noise(equations)
 
-        # Nothing to gain beyond noise, and noise itself small: done. Asked at full radius, so that a small radius never
-        # looks like convergence.
+        # Converged: nothing to gain beyond noise, and the noise itself small. Tested at full radius, so that a small
+        # radius never looks like convergence.
         _, promised = self._propose(equations, x, max(state.radius, 1.0))
         if promised <= noise_gain <= options.tolerance and not self._drowns(equations, state):
             return self._settled(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
@@ -223,8 +225,8 @@ class GaussNewton:
                     f"The loss is not finite at step {state.step}; check the capture for invalid radiance."
                 )
 
-            # Promise and comparison, each with its standard error; what the gradient's own noise would promise is taken
-            # off.
+            # Prediction and comparison, each with its standard error; the part of the prediction that the gradient's
+            # own noise causes is subtracted.
             model_se = math.hypot(
                 equations.step_noise(step), (options.slope_error + options.model_error * length) * promised
             )
@@ -259,7 +261,7 @@ class GaussNewton:
         )
 
     def _settled(self, problem: Problem, state: State, equations: Eliminated) -> State:
-        # Newton step in the directions that the data determine: curvature beyond its noise, and a noise of the step
+        # Newton step along the directions that the data determine: curvature beyond its noise, and noise of the step
         # below one scale.
         count = self.domain.tissue_count
         scale, x, settling = self.domain.scale[:count], state.x[:count], equations.settling
@@ -295,16 +297,16 @@ class GaussNewton:
         if refused:
             return state
         if length > 1:
-            # Too far for one linear model: look again from there.
+            # The step is too long for one linear model: linearise again from its end.
             return self._limited(
                 self._carry(replace(state, x=new, result=Result.RUNNING, verdict="settling"), whole, 1.0)
             )
         return replace(state, x=new, memory=state.memory.moved(whole), verdict=f"{state.verdict}, settled")
 
     def _drowns(self, equations: Eliminated, state: State) -> bool:
-        # Whether more samples are to tell a direction whose step noise is above one scale. What the instrument's errors
-        # leave to the tissue is small beside what images tell of both, and so are such directions beside the tolerance,
-        # which is one of images.
+        # Whether more samples are needed because the step's noise along a direction exceeds one scale. Instrument
+        # errors leave little information along such directions, so their gain lies below the tolerance, which is one of
+        # the image loss.
         if not self.domain.errors.names or state.samples >= self.options.max_samples:
             return False
         scale = self.domain.scale[: self.domain.tissue_count]
@@ -312,12 +314,12 @@ class GaussNewton:
         return bool((spread > np.maximum(eigenvalues, 0.0)).any())
 
     def _length(self, step: Array) -> float:
-        # Of a step of the tissue.
+        # Length of a step of the tissue, in scales.
         scale = self.domain.scale[: self.domain.tissue_count]
         return float(np.linalg.norm(step / scale)) / math.sqrt(self.options.parts)
 
     def _propose(self, equations: Eliminated, x: Array, radius: float) -> tuple[Array, float]:
-        # Step of the tissue within the radius and the gain that the model promises for it.
+        # Step of the tissue within the radius, and the gain that the model predicts for it.
         reach, count = radius * math.sqrt(self.options.parts), self.domain.tissue_count
         low, high = (bound[:count] for bound in self.domain.bounds)
         step = solve_box(
@@ -332,8 +334,8 @@ class GaussNewton:
         return step, -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
 
     def _carry(self, state: State, step: Array, length: float) -> State:
-        # What was known before a long step is worth less after it: the model's error grows with the step, its noise
-        # does not.
+        # Count the pooled samples as fewer after a long step, because the model's error grows with the step while its
+        # noise does not.
         assert state.memory is not None
         return replace(
             state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (length / 0.3) ** 2)
@@ -344,15 +346,15 @@ class GaussNewton:
 
 
 def _spread(equations: Eliminated, scale: Array) -> tuple[Array, Array, Array]:
-    # Scaled curvature: eigenvalues, directions, and the noise of the gradient along each.
+    # Eigenvalues and directions of the scaled curvature, and the standard deviation of the gradient along each.
     eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
     variance = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise * np.outer(scale, scale), vectors)
     return eigenvalues, vectors, np.sqrt(np.maximum(variance, 0.0))
 
 
 def gain_by_noise(equations: NormalEquations | Eliminated) -> float:
-    """What a Newton step at the true optimum promises on average because the gradient is noisy: tr(H^-1 C) / 2, over
-    directions that curve upwards.
+    """Mean gain tr(H^-1 C) / 2 that the gradient's noise alone predicts for a Newton step at the true optimum, over
+    directions of positive curvature.
     """
     eigenvalues, vectors = np.linalg.eigh(equations.hessian)
     floor = np.maximum(equations.eigenvalue_noise(vectors), 1e-13 * max(float(np.abs(eigenvalues).max()), 1e-300))
@@ -362,9 +364,7 @@ def gain_by_noise(equations: NormalEquations | Eliminated) -> float:
 
 @dataclass(frozen=True)
 class Judged:
-    """A step as two witnesses see it: the change of F by comparison and by a model, with their standard errors, and
-    from how many of them on one is sure.
-    """
+    """A step's change of F by comparison and by the model, with standard errors; ``sure_z`` of them are significant."""
 
     change: float
     change_se: float
@@ -374,24 +374,24 @@ class Judged:
 
     @property
     def is_worse(self) -> bool:
-        """Whether the comparison is surely against it."""
+        """Whether the comparison is significantly worse."""
         return self.change > self.sure_z * self.change_se
 
     @property
     def contradicted(self) -> bool:
-        """Whether the witnesses surely speak of different things."""
+        """Whether the two estimates differ significantly."""
         return abs(self.change - self.model) > self.sure_z * math.hypot(self.change_se, self.model_se)
 
     def is_better(self, z: float) -> bool:
-        """Whether both together are for it by z standard errors; a comparison that is surely against it, or
-        contradicts, has the last word.
+        """Whether both estimates combined are better by z standard errors. A comparison that is significantly worse, or
+        contradicts the prediction and is worse, overrules them.
         """
         total, total_se = _combine(self.change, self.change_se, self.model, self.model_se)
         return total + z * total_se < 0 and not self.is_worse and not (self.contradicted and self.change > 0)
 
 
 def _combine(first: float, first_se: float, second: float, second_se: float) -> tuple[float, float]:
-    # Inverse-variance mean; an exact witness speaks alone, the comparison before the model.
+    # Inverse-variance mean; an estimate without error is used alone, the comparison before the prediction.
     if first_se == 0:
         return first, 0.0
     if second_se == 0:

@@ -1,4 +1,6 @@
-"""What one more image would teach: the covariance of a fit that had it, from the image's Jacobian alone."""
+"""Predicted covariance of a fit with one more image, from the Jacobian of that image alone (optimal experimental
+design).
+"""
 
 from __future__ import annotations
 
@@ -15,29 +17,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Addition:
-    """What further measurements add in whitened coordinates y (F,), each (F, F); blocks add.
+    """Information and gradient covariance that further measurements add, each (F, F) in whitened coordinates y (F,);
+    blocks of measurements add up.
 
-    Where these measurements have errors of their own in common, such as a new light's gain, K of them in units of their
-    ± are the last coordinates (F + K,), and ``left`` is what remains for y.
+    Where these measurements have K calibration errors of their own, such as a new light's gain, these errors are the
+    last coordinates, in units of their standard error, the matrices are (F + K, F + K), and ``left`` eliminates them.
     """
 
     information: Array
-    """J'WJ"""
+    """Information J'WJ."""
     meat: Array
-    """Covariance of J'W r by the noise of the measurements and of the renders."""
+    """Covariance of the gradient J'W r that is due to the noise of the measurements and of the renders."""
     errors: int = 0
-    """K"""
+    """Number K of the measurements' own calibration errors."""
 
     def __add__(self, other: Addition) -> Addition:
         return Addition(self.information + other.information, self.meat + other.meat, self.errors)
 
     def scaled(self, factor: float) -> Addition:
-        """Of ``factor`` times as many measurements of the same kind."""
+        """The addition of ``factor`` times as many measurements of the same kind."""
         return Addition(factor * self.information, factor * self.meat, self.errors)
 
     def left(self) -> Addition:
-        """Of y alone, its own errors at their best for any y; noise in J makes them explain a little more than they
-        can.
+        """The addition to y (F,) alone, with the measurements' own errors at their optimum for any y.
+
+        Noise in J makes these errors explain a little more than they can in truth.
         """
         if not self.errors:
             return self
@@ -56,22 +60,22 @@ def addition(
     weight: float,
     errors: Array | None = None,
 ) -> Addition:
-    """Sum measurements that have not been made, with as many paths as the fit's last measurement.
+    """Sum planned measurements, rendered with as many paths as the last measurement of the fit.
 
     Args:
-        known: of the fit without them.
-        slopes: J (F, M) from two seeds.
-        renders: images (M,) from two more.
+        known: sandwich covariance of the fit without the planned measurements.
+        slopes: derivatives J (F, M) from two seeds.
+        renders: images (M,) from two further seeds.
         variance: the measurements' expected variance (M,).
-        weight: what the fit would give each of them.
-        errors: what one ± of each error of their own changes them by (K, M).
+        weight: the weight that the fit would give each measurement.
+        errors: changes (K, M) of the measurements by one standard error of each of their own calibration errors.
     """
     m, d = (known.transform.T @ (0.5 * (slopes[0] + sign * slopes[1])) for sign in (1, -1))
     if errors is not None:
         m, d = np.concatenate([m, errors]), np.concatenate([d, np.zeros(errors.shape)])
     render_variance = 0.25 * (renders[0] - renders[1]) ** 2
 
-    # Gradient noise as in the normal equations, with residuals that are noise alone.
+    # The gradient's noise as in the normal equations, where the expected residuals are noise alone.
     data = (variance * m) @ m.T - (variance * d) @ d.T
     monte_carlo = (render_variance * m) @ m.T + (variance * d) @ d.T
     meat = weight**2 * (known.misfit * data + monte_carlo)
@@ -79,8 +83,9 @@ def addition(
 
 
 def covariance_with(known: Sandwich, added: Addition) -> Array:
-    """Covariance (F, F) of x in a fit with the further measurements; negative information, which noise alone makes,
-    counts as none.
+    """Covariance (F, F) of x in a fit with the further measurements.
+
+    Negative eigenvalues of the added information come from noise alone and count as zero.
     """
     own = added.left()
     information, meat = (positive_part(matrix) for matrix in (own.information, own.meat))
@@ -89,8 +94,8 @@ def covariance_with(known: Sandwich, added: Addition) -> Array:
 
 
 def covariance_after(known: Uncertainty, added: Addition) -> Array:
-    """Covariance (F, F) of x as the fit states it, had it the further measurements; the step that was left stays
-    left.
+    """Covariance (F, F) of x that the fit would state with the further measurements; the covariance of its unfinished
+    step stays in it.
     """
     assert known.sandwich is not None
     return covariance_with(known.sandwich, added) + known.parts.get("unfinished", np.zeros_like(known.covariance))

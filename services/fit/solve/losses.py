@@ -11,10 +11,11 @@ relative_l1   abs r / (ref + floor)                       1 / ((ref + floor) abs
 robust        Cauchy, ln(1 + (u / c)^2)                   1 / (1 + (u / c)^2)
 ============  ==========================================  ==================================
 
-floor is a share of the mean reference; u = r over its standard deviation (sensor and Monte Carlo), in units of the
-median size of all u. The last three depend on the residual: iteratively reweighted least squares (Beaton and Tukey
-1974), weights from a render that no other pass sees, so that for given weights the fit is as unbiased as l2. What stays
-is that noise of that render enlarges small residuals: l1 becomes least squares where the fit is closer than the noise.
+floor is ``FLOOR`` times the mean reference; u = r over its standard deviation (sensor and Monte Carlo), in units of the
+median of all abs u (divided by ``MEDIAN_OF_NORMAL``). The last three losses depend on the residual: iteratively
+reweighted least squares (Beaton and Tukey 1974). Their weights come from a render whose seed no other pass uses, so
+that for given weights the fit is as unbiased as l2. One bias remains: the noise of that render enlarges small
+residuals, so l1 becomes least squares where the fit is closer than the noise.
 """
 
 from __future__ import annotations
@@ -30,16 +31,18 @@ from services.core.records import Loss
 Array = NDArray[np.float64]
 
 FLOOR = 0.1
-"""Added to the reference in relative losses, as a share of the mean reference."""
+"""Floor that relative losses add to the reference, as a share of the mean reference."""
 CAUCHY = 2.385
-"""Tuning constant: 95 % of least squares' efficiency under Gaussian noise (Holland and Welsch 1977)."""
+"""Tuning constant c of the Cauchy loss: 95 % of least squares' efficiency under Gaussian noise (Holland and Welsch
+1977)."""
 MEDIAN_OF_NORMAL = 0.6745
 MIN_RESIDUAL = 0.1
-"""Residuals of l1 count as at least this share of their own standard deviation."""
+"""Smallest residual of l1 and relative_l1, as a share of the residual's own standard deviation; smaller residuals count
+as this one."""
 
 
 def is_reweighted(loss: Loss) -> bool:
-    """Whether weights follow residuals."""
+    """Whether the loss's weights depend on the residuals."""
     return chosen("Loss", loss, {name: name not in {"l2", "relative_l2"} for name in get_args(Loss)})
 
 
@@ -47,8 +50,8 @@ def first_weights(loss: Loss, reference: Array, variance: Array) -> Array:
     """Weights (M,) before any residual is known.
 
     Args:
-        reference: the measurements that count, (M,).
-        variance: theirs.
+        reference: the valid measurements (M,).
+        variance: noise variance of the reference (M,).
     """
     weight = np.ones_like(reference)
     if loss in {"relative_l2", "relative_l1"}:
@@ -57,11 +60,13 @@ def first_weights(loss: Loss, reference: Array, variance: Array) -> Array:
 
 
 def weights(loss: Loss, reference: Array, variance: Array, residual: Array, residual_variance: Array) -> Array:
-    """Weights (M,) of the next round.
+    """Weights (M,) of the next round of reweighting.
 
     Args:
-        residual: render minus reference of a seed used for nothing else.
-        residual_variance: Monte Carlo variance of that render.
+        reference: the valid measurements (M,).
+        variance: noise variance of the reference (M,).
+        residual: render minus reference (M,), from a seed that no other pass uses.
+        residual_variance: Monte Carlo variance of that render (M,).
     """
     if not is_reweighted(loss):
         return first_weights(loss, reference, variance)
@@ -79,7 +84,7 @@ def _floored(reference: Array) -> Array:
 
 
 def _scaled(weight: Array, variance: Array) -> Array:
-    # So that F is in units of the measurements' noise, and priors keep their meaning; sensor noise of nothing leaves
-    # weights of mean one.
+    # Scale the weights so that F is in units of the measurements' noise and priors keep their meaning; where the sensor
+    # noise is zero, the weights have mean one instead.
     total = float(weight @ variance)
     return np.asarray(weight * (len(weight) / total if total > 0 else 1 / weight.mean()))

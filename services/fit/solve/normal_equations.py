@@ -1,9 +1,9 @@
-"""Unbiased sums over measurements from noisy Jacobians and images, and how noisy each sum is.
+"""Unbiased normal equations from noisy Jacobians and images, with the noise of each sum.
 
 Two independently seeded estimates j1, j2 of a derivative have the mean m = (j1 + j2) / 2 and the difference d = j1 -
 j2. Then m m' - d d' / 4 is the symmetrised product of the two, unbiased for j j', and for any direction u the product
 (u'j1)(u'j2) has the variance E[(u'm)^2 (u'd)^2] (m and d are uncorrelated; exact for Gaussian noise). So one pair of
-estimates gives every sum here together with its own error.
+estimates gives every sum of this module together with its own variance.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ class NormalEquations:
     hessian: Array
     """sum w j j', (F, F), from two independent seeds; may be indefinite."""
     gradient: Array
-    """sum w j r, (F,), residual from a third and a fourth seed."""
+    """sum w j r, (F,), with the residual from a third and a fourth seed."""
     hessian_noise: CurvatureNoise
     gradient_noise: Array
     """Monte Carlo covariance of the gradient, (F, F)."""
     data_noise: Array
-    """Covariance of the gradient by the noise of the measurements, J'W Sigma W J, (F, F)."""
+    """Covariance (F, F) of the gradient by the noise of the measurements, J'W Sigma W J."""
     squares: float = 0.0
     """sum w (r^2 - its Monte Carlo variance)."""
     expected_squares: float = 0.0
-    """sum w var_ref: what ``squares`` would be if only the measurements' noise were left."""
+    """sum w var_ref: the expectation of ``squares`` where the residuals are the measurements' noise alone."""
     carried: Array | float = 0.0
-    """How far (F,) the gradient was carried by this curvature since it was measured, mean over its samples."""
+    """Step (F,) over which the gradient was carried by this curvature since it was measured, mean over its samples."""
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
         return NormalEquations(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     def record(self) -> dict[str, Any]:
-        """As JSON values."""
+        """The sums as JSON values."""
         arrays = {f.name: np.asarray(getattr(self, f.name)).tolist() for f in fields(self) if f.name != "hessian_noise"}
         return arrays | {"hessian_noise": self.hessian_noise.record()}
 
     @staticmethod
     def of(record: dict[str, Any]) -> NormalEquations:
-        """From ``record``."""
+        """Normal equations from the JSON values of ``record``."""
         values: dict[str, Any] = {
             name: np.array(value) if isinstance(value, list) else value
             for name, value in record.items()
@@ -59,7 +59,7 @@ class NormalEquations:
         return NormalEquations(**values, hessian_noise=CurvatureNoise.of(record["hessian_noise"]))
 
     def scaled(self, factor: float) -> NormalEquations:
-        """The same with every weight multiplied: sums scale once, their covariances twice."""
+        """The sums with every weight multiplied by ``factor``: sums scale with it, covariances with its square."""
         linear, quadratic = factor, factor**2
         return NormalEquations(
             self.hessian * linear,
@@ -73,7 +73,7 @@ class NormalEquations:
         )
 
     def moved(self, step: Array) -> NormalEquations:
-        """The quadratic model seen from ``step`` further on; the curvature's noise enters the gradient."""
+        """The quadratic model expanded at ``step`` (F,) from here; the curvature's noise adds to the gradient's."""
         noise = self.gradient_noise + self.hessian_noise.of_product(step)
         return replace(
             self, gradient=self.gradient + self.hessian @ step, gradient_noise=noise, carried=self.carried + step
@@ -85,7 +85,8 @@ class NormalEquations:
 
 
 Region = tuple[Sequence[int], NDArray[np.bool_]]
-"""The coordinates that act on some measurements (M,), as far as the curvature's noise is concerned."""
+"""Coordinates on which some of the measurements depend, and the mask (M,) of these measurements, for the noise of the
+curvature."""
 
 
 def normal_equations(
@@ -99,12 +100,12 @@ def normal_equations(
     regions: Sequence[Region] | None = None,
     exact: int = 0,
 ) -> NormalEquations:
-    """Sum one block of measurements.
+    """Normal equations of one block of measurements.
 
-    Images of a pixel under all lights, and their derivatives, are of the same walks: their errors are correlated. So
-    noise is that of sums over the lights of a pixel, pixels being independent. With halves of differences d of J and s
-    of r, the sum of w m r over a pixel's lights has the covariance [sum w m s][..]' + [sum w r d][..]' - [sum w d
-    s][..]': the last term is what the first two both count.
+    The images of a pixel under all lights, and their derivatives, come from the same walks, so their errors are
+    correlated. The noise is therefore that of sums over the lights of a pixel; pixels are independent. With half
+    differences d of J and s of r, the sum of w m r over a pixel's lights has the covariance [sum w m s][..]' + [sum w r
+    d][..]' - [sum w d s][..]'; the last term corrects for a part that both of the first two contain.
 
     Args:
         j1, j2: derivatives (F, M) from two independent seeds.
@@ -112,10 +113,11 @@ def normal_equations(
         reference_variance: variance of the reference (M,).
         weight: (M,), 0 where a measurement does not count.
         lights: M = lights x pixels, light by light.
-        regions: which together hold all measurements; None for one of all coordinates.
-        exact: so many of the last derivatives, such as those to a gain, are of the very renders of r1 and r2. So each
-            is multiplied with the residual of the other, and what their own noise does to the curvature, far less than
-            that of the other derivatives, counts as nothing.
+        regions: sets of coordinates and measurements that together cover all measurements; None for one region of all
+            coordinates.
+        exact: number of coordinates, the last of all, whose derivatives, such as those to a gain, come from the very
+            renders of r1 and r2. Each of these derivatives is multiplied with the residual of the other render; their
+            own noise in the curvature, far smaller than that of the other derivatives, is neglected.
     """
     mean, difference = 0.5 * (j1 + j2), j1 - j2
     residual, spread = 0.5 * (r1 + r2), 0.5 * (r1 - r2)
@@ -131,7 +133,7 @@ def normal_equations(
         for near, chosen in regions
     ]
 
-    # Gradient, and its noise by pixels.
+    # The gradient, and its noise summed pixel by pixel.
     by_image, by_jacobian, by_both = (
         per_pixel(terms, lights)
         for terms in (weighted * spread, 0.5 * weight * difference * residual, 0.5 * weight * difference * spread)
@@ -154,9 +156,9 @@ def normal_equations(
 
 
 def pool(old: NormalEquations, old_samples: float, new: NormalEquations, new_samples: float) -> NormalEquations:
-    """Mean of two independent estimates of the same sums, weighted by their samples.
+    """Mean of two independent estimates of the same normal equations, weighted by their samples.
 
-    The measurements are the same ones: their own noise does not average.
+    Both use the same measurements, so the measurements' own noise does not average out.
     """
     share = new_samples / (old_samples + new_samples)
     pooled = old.scaled(1 - share) + new.scaled(share)
@@ -165,7 +167,7 @@ def pool(old: NormalEquations, old_samples: float, new: NormalEquations, new_sam
 
 @dataclass(frozen=True)
 class LossChange:
-    """Change of F = 1/2 sum w r^2 between two points, both rendered with the same two seeds, and its Monte Carlo
+    """Change of F = 1/2 sum w r^2 between two points that are rendered with the same two seeds, and its Monte Carlo
     variance.
     """
 
@@ -190,19 +192,19 @@ def loss_change(
     lights: int,
     cell: NDArray[np.int32] | None = None,
 ) -> LossChange:
-    """Compare residuals (M,), M = lights x pixels, at two points; index 1 and 2 are independent seeds, each shared by
+    """Compare residuals (M,), M = lights x pixels, at two points. Indices 1 and 2 are independent seeds, each shared by
     both points (common random numbers).
 
     The loss is the product of two independent residuals, so Monte Carlo noise does not bias it. Its variance follows
-    from the same identity as above, applied to the bilinear form n1 n2 - o1 o2, and is summed by pixels, whose lights
-    share their walks.
+    from the identity of this module, applied to the bilinear form n1 n2 - o1 o2, and is summed pixel by pixel, because
+    the lights of a pixel share their walks.
 
-    Few paths make the product of both seeds' noise its largest part. Sums over cells instead of pixels, of the cells'
-    mean residuals, keep what changes slowly from pixel to pixel, as what parameters do, and have a share of that noise
-    that falls with the root of a cell's pixels.
+    With few paths, the product of both seeds' noise is the largest part of the variance. Sums over cells instead of
+    pixels, of the cells' mean residuals, keep changes that vary slowly from pixel to pixel, as those by parameters do;
+    their share of that noise falls with the root of the number of pixels of a cell.
 
     Args:
-        cell: number (N,) of each pixel's cell; None where pixels stand alone.
+        cell: index (N,) of each pixel's cell; None to treat each pixel alone.
     """
     if cell is not None:
         total = _by_cell(weight, cell, lights)

@@ -1,17 +1,17 @@
-"""The instrument's errors and their prior once more, by how far either is off: the best unbiased combination of the
-two.
+"""Second combination of the instrument's errors with their prior: the linear unbiased estimate of least variance.
 
-A fit weighs the errors' prior against photographs whose noise alone it knows, by derivatives that are not the images'
-own. Held mean cosines, moves of scan and dome, and those derivatives leave an answer x (F,) with more error than that,
-so its errors e, the last K of x, may be worse than their prior was. The prior says e = m + n, n of covariance V. With B
-= dx / dm, the answer's response to the prior, and d = e - m,
+A fit weighs the errors' prior against photographs of which it knows the noise alone, by derivatives that are not the
+images' own. Held mean cosines, movements of scan and dome, and those derivatives give the solution x (F,) more error
+than that, so its errors e, the last K of x, may be less precise than their prior. The prior says e = m + n, n of
+covariance V. With B = dx / dm, the solution's response to the prior, and d = e - m,
 
     c = Cov(x, d) = C[:, e] - B V,   D = Cov(d) = C[e, e] - B[e] V - V B[e]' + V,   G = c D^-1,
     x <- x - G d,   C <- C - c D^-1 c'
 
 is the linear unbiased combination of least variance (Gauss and Markov). Where the fit used its prior in full, c = 0 and
-nothing changes; after it no ± of an error is larger than the prior's. The tissue goes along as far as its error goes
-with the instrument's. An error that lies too far from its prior is freed of it.
+nothing changes; afterwards no standard error of an instrument error is larger than the prior's. The tissue's parameters
+change by as much as their error is correlated with the instrument's. An error that lies too far from its prior is freed
+of the prior.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SMALLEST_SHARE = 1e-9
-"""A direction of d whose variance is a smaller share of the prior's is rounding: there the answer is the prior."""
+"""Smallest variance of a direction of d, as a share of the prior's. Below it the variance is rounding: the solution
+equals the prior there."""
 
 
 @dataclass(frozen=True)
 class Recombination:
-    """An answer and its prior, to be combined once more."""
+    """A solution and the prior of its last K coordinates, to be combined."""
 
     covariance: Array
-    """C (F, F) of the answer."""
+    """Covariance C (F, F) of the solution."""
     response: Array
-    """B (F, K)."""
+    """Response B = dx / dm (F, K) of the solution to the prior's mean."""
     prior: Array
-    """V (K, K)."""
+    """Covariance V (K, K) of the prior."""
 
     @property
     def cross(self) -> Array:
@@ -45,13 +46,13 @@ class Recombination:
 
     @property
     def spread(self) -> Array:
-        """D (K, K): covariance of the errors of the answer about their prior, if neither is wrong."""
+        """Covariance D (K, K) of d, if neither solution nor prior is faulty."""
         common = self.follows @ self.prior
         return np.asarray(self.covariance[self._first :, self._first :] - common - common.T + self.prior)
 
     @property
     def follows(self) -> Array:
-        """B[e] (K, K): how far the answer's errors follow their prior."""
+        """Response B[e] (K, K) of the solution's own errors to the prior's mean."""
         return self.response[self._first :]
 
     @property
@@ -62,8 +63,8 @@ class Recombination:
         """Q (F, K) of the best combination x + Q d, which is -G where every prior is believed.
 
         Args:
-            wrong: places of errors whose prior is not. The answer is freed of these: their prior's means go where the
-                answer puts the errors.
+            wrong: indices of the errors whose prior is rejected. The solution is freed of these priors: their means are
+                set where the solution puts the errors.
         """
         used = [k for k in range(len(self.prior)) if k not in wrong]
         freed = np.zeros_like(self.response)
@@ -77,7 +78,7 @@ class Recombination:
         return np.asarray(freed + change @ through)
 
     def after(self, change: Array) -> Recombination:
-        """The answer x + Q d."""
+        """The solution x + Q d, with its covariance and response."""
         both = change @ self.cross.T
         covariance = self.covariance + both + both.T + change @ self.spread @ change.T
         response = self.response + change @ (self.follows - np.eye(len(self.prior)))
@@ -85,7 +86,7 @@ class Recombination:
 
 
 def _inverse(spread: Array, unit: Array) -> Array:
-    # In units of the prior's ±; directions without any spread have no part in c either.
+    # Pseudo-inverse in units of the prior's standard errors: directions of d without variance have none in c either.
     values, vectors = np.linalg.eigh(0.5 * (spread + spread.T) / np.outer(unit, unit))
     kept = values > SMALLEST_SHARE
     whitened = (vectors[:, kept] / np.sqrt(values[kept])) / unit[:, None]
@@ -93,31 +94,32 @@ def _inverse(spread: Array, unit: Array) -> Array:
 
 
 FAULT_Z = 3.0
-"""An error that lies more than so many standard errors from its prior is a fault of the calibration: 1 good one in 370
-does."""
+"""An error that lies more than this many standard errors from its prior is a fault of the calibration: 1 sound error in
+370 is taken for one."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """An error that lies farther from its prior than both allow."""
+    """A calibration error that lies farther from its prior than the standard errors of both allow."""
 
     place: int
-    """Its place among the errors."""
+    """Index among the errors."""
     size: float
-    """What the images say of it, without its prior."""
+    """Estimate of the prior's fault from the images, in the error's unit."""
     z: float
-    """That over what the images' errors and the prior's ± allow together."""
+    """``size`` over its standard error, which covers the images' errors and the prior's."""
 
 
 def faults(off: Array, found: Recombination) -> tuple[Fault, ...]:
-    """Errors that lie more than ``FAULT_Z`` standard errors from their prior, the clearest first.
+    """Errors that lie more than ``FAULT_Z`` standard errors from their prior, the most significant first.
 
-    A prior that is off by f moves d by f h, h = (1 - B[e])'s own column, so f = h'D^-1 d / h'D^-1 h is what all errors
-    together say of it. One by one: each fault is taken out before the others are judged, as a wrong one draws others
-    along (Baarda 1968).
+    A prior that is off by f moves d by f h, with h the error's own column of 1 - B[e], so f = h'D^-1 d / h'D^-1 h is
+    the estimate of f from all errors together. The faults are removed one by one before the others are tested, because
+    a faulty error biases the others (data snooping, Baarda 1968).
 
     Args:
-        off: d (K,), errors of the first answer less their prior's mean.
+        off: d (K,), errors of the first solution less their prior's mean.
+        found: the first solution and its prior.
     """
     moves, weight = np.eye(len(off)) - found.follows, _inverse(found.spread, np.sqrt(np.diag(found.prior)))
     left, told = set(range(len(off))), list[Fault]()

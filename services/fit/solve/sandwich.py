@@ -1,5 +1,5 @@
-"""Cov(x) = T M^-1 meat M^-T T' of a fit's answer, and the same after the prior of the instrument's errors was used in
-full (``recombination``).
+"""Sandwich covariance Cov(x) = T M^-1 meat M^-T T' of a fit's solution, before and after the prior of the instrument's
+errors is used in full (``recombination``).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sandwich:
-    """Cov(x) = T M^-1 meat M^-T T', each (F, F), with the prior of the last K coordinates used in full."""
+    """Factors of Cov(x) = T M^-1 meat M^-T T', each (F, F), with the prior of the last K coordinates used in full."""
 
     transform: Array
     inverse: Array
@@ -27,17 +27,17 @@ class Sandwich:
     misfit: float
     """Factor s by which residuals exceed the measurements' noise."""
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """V (K, K) of the instrument's errors."""
+    """Covariance V (K, K) of the prior of the instrument's errors."""
     wrong: tuple[int, ...] = ()
-    """Places of those whose prior is not believed."""
+    """Indices of the instrument's errors whose prior is rejected as a fault."""
 
     @property
     def covariance(self) -> Array:
-        """Of x, (F, F)."""
+        """Covariance (F, F) of x."""
         return self.covariance_of(self.inverse, self.meat)
 
     def covariance_of(self, inverse: Array, meat: Array) -> Array:
-        """The same of another M^-1 and meat, each (F, F)."""
+        """Covariance (F, F) of x for another M^-1 and meat, each (F, F)."""
         plain = self.plain(inverse, meat)
         if not len(self.prior):
             return plain
@@ -45,19 +45,19 @@ class Sandwich:
         return found.after(found.change(self.wrong)).covariance
 
     def plain(self, inverse: Array, meat: Array) -> Array:
-        """T M^-1 meat M^-T T', (F, F): before the prior is used again."""
+        """Covariance T M^-1 meat M^-T T' (F, F) before the prior is used in full."""
         half = self.transform @ inverse
         return np.asarray(half @ meat @ half.T)
 
     def response(self, inverse: Array) -> Array:
-        """B = dx / dm (F, K): how the answer follows the mean of the errors' prior."""
+        """Response B = dx / dm (F, K) of the solution to the mean of the errors' prior."""
         own = self.transform[len(self.transform) - len(self.prior) :]
         return np.asarray(self.transform @ inverse @ own.T @ np.linalg.inv(self.prior))
 
 
 @dataclass(frozen=True)
 class Settled:
-    """An answer after its prior was used in full."""
+    """Solution after the prior of the instrument's errors was used in full."""
 
     x: Array
     covariance: Array
@@ -65,7 +65,8 @@ class Settled:
     sandwich: Sandwich
     faults: tuple[Fault, ...]
     is_whole: bool = True
-    """Whether the answer went all the way there, or as far as one linear model reaches."""
+    """Whether the solution took the whole step; False where the step was shortened to the range in which images are
+    linear."""
 
 
 def settle(
@@ -76,12 +77,16 @@ def settle(
     unfinished: Array,
     part_count: int = 1,
 ) -> Settled:
-    """Use the prior of the instrument's errors in full, but that of an error that is a fault of the calibration.
+    """Use the prior of the instrument's errors in full, except for errors that are found to be faults of the
+    calibration.
 
     Args:
-        meats: whitened, by source; they add up to the sandwich's.
-        unfinished: covariance (F, F) of what is left of the step.
-        part_count: how many things the fit is about that images tell apart, such as the teeth of a jaw.
+        domain: coordinates of the fit and the prior of the instrument's errors.
+        x: the solution (F,).
+        sandwich: factors of its covariance.
+        meats: whitened parts of the meat by source, (F, F) each; they add up to the sandwich's meat.
+        unfinished: covariance (F, F) of the remaining step to the minimum.
+        part_count: number of objects that the fit treats as separate in the images, such as the teeth of a jaw.
     """
     count, plain = domain.tissue_count, {name: sandwich.plain(sandwich.inverse, meat) for name, meat in meats.items()}
     whole = sandwich.plain(sandwich.inverse, sandwich.meat) + unfinished
@@ -95,13 +100,13 @@ def settle(
     change = found.change(wrong)
     after = found.after(change)
 
-    # Every part but the prior's goes through 1 + Q; the prior's columns are what the new answer makes of them.
+    # Transform every part but the prior's by 1 + Q; the prior's parts follow from the new solution's response.
     through = np.eye(len(x))
     through[:, count:] += change
     parts = {name: through @ part @ through.T for name, part in plain.items()} | _of_prior(domain, after)
 
-    # As much of the step as moves the tissue by one scale for each thing, as images are not linear farther than that;
-    # the rest of it counts as error.
+    # Take only as much of the step as moves the tissue by one scale for each object, because images are not linear
+    # farther than that; the rest of the step counts as error.
     step, (low, high) = change @ x[count:], domain.bounds
     length = float(np.linalg.norm((step / domain.scale)[:count]) / np.sqrt(part_count))
     gone = np.asarray(step / max(1.0, length), dtype=np.float64)
@@ -112,8 +117,8 @@ def settle(
 
 
 def _of_prior(domain: Domain, found: Recombination) -> dict[str, Array]:
-    # What the prior's error, of covariance V = L L', makes of the answer by kind; what kinds that go together have in
-    # common counts for the first of them.
+    # Covariance of the solution by the prior's error, of covariance V = L L', split by kind of error. Where kinds are
+    # correlated, their common part counts for the first of them.
     kinds = np.array([kind_of_error(name) for name in domain.errors.names])
     halves = found.response @ np.linalg.cholesky(found.prior)
     return {kind: halves[:, kinds == kind] @ halves[:, kinds == kind].T for kind in dict.fromkeys(kinds.tolist())}

@@ -1,8 +1,9 @@
-"""Start of a fit: the best homogeneous tooth in a table over albedo x density x anisotropy (teeth 2018, section 7).
+"""Search for the start of a fit: the best homogeneous tooth in a table over albedo x density x anisotropy (teeth 2018,
+section 7).
 
-An image is a polynomial in the albedo when its paths are kept by scattering order, I(alpha) = sum_n alpha^n I_n. So a
+An image is a polynomial in the albedo when its paths are binned by scattering order, I(alpha) = sum_n alpha^n I_n. So a
 render at alpha = 1, split into bins of orders, gives every albedo at once, and tens of renders over density x
-anisotropy carry tens of thousands of table points.
+anisotropy give tens of thousands of table points.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ from services.fit.optics.domain import to_natural
 Array = NDArray[np.float64]
 
 REDUCED_DENSITIES = (0.2, 0.4, 0.7, 1.1, 1.6, 2.3, 3.3, 4.8)
-"""Reduced scattering sigma (1 - g), per mm: the literature's span for enamel and dentin. A grid in it, not in sigma,
-keeps every render as costly as needed."""
+"""Reduced scattering coefficients sigma (1 - g), per mm: the literature's span for enamel and dentin. The grid is in
+the reduced coefficient and not in sigma, so that every render costs no more than needed."""
 ANISOTROPIES = (0.0, 0.7)
 KAPPA = (1.0, 3.0)
-"""Range of -log10(1 - alpha). Not beyond: where absorption is invisible the fit would start on a plateau."""
+"""Range of -log10(1 - alpha). The upper limit is where absorption becomes invisible; beyond it the fit would start on a
+plateau."""
 SCALE_TRUST = 0.35
-"""Log-scale misfit that costs as much as a relative image error of 1: lights are calibrated, but one medium stands for
-two."""
+"""Weight of the logarithm of the image scale against the relative image error. It is small although lights are
+calibrated, because one medium stands for two."""
 
 
 def order_edges(last: int = 2048) -> NDArray[np.int64]:
@@ -49,7 +51,7 @@ def bin_powers(alpha: Array, edges: NDArray[np.int64]) -> Array:
 
 @dataclass(frozen=True)
 class Node:
-    """One render of the table."""
+    """Density (1/mm) and anisotropy of one render of the table."""
 
     sigma: float
     g: float
@@ -57,7 +59,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A point of the table and how well it explains the photographs."""
+    """A point of the table and the error of its images."""
 
     sigma: float
     alpha: float
@@ -65,16 +67,16 @@ class Candidate:
     error: float
     """Relative image error after the best common scale, 0 to 1."""
     scale: float
-    """That scale: photographs over renders."""
+    """The best common scale: photographs over renders."""
 
     @property
     def score(self) -> float:
-        """What the search minimises: shape error and, weakly, the scale's distance from 1."""
+        """The quantity that the search minimises: image error and, with a small weight, the scale's distance from 1."""
         return float(np.hypot(self.error, np.log(self.scale) * SCALE_TRUST)) if self.scale > 0 else np.inf
 
 
 def nodes() -> tuple[Node, ...]:
-    """The renders of one channel's table."""
+    """The nodes of one channel's table."""
     return tuple(Node(reduced / (1 - g), g) for g in ANISOTROPIES for reduced in REDUCED_DENSITIES)
 
 
@@ -88,7 +90,7 @@ class Observed:
 
     @staticmethod
     def of(block: Block) -> Observed:
-        """From a stored block."""
+        """Photographs of a stored block."""
         return Observed(block.reference.reshape(-1), block.variance.reshape(-1), block.fit_weight.reshape(-1))
 
 
@@ -102,15 +104,17 @@ def search_node(
     """Errors of one node's table points, best first.
 
     Args:
+        node: density and anisotropy of the renders.
         orders: per block, two independently seeded images at alpha = 1 by bin of order, (K, L, N) each.
-        observed: per block, what was photographed.
+        edges: bin edges (K + 1,) over the number of scatterings.
+        observed: per block, the photographs.
         albedos: number of albedo values.
     """
     alpha = np.array([to_natural("alpha", x) for x in np.linspace(*KAPPA, albedos)])
     powers = bin_powers(alpha, edges)
 
-    # <C,R> and <C,C> are polynomials in the same powers, so no image is formed per albedo; two seeds keep noise out of
-    # <C,C>.
+    # <C,R> and <C,C> are polynomials in the same powers, so no image is formed per albedo; products of two seeds keep
+    # <C,C> unbiased by noise.
     bins = len(edges) - 1
     cross, gram, total = np.zeros(bins), np.zeros((bins, bins)), 0.0
     for (first, second), seen in zip(orders, observed, strict=True):

@@ -15,21 +15,22 @@ Array = NDArray[np.float64]
 
 
 class Noise(Protocol):
-    """How noisy a curvature H (F, F) is."""
+    """Noise of a curvature H (F, F)."""
 
     def variance(self, directions: Array) -> Array:
         """Variance of u'Hu for each column u of ``directions`` (F, K)."""
 
 
 def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: Array | None = None) -> Array:
-    """Step p that minimises g'p + p'Hp/2 over norm(p) <= radius, in coordinates where a ball is meant.
+    """Step p (F,) that minimises g'p + p'Hp/2 over norm(p) <= radius, in coordinates scaled so that the region is a
+    ball.
 
     Args:
         hessian: symmetric (F, F), may be indefinite.
-        gradient: (F,)
+        gradient: gradient g (F,).
         radius: largest length of the step, positive.
-        curvature_floor: least curvature (F,) that is believed in each eigendirection, ascending order of H's
-            eigenvalues; noise level of the eigenvalue.
+        curvature_floor: least curvature (F,) that is used in each eigendirection, in ascending order of H's
+            eigenvalues: the noise level of the eigenvalue; None for zero.
 
     Raises:
         NonFiniteError: NaN or infinity in the input.
@@ -43,17 +44,18 @@ def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: 
     if size == 0.0 or radius <= 0.0:
         return np.zeros_like(gradient)
 
-    # Work with numbers of order one, whatever the units of the loss.
+    # Scale the numbers to order one, whatever the units of the loss.
     largest = max(float(np.abs(hessian).max()), size / radius)
     eigenvalues, vectors = np.linalg.eigh(hessian / largest)
     floor = np.zeros_like(eigenvalues) if curvature_floor is None else np.maximum(curvature_floor / largest, 0.0)
     slope = vectors.T @ (gradient / largest)
 
-    # Curvature that is negative or below its noise is raised to the noise; rounding alone sets the least value.
+    # Raise curvature that is negative or below its noise to the noise; the least value is set by rounding alone.
     tiny = 1e-13 * max(1.0, float(np.abs(eigenvalues).max()))
     curvature = np.maximum(np.maximum(eigenvalues, floor), tiny)
 
-    # One damping for all directions, by bisection on the length of the step, which falls monotonically with it.
+    # Find one damping for all directions by bisection on the length of the step, which falls monotonically with the
+    # damping.
     def length(damping: float) -> float:
         return float(np.linalg.norm(slope / (curvature + damping)))
 
@@ -77,11 +79,18 @@ def solve_box(
     radius: float,
     hessian_noise: Noise | None = None,
 ) -> Array:
-    """Step p from x with norm(p / scale) <= radius and x + p within bounds; coordinates that would leave are set on
-    their bound and the rest solved again.
+    """Step p (F,) from x with norm(p / scale) <= radius and x + p within bounds (an active-set method).
+
+    Coordinates that would leave their bounds are set on the bound, and the others are solved again.
 
     Args:
-        hessian_noise: as in NormalEquations, for the least believed curvature; None for exact curvature.
+        hessian: symmetric (F, F), may be indefinite.
+        gradient: gradient (F,) at x.
+        x: present point (F,).
+        bounds: lower and upper bounds, (F,) each.
+        scale: length scale (F,) of each coordinate, positive.
+        radius: largest scaled length of the step.
+        hessian_noise: noise of the curvature, which sets the least curvature that is used; None for exact curvature.
     """
     low, high = bounds
     step = np.zeros_like(x)
@@ -103,7 +112,7 @@ def solve_box(
         room = max(radius**2 - float(((step[fixed] / scale[fixed]) ** 2).sum()), 0.0) ** 0.5
         step[index] = s * solve_ball(reduced, slope, room, floor)
 
-        # A coordinate stays free as long as its own step stays inside.
+        # Keep a coordinate free as long as its own step stays inside its bounds.
         target = x + step
         leaving = free & ((target < low) | (target > high))
         if not leaving.any():
