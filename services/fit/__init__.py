@@ -1,1 +1,3 @@
-"""Light transport, its derivatives, the inverse problem, and the exported asset."""
+"""Fit of tissue optics to photographs: light transport, its derivatives, the inverse problem, and the
+exported asset.
+"""

@@ -1,4 +1,4 @@
-"""The fit service's doors: ``run`` fits a prepared capture, ``export`` turns the fit into an asset."""
+"""Entry points of the fit service: ``run`` fits a prepared capture, ``export`` turns the fit into an asset."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ ENGINE = "services.fit.transport.engine:Engine"
 
 
 PACKAGES = ("drjit", "jinja2", "manifold3d", "mitsuba", "numba", "PIL", "rtree", "scipy", "xatlas")
-"""What the extra ``fit`` brings, by the names under which it is imported."""
+"""Packages of the extra ``fit``, by the names under which they are imported."""
 
 
 def check() -> None:
-    """Import what a fit and its export need, and render one pixel.
+    """Import the packages and modules that a fit and its export need, and render one pixel.
 
     Raises:
-        PlatformError: something is missing, or the renderer does not work.
+        PlatformError: a package is missing, or the renderer does not work.
     """
     from services.fit.transport.platform import import_renderer, require_renderer
 
-    with suppress(ModuleNotFoundError):  # told as a package below
+    with suppress(ModuleNotFoundError):  # require_packages reports the missing package below
         import_renderer()
     require_packages(PACKAGES, "fit")
     for module in ("services.fit.jaw.driver", "services.fit.export.report", "services.fit.transport.engine"):
@@ -50,15 +50,17 @@ def check() -> None:
 def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitReport:
     """Fit every channel and publish ``fit/``: report, history, task trace, pictures.
 
-    Inside a Dask task the passes spread over the cluster and this task holds no slot; elsewhere they run in this
-    process. Each step is on disk before the next begins; a new attempt continues after the last one.
+    Inside a Dask task the passes run on the cluster and this task holds no slot; elsewhere they run in this process.
+    Each step is on disk before the next begins; a new attempt continues after the last recorded step.
 
     Args:
-        engine: who renders, as ``module:class``.
+        spec: the job.
+        context: folder, progress and cancellation of the job.
+        engine: rendering engine, as ``module:class``.
 
     Raises:
-        CaptureInputError, SettingsError, StoreError: what was prepared cannot be fitted as asked. JobCancelledError:
-            between two steps.
+        CaptureInputError, SettingsError, StoreError: the prepared capture cannot be fitted as the job asks.
+        JobCancelledError: the job was cancelled; raised between two steps.
     """
     from services.fit.execution.attempt import Attempt
     from services.fit.jaw.driver import JawDriver
@@ -90,7 +92,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     """Write the asset, and parameters.json, errors.json and report.html beside it in the job's folder.
 
     Raises:
-        StoreError: fit or prepared stage missing or damaged.
+        StoreError: the fit or the prepared stage is missing or damaged.
     """
     import numpy as np
 
@@ -179,7 +181,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
 def fitted_teeth(
     prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport
 ) -> tuple[Tooth, ...]:
-    """The teeth with the dentin surfaces the fit ended with."""
+    """The teeth with the fitted dentin surfaces."""
     from services.core.files.meshes import read_teeth
     from services.fit.jaw.driver import jaw_dentins
     from services.fit.tooth.driver import dentin_shape
@@ -207,9 +209,9 @@ def _with_dentin(tooth: Tooth, dentin: DentinShape | None, shape: tuple[float, .
 
 
 def describe_options(spec: JobSpec) -> str:
-    """The options with which a fit was made, where they are not at their defaults.
+    """Options of a fit that differ from their defaults, as one sentence.
 
-    Paths lead nowhere for whoever reads a report.
+    Paths are left out, because they mean nothing to the reader of a report.
     """
     named = spec.changed_options - {"kind", "capture", "rig", "calibration", "seed", "workers", "priority"}
     values = spec.model_dump(mode="json", include=set(named))

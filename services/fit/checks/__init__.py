@@ -1,1 +1,3 @@
-"""What a fit is worth: errors, ±, alignment, what images cannot tell, and what to capture next."""
+"""Checks of a fit: image errors, standard errors, alignment, undetermined parameters, and advice for the
+next capture.
+"""

@@ -1,1 +1,1 @@
-"""How a fit runs: its steps, tasks over blocks of pixels, engines in processes, the journal."""
+"""Execution of a fit: its steps, tasks over blocks of pixels, engines in processes, the journal."""

@@ -77,7 +77,7 @@ class Journal:
             self._append(_line({"key": key, "value": value}))
         except BaseException:
             self._inode = (
-                None  # what was written of the line, if anything, goes with the file: the next result begins it anew
+                None  # discard a partly written line with its file: the next result begins a new one
             )
             raise
         self.entries[key] = value

@@ -1,1 +1,1 @@
-"""The asset: Mitsuba scene, parameters, report."""
+"""Export of a fit: Mitsuba scene, parameters, report."""

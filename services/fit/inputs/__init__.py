@@ -1,1 +1,1 @@
-"""What a fit is made from: measured pixels with their weights, and the textures of stains."""
+"""Inputs of a fit: measured pixels with their weights, and the layout of stain textures."""

@@ -1,4 +1,4 @@
-"""Which images a fit does not see, to be judged by them."""
+"""Images that are held out of a fit to test it."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from services.core.records import JobSpec, PreparedManifest
 
 
 def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:
-    """Which images (camera, light) stay out of the fit: the job's choice, else the capture's, else every fourth light,
-    at least one.
+    """Mask (camera, light) of the held-out images: the job's choice, else the capture's, else every fourth light, at
+    least one.
 
     Raises:
-        SettingsError: a light or camera is unknown or none is left to fit. CaptureInputError: fewer than two lights.
+        SettingsError: a light or camera is unknown, or no image is left to fit.
+        CaptureInputError: fewer than two lights.
     """
     cameras, lights = [c.name for c in manifest.cameras], [light.name for light in manifest.lights]
     if len(lights) < 2:

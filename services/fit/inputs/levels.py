@@ -1,7 +1,6 @@
-"""Prepared images at the resolution that is fitted: squares of pixels averaged to one, none left out.
+"""Prepared images at the resolution of the fit: squares of pixels are averaged to one pixel, and none is skipped.
 
-A square is the pixel of a camera with so many times fewer of them, so what a scene is rendered for is exactly what was
-averaged.
+A square is one pixel of a camera with fewer and larger pixels, so renders and averages cover exactly the same areas.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ BoolArray = NDArray[np.bool_]
 
 
 def reduced_camera(camera: Camera, step: int) -> Camera:
-    """The camera whose pixels are squares of ``step`` by ``step`` pixels; what is left of a square at the right and
-    below is dropped.
+    """Camera whose pixels are squares of ``step`` by ``step`` pixels; incomplete squares at the right and at the bottom
+    are dropped.
     """
     first, second, last = camera.K
     width, height = camera.size
@@ -41,18 +40,20 @@ def averaged(values: NDArray[Any], step: int) -> Array:
 
 
 def whole_squares(chosen: BoolArray, step: int) -> BoolArray:
-    """Squares (height // step, width // step) of which every pixel is chosen; a part of one would have another mean
-    than what is rendered.
+    """Mask (height // step, width // step) of the squares whose pixels are all chosen; the chosen part of a square
+    would have another mean than the rendered whole.
     """
     height, width = (n // step for n in chosen.shape)
     return np.asarray(chosen[: height * step, : width * step].reshape(height, step, width, step).all(axis=(1, 3)))
 
 
 class LevelReader:
-    """One channel of a prepared store, averaged.
+    """Reader of one channel of a prepared store, averaged over squares.
 
     Args:
-        store: ``prepared.zarr``. index: of the channel. step: pixels of a square's edge.
+        store: path of ``prepared.zarr``.
+        index: index of the channel.
+        step: edge of a square, in pixels.
     """
 
     def __init__(self, store: Path, index: int, step: int) -> None:
@@ -62,11 +63,13 @@ class LevelReader:
         self._index, self.step = index, step
 
     def image(self, number: int, light: int, camera: Camera) -> tuple[Array, Array]:
-        """Radiance and its variance (H, W) of one image; errors of a square's pixels are independent, so their
-        variances add.
+        """Radiance and its variance, (H, W) each, of one image. The errors of a square's pixels are independent, so
+        their variances add.
 
         Args:
-            camera: as it was before it was reduced.
+            number: index of the camera.
+            light: index of the light.
+            camera: the camera at full resolution.
         """
         width, height = camera.size
         radiance, variance = (
@@ -76,6 +79,6 @@ class LevelReader:
         return radiance, variance / self.step**2
 
     def bits(self, number: int, light: int, camera: Camera) -> NDArray[np.uint16]:
-        """Mask bits (height, width) of one image, not reduced."""
+        """Mask bits (height, width) of one image at full resolution."""
         width, height = camera.size
         return np.asarray(self._valid[number, light, :height, :width], dtype=np.uint16)

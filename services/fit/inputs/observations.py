@@ -1,4 +1,4 @@
-"""From the prepared stage to a fit's inputs: which measurements count, how much, and in which blocks."""
+"""Inputs of a fit from the prepared stage: its measurements, their weights, and their partition into blocks."""
 
 from __future__ import annotations
 
@@ -27,19 +27,23 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 Array = NDArray[np.float64]
 
 CELL_EDGE = 4
-"""Losses are compared as means over squares of so many pixels of the coarse grid: what parameters change is smooth, and
-noise is not."""
+"""Edge of a comparison cell, in pixels of the coarse grid. Losses are compared as means over cells, because changes by
+parameters are smooth and noise is not."""
 MIN_CELLS = 24
-"""Squares are smaller where a view would have about fewer, so that they still tell the comparison's error."""
+"""Least number of cells of a view, approximately: cells are smaller where there would be fewer, so that the error of a
+comparison can still be estimated."""
 COARSE_PIXELS = 600
-"""Most pixels of a view, for each of its teeth, in all stages but the last, and while the fit is watched."""
+"""Largest number of pixels of a view, for each of its teeth, in all stages but the last, and in the evaluations after
+each step."""
 SEARCH_PIXELS = 210
-"""Pixels over all views that the table search compares."""
+"""Number of pixels, over all views, that the table search compares."""
 
 
 @dataclass(frozen=True)
 class ViewStack:
-    """One camera's pixels in one channel; arrays over (light, pixel) are (L, N), lights in the manifest's order."""
+    """Pixels of one camera in one channel; arrays over (light, pixel) are (L, N), with lights in the
+    manifest's order.
+    """
 
     camera: Camera
     pixels: NDArray[np.int32]
@@ -47,41 +51,43 @@ class ViewStack:
     variance: Array
     valid: NDArray[np.bool_]
     held_out: NDArray[np.bool_]
-    """(L,): this camera's image under that light is kept from the fit."""
+    """Mask (L,) of the lights under which this camera's image is held out of the fit."""
     parts: PixelParts | None = None
-    """What each pixel shows, where the scene is more than one tooth."""
+    """Part of a jaw that each pixel shows; None where the scene is one tooth."""
 
     def of(self, pixels: NDArray[np.bool_]) -> ViewStack:
-        """Some of its pixels, by a mask (N,)."""
+        """View of some of the pixels, by a mask (N,)."""
         parts = None if self.parts is None else self.parts.of(pixels)
         arrays = (self.reference[:, pixels], self.variance[:, pixels], self.valid[:, pixels])
         return ViewStack(self.camera, self.pixels[pixels], *arrays, self.held_out, parts)
 
     @property
     def fitted(self) -> NDArray[np.bool_]:
-        """(L, N): what the fit may use."""
+        """Mask (L, N) of the measurements that the fit may use."""
         return self.valid & ~self.held_out[:, None]
 
 
 @dataclass(frozen=True)
 class Observations:
-    """What the prepared stage holds."""
+    """Content of the prepared stage."""
 
     folder: Path
     manifest: PreparedManifest
     teeth: tuple[Tooth, ...]
     held_out: NDArray[np.bool_]
-    """(camera, light)"""
+    """Mask (camera, light) of the held-out images."""
     gums: Mesh | None = None
     cavity: Mesh | None = None
 
     @property
     def light_positions_mm(self) -> Array:
-        """Positions (L, 3)."""
+        """Positions (L, 3) of the lights, in mm."""
         return np.array([light.position_mm for light in self.manifest.lights])
 
     def light_intensities(self, channel: str) -> Array:
-        """(L,) radiant intensities of a channel; a light given by one number has it in all channels."""
+        """Radiant intensities (L,) of the lights in a channel; a light with a single intensity has it in
+        all channels.
+        """
         index = self.manifest.channels.index(channel)
         return np.array([light.intensity[index if len(light.intensity) > 1 else 0] for light in self.manifest.lights])
 
@@ -91,23 +97,24 @@ class Level:
     """One resolution of a channel's images."""
 
     blocks: tuple[StoredFile, ...]
-    """Fitted lights only."""
+    """Blocks under the fitted lights."""
     evaluation_blocks: tuple[StoredFile, ...]
-    """All lights."""
+    """Blocks under all lights with a valid pixel."""
     pixels: int
-    """Fitted pixels of all views."""
+    """Number of fitted pixels in all views."""
     signal: float
-    """sum weight ref^2 over fitted measurements, so that loss / signal is relative."""
+    """sum weight ref^2 over fitted measurements; the relative loss is the loss divided by it."""
 
 
 @dataclass(frozen=True)
 class ChannelFiles:
-    """One channel's blocks and scenes on disk."""
+    """Blocks and scenes of one channel on disk."""
 
     channel: str
     recipe: StoredFile
     coarse: Level
-    """Every n-th pixel in x and y, so that no view has more than about COARSE_PIXELS."""
+    """Every n-th pixel in x and y, so that no view has more than ``COARSE_PIXELS`` fitted pixels for each of
+    its teeth."""
     full: Level
     search_blocks: tuple[StoredFile, ...]
     """A few pixels of each view under the fitted lights."""
@@ -117,13 +124,13 @@ class ChannelFiles:
     quality: float
     """Signal-to-noise power over fitted measurements."""
     errors: InstrumentErrors = NO_ERRORS
-    """Of the instrument, those that act on what is fitted."""
+    """Errors of the instrument that act on the fitted photographs."""
     moves: tuple[Move, ...] = ()
-    """Of scan and dome, which the ± consider."""
+    """Moves of scan and dome, which the standard errors include."""
 
     @property
     def blocks(self) -> tuple[StoredFile, ...]:
-        """All that is fitted or compared at full resolution."""
+        """Blocks of full resolution, fitted or evaluated."""
         return self.full.blocks + self.full.evaluation_blocks
 
 
@@ -131,7 +138,7 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
     """Open and check the prepared stage.
 
     Raises:
-        CaptureInputError, SettingsError: what is asked cannot be fitted to what was captured; names the thing and the
+        CaptureInputError, SettingsError: the job cannot be fitted to the capture; the message names the cause and the
             remedy.
     """
     folder, manifest = open_stage(root, "prepared", PreparedManifest)
@@ -168,7 +175,7 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
 
 
 def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
-    """Gather one channel's valid pixels of every camera, at the resolution that is fitted.
+    """Valid pixels of one channel in every camera, at the resolution of the fit.
 
     Raises:
         CaptureInputError: no valid pixel, or no light in them.
@@ -212,7 +219,7 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
 
 
 def require_signal(views: Sequence[ViewStack], name: str) -> None:
-    """Refuse views with nothing to fit.
+    """Refuse views without a signal to fit.
 
     Raises:
         CaptureInputError: no valid pixel, or no light in them.
@@ -238,7 +245,7 @@ def channel_scene(
     spec: JobSpec,
     stain_uv: Array | None = None,
 ) -> SceneRecipe:
-    """All that was captured, with the dentin of each tooth, under all lights of a channel."""
+    """Scene recipe of the capture, with the dentin of each tooth, under all lights of a channel."""
     return SceneRecipe(
         tuple(
             ToothSurfaces(tooth.outer, dentin, stain_uv)
@@ -265,8 +272,12 @@ def write_channel(
     """Write one channel's blocks and scenes; the same input gives the same files.
 
     Args:
-        scene: under all lights, in the order of the views' images.
-        instrument: None for one without errors.
+        folder: receives the files.
+        scene: scene under all lights, in the order of the views' images.
+        channel: name of the channel.
+        views: observed views.
+        loss: the fitted loss.
+        instrument: the instrument; None for one without errors.
     """
     fitted = [v.fitted for v in views]
     used = np.any([f.any(axis=1) for f in fitted], axis=0)
@@ -344,8 +355,8 @@ def write_channel(
 
 
 def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
-    """Which pixels (N, 2) are every n-th in x and y, n the least that leaves no more than ``most`` of the counted
-    ones.
+    """Mask (N,) of the pixels (N, 2) on a grid of every n-th in x and y, with the least n that leaves at most ``most``
+    of the counted pixels.
     """
     every = 1
     while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > most:
@@ -354,8 +365,8 @@ def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: 
 
 
 def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
-    """Number (N,) of each pixel's cell: squares of some pixels of the coarse grid, which has no more than ``most``
-    fitted ones, each of one part alone.
+    """Index (N,) of each pixel's comparison cell. Cells are squares of a few pixels of the coarse grid, which has at
+    most ``most`` fitted pixels; each cell shows one part only.
     """
     counted = np.asarray(view.fitted.any(axis=0))
     coarse = view.pixels[counted & on_coarse_grid(view.pixels, counted, most)]
@@ -369,5 +380,5 @@ def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
 
 
 def _spread(pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    # Evenly over the raster order.
+    # Choose pixels evenly over the raster order.
     return pixels[np.unique(np.linspace(0, len(pixels) - 1, max(count, 1)).astype(int))] if len(pixels) else pixels

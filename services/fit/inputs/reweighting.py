@@ -1,5 +1,5 @@
-"""Weights of the next round of a fit whose loss follows residuals: one render of all blocks, then the blocks written
-anew.
+"""Weights of the next round for a loss whose weights depend on the residuals: render all blocks once, then write them
+with new weights.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from services.fit.transport.scene.recipe import StackEstimate
 
 @dataclass(frozen=True)
 class Residual:
-    """Render minus reference of one block, and the render's variance, (L, N)."""
+    """Render minus reference of one block, and the render's variance, (L, N) each."""
 
     residual: NDArray[np.float64]
     variance: NDArray[np.float64]
@@ -44,7 +44,9 @@ def residual_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
 
 
 def reweighted(passes: Passes, journal: Journal, loss: Loss, tissue: Tissue, *, samples: int, stage: str) -> Passes:
-    """The same passes over blocks with weights by the residuals of a tissue, from a seed that no other pass has."""
+    """The passes over blocks with new weights, which follow from the residuals of a tissue with a seed that no other
+    pass uses.
+    """
     key = f"{passes.seeds.channel}/{stage}/weights"
 
     def compute() -> list[tuple[str, str]]:
@@ -55,7 +57,7 @@ def reweighted(passes: Passes, journal: Journal, loss: Loss, tissue: Tissue, *, 
         passes.record([r.trace for r in residuals])
         blocks = passes.read_blocks()
 
-        # One set of weights over all blocks, because scale and floor are those of the whole channel.
+        # Compute one set of weights over all blocks, because scale and floor are those of the whole channel.
         fitted = [block.fit_weight > 0 for block in blocks]
         columns = zip(
             *(

@@ -1,5 +1,5 @@
-"""Where stains lie: a chart of a tooth's outer surface in a coarse texture, made by xatlas, and which of its texels are
-neighbours on the surface.
+"""Layout of a stain texture: a chart of a tooth's outer surface in a coarse texture, made by xatlas, and the pairs of
+texels that are neighbours on the surface.
 """
 
 from __future__ import annotations
@@ -16,34 +16,36 @@ from services.fit.optics.parameters import Stain
 Array = NDArray[np.float64]
 
 TEXEL_MM = (0.5, 1.0)
-"""Least and greatest edge of a texel."""
+"""Least and greatest edge of a texel, in mm."""
 TEXEL_PIXELS = 1.5
-"""Edge of a texel in pixels of the capture: what one pixel sees does not fix two texels."""
+"""Edge of a texel in pixels of the capture: one pixel does not determine two texels."""
 REACH = 1.6
-"""Texels this many edges apart are neighbours: the eight around one, and those across a seam."""
+"""Largest distance between neighbouring texels, in edges: it covers the eight around a texel and those across
+a seam."""
 SAME_SIDE = 0.3
-"""Least cosine between neighbours' normals, so that the two sides of an incisal edge are none."""
+"""Least cosine between the normals of neighbours, so that texels on the two sides of an incisal edge are not
+neighbours."""
 SAMPLES_PER_TEXEL = 4
-"""Along an edge, for finding the texels that a face touches."""
+"""Samples per texel edge that are used to find the texels that a face touches."""
 
 
 @dataclass(frozen=True)
 class StainLayout:
-    """A texture's place on a surface of F faces; T of its texels are touched by it."""
+    """Layout of a texture on a surface of F faces, which touches T of its texels."""
 
     corners_uv: Array
     """Texture coordinates (F, 3, 2) of the faces' corners, 0 to 1."""
     index: NDArray[np.int64]
-    """(H, W): a texel's number among those that count, -1 where no face is near."""
+    """Index (H, W) of each texel among the T touched ones, -1 for untouched ones."""
     points_mm: Array
-    """(T, 3): the mean place that a texel colours."""
+    """Mean point (T, 3) of the surface that a texel colours."""
     area_mm2: Array
-    """(T,) of the surface, by the texels' bilinear shares."""
+    """Area (T,) of the surface that a texel colours, by its bilinear weights."""
     neighbours: NDArray[np.int64]
-    """(E, 2) pairs of texels next to each other on the surface."""
+    """Pairs (E, 2) of texels that are next to each other on the surface."""
 
     def texture(self, optical_depth: Array) -> Stain:
-        """The stain of optical depths d (T,), a_t = exp(-d)."""
+        """Stain texture of optical depths d (T,), a_t = exp(-d)."""
         values = np.append(np.exp(-np.asarray(optical_depth, dtype=np.float64)), 1.0)
         return Stain(values[self.index])
 
@@ -54,27 +56,28 @@ class StainLayout:
 
 @dataclass(frozen=True)
 class ToothStains:
-    """A tooth's textures by channel, where it has one, and where they lie on its outer faces."""
+    """Stain textures of a tooth, for the channels that have one, and their layout on its outer faces."""
 
     corners_uv: Array
-    """(F, 3, 2)"""
+    """Texture coordinates (F, 3, 2) of the faces' corners, 0 to 1."""
     textures: Mapping[str, Stain]
 
 
 def texel_edge_mm(pixel_mm: float) -> float:
-    """Edge of a texel for a capture whose pixels have this size at the tooth."""
+    """Edge of a texel, in mm, for a capture with pixels of this size at the tooth."""
     return float(np.clip(TEXEL_PIXELS * pixel_mm, *TEXEL_MM))
 
 
 def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
-    """Unwrap a surface; the same mesh and size give the same layout.
+    """Layout of a surface; the same mesh and texel size give the same layout.
 
     Args:
+        outer: the tooth's outer surface.
         texel_mm: edge of a texel on the surface.
     """
     import xatlas
 
-    # A texel between charts, so that no bilinear look-up of one reaches another.
+    # Keep a distance between charts, so that no bilinear look-up in one chart reads a texel of another.
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
     atlas.add_mesh(outer.vertices_mm.astype(np.float32), outer.faces.astype(np.uint32))
     packing.padding, packing.bilinear, packing.texels_per_unit = 2, True, 1.0 / texel_mm
@@ -83,7 +86,7 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
     corners_uv = np.asarray(uv, dtype=np.float64)[np.asarray(corners)]
     height, width = int(atlas.height), int(atlas.width)
 
-    # Splat samples of the surface onto the texels that a look-up there reads.
+    # Distribute samples of the surface to the texels that a look-up at the sample reads.
     faces, weights, shares = _surface_samples(outer, texel_mm / SAMPLES_PER_TEXEL)
     texels, bilinear = bilinear_texels(np.einsum("sc,scd->sd", weights, corners_uv[faces]), (height, width))
     carried = (bilinear * shares[:, None]).reshape(-1)
@@ -112,8 +115,8 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
 
 
 def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64], Array]:
-    """Texels (N, 4), numbered row by row, and weights (N, 4) that a look-up at uv (N, 2) mixes; texel centres lie at
-    half-integers, edges go on.
+    """Texels (N, 4), numbered row by row, and weights (N, 4) of a bilinear look-up at uv (N, 2). Texel centres lie at
+    half-integers; look-ups are clamped at the edges.
     """
     height, width = size
     x, y = (np.clip(uv[:, k] * n - 0.5, 0, n - 1) for k, n in ((0, width), (1, height)))
@@ -127,7 +130,7 @@ def bilinear_texels(uv: Array, size: tuple[int, int]) -> tuple[NDArray[np.int64]
 
 
 def _surface_samples(mesh: Mesh, spacing_mm: float) -> tuple[NDArray[np.int64], Array, Array]:
-    """Faces (S,), barycentric weights (S, 3) and areas (S,) of a lattice of points on every face, its corners
+    """Faces (S,), barycentric weights (S, 3) and areas (S,) in mm² of a lattice of points on every face, its corners
     included.
     """
     corners = mesh.vertices_mm[mesh.faces]

@@ -1,3 +1,1 @@
-"""What an instrument may have wrong: gain, lights and flare as coordinates of a fit, with the calibration's
-covariance.
-"""
+"""Errors of the instrument: gain, lights and flare as coordinates of a fit, with the calibration's covariance."""

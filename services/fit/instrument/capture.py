@@ -1,4 +1,4 @@
-"""What the calibration of a capture says of its instrument, and which errors act on which photographs."""
+"""Instrument of a capture as its calibration states it, and the errors that act on each photograph."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from services.fit.instrument.moves import Move, is_dome_placed, move_covariance,
 from services.fit.transport.scene.recipe import SceneRecipe
 
 MAX_JAW_LIGHTS = 12
-"""A jaw under more lights takes the gain of each for exact. How noisy the products of derivatives and single lights'
-images are has to be kept for every tooth and its neighbours: 2 MB a tooth with 12 lights, which grows with their
-square. And where there are many, their errors average out."""
+"""Largest number of lights under which a jaw's fit has a gain for each light. With more, each light's gain counts as
+exact. The noise of the products of derivatives and single lights' images has to be kept for every tooth and its
+neighbours: 2 MB a tooth with 12 lights, and it grows with the square of their number. And the errors of many lights
+average out."""
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """What a calibration says of the instrument that took a capture."""
+    """Instrument that took a capture, as a calibration states it."""
 
     lights: tuple[Light, ...]
-    """In the order of the views' images."""
+    """Lights in the order of the views' images."""
     stated: CalibrationUncertainty | None
     knows_distances: bool = False
-    """Whether gains of single lights are of their irradiance at the teeth."""
+    """Whether the gain of a single light is the error of its irradiance at the teeth."""
     max_light_gains: int | None = None
-    """Under more fitted lights than this, gains of single lights are no coordinates; None for any number."""
+    """Largest number of fitted lights under which gains of single lights are coordinates; None for no limit."""
 
     def moves(self, folder: Path, recipe: SceneRecipe) -> tuple[Move, ...]:
         """Moves of scan and dome under the lights of a recipe, with their scenes."""
@@ -44,17 +45,19 @@ class Instrument:
         return write_moves(folder, recipe, covariance, centre_mm, keep_irradiance=known)
 
     def errors(self, channel: str, cameras: Sequence[str], used: NDArray[np.bool_]) -> InstrumentErrors:
-        """Those of a channel that act on the fitted photographs of some cameras under the lights (L,) that are used."""
+        """Errors of one channel that act on the fitted photographs of some cameras under the lights of the mask
+        ``used`` (L,).
+        """
         lights = self._chosen(used)
         if self.max_light_gains is not None and len(lights) > self.max_light_gains:
             lights = []
         return errors_of(channel, lights, cameras, self.stated)
 
     def acting(self, channel: str, camera: str, brightest: float, chosen: NDArray[np.bool_]) -> BlockInstrument:
-        """Those that act on a camera's photographs under the chosen lights (L,).
+        """Errors that act on one camera's photographs under the chosen lights (L,).
 
         Args:
-            brightest: greatest radiance among its valid pixels in this channel.
+            brightest: largest radiance among the camera's valid pixels in this channel.
         """
         names = light_names(self._chosen(chosen), channel, self.stated)
         return BlockInstrument(gain_name(channel), names, flare_name(camera, channel), brightest)
@@ -64,11 +67,11 @@ class Instrument:
 
 
 def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[np.float64]) -> Instrument | None:
-    """What is known of the instrument; None where the job takes it for perfect, and for the solver adam, which does not
-    know it.
+    """The instrument of a capture; None where the job takes it for exact, and for the solver adam, which does not fit
+    its errors.
 
     Args:
-        manifest: of what was prepared.
+        manifest: manifest of the prepared capture.
         spec: the job.
         teeth_mm: centre of the teeth (3,).
     """

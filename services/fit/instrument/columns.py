@@ -1,4 +1,4 @@
-"""What an instrument with errors makes of an image, and the derivatives of that to its errors."""
+"""Photographs of an image by an instrument with errors, and their derivatives with respect to these errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 def photographed(image: Array, block: Block, errors: Mapping[str, float]) -> Array:
-    """The photographs (L, N) that the instrument would take of an image (L, N) with these errors."""
+    """Photographs (L, N) that an instrument with these errors would take of an image (L, N)."""
     acting = block.instrument
     if not errors or acting is None:
         return image
@@ -22,8 +22,8 @@ def photographed(image: Array, block: Block, errors: Mapping[str, float]) -> Arr
 
 
 def columns(image: Array, block: Block, names: Sequence[str]) -> Array:
-    """Derivatives (K, L N) of the photographs to each named error: the image, one light's, or the brightest pixel's
-    value everywhere.
+    """Derivatives (K, L N) of the photographs with respect to each named error: the image for the gain, one light's
+    image for a light's gain, and the brightest pixel's value everywhere for a flare.
     """
     found = np.zeros((len(names), *image.shape))
     acting = block.instrument

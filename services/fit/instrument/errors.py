@@ -1,9 +1,10 @@
-"""The errors of an instrument that a fit of one channel knows, with their covariance.
+"""Errors of the instrument in the fit of one channel, with their covariance.
 
-Photographs follow (1 + gain + light_gain) C + flare, C the image that the media make. The derivatives to the errors are
-the image itself for the gain, one light's for a light's gain, and the brightest pixel's value for a flare; they come
-from the renders of the residual and cost nothing. (The photographs in their place would hold the sensor's noise, which
-residuals hold too: that pulls a gain by 1e-4, one of the ± that it has where the tissue is known.)
+Photographs follow (1 + gain + light_gain) C + flare, where C is the image that the media give. The derivatives with
+respect to the errors are the image itself for the gain, one light's image for a light's gain, and the brightest pixel's
+value for a flare; they come from the renders of the residual and cost nothing. (Photographs in place of the renders
+would bring in the sensor's noise, which the residuals contain too: that biases a gain by 1e-4, one standard error of a
+gain where the tissue is known.)
 """
 
 from __future__ import annotations
@@ -21,34 +22,34 @@ from services.core.calibration.uncertainty import CalibrationUncertainty
 Array = NDArray[np.float64]
 
 DEFAULT_SE: Mapping[str, float] = MappingProxyType({"gain": 0.01, "light_gain": 0.01, "flare": 0.003})
-"""One standard error by kind where a calibration states none: relative, relative, and a share of the camera's brightest
+"""Standard error by kind where a calibration states none: relative, relative, and a share of the camera's brightest
 valid pixel in that channel. A white standard is certified to about 1 %, lights are compared on it to 1 %, and a lens
 shade leaves about 0.3 % of veiling glare."""
 _DEGREE = math.radians(1)
 DEFAULT_MOVE_SE: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {"teeth": (0.1 * _DEGREE,) * 3 + (0.05,) * 3, "dome": (0.1 * _DEGREE,) * 3 + (2.0,) * 3}
 )
-"""One standard error of rotations (rad) and translations (mm) of the scan and of the dome: what registration reaches at
-best, and what a tape measure does."""
+"""Standard errors of rotations (rad) and translations (mm) of the scan and of the dome where a calibration states none:
+the best that registration reaches, and the precision of a tape measure."""
 LINEAR_REACH = 0.1
-"""Length over which images count as linear in an error, for step lengths; they are exactly linear."""
+"""Length scale of an error for the lengths of steps; images are exactly linear in an error."""
 
 MAX_ERROR = 10.0
 
 
 def kind_of_error(name: str) -> str:
-    """``gain``, ``light_gain`` or ``flare``."""
+    """Kind of an error by its name: ``gain``, ``light_gain`` or ``flare``."""
     return name.partition(".")[0]
 
 
 @dataclass(frozen=True)
 class InstrumentErrors:
-    """Errors of one channel, the last coordinates of its fit; their prior is Gaussian about 0."""
+    """Errors of the instrument in one channel, the last coordinates of its fit; their prior is Gaussian about 0."""
 
     names: tuple[str, ...] = ()
     covariance: tuple[tuple[float, ...], ...] = ()
     assumed: frozenset[str] = frozenset()
-    """Those whose covariance is a default and not the calibration's."""
+    """Names of the errors whose covariance is a default and not the calibration's."""
 
     @property
     def precision(self) -> Array:
@@ -62,12 +63,12 @@ class InstrumentErrors:
 
     @property
     def se(self) -> Array:
-        """One standard error of each before the fit, (K,)."""
+        """Standard errors of the prior, (K,)."""
         return np.sqrt(np.diag(self.matrix))
 
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]:
-        """Between which each stays, which only keeps a wild step representable."""
+        """Bounds of each error, wide enough to do no more than keep a wild step representable."""
         return ((-MAX_ERROR, MAX_ERROR),) * len(self.names)
 
 
@@ -75,17 +76,17 @@ NO_ERRORS = InstrumentErrors()
 
 
 def gain_name(channel: str) -> str:
-    """The name of a channel's gain."""
+    """Name of a channel's gain."""
     return f"gain.{channel}"
 
 
 def flare_name(camera: str, channel: str) -> str:
-    """The name of a camera's flare in a channel."""
+    """Name of a camera's flare in a channel."""
     return f"flare.{camera}.{channel}"
 
 
 def light_names(lights: Sequence[str], channel: str, stated: CalibrationUncertainty | None) -> tuple[str, ...]:
-    """The names of the lights' gains: those of the channel where the calibration tells channels apart."""
+    """Names of the lights' gains: those of the channel where the calibration states a gain for each channel."""
     known = frozenset(() if stated is None else stated.names)
     own = {light: f"light_gain.{light}.{channel}" for light in lights}
     return tuple(own[light] if own[light] in known else f"light_gain.{light}" for light in lights)
@@ -94,10 +95,11 @@ def light_names(lights: Sequence[str], channel: str, stated: CalibrationUncertai
 def errors_of(
     channel: str, lights: Sequence[str], cameras: Sequence[str], stated: CalibrationUncertainty | None
 ) -> InstrumentErrors:
-    """The errors of a channel under the lights and cameras of its fit.
+    """Errors of a channel under the lights and cameras of its fit.
 
     Args:
-        stated: by the calibration; what it does not name takes a default, independent of all others.
+        stated: the calibration's uncertainty; an error that it does not name takes a default, independent of all
+            others.
     """
     names = (
         gain_name(channel),

@@ -1,4 +1,4 @@
-"""What a fit found of the instrument, as its report holds it."""
+"""Results of a fit on the instrument, as fields of its report."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from services.fit.solve.estimates import instrument_estimates
 
 
 def instrument_report(spec: JobSpec, known: Mapping[str, Uncertainty], manifest: PreparedManifest) -> dict[str, Any]:
-    """The fields of a ``FitReport`` that are about the instrument.
+    """Fields of a ``FitReport`` on the instrument.
 
     Args:
+        spec: the job.
         known: by channel, the uncertainty at the solution.
-        manifest: of what was prepared, with what its calibration states.
+        manifest: manifest of the prepared capture, with the uncertainty that its calibration states.
     """
     errors = {channel: one.domain.errors for channel, one in known.items()}
     found = {channel: own for channel, one in known.items() if (own := instrument_estimates(one))}

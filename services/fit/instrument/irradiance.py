@@ -1,5 +1,5 @@
-"""How wrong each light's brightness is at the teeth, which is what photographs show: its intensity and its distance
-together.
+"""Uncertainty of each light's irradiance at the teeth, which photographs show: its intensity and its
+distance together.
 """
 
 from __future__ import annotations
@@ -14,30 +14,31 @@ from services.core.geometry import Light
 
 Array = NDArray[np.float64]
 DRIFT = 1e-4
-"""Of a light by itself, relative: what a lamp changes while it warms. Without it errors whose mean is 0 would have no
-inverse."""
+"""Relative standard deviation of each light's own drift: the change of a lamp while it warms up. It keeps the
+covariance invertible, which that of errors with mean 0 is not."""
 
 
 def at_the_teeth(
     stated: CalibrationUncertainty | None, lights: Sequence[Light], channels: Sequence[str], centre_mm: Array
 ) -> CalibrationUncertainty | None:
-    """A calibration's uncertainty whose ``light_gain`` is the error of a light's irradiance at the teeth.
+    """The calibration's uncertainty with ``light_gain`` as the error of a light's irradiance at the teeth.
 
-    A light that is taken to be farther away than it is comes out brighter on a white sphere, and at the teeth both
-    errors cancel: irradiance goes as I ÷ d², so its relative error is that of I less 2 (p − c) · δp ÷ |p − c|². Alone,
-    the ± of I would count an error of the distance that the teeth do not see.
+    A light whose assumed distance is too large appears too bright on a white sphere, and at the teeth both errors
+    cancel: irradiance is I ÷ d², so its relative error is that of I less 2 (p − c) · δp ÷ |p − c|², for a light at p
+    and teeth at c. The standard error of I alone would include an error of the distance that has no effect at the
+    teeth.
 
     Only products of intensity and radiance per count are measured, and a calibration sets the lights' mean intensity to
-    1. If all lights are taken to be too far, all irradiances come out low, and all radiances too, by the same share; so
-    the part that all lights have in common is none of photographs against renders, and is taken off. What a white
-    sphere's reflectance leaves is ``gain``.
+    1. If all assumed distances are too large, all irradiances are too low, and all radiances too, by the same share. So
+    the part that is common to all lights does not change the difference of photographs and renders, and is subtracted.
+    The remaining error of a white sphere's reflectance is ``gain``.
 
     Args:
-        stated: by the calibration; None stays None. Where it states no place of some light, or of a light that was not
-            used, all stays as it is.
-        lights: where it says that they are, and how bright.
-        channels: of the lights' intensities.
-        centre_mm: of the teeth (3,).
+        stated: the calibration's uncertainty; None gives None. Where it does not state the place of some light, or
+            states the gain of an unused light, it is returned unchanged.
+        lights: lights with the calibrated places and intensities.
+        channels: names of the intensities' channels.
+        centre_mm: centre of the teeth (3,).
     """
     if stated is None:
         return None
@@ -62,12 +63,12 @@ def at_the_teeth(
     whole = common @ transform
     covariance = whole @ stated.matrix @ whole.T
     covariance[seen, seen] += DRIFT**2
-    # Rounding leaves halves that differ in their last digits.
+    # Make the covariance exactly symmetric: rounding leaves its halves different in their last digits.
     table = ((covariance + covariance.T) / 2).tolist()
     return CalibrationUncertainty(names=stated.names, covariance=tuple(map(tuple, table)))
 
 
 def _axes(place: Mapping[str, int], light: Light) -> list[int]:
-    """Numbers of the three errors of a light's place; none where they are not stated."""
+    """Indices of the three errors of a light's place; empty where they are not stated."""
     names = [f"light.{light.name}.{axis}" for axis in "xyz"]
     return [place[name] for name in names] if all(name in place for name in names) else []

@@ -1,16 +1,17 @@
-"""Moves of the scan and of the dome as one: what they do to images enters the ±, and no fit moves them.
+"""Rigid moves of the scan and of the dome: their effect on images enters the standard errors, but no fit estimates
+them.
 
-Images of a moved tooth need many paths: 0.05 mm move an image by 2 %, and two images of 256 paths differ by as much by
-chance. As coordinates such moves would follow that noise. So they are considered and not estimated (Schmidt 1966): each
-changes the photographs by one standard deviation of its own, and the answer with them.
+Images of a moved tooth need many paths: a move of 0.05 mm changes an image by 2 %, and two images of 256 paths differ
+by as much by chance. As coordinates of a fit, such moves would follow that noise. So they are considered and not
+estimated (Schmidt 1966): each move by one standard deviation changes the photographs, and with them the solution.
 
-A dome of which the calibration states every light's place has no error of its own: it moves by what the lights' errors
-have in common. The 2 mm that are assumed otherwise would count those errors twice. Where some light's place is not
-stated the assumed move stays, and is of all lights: nothing else speaks for that light, a dome moves as one, and the
-other lights' distances are then in no gain (``irradiance``).
+A dome whose calibration states the place of every light has no error of its own: it moves by the common part of the
+lights' errors. The default of 2 mm would count those errors twice. Where the place of some light is not stated, the
+default applies to all lights: that light has no other uncertainty, a dome moves as a whole, and the other lights'
+distances are then in no gain (``irradiance``).
 
-A tooth that moves by T under cameras and lights that stay is a tooth that stays under cameras and lights that move by
-T^-1, so no surface is built again.
+A tooth that moves by T under fixed cameras and lights gives the same images as a fixed tooth under cameras and lights
+that move by T^-1, so no surface is built again.
 """
 
 from __future__ import annotations
@@ -33,36 +34,37 @@ from services.fit.transport.scene.recipe import SceneRecipe, View
 Array = NDArray[np.float64]
 
 MOVED = tuple(DEFAULT_MOVE_SE)
-"""What moves as one: ``teeth`` and ``dome``."""
+"""Bodies that move rigidly: ``teeth`` and ``dome``."""
 REACH = 2.0
-"""Standard deviations between the two images of a difference: wider is quieter, and images of 0.1 mm or 4 mm apart are
-still about linear."""
+"""Standard deviations between the two images of a difference. A wider difference has less noise, and images 0.1 mm or 4
+mm apart are still about linear."""
 MAX_LIGHTS = 80
-"""Of one scene, which holds the lights where they are and as several moves have them; more would cost memory for their
-maps."""
+"""Largest number of lights in one scene, which holds the lights at their places and again as several moves put them;
+more lights would need more memory for their maps."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """One standard deviation of a move, as lights and cameras see it."""
+    """A move by ``REACH`` standard deviations, as a change of lights and cameras."""
 
     body: str
     """``teeth`` or ``dome``."""
     recipe: StoredFile
-    """The scene whose first lights are where they are said to be, and which has them again where the move puts them."""
+    """Scene whose first lights stand at their calibrated places, and which holds them again where the move
+    puts them."""
     first: int
     """Index of the first moved light."""
     camera_move: tuple[tuple[float, ...], ...]
-    """4 x 4, multiplies camera_from_world from the right."""
+    """Rigid transform (4, 4) that multiplies camera_from_world from the right."""
 
     def seen_by(self, camera: Camera) -> Camera:
-        """The camera as the move puts it."""
+        """The camera after the move."""
         pose = np.asarray(camera.camera_from_world) @ np.array(self.camera_move)
         return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, pose.tolist()))})
 
 
 def rigid(twist: Array, centre_mm: Array) -> Array:
-    """The move (4, 4) by a rotation vector (rad) and a translation (mm) about a centre; Rodrigues' formula."""
+    """Rigid transform (4, 4) by a rotation vector (rad) and a translation (mm) about a centre; Rodrigues' formula."""
     angle = float(np.linalg.norm(twist[:3]))
     x, y, z = twist[:3] / angle if angle > 0 else np.zeros(3)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -73,18 +75,20 @@ def rigid(twist: Array, centre_mm: Array) -> Array:
 
 
 def is_dome_placed(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> bool:
-    """Whether every light's place is stated, which says how wrong the dome's may be, and no dome's move is named."""
+    """Whether the place of every light is stated, which determines the dome's uncertainty, and no move of the dome is
+    stated.
+    """
     if stated is None or any(f"dome.{axis}" in stated.names for axis in TWIST):
         return False
     return all(name in stated.names for name in _places(lights))
 
 
 def move_covariance(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> tuple[Array, tuple[str, ...]]:
-    """Covariance (12, 12) of the moves of teeth and dome, and those of them of which some part took its default.
+    """Covariance (12, 12) of the moves of teeth and dome, and the bodies whose move is at least partly a default.
 
     Args:
-        stated: by the calibration.
-        lights: all of the capture.
+        stated: the calibration's uncertainty.
+        lights: all lights of the capture.
     """
     names = [f"{body}.{axis}" for body in MOVED for axis in TWIST]
     covariance = np.diag([se**2 for body in MOVED for se in DEFAULT_MOVE_SE[body]])
@@ -109,8 +113,8 @@ def _stated(stated: CalibrationUncertainty, names: Sequence[str]) -> Array:
 
 
 def _twist_derivative(places_mm: Array) -> Array:
-    # Of places (L, 3) to a turn w and a shift t about their mean, w x r + t: (3 L, 6). Its pseudo-inverse gives the
-    # move nearest to any errors of places.
+    # Derivative (3 L, 6) of places (L, 3) with respect to a rotation w and a translation t about their mean, w x r + t.
+    # Its pseudo-inverse gives the rigid move nearest to any errors of the places.
     arms_mm = places_mm - places_mm.mean(axis=0)
     turned = np.cross(np.eye(3)[:, None], arms_mm).transpose(1, 2, 0)
     return np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2).reshape(-1, 6)
@@ -119,10 +123,15 @@ def _twist_derivative(places_mm: Array) -> Array:
 def write_moves(
     folder: Path, recipe: SceneRecipe, covariance: Array, dome_centre_mm: Array, *, keep_irradiance: bool = False
 ) -> tuple[Move, ...]:
-    """Independent moves whose covariances add up to the whole, with their scenes.
+    """Independent moves, whose covariances add up to the given one, with their scenes.
 
     Args:
-        keep_irradiance: lights that the dome moves stay as bright at the teeth, as their gains know the distances.
+        folder: receives the scenes.
+        recipe: scene at the calibrated places.
+        covariance: of the moves of teeth and dome, (12, 12).
+        dome_centre_mm: point (3,) about which the dome turns.
+        keep_irradiance: keep the irradiance at the teeth of lights that the dome moves, because their gains include the
+            error of the distances.
     """
     teeth_centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in recipe.teeth]).mean(axis=0)
     lights, moves = recipe.light_positions_mm, list[tuple[str, Array, Array, Array]]()
@@ -153,7 +162,7 @@ def _moved(move: Array, points_mm: Array) -> Array:
 
 
 def by_scene(moves: Sequence[Move]) -> tuple[tuple[Move, ...], ...]:
-    """Moves that share a scene, in order."""
+    """Moves grouped by their scene, in order."""
     scenes = dict.fromkeys(move.recipe.digest for move in moves)
     return tuple(tuple(move for move in moves if move.recipe.digest == digest) for digest in scenes)
 
@@ -161,7 +170,7 @@ def by_scene(moves: Sequence[Move]) -> tuple[tuple[Move, ...], ...]:
 def moves_task(
     host: EngineHost, task: BlockTask, tissue: Tissue | Mouth, moves: tuple[Move, ...], seeds: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """By how much moves of one scene, of one standard deviation each, change a block's images: (K, 2, L, N) by move and
+    """Changes of a block's images by the moves of one scene, of one standard deviation each: (K, 2, L, N) by move and
     seed.
     """
     block = read_block(task.block)

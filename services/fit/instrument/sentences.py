@@ -1,5 +1,5 @@
-"""What to know of the instrument, in plain words: what was assumed of it, and which of its errors the images put down
-to a fault of the calibration.
+"""Sentences on the instrument for the report: the assumed uncertainties, and the errors that the images show to be
+faults of the calibration.
 """
 
 from __future__ import annotations
@@ -26,10 +26,12 @@ REMEDY = {
 
 
 def assumed_names(errors: Mapping[str, InstrumentErrors], moves: Sequence[str]) -> tuple[str, ...]:
-    """Errors that took their default, over all channels.
+    """Names of the errors that took their default, over all channels.
 
     Args:
-        moves: ``teeth`` or ``dome``, where some part of their move did and some channel's ± know it.
+        errors: by channel, the errors before the fit.
+        moves: ``teeth`` or ``dome``, each where its move is at least partly a default and some channel's standard
+            errors include it.
     """
     names = dict.fromkeys(name for own in errors.values() for name in own.names if name in own.assumed)
     return (*names, *moves)
@@ -42,13 +44,14 @@ def instrument_sentences(
     assumed: tuple[str, ...],
     stated: CalibrationUncertainty | None = None,
 ) -> tuple[str, ...]:
-    """One sentence each, what was assumed first.
+    """Sentences for the report, the assumptions first.
 
     Args:
-        stated: by the calibration.
+        spec: the job.
+        stated: the calibration's uncertainty.
         assumed: names, as ``assumed_names`` gives them.
-        errors: by channel, as they were known before the fit.
-        faults: by channel, which of them the images put down to the calibration.
+        errors: by channel, the errors before the fit.
+        faults: by channel, the errors that the images show to be faults of the calibration.
     """
     if spec.instrument == "off":
         return (
@@ -80,7 +83,7 @@ def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> 
 
 
 def _sizes(names: tuple[str, ...], every: Collection[str]) -> Iterator[str]:
-    # A kind as a whole, or the few of it that no calibration states.
+    # Name a kind as a whole, or only those of its errors that the calibration does not state.
     for kind, size in SIZES.items():
         own = [name for name in names if kind_of_error(name) == kind]
         if own and len(own) < sum(kind_of_error(name) == kind for name in every):

@@ -1,4 +1,4 @@
-"""Runs a jaw's fit: single teeth first, each on its own, then all together; one report at the end."""
+"""Driver of a jaw's fit: fit single teeth first, each on its own, then all together; write one report."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from services.fit.tooth.driver import blend_shape, viewpoints_mm
 from services.fit.tooth.schedule import ChannelSchedule
 
 START_STEPS = 4
-"""About so many steps start one tooth, for the progress shown."""
+"""Approximate number of steps at the start of one tooth, for the displayed progress."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel's inputs."""
+    """Inputs of one channel."""
 
     name: str
     views: tuple[ViewStack, ...]
@@ -56,16 +56,16 @@ class Channel:
 
 @dataclass
 class JawDriver:
-    """One attempt at a jaw."""
+    """One attempt at the fit of a jaw."""
 
     attempt: Attempt
 
     def run(self, started_s: float) -> FitReport:
-        """Fit all channels; files land in the stage's folder, the report is returned.
+        """Fit all channels, write files into the stage's folder and return the report.
 
         Raises:
-            SettingsError: an option that only a tooth alone has. CaptureInputError, StoreError: what was prepared is no
-                jaw that can be fitted.
+            SettingsError: an option applies to single teeth only.
+            CaptureInputError, StoreError: the prepared capture is no jaw that can be fitted.
         """
         attempt, spec = self.attempt, self.attempt.spec
         require_jaw_options(spec)
@@ -97,7 +97,7 @@ class JawDriver:
         journal = attempt.journal(channel.files for channel in channels)
         begun, _ = journal.once("begun", lambda: started_s)
 
-        # The channel with the most signal goes first; where blend weights are fitted, the others take them from it.
+        # Fit the channel with the most signal first; where blend weights are fitted, the others take them from it.
         order = sorted(channels, key=lambda channel: -channel.files.quality)
         found: dict[str, JawFit] = {}
         with attempt.workers() as run_on:
@@ -118,10 +118,10 @@ class JawDriver:
 
 
 def require_jaw_options(spec: JobSpec) -> None:
-    """Refuse what a jaw's fit would not do.
+    """Refuse options that a jaw's fit does not support.
 
     Raises:
-        SettingsError: names the option and what it must be.
+        SettingsError: names the option and its required value.
     """
     for option, usual in job_kinds()["jaw"].fixed_options.items():
         if (asked := getattr(spec, option)) != usual:
@@ -132,9 +132,9 @@ def require_jaw_options(spec: JobSpec) -> None:
 
 
 def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSpec) -> list[DentinShape | None]:
-    """The dentin of a jaw's teeth that the job asks for: the given ones, blend shapes made from the enamel, or none.
+    """Dentin of each tooth that the job asks for: the given surface, a blend shape made from the enamel, or none.
 
-    A tooth without one, or whose mesh allows no such shape, is homogeneous.
+    A tooth without dentin, or whose mesh allows no blend shape, is homogeneous.
     """
     if spec.dentin == "known":
         return known_dentins(teeth)
@@ -154,13 +154,13 @@ def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSp
 
 
 def known_dentins(teeth: Sequence[Tooth]) -> list[DentinShape | None]:
-    """Each tooth's dentin as a surface that does not move."""
+    """Dentin of each tooth as a fixed surface."""
     return [None if tooth.dentin is None else DentinShape.known(tooth.dentin) for tooth in teeth]
 
 
 @dataclass
 class _ChannelRun:
-    """One channel, from single teeth to the whole mouth."""
+    """Fit of one channel, from single teeth to the whole mouth."""
 
     attempt: Attempt
     observations: Observations
@@ -169,9 +169,9 @@ class _ChannelRun:
     journal: Journal
     run_on: Executor
     place: tuple[int, int]
-    """Number of this channel, and of how many."""
+    """Index of this channel, and the number of channels."""
     instrument: Instrument | None
-    """Whose errors all teeth share; None for one without."""
+    """Instrument whose errors all teeth share; None for one without errors."""
     shapes: Sequence[tuple[float, ...]] | None = None
     """Known blend weights of each tooth; None where they are to be fitted."""
     steps: int = 0
@@ -190,8 +190,8 @@ class _ChannelRun:
             mouth, teeth=tuple(replace(tooth, shape=shape) for tooth, shape in zip(mouth.teeth, shapes, strict=True))
         )
 
-        # Pixels of a tooth that no medium could be fitted to would mislead its neighbours; no error is known of it, so
-        # the jaw's does not hold it.
+        # Leave out the pixels of teeth whose fit failed: they would mislead the neighbours. Their image error is not
+        # known, so the jaw's error does not include it.
         failed = [k for k, start in enumerate(starts) if start.state == "failed"]
         files, dentins = (
             self.channel.files,
@@ -227,13 +227,12 @@ class _ChannelRun:
         return self._start(f"{tooth.fdi}", alone, self.dentins[k], self._shape(k), views, tooth.fdi)
 
     def _shape(self, k: int) -> tuple[float, ...]:
-        # A tooth's blend weights at the start.
-        # Known ones are none where another channel had to drop the dentin.
+        # Blend weights of a tooth at the start. Known weights are empty where another channel had to drop the dentin.
         dentin, known = self.dentins[k], () if self.shapes is None else self.shapes[k]
         return known or (() if dentin is None else (SHAPE[0],) * len(dentin.modes_mm))
 
     def _gums(self) -> Medium | None:
-        # Gums alone are fitted like a tooth without dentin.
+        # Start of the gums, fitted like a tooth without dentin.
         gums, views = self.observations.gums, showing(self.channel.views, GUMS)
         if gums is None:
             return None
@@ -258,7 +257,7 @@ class _ChannelRun:
         views: tuple[ViewStack, ...],
         fdi: int | None,
     ) -> Tissue:
-        # The first stages of a single tooth's fit, on a scene of its own.
+        # Run the first stages of a single tooth's fit, on a scene of its own.
         channel, spec = self.channel.name, self.attempt.spec
         require_signal(views, f"Tooth {name}" if fdi is not None else "The picture of the gums")
         folder = self.attempt.inputs / name

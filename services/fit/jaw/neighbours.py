@@ -1,4 +1,4 @@
-"""Which teeth of a jaw stand beside which, and so which of its coordinates act on which pixels."""
+"""Neighbours of a jaw's teeth, and so the coordinates that act on each pixel."""
 
 from __future__ import annotations
 
@@ -13,38 +13,40 @@ from services.fit.execution.blocks import PixelParts
 from services.fit.optics.domain import Domain
 
 COLOURS = 3
-"""Teeth of one colour have at least two others between them: what is seen of any tooth tells which one of them was
-changed."""
+"""Number of colours of the teeth. Between two teeth of one colour there are at least two others, so each pixel can be
+assigned to the one tooth of a colour that affects it."""
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Teeth, by their positions in the scene, in the order in which they stand along the arch, one jaw after the
-    other.
-    """
+    """Positions of the teeth in the scene, in the order in which they stand along the arch, one jaw after the other."""
 
     order: tuple[int, ...]
 
     @staticmethod
     def of(fdi: Sequence[int]) -> Neighbours:
-        """Those of some teeth by their numbers."""
+        """Neighbours of teeth by their FDI numbers."""
         return Neighbours(tuple(sorted(range(len(fdi)), key=lambda k: (is_upper(fdi[k]), arch_place(fdi[k])))))
 
     def colour(self, tooth: int) -> int:
-        """One of COLOURS, in turn along the arch."""
+        """Colour of a tooth, from 0 to ``COLOURS`` - 1, in turn along the arch."""
         return self.order.index(tooth) % COLOURS
 
     def beside(self, tooth: int) -> tuple[int, ...]:
-        """A tooth and its one or two neighbours: those that stand nearer to it than to any other of its colour."""
+        """Positions of a tooth and its one or two neighbours: the teeth that are nearer to it than to any other tooth
+        of its colour.
+        """
         place = self.order.index(tooth)
         return self.order[max(place - 1, 0) : place + 2]
 
     def pixels(self, tooth: int, parts: PixelParts) -> NDArray[np.bool_]:
-        """Which pixels (N,) show a tooth or its neighbours, or gums and wall nearest to them."""
+        """Mask (N,) of the pixels that show a tooth or its neighbours, or gums and wall nearest to them."""
         return np.isin(parts.tooth, self.beside(tooth))
 
     def near(self, domain: Domain) -> tuple[tuple[int, ...], ...]:
-        """For each tooth the coordinates of itself, its neighbours, and what belongs to no one tooth."""
+        """For each tooth, the indices of the coordinates of itself, of its neighbours, and of parts that belong to no
+        single tooth.
+        """
         found = []
         for tooth in range(len(self.order)):
             teeth = {None, *self.beside(tooth)}

@@ -1,4 +1,4 @@
-"""What a jaw's fit says: gums and wall by channel, and each tooth by its own."""
+"""Report of a jaw's fit: gums and wall by channel, and each tooth with a report of its own."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ STATES = ("fitted", "tied", "failed")
 
 @dataclass(frozen=True)
 class JawFit:
-    """One channel's result, with where its teeth came from."""
+    """Result of one channel, with the starts of its teeth."""
 
     starts: tuple[ToothStart, ...]
     dentin: tuple[bool, ...]
-    """Which teeth have any."""
+    """Whether each tooth has dentin."""
     fit: ChannelFit[Mouth]
     views: tuple[ViewStack, ...]
-    """What was fitted and judged."""
+    """Views that were fitted and evaluated."""
 
 
 def report(
@@ -48,11 +48,15 @@ def report(
     observations: Observations,
     seconds: float,
 ) -> FitReport:
-    """The report of all channels.
+    """Report of all channels.
 
     Args:
-        shaped_by: the channel in which blend weights were fitted, if any were.
-        dentins: of each tooth.
+        spec: the job.
+        fits: results by channel.
+        shaped_by: channel in which blend weights were fitted, where any were.
+        dentins: dentin of each tooth.
+        observations: the fit's observations.
+        seconds: duration of the fit.
     """
     first = fits[shaped_by]
     converged, advice = judge({c: jaw.fit for c, jaw in fits.items()})
@@ -109,8 +113,8 @@ def _tooth(
     *,
     is_placed: bool,
 ) -> ToothReport:
-    # The worst state of all channels, and what it says; whether it lies elsewhere is asked only where the jaw as a
-    # whole lies where it should.
+    # Report of one tooth, with the worst state over all channels and its sentence. Whether the tooth is misplaced is
+    # tested only where the jaw as a whole is not.
     start = max((jaw.starts[k] for jaw in fits.values()), key=lambda s: STATES.index(s.state))
     fit_error, held_out_error = (_errors(_evaluations(fits), k, kind) for kind in (0, 1))
     worst = max([*fit_error.values(), *held_out_error.values()], default=0.0)

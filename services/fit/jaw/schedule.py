@@ -14,16 +14,15 @@ again      the same                                                        exact
                                                                                     moved x far
 =========  ==============================================================  =======  ===========================
 
-Before the first stage every tooth was looked at alone, as if homogeneous. Which of its two media is the denser one is
-asked with everything around it in place: alone, gums and wall are missing, and what they reflect is taken for the
-tooth's own.
+Before the first stage every tooth was fitted alone, as if homogeneous. Which of its two media is the denser one is
+decided with its surroundings in place: without gums and wall, their reflections would be attributed to the tooth.
 
-Gain, lights and flare of the instrument, and where scan and dome lie, are the same for all teeth. Like a tooth's they
-join in exact media.
+Gain, lights and flare of the instrument, and the places of scan and dome, are common to all teeth. As in the fit of a
+single tooth, they are taken into account in the stages of exact media.
 
-Teeth of which too little is seen, or whose own fit failed, have coordinates like all others, but with a Gaussian prior
-about the median of the front teeth, taken anew before each stage. So what little is seen of them still counts, and
-where nothing is, they follow.
+Teeth with too few visible pixels, or whose own fit failed, have coordinates like all others, but with a Gaussian prior
+about the median of the front teeth, which is updated before each stage. So the few pixels that show them still count,
+and without any they follow the median.
 """
 
 from __future__ import annotations
@@ -45,11 +44,13 @@ from services.fit.optics.priors import COSINE, SHAPE, WEAK, priors_of
 from services.fit.tooth.schedule import EXACT_SAMPLES, SIMILAR_G, START_RATIOS, START_STEPS
 
 TIED_SD = {"sigma": 0.2, "alpha": 0.15}
-"""Spread of one mouth's teeth about their median, in the unbounded domain: 20 % of sigma, 35 % of 1 - alpha."""
+"""Standard deviations of the teeth of one mouth about their median, in the unbounded domain: 20 % of sigma, 35 % of 1 -
+alpha."""
 GUMS_SD = {"sigma": 1.0, "alpha": 0.7}
-"""About the start: gums were never measured alone."""
+"""Prior standard deviations of the gums' parameters about their start, in the unbounded domain; wide, because gums were
+never measured alone."""
 WALL_SD = 1.5
-"""Of the logit of the wall's reflectance about its start."""
+"""Prior standard deviation of the logit of the wall's reflectance about its start."""
 
 
 @dataclass(kw_only=True)
@@ -59,7 +60,7 @@ class JawSchedule(Stages[Mouth]):
     start: Mouth
     teeth: Sequence[ToothStart]
     dentin: Sequence[bool]
-    """Which teeth have dentin."""
+    """Whether each tooth has dentin."""
     fits_shape: bool = True
     """Whether blend weights, where there are any, are fitted."""
 
@@ -86,7 +87,7 @@ class JawSchedule(Stages[Mouth]):
         )
 
     def _best_starts(self) -> Mouth:
-        # Every ratio for all teeth at once; their losses are compared tooth by tooth, with the same seeds.
+        # Fit every ratio for all teeth at once, then compare the losses tooth by tooth, with the same seeds.
         ends = []
         for k, ratio in enumerate(START_RATIOS):
             start = replace(self.start, teeth=tuple(map(partial(_layered, ratio), self.start.teeth, self.dentin)))
@@ -131,7 +132,8 @@ class JawSchedule(Stages[Mouth]):
         return len(self.teeth)
 
     def _held(self, domain: Domain) -> Held:
-        # Media of one tissue are wrong alike: 29 of them, each on its own, would cost more than the fit.
+        # The mean cosines of one tissue's media share one error: with errors of their own, 29 media would cost more
+        # than the fit.
         kinds = {"enamel": WEAK["enamel.g1"], "dentin": WEAK["dentin.g1"], "gums": WEAK["enamel.g1"]}
         held = [part for part in self.media if part not in domain.cosines]
         alike = {
@@ -144,7 +146,7 @@ class JawSchedule(Stages[Mouth]):
         return shapes | ({} if tissue.reflectance is None else {"cavity.reflectance": tissue.reflectance})
 
     def _told_name(self, name: str) -> str:
-        # Inside the fit a tooth goes by its place in the list, for people by its FDI number.
+        # Name with the tooth's FDI number, where the fit uses its position in the list.
         place, _, own = name.partition(".")
         return f"{self.teeth[int(place)].fdi}.{own}" if place.isdigit() else name
 
@@ -172,8 +174,8 @@ class JawSchedule(Stages[Mouth]):
         return Domain(tuple(coordinates))
 
     def _exact_domain(self, mouth: Mouth) -> Domain:
-        # Enamel of one mouth has one mean cosine, which images of similar media would not show; tied teeth keep the
-        # blend weights of the start.
+        # Add one mean cosine for the enamel of a mouth, which images of similar media would not show, and the blend
+        # weights; tied teeth keep those of the start.
         enamel = tuple(f"{k}.enamel.cosine" for k in range(len(mouth.teeth)))
         weights = [f"{k}.shape.{mode}" for k in self._shaped for mode in range(len(mouth.teeth[k].shape))]
         return Domain(
@@ -187,7 +189,7 @@ class JawSchedule(Stages[Mouth]):
 
     @property
     def _shaped(self) -> list[int]:
-        # Teeth whose blend weights are fitted.
+        # Positions of the teeth whose blend weights are fitted.
         return [
             k
             for k, tooth in enumerate(self.start.teeth)
@@ -195,7 +197,7 @@ class JawSchedule(Stages[Mouth]):
         ]
 
     def _retied(self, mouth: Mouth) -> Mouth:
-        # Teeth that are tied start the next stage where the others now are, at the cosine that their enamel shares.
+        # Start the next stage of tied teeth at the median of the others, with the mean cosine that all enamel shares.
         common = self._typical(mouth)
         cosine = next(
             tooth.enamel.mean_cosine
@@ -215,7 +217,7 @@ class JawSchedule(Stages[Mouth]):
 
 
 def _layered(ratio: tuple[float, float], tooth: Tissue, has_dentin: bool) -> Tissue:
-    # The homogeneous tooth with its density shared out to its two media.
+    # The homogeneous tooth with its density split between its two media.
     return (
         tooth.with_values(
             {

@@ -1,5 +1,5 @@
-"""Where a jaw's joint fit starts: each tooth from a fit of its own pixels, hidden and failed ones from the others, gums
-and wall from what is left.
+"""Start of a jaw's joint fit: each tooth from a fit of its own pixels, hidden teeth and those whose fit failed from the
+others, gums from a fit of their own, and the cavity's wall from the gums.
 """
 
 from __future__ import annotations
@@ -15,38 +15,41 @@ from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 
 MIN_TOOTH_PIXELS = 16
-"""A tooth of fewer fitted pixels over all views is tied: four media numbers and their misfit cannot be told from so
-few."""
+"""Least number of fitted pixels of a tooth over all views. A tooth with fewer is tied to the others, because so few do
+not determine four parameters of media and their misfit."""
 FRONT_PLACES = (1, 2, 3)
-"""Incisors and canines, the last digit of their FDI numbers: lit and seen best (teeth 2018, section 7)."""
+"""Last digits of the FDI numbers of incisors and canines, which are lit and seen best (teeth 2018, section 7)."""
 TOOTH_FAULTS = (InputError, NonFiniteError)
-"""What one tooth's data or meshes can cause; all else is the machine's or the operator's doing and ends the job."""
+"""Errors that the data or meshes of one tooth can cause. Any other error has its cause in the machine or in its
+operation and ends the job."""
 GUMS_START = Medium(8.5, 0.97, g1=HELD_G)
-"""Generic soft tissue: reduced scattering 1.65 per mm at 540 nm (Jacques 2013), absorption between that of red and
-green."""
+"""Generic soft tissue at the start: reduced scattering 1.65 per mm at 540 nm (Jacques 2013), absorption between that of
+red and green."""
 
 
 @dataclass(frozen=True)
 class ToothStart:
-    """Where one tooth starts."""
+    """Start of one tooth."""
 
     fdi: int
     state: Literal["fitted", "tied", "failed"]
     sentence: str
     pixels: int
     tissue: Tissue | None
-    """None where it has to take the others'."""
+    """Tissue parameters; None where the tooth takes those of the others."""
     drops_dentin: bool = False
-    """Its surfaces cannot bound media together, so it counts as homogeneous."""
+    """Whether its surfaces cannot bound media together, so that it is fitted as homogeneous."""
 
     @property
     def is_front(self) -> bool:
-        """Whether it is an incisor or a canine."""
+        """Whether the tooth is an incisor or a canine."""
         return self.fdi % 10 in FRONT_PLACES
 
 
 def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
-    """Fit one tooth alone, unless too little of it is seen; what its own data or meshes cause becomes its state."""
+    """Fit one tooth alone, unless too few of its pixels are fitted; an error that its own data or meshes cause becomes
+    its state.
+    """
     if pixels < MIN_TOOTH_PIXELS:
         seen = f"shows in {pixels} usable pixels" if pixels else "is hidden or masked in every image"
         return ToothStart(
@@ -60,11 +63,12 @@ def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
 
 
 def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tissue:
-    """Median of the front teeth that were fitted, coordinate by coordinate, at mean cosine ``HELD_G``; of all that were
-    where no front tooth was.
+    """Median tissue of the front teeth that were fitted, coordinate by coordinate, at mean cosine ``HELD_G``; where
+    none of them was fitted, of all fitted teeth.
 
     Args:
-        teeth: present optics of each tooth, None where there are none yet.
+        starts: start of each tooth.
+        teeth: present tissue of each tooth, None where there is none yet.
 
     Raises:
         InputError: no tooth was fitted.
@@ -91,7 +95,9 @@ def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tis
 
 
 def start_mouth(starts: Sequence[ToothStart], gums: Medium | None, *, has_cavity: bool) -> Mouth:
-    """All parts together; the wall reflects like a half space of the gums (teeth 2018, section 4.3)."""
+    """Start of all parts of a mouth; the cavity's wall reflects like a half space of the gums (teeth 2018, section
+    4.3).
+    """
     common = typical(starts, [start.tissue for start in starts])
     teeth = tuple(start.tissue or common for start in starts)
     return Mouth(teeth, gums, half_space_reflectance(gums or GUMS_START) if has_cavity else None)

@@ -1,4 +1,4 @@
-"""What each pixel of a jaw's photographs shows, by casting a ray through it."""
+"""Part of a jaw that each pixel of the photographs shows, by casting a ray through it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from services.fit.transport.rays import RayScene
 
 
 def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple[ViewStack, ...]:
-    """The views with what their pixels show at their middle; pixels whose middle shows nothing are left out.
+    """The views with the part that each pixel shows at its centre; pixels whose centre shows none are left out.
 
     Raises:
         CaptureInputError: no pixel shows anything.
@@ -50,17 +50,19 @@ def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple
 
 
 def showing(views: Sequence[ViewStack], *parts: int) -> tuple[ViewStack, ...]:
-    """The pixels that show some parts (position of a tooth, GUMS, CAVITY); views without any are left out."""
+    """Pixels that show one of some parts (position of a tooth, GUMS, CAVITY); views without such pixels are
+    left out.
+    """
     return _cut(views, [np.isin(_parts(view).shown, parts) for view in views])
 
 
 def without(views: Sequence[ViewStack], teeth: Sequence[int]) -> tuple[ViewStack, ...]:
-    """The pixels that show none of these teeth."""
+    """Pixels that show none of these teeth."""
     return _cut(views, [~np.isin(_parts(view).shown, teeth) for view in views])
 
 
 def fitted_pixels(views: Sequence[ViewStack]) -> int:
-    """Pixels with a measurement that the fit may use, over all views."""
+    """Number of pixels, over all views, with a measurement that the fit may use."""
     return sum(int(view.fitted.any(axis=0).sum()) for view in views)
 
 

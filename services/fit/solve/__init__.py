@@ -1,1 +1,1 @@
-"""Table search, Gauss-Newton, uncertainty."""
+"""Solvers of a fit: table search, Gauss-Newton, Adam, stain textures, and the uncertainty of the solution."""

@@ -1,4 +1,4 @@
-"""Runs a tooth's fit: inputs to files, channels through their schedule, one report at the end."""
+"""Driver of a tooth's fit: write inputs to files, fit the channels one after another, write one report."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ from services.fit.tooth.schedule import ChannelSchedule
 
 @dataclass
 class FitDriver:
-    """One attempt at a tooth."""
+    """One attempt at the fit of a tooth."""
 
     attempt: Attempt
 
     def run(self, started_s: float) -> FitReport:
-        """Fit all channels; files land in the stage's folder, the report is returned."""
+        """Fit all channels, write files into the stage's folder and return the report."""
         attempt, spec = self.attempt, self.attempt.spec
         observations = read_observations(attempt.context.root, spec)
         (tooth,) = observations.teeth
@@ -79,7 +79,7 @@ class FitDriver:
         journal = attempt.journal(files.values())
         begun, _ = journal.once("begun", lambda: started_s)
 
-        # The channel with the most signal goes first; where blend weights are fitted, the others take them from it.
+        # Fit the channel with the most signal first; where blend weights are fitted, the others take them from it.
         modes = len(dentin.modes_mm) if dentin is not None else 0
         order = sorted(channels, key=lambda c: -files[c].quality)
         fits: dict[str, ChannelFit[Tissue]] = {}
@@ -191,10 +191,10 @@ class FitDriver:
 
 
 def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> DentinShape | None:
-    """The dentin surface the job asks for: the given one, a blend shape made from the enamel, or none.
+    """Dentin surface that the job asks for: the given one, a blend shape made from the enamel, or none.
 
-    The blend modes' axes follow from the mesh, from its FDI number, and where these leave them open from where the
-    cameras stand.
+    The axes of the blend modes follow from the mesh and from its FDI number and, where these leave them open, from the
+    places of the cameras.
     """
     if spec.dentin == "known":
         assert tooth.dentin is not None
@@ -213,10 +213,10 @@ def _number_told(tooth: Tooth, spec: JobSpec) -> str:
 
 
 def blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
-    """The dentin's blend shape of a tooth with its canonical frame.
+    """Blend shape of a tooth's dentin, with the tooth's canonical frame.
 
     Raises:
-        MeshError: the mesh allows none.
+        MeshError: the mesh allows no blend shape.
     """
     from services.anatomy.blend import dentin_blend_shape
     from services.anatomy.templates.dimensions import upper_tooth
@@ -225,12 +225,12 @@ def blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
 
 
 def viewpoints_mm(cameras: tuple[Camera, ...]) -> NDArray[np.float64]:
-    """The cameras' centres (N, 3)."""
+    """Centres (N, 3) of the cameras, in mm."""
     return np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
 
 
 def shape_covariance(known: Uncertainty, tooth: int | None = None) -> tuple[tuple[float, ...], ...]:
-    """Covariance of the blend weights, of a jaw those of one tooth; empty where they were not fitted."""
+    """Covariance of the blend weights, in a jaw those of one tooth; empty where they were not fitted."""
     own = [
         k
         for k, coordinate in enumerate(known.domain.coordinates)
@@ -246,12 +246,15 @@ def fitted_thickness(
     shape: tuple[float, ...],
     covariance: tuple[tuple[float, ...], ...],
 ) -> ThicknessMap | None:
-    """Enamel's thickness as the first camera sees it, of the fitted dentin; None without dentin, or where it does not
-    see the tooth.
+    """Map of the enamel's thickness over the fitted dentin, as the first camera sees it; None without dentin, or where
+    the camera does not see the tooth.
 
     Args:
-        tooth: with its dentin where the job says that it is known.
-        covariance: of the blend weights; empty where they were not fitted.
+        tooth: the tooth, with its dentin where the job takes it as known.
+        cameras: cameras of the capture.
+        spec: the job.
+        shape: blend weights.
+        covariance: covariance of the blend weights; empty where they were not fitted.
     """
     dentin = dentin_shape(tooth, cameras, spec)
     return (

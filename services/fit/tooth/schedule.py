@@ -1,4 +1,4 @@
-"""One channel's fit, from nothing to parameters: table search, homogeneous tooth, starts for two media, exact fit.
+"""Schedule of one channel's fit: table search, homogeneous tooth, starts for two media, fit of the exact media.
 
 ============  ===============================================  ========  ===============================================
 stage         free                                             media     ends
@@ -14,16 +14,16 @@ again         the same                                         exact     as befo
 stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; where fitted
 ============  ===============================================  ========  ===============================================
 
-Similar media have the same reduced scattering and absorption at mean cosine 0 (similarity theory). They cost several
-times less for equal noise, and their derivatives to sigma are several times less noisy, at an image error of 1 to 15 %.
-So they carry the fit to its neighbourhood. In the last stage residuals come from the exact media and only the Jacobian
-from similar ones: where J'W r = 0 the exact image fits, whatever approximates J.
+Similar media have the same reduced scattering and absorption at mean cosine 0 (similarity theory). At equal noise they
+cost several times less, and their derivatives to sigma have several times less noise, at an image error of 1 to 15 %.
+So they bring the fit into the neighbourhood of the solution. In the last stage residuals come from the exact media and
+only the Jacobian from similar ones: where J'W r = 0 the exact image fits, whatever approximates J.
 
 sigma and g are nearly one parameter in a thick medium. With one lobe the enamel's mean cosine is a coordinate at
 constant reduced scattering and absorption, from the first exact stage on, under a weak prior: it decides how much light
 turns back after few scatterings. With two lobes g1, beta and g2 are free under weak Gaussian priors. The instrument's
-errors join with the first exact stage: in similar media they would only hide what these have wrong. Absorption of a
-thin enamel cap is nearly invisible, so its exponent carries a prior two decades wide.
+errors become coordinates in the first exact stage: in similar media they would only compensate the bias of these.
+Absorption of a thin enamel cap is nearly invisible, so its exponent has a prior that is two decades wide.
 """
 
 from __future__ import annotations
@@ -50,24 +50,25 @@ from services.fit.solve.losses import is_reweighted
 ALL_LEAVES = ("sigma", "alpha", "g1", "beta", "g2")
 SIMILAR_G = 0.0
 START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
-"""Density of enamel and dentin over the homogeneous tooth's: dentin scatters more in every source of the literature
-table."""
+"""Densities of enamel and dentin relative to the homogeneous tooth's: dentin scatters more in every source of the
+literature table."""
 HOMOGENEOUS_STEPS = 4
 EXACT_SAMPLES = 4
-"""Paths per pixel at which the exact stages begin, over those of the start, for three views; they double as noise
-asks."""
+"""Paths per pixel at the begin of the exact stages, relative to those of the start, for three views; they double where
+noise requires it."""
 MIN_EXACT_SAMPLES = 32
-"""With fewer, where the limit allows them, comparisons of full images decide little: a large stack takes longer from 11
-to its 21 than at 21 alone."""
+"""Least number of paths per pixel at the begin of the exact stages, where the limit allows it. With fewer, comparisons
+of full images decide little: a large stack takes longer from 11 to its limit of 21 than at 21 alone."""
 SEARCH_SAMPLES = 64
-"""Least paths per pixel of the search, which looks at a few hundred pixels only."""
+"""Least number of paths per pixel in the search, which renders only a few hundred pixels."""
 REWEIGHTINGS = 2
-"""Rounds of a loss that follows residuals, after the first exact stage."""
+"""Rounds of reweighting after the first exact stage, for losses whose weights depend on the residuals."""
 STAIN_SAMPLES = 2
-"""Least paths per pixel of a step of the stains, over those of the start; as many as the media needed in the end."""
+"""Least number of paths per pixel in a step of the stains, relative to those of the start; never fewer than the media
+needed in the end."""
 START_STEPS = 2
 ADAM_BURST = 10
-"""Steps of Adam between two journal entries and reports, each of which costs an evaluation of all images."""
+"""Number of Adam steps between two journal entries and reports, each of which costs an evaluation of all images."""
 
 Fitted = tuple[StackProblem[Tissue], Tissue, Solution]
 
@@ -82,7 +83,7 @@ class ChannelSchedule(Stages[Tissue]):
     shape: tuple[float, ...] = ()
     """Known blend weights."""
     stain_layout: StainLayout | None = None
-    """Texels to fit; None where the surface counts as clean."""
+    """Texels to fit; None where the surface is taken as clean."""
 
     def run(self) -> ChannelFit[Tissue]:
         """Fit the channel."""
@@ -94,7 +95,7 @@ class ChannelSchedule(Stages[Tissue]):
         return self._finish(replace(problem, base=tissue, stage="final"), solution)
 
     def start(self) -> Tissue:
-        """The first stages alone: the table's best point, and with dentin a few steps of the homogeneous tooth."""
+        """Run the first stages alone: the table's best point, and with dentin a few steps of the homogeneous tooth."""
         tissue = self._homogeneous_start()
         if not self.has_dentin:
             return tissue
@@ -118,7 +119,7 @@ class ChannelSchedule(Stages[Tissue]):
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
 
     def next_capture(self, fit: ChannelFit[Tissue], folder: Path) -> str:
-        """The light or view that would help this channel most, in one sentence."""
+        """One sentence on the light or view that would help this channel most."""
         self.pause()
         sensor = Sensor(self.spec.sensor_noise_relative, self.spec.sensor_noise_floor)
         given = folder, self.media, sensor, self.files.weight, fit.samples
@@ -126,7 +127,7 @@ class ChannelSchedule(Stages[Tissue]):
         return str(found)
 
     def _stages(self) -> Fitted:
-        # The media, and the dentin's shape, by Gauss-Newton.
+        # Fit the media and the dentin's shape by Gauss-Newton.
         spec, samples, options = self.spec, self.spec.samples_per_pixel, self.options(self.files.coarse)
         domain = self._domain(("sigma", "alpha"))
         tissue, reached = self._neighbourhood(domain, options) if domain.coordinates else (self._given(), 2 * samples)
@@ -157,7 +158,7 @@ class ChannelSchedule(Stages[Tissue]):
         return problem, tissue, solution
 
     def _neighbourhood(self, domain: Domain, options: Options) -> tuple[Tissue, int]:
-        # The stages in similar media, and how many paths per pixel they came to.
+        # Run the stages in similar media; returns the tissue and the last number of paths per pixel.
         tissue = self.start()
         if self.has_dentin:
             tissue = self._best_start(tissue, self.short(START_STEPS))
@@ -168,14 +169,14 @@ class ChannelSchedule(Stages[Tissue]):
         return tissue, solution.samples
 
     def _given(self) -> Tissue:
-        # Media that are held whole, so that only the dentin's shape is asked for.
+        # Media that are held in whole, so that only the dentin's shape is fitted.
         return self._uniform(Medium(1.0, 0.5, g1=HELD_G)).with_values(self.spec.held)
 
     def _uniform(self, medium: Medium) -> Tissue:
         return Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
 
     def _paper_stages(self) -> Fitted:
-        # As in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
+        # Fit as in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
         tissue = self._homogeneous_start()
         if self.has_dentin:
             _, tissue, _ = self._descend(
@@ -189,14 +190,14 @@ class ChannelSchedule(Stages[Tissue]):
         )
 
     def _descend(self, stage: str, domain: Domain, tissue: Tissue, samples: int) -> Fitted:
-        # The exact media and their own derivatives, at constant samples.
+        # Descend by Adam in the exact media with their own derivatives, at a constant number of samples.
         self._reweight(stage, tissue)
         problem = StackProblem(self.passes, domain, tissue, stage)
         solver = adam.Adam(domain, adam.Options(self.spec.adam_rate, max_steps=self.spec.adam_steps))
         return problem, *self._run(solver, adam, problem, solver.init(domain.x_of(tissue), samples), ADAM_BURST)
 
     def _reweight(self, stage: str, tissue: Tissue) -> None:
-        # New weights where the loss follows residuals; all later stages have them.
+        # Compute new weights, which all later stages use, where the loss depends on the residuals.
         if is_reweighted(self.spec.loss):
             self.pause()
             samples = self.fewer(self.spec.max_samples_per_pixel)
@@ -205,7 +206,7 @@ class ChannelSchedule(Stages[Tissue]):
     def _stained(
         self, layout: StainLayout, problem: StackProblem[Tissue], tissue: Tissue, solution: Solution
     ) -> Fitted:
-        # The texture in turn with the media; what is returned is the plain fit where a texture gains nothing.
+        # Fit the texture and the media alternately; return the plain fit where a texture gains nothing.
         options = self.options(self.files.full)
         samples = min(
             max(self.fewer(STAIN_SAMPLES * self.spec.samples_per_pixel), solution.samples), options.max_samples
@@ -233,13 +234,13 @@ class ChannelSchedule(Stages[Tissue]):
         return last if stage.run(tissue, refit) is not None else (problem, tissue, solution)
 
     def _domain(self, leaves: tuple[str, ...]) -> Domain:
-        # The media's parameters that are not held.
+        # Domain of the media's parameters that are not held.
         domain = media_domain(self.media, leaves, self._priors)
         return Domain(tuple(c for c in domain.coordinates if not set(c.targets) & self.spec.held.keys()))
 
     def _with_cosines(self, domain: Domain) -> Domain:
-        # Of the enamel where nothing of it is given, which another cosine would change: what lies below it is lit by
-        # light that has scattered often.
+        # Add the enamel's mean cosine unless some parameter of the enamel is held, which another cosine would change.
+        # The dentin's is left out, because light that reaches it has scattered often.
         fitted = [part for part in self.media[:1] if not any(name.startswith(f"{part}.") for name in self.spec.held)]
         return Domain(domain.coordinates + tuple(Coordinate((f"{part}.cosine",), *COSINE) for part in fitted))
 
@@ -251,13 +252,13 @@ class ChannelSchedule(Stages[Tissue]):
         return priors_of(self.spec.prior)
 
     def _homogeneous_start(self) -> Tissue:
-        # The table's best point, seen as a medium of the mean cosine that is held.
+        # Start at the table's best point, as a similar medium of the mean cosine that is held.
         start = self._search()
         return self._uniform(similar_medium(Medium(start.sigma, start.alpha, g1=start.g), HELD_G))
 
     def _search(self) -> table_search.Candidate:
-        # One render per node and view with two seeds each, so that <C,C> is free of noise; every albedo follows from
-        # it.
+        # Render once per node and block with two seeds, so that <C,C> is unbiased by noise; every albedo follows from
+        # these renders.
         nodes, edges = table_search.nodes(), table_search.order_edges()
         passes = replace(self.passes, blocks=self.files.search_blocks)
 
@@ -288,8 +289,8 @@ class ChannelSchedule(Stages[Tissue]):
         return table_search.Candidate(**best[0])
 
     def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
-        # Several density ratios, each improved a little, then compared by loss with the same seeds: with few samples a
-        # single start may end with enamel and dentin exchanged.
+        # Improve several density ratios by a few steps each and compare their losses with the same seeds: with few
+        # samples a single start may end with enamel and dentin exchanged.
         domain, ends = self._domain(("sigma", "alpha")), list[Tissue]()
         for k, (thin, dense) in enumerate(START_RATIOS):
             start = tissue.with_values(
@@ -314,7 +315,7 @@ class ChannelSchedule(Stages[Tissue]):
         return ends[int(best)]
 
     def _with_lobes(self, tissue: Tissue) -> Tissue:
-        # A second lobe starts at its prior's centre, the first keeps the mean cosine.
+        # Start the second lobe at its prior's centre; the first keeps the mean cosine.
         beta, g2 = 0.9, -0.1
         g1 = (HELD_G - (1 - beta) * g2) / beta
         lobes = (("beta", beta), ("g1", g1), ("g2", g2))
@@ -324,17 +325,17 @@ class ChannelSchedule(Stages[Tissue]):
 
 
 def shared_domain(priors: Priors = WEAK) -> Domain:
-    """Both media alike, sigma and alpha."""
+    """Domain of sigma and alpha, each shared by both media."""
     return Domain(tuple(_coordinate((f"enamel.{leaf}", f"dentin.{leaf}"), priors) for leaf in ("sigma", "alpha")))
 
 
 def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...], priors: Priors = WEAK) -> Domain:
-    """Each medium on its own."""
+    """Domain of parameters of each medium on its own."""
     return Domain(tuple(_coordinate((f"{part}.{leaf}",), priors) for part in parts for leaf in leaves))
 
 
 def _coordinate(targets: tuple[str, ...], priors: Priors) -> Coordinate:
-    # What both media share has a prior only where theirs are one.
+    # A coordinate shared by both media has a prior only where the priors of both are equal.
     prior, *others = (priors.get(target) for target in targets)
     return (
         Coordinate(targets) if prior is None or any(other != prior for other in others) else Coordinate(targets, *prior)
