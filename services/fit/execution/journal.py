@@ -76,9 +76,8 @@ class Journal:
         try:
             self._append(_line({"key": key, "value": value}))
         except BaseException:
-            self._inode = (
-                None  # discard a partly written line with its file: the next result begins a new one
-            )
+            # Discard a partly written line with its file: the next result begins a new file.
+            self._inode = None
             raise
         self.entries[key] = value
         return value, True
