@@ -1,8 +1,8 @@
-"""Whether photographs show the teeth where the meshes are: if not, how far apart they are as a camera sees it.
+"""Check that photographs show the teeth where the meshes are, and by how much they are apart in each camera's image.
 
-The fitted render is slid over the photograph (``offset``). Where that explains most of what the fit left unexplained,
-and more than noise could, no medium, light or noise is to blame but a pose. Offsets along the line of sight cannot be
-seen in this way, and turns are not looked for.
+The fitted render is shifted over the photograph (``offset``). Where a shift explains most of the remaining difference,
+and more than noise could, the cause is a pose and not a medium, a light or noise. Offsets along the line of sight are
+not visible in this way, and rotations are not tested.
 """
 
 from __future__ import annotations
@@ -20,44 +20,46 @@ from services.fit.inputs.levels import LevelReader, whole_squares
 from services.fit.inputs.observations import Observations, ViewStack
 
 LOOKED_AT = 0.05
-"""Relative image error above which a fit asks for its offset: what is explained better shows no shift that matters."""
+"""Relative image error above which a fit is tested for an offset: below it, a shift does not matter."""
 MIN_MM = 0.5
-"""Least offset that is told; a registration of scan and photographs is good to about 0.1 mm."""
+"""Least offset that is reported, in mm; a registration of scan and photographs is accurate to about 0.1 mm."""
 MIN_PX = 0.75
-"""And in pixels of the fit, which may be a millimetre wide: nearer to the next pixel than to its own place. A whole
-pixel was too much: three rendered teeth 1 mm aside in pixels of 1 mm were told in 96 of 144 cameras with it, in 144
-without, and in place in none of 72."""
+"""Least offset that is reported, in pixels of the fit, which may be a millimetre wide: nearer to the next pixel than to
+its own place. A limit of a whole pixel was too large: with it, three rendered teeth 1 mm aside in pixels of 1 mm were
+reported in 96 of 144 cameras, with this limit in all 144, and teeth in place in none of 72."""
 MIN_GAIN = 0.55
-"""Share of the unexplained squared difference that an offset has to take away. Rendered teeth off by 1 mm gave 0.53 to
-1; in place 0, with stains, gums or absorption that the render lacks too, and at most 0.5 with a third of the
-scattering."""
+"""Least share of the unexplained squared difference that an offset has to remove. Rendered teeth that were off by 1 mm
+gave 0.53 to 1; teeth in place gave 0, also with stains, gums or absorption that the render lacks, and at most 0.5 with
+a third of the scattering."""
 MIN_Z = 3.0
-"""Standard errors that what goes away has to reach. Noise passes at one shift with a chance of 1e-3, and is tried at
-some 300 that are far from independent: of 720 draws in place, 480 of them of a dim image alone, none reached 2."""
+"""Least removed difference, in its own standard errors. By chance noise passes this limit at one shift with a
+probability of 1e-3, and some 300 shifts are tried that are far from independent: of 720 draws in place, 480 of them of
+a dim image alone, none reached 2."""
 MIN_SE_MM = 0.01
-"""Least ± that is told: what an offset is off by besides noise, such as by its pixels, is more."""
+"""Least standard error that is reported, in mm: other errors of an offset than noise, such as that of its pixels, are
+larger."""
 MIN_PIXELS = 16
 
 
 @dataclass(frozen=True)
 class Offset:
-    """By how much the photographs of a camera lie beside the mesh, across the line of sight."""
+    """Offset of a camera's photographs from the mesh, across the line of sight."""
 
     camera: str
     right_mm: float
     down_mm: float
     length_se_mm: float
-    """One standard error of ``length_mm`` by the photographs' noise."""
+    """Standard error of ``length_mm`` by the photographs' noise."""
     gain: float
-    """Share of the unexplained squared difference that goes away."""
+    """Share of the unexplained squared difference that the offset removes."""
 
     @property
     def length_mm(self) -> float:
-        """How far."""
+        """Length of the offset."""
         return float(np.hypot(self.right_mm, self.down_mm))
 
     def sentence(self, what: str) -> str:
-        """What is wrong and what to do."""
+        """Sentence on the fault and its remedy."""
         steps = [(self.right_mm, "right", "left"), (self.down_mm, "down", "up")]
         parts = [
             f"{abs(size):.1f} mm {name if size > 0 else other}"
@@ -80,11 +82,14 @@ def clearest_offset(
     channel: str,
     tooth: int | None = None,
 ) -> Offset | None:
-    """The offset of the camera that shows one most clearly, or None where none does.
+    """Offset of the camera that shows one most clearly, or None where none does.
 
     Args:
-        evaluation: of the final answer, with the images to compare.
-        tooth: position of the one tooth of a jaw to look at; None for all that was fitted.
+        evaluation: evaluation of the final solution, with the images to compare.
+        observations: the fit's observations.
+        views: the observed views.
+        channel: name of the channel.
+        tooth: position of the one tooth of a jaw to compare; None for all fitted pixels.
     """
     found = [
         _offset(view, pixel_mm, images, tooth)
@@ -110,8 +115,8 @@ def _compared(
             if camera != view.camera.name:
                 continue
             light = int(seen[shown])
-            # What lies beside the teeth is compared too: a mask that was drawn from a wrong pose hides the very pixels
-            # that tell.
+            # Compare pixels beside the teeth, too: a mask that was drawn from a wrong pose hides exactly those pixels
+            # that show the offset.
             usable = whole_squares(
                 level.bits(number, light, whole_camera) & ~np.uint16(MaskBit.OUTSIDE) == 0, level.step
             )
@@ -131,10 +136,12 @@ def _offset(view: ViewStack, pixel_mm: float, images: list[Comparison], tooth: i
 
 
 def told_offset(camera: str, images: list[Comparison], pixels: NDArray[np.int64], pixel_mm: float) -> Offset | None:
-    """The offset of a camera's photographs beside their renders, if it is clear and large enough to be told.
+    """Offset of a camera's photographs from their renders, if it is clear and large enough to be reported.
 
     Args:
-        pixels: (N, 2) of the render that are compared.
+        camera: name of the camera.
+        images: photographs beside their renders.
+        pixels: pixels (N, 2) of the render that are compared.
         pixel_mm: edge of a pixel at the tooth.
     """
     if len(pixels) < MIN_PIXELS or not images:
@@ -162,12 +169,15 @@ def offsets_told(
     what: str,
     tooth: int | None = None,
 ) -> list[str]:
-    """A sentence for each channel whose images lie beside the mesh.
+    """One sentence for each channel whose images lie beside the mesh.
 
     Args:
+        evaluations: evaluations of the final solution by channel.
         errors: relative image error by channel.
-        what: whose mesh, such as "the mesh of tooth 11".
-        tooth: position of the one tooth of a jaw to look at; None for all that was fitted.
+        observations: the fit's observations.
+        views: observed views by channel.
+        what: name of the mesh in the sentence, such as "the mesh of tooth 11".
+        tooth: position of the one tooth of a jaw to compare; None for all fitted pixels.
     """
     found = {
         c: clearest_offset(evaluations[c], observations, views[c], c, tooth)

@@ -1,11 +1,11 @@
-"""How well renders explain photographs: the relative image error, with both noises taken out.
+"""Evaluation of renders against photographs: the relative image error, without the noise of either.
 
     err^2 = [sum (C1 - ref)(C2 - ref) - sum var_ref] / [sum ref^2 - sum var_ref]
 
-over valid pixels, linear radiance, C1 and C2 two independent renders. Monte Carlo noise cancels in the product, sensor
-noise in the subtraction, so a perfect model scores 0 on average whatever the noise; a negative square is noise and
-counts as 0. What is reported is never below its own Monte Carlo error, so that few samples cannot look like a perfect
-fit.
+over valid pixels, in linear radiance, with C1 and C2 two independent renders. Monte Carlo noise cancels in the product,
+and sensor noise is subtracted, so a perfect model has error 0 on average whatever the noise; a negative square is noise
+and counts as 0. A reported error is never below its own Monte Carlo standard error, so that few samples cannot look
+like a perfect fit.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ErrorSums:
-    """Sums over measurements; blocks add."""
+    """Sums over measurements; the sums of blocks add."""
 
     product: float = 0.0
     reference_squared: float = 0.0
     reference_variance: float = 0.0
     product_noise: float = 0.0
-    """Monte Carlo variance of ``product``; the lights of a pixel share their walks, so their errors are summed before
+    """Monte Carlo variance of ``product``. The lights of a pixel share their walks, so their errors are summed before
     they are squared."""
 
     def __add__(self, other: ErrorSums) -> ErrorSums:
@@ -46,27 +46,27 @@ class ErrorSums:
 
     @property
     def error(self) -> float | None:
-        """Relative image error, 0.05 for 5 %; None where there is no signal to compare with."""
+        """Relative image error, 0.05 for 5 %; None where there is no signal."""
         signal = self.reference_squared - self.reference_variance
         return float(np.sqrt(max(self.product - self.reference_variance, 0.0) / signal)) if signal > 0 else None
 
     @property
     def loss(self) -> float | None:
-        """Relative squared error, the reference's noise included, and not below its own standard error: what the
-        samples resolve.
+        """Relative squared error, with the reference's noise included, and not below its own Monte Carlo standard
+        error.
         """
         signal = self.reference_squared
         return float(max(self.product, np.sqrt(self.product_noise)) / signal) if signal > 0 else None
 
     @property
     def resolved_error(self) -> float | None:
-        """``error``, and not below what the samples resolve."""
+        """``error``, and not below its own Monte Carlo standard error."""
         return None if self.error is None or self.error_se is None else max(self.error, self.error_se)
 
     @property
     def error_se(self) -> float | None:
-        """One standard error of ``error`` by Monte Carlo noise; at error 0 the error whose square is one standard error
-        of the square.
+        """Monte Carlo standard error of ``error``. At error 0 it is the error whose square equals the standard error of
+        the squared error.
         """
         error, signal = self.error, self.reference_squared - self.reference_variance
         if error is None:
@@ -76,7 +76,7 @@ class ErrorSums:
 
 
 def error_sums(first: Array, second: Array, reference: Array, variance: Array, chosen: NDArray[np.bool_]) -> ErrorSums:
-    """Sums over the chosen measurements of two independent renders against a reference; all arrays (L, N), or (N,) of
+    """Sums over the chosen measurements of two independent renders against a reference; all arrays (L, N), or (N,) for
     one light.
     """
     a, b, r, v = (np.where(chosen, values, 0.0) for values in (first, second, reference, variance))
@@ -86,28 +86,28 @@ def error_sums(first: Array, second: Array, reference: Array, variance: Array, c
 
 @dataclass(frozen=True)
 class FrameSums:
-    """Sums over pixels that both lights have, (L, L): row the render's light, column the photograph's; blocks of one
-    camera add.
+    """Sums (L, L) over pixels that are valid under both lights: the row is the render's light, the column the
+    photograph's; the sums of one camera's blocks add.
     """
 
     product: Array
-    """(C1 - ref)(C2 - ref) less the reference's variance, of two independent renders."""
+    """Sum of (C1 - ref)(C2 - ref) less the reference's variance, for two independent renders C1 and C2."""
     signal: Array
-    """ref^2 less its variance."""
+    """Sum of ref^2 less the reference's variance."""
 
     def __add__(self, other: FrameSums) -> FrameSums:
         return FrameSums(self.product + other.product, self.signal + other.signal)
 
     @property
     def errors(self) -> Array:
-        """Relative error (L, L) of each photograph against each render; infinite where there is nothing to compare."""
+        """Relative error (L, L) of each photograph against each render; infinite where there is no signal."""
         seen = self.signal > 0
         square = np.where(seen, self.product, 0.0) / np.where(seen, self.signal, 1.0)
         return np.where(seen, np.sqrt(np.maximum(square, 0.0)), np.inf)
 
 
 def frame_sums(first: Array, second: Array, reference: Array, variance: Array, valid: NDArray[np.bool_]) -> FrameSums:
-    """Sums of one block of a camera; all arrays (L, N)."""
+    """Frame sums of one block of a camera; all arrays (L, N)."""
     a, b, r, v = (np.where(valid, values, 0.0) for values in (first, second, reference, variance))
     counted = valid.astype(np.float64)
     signal = counted @ (r**2 - v).T
@@ -115,33 +115,39 @@ def frame_sums(first: Array, second: Array, reference: Array, variance: Array, v
 
 
 Shown = tuple[tuple[str, int], ...]
-"""Images to return whole: camera name and light index."""
+"""Images to return as a whole: camera name and light index."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors on fitted and on held-out images, and the images that were asked for."""
+    """Errors on fitted and on held-out images, and the requested images."""
 
     fitted: ErrorSums
     held_out: ErrorSums
     renders: dict[tuple[str, int], tuple[NDArray[np.int32], Array]]
-    """By camera name and light index: pixels (N, 2) and the mean of the two renders (N,)."""
+    """Mean of the two renders (N,) and its pixels (N, 2), by camera name and light index."""
     parts: dict[int, tuple[ErrorSums, ErrorSums]] = field(default_factory=dict)
-    """Of a jaw: sums on fitted and on held-out images by what the pixels show (``blocks.PixelParts``)."""
+    """For a jaw, sums on fitted and on held-out images by the part that the pixels show (``blocks.PixelParts``)."""
     spreads: dict[tuple[str, int], Array] = field(default_factory=dict)
-    """Of the images in ``renders``, half of what the two renders differ by (N,): one standard error of their mean, from
-    two values."""
+    """Half the absolute difference (N,) of the two renders, for the images in ``renders``: one standard error of their
+    mean, estimated from two values."""
     frames: dict[str, FrameSums] = field(default_factory=dict)
-    """By camera, each photograph against the media's renders under all lights; where they were asked for."""
+    """By camera, sums of each photograph against the renders under all lights, without the instrument's errors; empty
+    where they were not requested."""
 
 
 def evaluate(
     passes: Passes, label: str, tissue: Tissue | Mouth, samples: int, shown: Shown = (), *, by_frame: bool = False
 ) -> Evaluation:
-    """Evaluate a tissue with two renders of ``samples`` paths per pixel each, seeds used nowhere else.
+    """Evaluate a tissue with two renders of ``samples`` paths per pixel each, from seeds that no other pass uses.
 
     Args:
-        by_frame: compare each photograph with the renders under all lights, too.
+        passes: passes over the blocks to evaluate.
+        label: names the evaluation in seeds and keys.
+        tissue: the tissue parameters.
+        samples: paths per pixel of each render.
+        shown: images to return.
+        by_frame: whether to compare each photograph with the renders under all lights, too.
     """
     seeds = passes.seeds(label, "evaluate-1"), passes.seeds(label, "evaluate-2")
     found: list[BlockErrors] = passes.run(
@@ -175,7 +181,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class BlockErrors:
-    """One block's share of an evaluation."""
+    """Errors, images and frame sums of one block."""
 
     fitted: ErrorSums
     held_out: ErrorSums
@@ -191,7 +197,7 @@ class BlockErrors:
 def evaluate_task(
     host: EngineHost, task: BlockTask, seeds: tuple[int, int], shown: Shown, by_frame: bool = False
 ) -> BlockErrors:
-    """Errors of one block, of renders as the instrument sees them."""
+    """Evaluate one block, with the instrument's errors applied to the renders."""
     start, block = time.time(), read_block(task.block)
     used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
     used[[light for name, light in shown if name == block.view.camera.name]] = True
@@ -219,7 +225,7 @@ def evaluate_task(
     renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in seen}
     spreads = {(name, light): 0.5 * np.abs(first[light] - second[light]) for name, light in seen}
     valid = (block.fit_weight > 0) | block.held_out
-    # What the media make: gains that followed a wrong frame would hide it.
+    # Use the media's renders without the instrument's errors: gains that adapted to a wrong frame would hide it.
     frames = frame_sums(stacks[0].mean, stacks[1].mean, block.reference, block.variance, valid) if by_frame else None
     trace = trace_row("evaluate", task, start)
     return BlockErrors(fitted, held_out, block.view.pixels, renders, spreads, parts, trace, camera, frames)

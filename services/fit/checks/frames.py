@@ -1,9 +1,8 @@
-"""Whether each photograph is that of its light: each is compared with the renders under all lights of its camera, not
-with its own alone.
+"""Check that each photograph shows its own light: it is compared with the renders under all lights of its camera.
 
-A photograph that another light's render explains far better than its own was filed under the wrong light, two that
-explain each other were exchanged, and one that nothing explains while the others are well explained was taken wrong.
-Such frames bend the media, and their share of an average hides them.
+A photograph that another light's render explains far better than its own was filed under the wrong light. Two
+photographs that explain each other were exchanged. A photograph that no render explains, while the others are well
+explained, was taken wrongly. Such frames bias the media, and in an average over all frames their error hardly shows.
 """
 
 from __future__ import annotations
@@ -21,43 +20,45 @@ from services.fit.inputs.observations import Observations, ViewStack
 Array = NDArray[np.float64]
 
 LOOKED_AT = 0.1
-"""Relative error of a photograph above which other lights are tried: below it a neighbour's light is hardly another
-picture."""
+"""Relative error of a photograph above which other lights are tried: below it, the renders of neighbouring lights
+hardly differ from its own."""
 BETTER = 0.5
-"""Another light's error has to be at most this part of its own light's. Lights 10 degrees apart differ by more than
-lights that are off by 10 mm."""
+"""Largest error of another light's render, as a part of the error of the photograph's own light. Renders of lights 10
+degrees apart differ by more than those of lights that are misplaced by 10 mm."""
 EXCHANGED = 0.75
-"""Two photographs are exchanged where each is better explained by the other's light, and both together have at most
-this part of their error. A fit bends its media towards them, so less is asked than of a single one; by chance two do
-not explain each other at all."""
+"""Largest joint error of two exchanged photographs with lights swapped, as a part of their joint error; each has to be
+better explained by the other's light. The limit is weaker than for a single photograph, because a fit biases its media
+towards exchanged ones; by chance two photographs do not explain each other at all."""
 ODD = 0.3
-"""Relative error of a photograph that is told where no other light explains it either."""
+"""Relative error above which a photograph is reported although no other light explains it."""
 ODD_RATIO = 5.0
-"""And by so many times it has to exceed the median of its camera's: where all are poorly explained, no single one is
-odd."""
+"""Factor by which the error of an odd photograph must exceed the median of its camera's: where all are poorly
+explained, no single one is odd."""
 MIN_FRAMES = 3
-"""Photographs that a camera needs for one of them to be odd."""
+"""Least number of photographs of a camera for one of them to be odd."""
 
 
 @dataclass(frozen=True)
 class WrongFrame:
-    """A photograph that is not what its light makes, or two that are each other's."""
+    """A photograph that does not show its light, or two that are exchanged."""
 
     camera: str
     light: str
     error: float
-    """Relative, against its own light's render."""
+    """Relative error against the render of the photograph's own light."""
     other: str = ""
-    """The light whose render explains it; '' where none does."""
+    """Light whose render explains the photograph; '' where none does."""
     exchanged: bool = False
-    """Whether that light's photograph is this light's."""
+    """Whether the photograph of ``other`` in turn shows this light."""
 
 
 def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterator[WrongFrame]:
-    """The wrong frames of a camera; of two that were exchanged the first.
+    """Wrong frames of a camera; of two exchanged ones only the first.
 
     Args:
-        lights: names (L,).
+        camera: name of the camera.
+        lights: names of the lights (L,).
+        sums: sums over the camera's frames.
     """
     errors = sums.errors
     own, told = np.diag(errors), set[int]()
@@ -100,10 +101,12 @@ def photographs_told(
     *,
     is_placed: bool,
 ) -> list[str]:
-    """A sentence for each wrong frame of a fit.
+    """One sentence for each wrong frame of a fit.
 
     Args:
-        evaluations: by channel, of the final answer, with sums over frames.
+        evaluations: by channel, evaluation of the final solution with sums over frames.
+        observations: the fit's observations.
+        views: by channel, the observed views.
         is_placed: whether the mesh lies where the photographs show it; see ``frames_told``.
     """
     lights = {
@@ -122,14 +125,15 @@ def photographs_told(
 def frames_told(
     sums: Mapping[str, Mapping[str, FrameSums]], lights: Mapping[str, Sequence[str]], *, is_placed: bool = True
 ) -> tuple[list[str], tuple[WrongFrame, ...]]:
-    """A sentence for each wrong frame, what several cameras show alike told once; and the frames.
+    """One sentence for each wrong frame, with one common sentence where several cameras show the same fault; and the
+    frames.
 
     Args:
-        sums: by channel and camera.
-        lights: names, by channel.
-        is_placed: whether the mesh lies where the photographs show it. Renders of a misplaced one are like no
-            photograph, so that single ones seem odd or another light's; two that explain each other are exchanged
-            there, too.
+        sums: sums over frames, by channel and camera.
+        lights: names of the lights, by channel.
+        is_placed: whether the mesh lies where the photographs show it. Renders of a misplaced mesh resemble no
+            photograph, so single photographs can seem odd or to show another light; only exchanged ones are then
+            reported, because two that explain each other are reliable.
     """
     found: dict[tuple[str, str, str, bool], tuple[WrongFrame, list[str]]] = {}
     for channel, cameras in sums.items():
@@ -137,7 +141,7 @@ def frames_told(
             for frame in wrong_frames(camera, lights[channel], own):
                 if not is_placed and not frame.exchanged:
                     continue
-                # Odd ones are told by camera, as what is wrong with one need not be with another.
+                # Report odd photographs by camera, because a fault in one camera need not occur in another.
                 key = frame.camera if not frame.other else "", frame.light, frame.other, frame.exchanged
                 seen = found.setdefault(key, (frame, []))[1]
                 if camera not in seen:

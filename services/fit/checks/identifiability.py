@@ -1,4 +1,4 @@
-"""What a capture tells of a tooth and what it cannot, in plain words."""
+"""Sentences on which quantities of a tooth a capture determines and which it does not."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from services.fit.solve.covariance import Uncertainty
 NOTHING = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."
 QUANTITIES = {"sigma_s_reduced": "scattering", "sigma_a": "absorption"}
 COORDINATES = {"sigma": ("scattering", 1), "alpha": ("absorption", -1)}
-"""What grows with a coordinate, and the sign of that."""
+"""Quantity that changes with a coordinate, and the sign of the change."""
 TOLD = 0.5
-"""A quantity is told when the data fix it and its standard error is at most this part of it."""
+"""Largest relative standard error of a quantity that counts as determined in these sentences."""
 EXCHANGEABLE = 0.9
-"""Correlation from which two quantities can stand in for each other."""
+"""Absolute correlation from which two quantities count as exchangeable."""
 
 
 def correlation(known: Uncertainty) -> Correlation:
-    """Correlation of the tissue's coordinates' errors, but for what is left of the step to the minimum; one without any
-    error has none with others.
+    """Correlation of the errors of the tissue's coordinates, without the remaining step to the minimum. A coordinate
+    without error is uncorrelated with the others.
     """
     count = known.domain.tissue_count
     covariance = (known.covariance if known.sandwich is None else known.sandwich.covariance)[:count, :count]
@@ -34,8 +34,8 @@ def correlation(known: Uncertainty) -> Correlation:
 
 
 def told(tables: Mapping[str, Mapping[str, Estimate]], correlations: Mapping[str, Correlation]) -> str:
-    """One or two sentences: what is known with unit and standard error, what is not and between which limits, and what
-    looks alike.
+    """One or more sentences: the determined quantities with unit and standard error, the others with their limits, and
+    the pair of quantities that is hardest to distinguish.
     """
     groups: dict[tuple[str, ...], list[str]] = {}
     for channel, table in tables.items():
@@ -46,7 +46,7 @@ def told(tables: Mapping[str, Mapping[str, Estimate]], correlations: Mapping[str
 
 
 def in_words(name: str) -> str:
-    """``enamel.sigma_a`` as *enamel absorption*."""
+    """Name of a quantity in words: ``enamel.sigma_a`` becomes *enamel absorption*."""
     part, _, leaf = name.rpartition(".")
     return f"{part} {QUANTITIES[leaf]}"
 
@@ -86,7 +86,7 @@ def _value(estimate: Estimate) -> str:
 
 
 def _limits(estimate: Estimate) -> str:
-    # 95 % limits; none of these quantities is negative.
+    # 95 % limits, at least 0, because none of these quantities is negative.
     if estimate.se is None or not np.isfinite(estimate.se):
         return "anything"
     low, high = max(estimate.value - 2 * estimate.se, 0.0), estimate.value + 2 * estimate.se
@@ -94,7 +94,7 @@ def _limits(estimate: Estimate) -> str:
 
 
 def _alike(correlations: Mapping[str, Correlation]) -> str:
-    # The pair whose errors go together most, over all channels.
+    # The pair with the largest correlation of errors, over all channels.
     found: list[tuple[float, str]] = []
     for one in correlations.values():
         for a, b in combinations(range(len(one.names)), 2):

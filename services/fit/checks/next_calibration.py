@@ -1,5 +1,5 @@
-"""Which measurement of the instrument would help most: the covariance of a fit whose calibration knew one kind of error
-twice as well.
+"""Advice on the instrument's measurement that would help most: covariance of a fit whose calibration knew one kind of
+error twice as precisely.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from services.fit.solve.information import Addition, covariance_after
 Array = NDArray[np.float64]
 
 FEWER = 2.0
-"""By what each ± of a kind is divided."""
+"""Factor by which the standard errors of a kind are divided."""
 WORDS = {
     "gain": "Measuring the gain",
     "light_gain": "Measuring each light",
@@ -33,13 +33,13 @@ WORDS = {
 
 
 def calibration_advice(tissue: Tissue, parts: Sequence[str], known: Uncertainty) -> str:
-    """One sentence on the kind of error that is worth measuring, judged by the quantity whose relative error is
-    largest, or the next; '' where none is.
+    """One sentence on the kind of error that is worth measuring; '' where none is. It is judged by the quantity with
+    the largest relative error, or by the next ones where no measurement helps that one.
 
     Args:
         tissue: the solution.
-        parts: ``enamel``, ``dentin``.
-        known: uncertainty there.
+        parts: names of the media, ``enamel`` and ``dentin``.
+        known: uncertainty at the solution.
     """
     before = relative_errors(estimates(tissue, parts, known))
     kinds = dict.fromkeys([*map(kind_of_error, known.domain.errors.names), *(k for k in MOVED if k in known.parts)])
@@ -59,8 +59,8 @@ def calibration_advice(tissue: Tissue, parts: Sequence[str], known: Uncertainty)
 
 
 def covariance_if_known(known: Uncertainty, kind: str) -> Array:
-    """Covariance (F, F) of a fit that knew a kind of error ``FEWER`` times as well beforehand; the step that was left
-    stays left.
+    """Covariance (F, F) of a fit whose calibration knew a kind of error ``FEWER`` times as precisely; the remaining
+    step of the fit stays in it.
     """
     if kind in MOVED:
         return np.asarray(known.covariance - (1 - FEWER**-2) * known.parts[kind])
@@ -68,7 +68,7 @@ def covariance_if_known(known: Uncertainty, kind: str) -> Array:
     domain = known.domain
     own = [k for k, name in enumerate(domain.errors.names) if kind_of_error(name) == kind]
     chosen = [domain.tissue_count + k for k in own]
-    # Information that divides the kind's own covariance, whatever it goes together with.
+    # Add information that divides the kind's own covariance, whatever its correlations with other kinds.
     added = np.zeros_like(known.covariance)
     added[np.ix_(chosen, chosen)] = (FEWER**2 - 1) * np.linalg.inv(domain.errors.matrix[np.ix_(own, own)])
     whitened = known.sandwich.transform.T @ added @ known.sandwich.transform

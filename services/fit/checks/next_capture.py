@@ -1,5 +1,5 @@
-"""Which further light or view would help most: Jacobians of images that were not taken, on a few hundred pixels, beside
-what the fit knows.
+"""Advice on the further light or view that would help most, from Jacobians of planned images on a few hundred pixels
+and the fit's covariance.
 """
 
 from __future__ import annotations
@@ -41,58 +41,59 @@ from services.fit.transport.scene.recipe import SceneRecipe, View
 Array = NDArray[np.float64]
 
 PIXELS = 100
-"""Of each view, spread evenly."""
+"""Number of pixels of each view, spread evenly."""
 VIEW_ANGLE = np.radians(60)
 WORTH = 0.1
-"""A candidate is named when it cuts the error by more than this part, and by more than the prediction is unsure of."""
+"""Least relative reduction of an error, including the prediction's own uncertainty, for which a candidate is
+recommended."""
 LIGHTS = {
     "at the left": (-1, 0, 0), "at the right": (1, 0, 0), "above": (0, 1, 0), "below": (0, -1, 0),
     "beside the camera": (0, 0, 1), "behind the tooth": (0, 0, -1), "at the left behind the tooth": (-1, 0, -1),
     "at the right behind the tooth": (1, 0, -1), "above, behind the tooth": (0, 1, -1),
 }  # fmt: skip
-"""Directions from the tooth in the first camera's image: right, up, towards the camera."""
+"""Directions from the tooth in the first camera's axes: right, up, towards the camera."""
 VIEWS = {"60° further to the left": (0, -1, 0), "60° further to the right": (0, 1, 0), "60° higher": (-1, 0, 0)}
-"""Axes, right, up, towards the camera, about which the first camera is turned around the tooth."""
+"""Axes (right, up, towards the camera) about which the first camera is turned around the tooth."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An image that was not taken; halves are two predictions from different pixels."""
+    """A planned light or view; the halves are predictions from two sets of pixels."""
 
     words: str
     halves: tuple[Addition, Addition]
 
     @property
     def whole(self) -> Addition:
-        """From all pixels."""
+        """Prediction from all pixels."""
         return self.halves[0] + self.halves[1]
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """Expected noise of an image: a share of the value, and of the image's maximum."""
+    """Expected noise of an image: standard deviations as a share of the value and as a share of the image's maximum."""
 
     relative: float
     floor: float
 
     def variance(self, image: Array) -> Array:
-        """Of images (L, N)."""
+        """Noise variance (L, N) of images (L, N)."""
         return np.asarray((self.relative * image) ** 2 + (self.floor * image.max(axis=-1, keepdims=True)) ** 2)
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A view of images that were not taken, stored as a block, and how many times more measurements the fit would have
-    of it.
+    """A view of planned images, stored as a block, and the number of measurements that the fit would have for each
+    measurement of the block.
     """
 
     block: StoredFile
     words: tuple[str, ...]
-    """Candidate that each light belongs to, '' for those that do not count."""
+    """Candidate to which each light belongs, '' for lights that do not count."""
     ratio: float
     own_error: str = ""
-    """Kind of the error that such images have of their own: a new light's gain, a new camera's flare; '' where the
-    instrument counts as perfect."""
+    """Kind of error that such images add: a new light's gain, a new camera's flare; '' where the instrument counts as
+    exact."""
 
 
 def advice(
@@ -104,15 +105,17 @@ def advice(
     weight: float,
     samples: int,
 ) -> tuple[str, tuple[Candidate, ...]]:
-    """One sentence on the light or view that would cut the largest relative error most, and all candidates; '' where
-    none would.
+    """One sentence on the light or view that would reduce the largest relative error most, and all candidates; '' where
+    there are none.
 
     Args:
-        problem: at the solution, which is its base.
-        known: uncertainty there.
-        folder: for the scenes and blocks of what was not taken.
-        weight: of a measurement in the fit.
-        samples: paths per pixel and seed, those of the fit's last measurement.
+        problem: the least-squares problem at the solution, which is its base.
+        known: uncertainty at the solution.
+        folder: receives the scenes and blocks of the planned images.
+        parts: names of the media, such as ``enamel``.
+        sensor: expected noise of the planned images.
+        weight: weight of a measurement in the fit.
+        samples: paths per pixel and seed, as in the fit's last measurement.
     """
     assert known.sandwich is not None
     recipe, probes = probes_of(problem, folder)
@@ -136,8 +139,8 @@ def advice(
 
 
 def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidates: Sequence[Candidate]) -> str:
-    """The best candidate in words, judged by the quantity whose relative error is largest now; by the next one where
-    that stays out of every reach.
+    """Sentence on the best candidate, judged by the quantity with the largest relative error, or by the next ones where
+    no candidate reduces that one.
     """
     before = relative_errors(estimates(tissue, parts, known))
     if not before or not candidates:
@@ -161,8 +164,8 @@ def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate
 def predicted(
     tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate: Candidate
 ) -> dict[str, tuple[float, float]]:
-    """Relative errors with a candidate's images, and how unsure these predictions are: half the pixels, counted twice,
-    differ by noise alone.
+    """Relative errors with a candidate's images, and the uncertainty of these predictions: two predictions from half
+    the pixels each, counted twice, differ by noise alone.
     """
 
     def after(added: Addition) -> dict[str, float]:
@@ -173,7 +176,7 @@ def predicted(
 
 
 def relative_errors(table: Mapping[str, Estimate]) -> dict[str, float]:
-    """Standard errors over values of what a report leads with."""
+    """Relative standard errors of the report's leading quantities."""
     return {
         name: e.se / abs(e.value)
         for name, e in table.items()
@@ -182,8 +185,8 @@ def relative_errors(table: Mapping[str, Estimate]) -> dict[str, float]:
 
 
 def probes_of(problem: StackProblem[Tissue], folder: Path) -> tuple[StoredFile, tuple[Probe, ...]]:
-    """The scene with the candidate lights added, and views to probe: the fit's own under these lights, further ones
-    under the lights there are.
+    """Scene with the candidate lights added, and views to predict: the fit's own under these lights, and further views
+    under the present lights.
     """
     blocks, recipe = problem.passes.read_blocks(), read_recipe(problem.passes.recipe)
     cameras = {block.view.camera.name: block.view.camera for block in blocks}
@@ -248,20 +251,20 @@ def _probe(
 
 
 def _of_new_images(known: BlockInstrument, lights: int, own_error: str) -> BlockInstrument:
-    # Errors that the fit knows act on them too: gains of lights that it has, and the flare of a camera that it has.
+    # Errors of the fit that also act on planned images: gains of its lights, and flares of its cameras.
     flare = "" if own_error == "flare" else known.flare
     return replace(known, lights=known.lights + ("",) * (lights - len(known.lights)), flare=flare)
 
 
 def turned(camera: Camera, centre_mm: Array, axis: Array) -> Camera:
-    """The camera carried around a point about an axis, still looking at it as before."""
+    """The camera turned around a point about an axis by ``VIEW_ANGLE``, still looking at the point as before."""
     turn = rigid(np.concatenate([VIEW_ANGLE * axis, np.zeros(3)]), centre_mm)
     moved = np.asarray(camera.camera_from_world) @ np.linalg.inv(turn)
     return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, moved.tolist()))})
 
 
 def seen_pixels(camera: Camera, recipe: SceneRecipe, step: int) -> NDArray[np.int32]:
-    """Every ``step``-th pixel (N, 2) in whose cell some point of the tooth's surface appears."""
+    """Every ``step``-th pixel (N, 2) in whose cell a point of the tooth's surface appears."""
     outer = recipe.teeth[0].outer
     corners = outer.vertices_mm[outer.faces]
     weights = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4
@@ -282,7 +285,7 @@ def advice_task(
     sensor: Sensor,
     weight: float,
 ) -> tuple[dict[str, tuple[Addition, Addition]], TraceRow]:
-    """What one view adds by candidate, from its even and its odd pixels."""
+    """Information that one view adds, by candidate, from its even and its odd pixels, and the task's trace."""
     start, block = time.time(), read_block(task.block)
     view, half = block.fitted_view, max(task.samples // 2, 1)
     images = [
@@ -319,8 +322,8 @@ def advice_task(
 
 
 def _own_errors(probe: Probe, image: Array, acting: BlockInstrument | None, fitted: tuple[str, ...]) -> Array:
-    """What one ± of the error that new images have of their own changes them by (K, L, N); none where the fit knows no
-    errors.
+    """Change (K, L, N) of new images by one standard error of the error that they add; empty where the fit has no
+    errors of the instrument.
     """
     if not probe.own_error or acting is None or not fitted:
         return np.zeros((0, *image.shape))
@@ -329,5 +332,5 @@ def _own_errors(probe: Probe, image: Array, acting: BlockInstrument | None, fitt
 
 
 def in_percent(fraction: float) -> str:
-    """A relative error as a report's sentences give it."""
+    """A relative error in percent, as the sentences of a report state it."""
     return f"{100 * fraction:.0f} %" if fraction >= 0.1 else f"{100 * fraction:.1f} %"

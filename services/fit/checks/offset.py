@@ -1,15 +1,15 @@
-"""How far photographs lie beside the render that should explain them, with the ± that the noise of both gives.
+"""Offset of photographs from the render that should explain them, with its standard error by the noise of both.
 
-The render's pixels are slid over the photographs. With a the render, s the spread of its mean, b the photograph under
-it and v the photograph's variance,
+The render's pixels are shifted over the photographs. With a the render, s the standard error of its mean, b the
+photograph under it and v the photograph's variance,
 
     U = sum (|b - beta a|^2 - sum v - beta^2 sum s^2) / sum (|b|^2 - sum v),    beta = a.b / (|a|^2 - sum s^2)
 
-is the share of the photographs that stays unexplained at the best brightness of each, the noise of both taken out. The
-outer sums are over the images, so that those of little light, which a shift onto the dark would explain as well, count
-for little. The shift of least U is refined below a pixel by a parabola. With E the lower sum, noise n of a photograph's
-pixel changes U by 2 (b - beta a - U b) n / E to first order, that of a render's by -2 beta (b - beta a) n / E. Several
-U share that noise, and so the error of what is made of them follows (the delta method).
+is the share of the photographs that stays unexplained at the best brightness of each image, without the noise of both.
+The outer sums are over the images, so that those with little light, which a shift onto the dark would explain as well,
+count for little. The shift of least U is refined below a pixel by a parabola. With E the lower sum, noise n of a
+photograph's pixel changes U by 2 (b - beta a - U b) n / E to first order, that of a render's pixel by -2 beta (b - beta
+a) n / E. Several U share that noise, so the error of quantities derived from them follows by the delta method.
 """
 
 from __future__ import annotations
@@ -25,44 +25,45 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Shift = tuple[int, int]
-"""Pixels to the right and down."""
+"""Shift in pixels to the right and down."""
 
 REACH_MM = 4.0
-"""Farthest offset that is looked for, half of a small tooth."""
+"""Largest offset of the search, half of a small tooth."""
 GRID = 8
-"""Offsets tried to each side before the best is refined."""
+"""Number of grid steps to each side in the first search."""
 MIN_KNOWN = 0.7
-"""Share of the render's pixels that a shift must leave on usable pixels of the photograph."""
+"""Least share of the render's pixels that a shift must leave on usable pixels of the photograph."""
 MEDIAN_OF_SQUARE = 0.4549
 """Median of the square of a standard normal number."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A photograph as taken beside its render, each (H, W)."""
+    """A photograph and its render, (H, W) each."""
 
     photo: Array
-    """NaN where it is unusable."""
+    """Photograph; NaN where it is unusable."""
     variance: Array
-    """Of the photograph's noise, as stated."""
+    """Stated variance of the photograph's noise."""
     render: Array
-    """NaN where nothing was fitted."""
+    """Render; NaN where nothing was fitted."""
     spread: Array
-    """One standard error of ``render``, as far as it is known."""
+    """Standard error of ``render``; 0 where it is not known."""
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What stays unexplained at one shift, and how it changes with the noise of each pixel."""
+    """Unexplained share at one shift, and its derivatives with respect to the noise of each pixel."""
 
     value: float
     slopes: Array
-    """(2, I, H, W), of photographs and renders: change of ``value`` by a noise of one standard deviation."""
+    """Change of ``value`` by a noise of one standard deviation in each pixel, (2, I, H, W): of the I photographs, then
+    of their renders."""
 
 
 @dataclass(frozen=True)
 class _Match:
-    # One image's pixels at one shift, as far as photograph and render are known there: indices and values (n,) of both.
+    # Pixels of one image at one shift where photograph and render are known: indices and values (n,) of both.
     photo_at: tuple[NDArray[np.int64], NDArray[np.int64]]
     render_at: tuple[NDArray[np.int64], NDArray[np.int64]]
     b: Array
@@ -74,21 +75,21 @@ class _Match:
         return self.b - beta * self.a
 
     def beta(self, render_noise: float) -> float:
-        # 0 where the render is all noise.
+        # Best brightness of the render; 0 where the render is all noise.
         energy = float(self.a @ self.a) - render_noise
         return float(self.a @ self.b) / energy if energy > 0 else 0.0
 
 
 @dataclass(frozen=True)
 class Slide:
-    """The pixels of a render on photographs of one camera."""
+    """Pixels of a render that are shifted over the photographs of one camera."""
 
     images: Sequence[Comparison]
     pixels: NDArray[np.int64]
-    """(N, 2) of the render that are compared."""
+    """Compared pixels (N, 2) of the render."""
 
     def cropped(self, margin_px: int) -> Slide:
-        """The same without what lies farther than a margin from the render's pixels: large images would cost memory."""
+        """The images cropped to a margin around the render's pixels, because large images would need much memory."""
         height, width = self.images[0].photo.shape
         low = np.maximum(self.pixels.min(axis=0) - margin_px, 0)
         high = np.minimum(self.pixels.max(axis=0) + margin_px + 1, (width, height))
@@ -99,9 +100,10 @@ class Slide:
         return Slide(images, self.pixels - low)
 
     def unlikeness(self, shift: Shift) -> float:
-        """Share that stays unexplained with the noise in it, 1 where nothing is alike: what a search may compare.
+        """Unexplained share at a shift, noise included, as the objective of the search; 1 where photograph and render
+        have nothing in common.
 
-        Infinite where too little is known.
+        Infinite where too few pixels are known.
         """
         matches = self._matches(shift)
         energy = sum(float(match.b @ match.b) for match in matches)
@@ -110,18 +112,20 @@ class Slide:
         return sum(float(match.residual(max(match.beta(0.0), 0.0)) @ match.b) for match in matches) / energy
 
     def noise(self, shift: Shift) -> float:
-        """How many times its stated variance the noise has, by differences of neighbouring residuals; at least 1.
+        """Ratio of the photographs' noise variance to the stated one, from differences of neighbouring residuals; at
+        least 1.
 
-        A capture that says nothing of its noise is given a guess. The median passes over edges.
+        A capture that states no noise has an assumed one. The median ignores edges.
         """
         ratios = [ratio for match in self._matches(shift) for ratio in _neighbours(match, self.images[0].photo.shape)]
         return max(float(np.median(ratios)) / MEDIAN_OF_SQUARE, 1.0) if ratios else 1.0
 
     def unexplained(self, shift: Shift, noise: float) -> Unexplained | None:
-        """See ``Unexplained``; None where too little is known or the photographs are all noise.
+        """Unexplained share at a shift; None where too few pixels are known or the photographs are all noise.
 
         Args:
-            noise: how many times its stated variance the photographs' noise has.
+            shift: shift in pixels.
+            noise: ratio of the photographs' noise variance to the stated one.
         """
         matches = self._matches(shift)
         betas = [match.beta(float(match.spread @ match.spread)) for match in matches]
@@ -139,7 +143,7 @@ class Slide:
         return Unexplained(value, slopes)
 
     def _matches(self, shift: Shift) -> list[_Match]:
-        # Of all images, or none where one of them is known on too few pixels.
+        # Matches of all images; none where one of the images is known on too few pixels.
         matches = [_match(image, self.pixels, shift) for image in self.images]
         return matches if all(len(match.a) >= MIN_KNOWN * len(self.pixels) for match in matches) else []
 
@@ -156,7 +160,7 @@ def _match(image: Comparison, pixels: NDArray[np.int64], shift: Shift) -> _Match
 
 
 def _neighbours(match: _Match, shape: tuple[int, ...]) -> Array:
-    # Squared differences between a pixel's residual and its right neighbour's, in units of their stated variance.
+    # Squared differences between the residuals of a pixel and its right neighbour, in units of their stated variance.
     beta = match.beta(0.0)
     residual, stated = np.full(shape, np.nan), np.zeros(shape)
     residual[match.photo_at] = match.residual(beta)
@@ -168,40 +172,41 @@ def _neighbours(match: _Match, shape: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True)
 class FoundOffset:
-    """The offset at which a render explains its photographs best."""
+    """Offset at which a render explains its photographs best."""
 
     right_px: float
     down_px: float
     right_se_px: float
-    """One standard error by the photographs' noise."""
+    """Standard error by the photographs' noise."""
     down_se_px: float
     gain: float
-    """Share of what is unexplained in place that goes away."""
+    """Share of the unexplained difference at shift 0 that the offset removes."""
     z: float
-    """What goes away, in standard errors of its own."""
+    """Removed difference in its own standard errors."""
 
     @property
     def length_px(self) -> float:
-        """How far."""
+        """Length of the offset."""
         return float(np.hypot(self.right_px, self.down_px))
 
     @property
     def length_se_px(self) -> float:
-        """One standard error of ``length_px``, the errors to the right and down taken as independent."""
+        """Standard error of ``length_px``, with the errors to the right and down taken as independent."""
         along = np.array([self.right_px, self.down_px]) / max(self.length_px, 1e-9)
         return float(np.hypot(along[0] * self.right_se_px, along[1] * self.down_se_px))
 
 
 def best_offset(slide: Slide, pixel_mm: float) -> FoundOffset | None:
-    """Search a grid of shifts, then ever smaller steps around the best one.
+    """Best offset by search over a grid of shifts, then with ever smaller steps around the best one.
 
-    None where nothing can be compared or nothing is unexplained.
+    None where nothing can be compared or no difference is unexplained.
     """
     slide = slide.cropped(2 * math.ceil(REACH_MM / pixel_mm))
     best = _most_alike(slide, pixel_mm)
     if best is None:
         return None
-    # At a wrong shift the tooth's edges are among the residuals, so the lesser of the two is nearer to the noise.
+    # Take the smaller of the two noise estimates: at a wrong shift the tooth's edges are in the residuals and enlarge
+    # it.
     noise = min(slide.noise((0, 0)), slide.noise(best))
     in_place, there = (slide.unexplained(shift, noise) for shift in ((0, 0), best))
     if in_place is None or there is None or in_place.value <= 0:
@@ -236,8 +241,8 @@ class _Vertex(NamedTuple):
 
 
 def _vertex(slide: Slide, best: Shift, there: Unexplained, noise: float, direction: Shift) -> _Vertex:
-    # Where a parabola through the values at -1, 0 and 1 is least, with its standard error; (0, infinite) where that is
-    # nowhere between them.
+    # Minimum of the parabola through the values at -1, 0 and 1, with its standard error; (0, infinite) where the
+    # parabola has no minimum or a value is unknown.
     steps = [(best[0] + k * direction[0], best[1] + k * direction[1]) for k in (-1, 1)]
     before, after = (slide.unexplained(step, noise) for step in steps)
     if before is None or after is None or before.value + after.value <= 2 * there.value:

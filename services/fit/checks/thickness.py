@@ -1,4 +1,4 @@
-"""Enamel thickness: shortest distance from the enamel's outer surface to dentin."""
+"""Enamel thickness: shortest distance from the enamel's outer surface to the dentin."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from services.core.results import Estimate
 from services.fit.transport.rays import RayScene, pixel_rays
 
 MIN_STEP = 0.01
-"""Least half step of a difference by a blend weight: some micrometres of dentin, far above rounding."""
+"""Least half width of the central difference by a blend weight: some micrometres of dentin, far above rounding."""
 
 
 def enamel_thickness_mm(points_mm: NDArray[np.float64], dentin: Mesh) -> NDArray[np.float64]:
-    """Distance (N,) from points on the enamel's outer surface (N, 3) to the dentin surface, mm."""
+    """Distance (N,) in mm from points (N, 3) on the enamel's outer surface to the dentin's surface."""
     return SurfaceDistance(dentin).closest(points_mm)[1]
 
 
 @dataclass(frozen=True)
 class UncertainThickness:
-    """Enamel thickness with one standard error, mm."""
+    """Enamel thickness at N points with its standard error, mm."""
 
     values_mm: NDArray[np.float64]
     """(N,)"""
@@ -32,17 +32,18 @@ class UncertainThickness:
     """(N,)"""
     mean_mm: float
     mean_error_mm: float
-    """Of the mean over all points; errors of points go together, so it is hardly smaller than theirs."""
+    """Standard error of the mean over all points. The points' errors are correlated, so it is hardly smaller than
+    theirs."""
 
 
 def uncertain_thickness(
     points_mm: NDArray[np.float64], shape: DentinShape, weights: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> UncertainThickness:
-    """Thickness at points (N, 3) of the outer surface for fitted blend weights c (M,) of covariance (M, M), to first
-    order.
+    """Thickness at points (N, 3) of the outer surface for fitted blend weights c (M,) of covariance (M, M), by
+    first-order error propagation.
 
-    The slope of the distance is a central difference over one standard error of each weight, cut at 0 and 1, so that it
-    is that of the range that counts.
+    The derivative of the distance is a central difference over one standard error of each weight, limited to weights
+    from 0 to 1, so that it is the mean derivative over the likely range.
     """
 
     def thickness(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -62,24 +63,29 @@ def uncertain_thickness(
 
 @dataclass(frozen=True)
 class ThicknessMap:
-    """Enamel thickness where a camera sees the tooth, mm."""
+    """Enamel thickness in the view of a camera, mm."""
 
     image_mm: NDArray[np.float64]
-    """(H, W), NaN off the tooth."""
+    """Thickness (H, W), NaN off the tooth."""
     errors_mm: NDArray[np.float64] | None
-    """One standard error (H, W); None where the dentin is known."""
+    """Standard error (H, W); None where the dentin is known."""
     mean: Estimate
-    """Over what is seen, mm."""
+    """Mean over the visible surface, mm."""
 
 
 def thickness_map(
     outer: Mesh, shape: DentinShape, weights: tuple[float, ...], covariance: NDArray[np.float64] | None, camera: Camera
 ) -> ThicknessMap | None:
-    """What a camera sees of a fitted dentin; None where it does not see the tooth.
+    """Map of the enamel's thickness over a fitted dentin in a camera's view; None where the camera does not see the
+    tooth.
 
     Args:
-        covariance: of the weights (M, M); None where none were fitted: the dentin is known, or its weights are only
-            assumed, which determines nothing.
+        outer: the enamel's outer surface.
+        shape: the dentin's blend shape.
+        weights: blend weights (M,).
+        covariance: covariance of the weights (M, M); None where they were not fitted, because the dentin is known or
+            the weights are assumed. An assumed weight determines nothing.
+        camera: the camera.
     """
     if covariance is None:
         image = thickness_image(outer, Mesh(shape.vertices_mm(weights), shape.base.faces), camera)
@@ -105,13 +111,13 @@ def thickness_map(
 
 
 def thickness_image(outer: Mesh, dentin: Mesh, camera: Camera) -> NDArray[np.float64]:
-    """Enamel thickness in mm at the surface point that each pixel sees, (H, W); NaN off the tooth."""
+    """Enamel thickness in mm at the surface point that each pixel shows, (H, W); NaN off the tooth."""
     seen, points_mm = _seen(outer, camera)
     return _image(seen, enamel_thickness_mm(points_mm, dentin) if seen.any() else np.zeros(0), camera)
 
 
 def _seen(outer: Mesh, camera: Camera) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    # Which pixels (H W,) see the tooth, and where.
+    # Mask (H W,) of the pixels that show the tooth, and the surface points (N, 3) that they show.
     hits = RayScene(outer).first_hits(*pixel_rays(camera))
     return hits.hit, hits.points_mm[hits.hit]
 

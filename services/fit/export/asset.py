@@ -1,4 +1,4 @@
-"""The asset: a folder that stock Mitsuba renders, with the measured numbers beside it.
+"""The exported asset: a folder that stock Mitsuba renders, with the measured parameters beside the scenes.
 
 ::
 
@@ -39,7 +39,7 @@ from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
 SHIPPED = Path(__file__).parent / "shipped"
 NOT_CONVERGED = "NOT-CONVERGED.txt"
-"""Lies in the asset of a fit that did not converge, with what to do about it."""
+"""File in the asset of a fit that did not converge, with advice on what to do."""
 
 
 def write_asset(
@@ -56,18 +56,18 @@ def write_asset(
     cavity: Mesh | None = None,
     stains: ToothStains | None = None,
 ) -> tuple[str, ...]:
-    """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; returns the files' paths relative
-    to ``folder``.
+    """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; return the files' paths relative to
+    ``folder``.
 
     Args:
         teeth: with the **fitted** dentin surface (``DentinShape.vertices_mm(shape)``) where the fit had one.
         lights: ``intensity`` in the order of ``channels``.
-        gums, cavity: of a jaw.
-        stains: of a single tooth.
+        gums, cavity: surfaces of a jaw; None for a single tooth.
+        stains: stain textures of a single tooth.
 
     Raises:
-        CaptureInputError: a camera that Mitsuba cannot render. MeshError: surfaces of a jaw that cannot be cut along
-            each other.
+        CaptureInputError: a camera that Mitsuba cannot render.
+        MeshError: surfaces of a jaw that cannot be cut along each other.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = {}
@@ -130,12 +130,12 @@ def write_asset(
 
 
 def tissue_of(table: dict[str, Estimate]) -> Tissue:
-    """The tissue that a table of estimates describes; a part that was not modelled is empty."""
+    """Tissue of a table of estimates; a part that was not modelled is an empty medium."""
     return Tissue(_medium_of(table, "enamel"), _medium_of(table, "dentin"))
 
 
 def mouth_of(report: FitReport, channel: str) -> Mouth:
-    """The mouth that a jaw's report describes, teeth in its order."""
+    """Mouth of a jaw's report in one channel, with the teeth in the report's order."""
     table = report.parameters[channel]
     gums = _medium_of(table, "gums") if "gums.sigma" in table else None
     reflectance = table["cavity.reflectance"].value if "cavity.reflectance" in table else None
@@ -150,7 +150,9 @@ def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
 
 
 def parameters_json(report: FitReport) -> dict[str, Any]:
-    """Per channel and name: value, se, unit, determined, se_parts; the instrument's errors among them."""
+    """Estimates per channel and name as JSON values: value, se, unit, determined, se_parts; the instrument's errors are
+    included.
+    """
     tables = {channel: dict(table) | report.instrument.get(channel, {}) for channel, table in report.parameters.items()}
     for fdi, tooth in report.teeth.items():
         for channel, own in tooth.parameters.items():
@@ -168,7 +170,7 @@ def _plain(estimate: Estimate) -> dict[str, Any]:
 
 
 def errors_json(report: FitReport) -> dict[str, Any]:
-    """Relative image errors per channel, and whether they are those of a converged fit."""
+    """Relative image errors per channel as JSON values, with the verdict on the fit's convergence."""
     verdict = verdict_of(report)
     errors = {
         "unit": "1",

@@ -10,19 +10,19 @@ from html import escape
 WIDTH, HEIGHT = 520, 240
 LEFT, RIGHT, TOP, BOTTOM = 64, 104, 16, 40
 DASHES = ("", "6 4", "2 3")
-"""Series differ by dash as well as by colour."""
+"""Dash patterns, so that series differ by more than their colour."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line: steps and positive values."""
+    """One line of a chart: steps and positive values."""
 
     label: str
     points: tuple[tuple[float, float], ...]
 
 
 def log_chart(title: str, x_label: str, y_label: str, series: Sequence[Series], percent: bool = False) -> str:
-    """A chart with a logarithmic y axis; empty text when no series has a positive value."""
+    """Line chart with a logarithmic y axis; an empty string where no series has a positive value."""
     lines = [Series(s.label, tuple((x, y) for x, y in s.points if math.isfinite(y) and y > 0)) for s in series]
     lines = [s for s in lines if s.points]
     if not lines:
@@ -64,7 +64,7 @@ def log_chart(title: str, x_label: str, y_label: str, series: Sequence[Series], 
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    # 1, 2, 5 of each decade where they are few, whole decades where they are many.
+    # Ticks at 1, 2 and 5 of each decade, or at whole decades where these would be too many.
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     fine = [m * 10.0**k for k in decades for m in (1, 2, 5) if low <= m * 10.0**k <= high]
     whole = [10.0**k for k in decades if low <= 10.0**k <= high]
@@ -77,7 +77,7 @@ def _step_ticks(low: float, high: float) -> list[float]:
 
 
 def _spread(heights: list[float], gap: float = 14.0) -> list[float]:
-    # Labels at the lines' ends, moved apart downwards where they would overlap.
+    # Heights of the labels at the lines' ends, moved downwards where they would overlap.
     placed = list(heights)
     previous = -math.inf
     for index in sorted(range(len(heights)), key=lambda k: heights[k]):

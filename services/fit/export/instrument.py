@@ -1,4 +1,4 @@
-"""The report's tables of the instrument: what the images make of its errors, and what each ± is made of."""
+"""Tables of the report on the instrument: estimates of its errors, and the sources of each standard error."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ SOURCES = {
     "mean_cosine": "mean cosine",
     "unfinished": "unfinished",
 }
-"""Sources of a ± as the report heads them."""
+"""Sources of a standard error, with their headings in the report."""
 MIN_SHARE = 0.005
-"""Smaller shares of a squared ± are not shown."""
+"""Smallest share of a squared standard error that is shown."""
 
 
 def source_tables(
     report: FitReport, leading: Callable[[str], bool], label: Callable[[str], str]
 ) -> list[dict[str, Any]]:
-    """By channel, the shares of the squared ± of the quantities that lead the report.
+    """Tables, by channel, of the shares by source of the squared standard errors of the report's leading quantities.
 
     Args:
-        leading: whether a parameter is shown, by its name.
-        label: what it is called.
+        report: the fit's report.
+        leading: whether the parameter of a name is shown.
+        label: the label of a parameter, by its name.
     """
     tables = []
     for channel, table in _tables(report).items():
@@ -44,7 +45,9 @@ def source_tables(
 
 
 def instrument_tables(report: FitReport) -> list[dict[str, Any]]:
-    """By channel, each error of the instrument as the images tell it, and its ± before the fit, in percent."""
+    """Tables, by channel, of each error of the instrument: estimate, its standard error, and its standard error before
+    the fit, in percent.
+    """
     tables = []
     for channel, found in report.instrument.items():
         rows = []
@@ -65,7 +68,7 @@ def instrument_tables(report: FitReport) -> list[dict[str, Any]]:
 
 
 def _tables(report: FitReport) -> dict[str, dict[str, Estimate]]:
-    # A jaw's parameters are those of gums and wall, and each tooth's by its number.
+    # All parameters by channel: those of the report's own table and, in a jaw, those of each tooth under its number.
     teeth = {
         channel: {
             f"{fdi}.{name}": one

@@ -1,4 +1,4 @@
-"""A tooth as a scene for stock Mitsuba: nested homogeneous media, point lights, pinhole cameras; one colour channel."""
+"""Scene of a tooth for stock Mitsuba: nested homogeneous media, point lights, pinhole cameras; one colour channel."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from services.fit.optics.parameters import Medium, Tissue
 
 MAX_DEPTH = 5000
 ROULETTE_DEPTH = 100
-"""Russian roulette starts here: paths in enamel scatter hundreds of times, and an earlier start costs more variance
-than it saves."""
+"""Path depth at which Russian roulette starts: paths in enamel scatter hundreds of times, and an earlier start costs
+more variance than it saves."""
 MAX_UNEVEN = 0.01
-"""Of a camera's focal lengths along x and y: calibrations of square pixels leave a thousandth between them."""
+"""Largest relative difference of a camera's focal lengths along x and y: calibrations of square pixels leave a
+thousandth between them."""
 
 SceneDict = dict[str, Any]
 
 
 def medium_dict(medium: Medium) -> SceneDict:
-    """A homogeneous medium; two lobes become a blended phase function.
+    """Homogeneous medium; two lobes become a blended phase function.
 
     Raises:
-        InputError: its phase function is a table.
+        InputError: the medium's phase function is a table.
     """
     medium.require_lobes("An exported scene")
     first: SceneDict = {"type": "hg", "g": float(medium.g1)}
@@ -43,11 +44,10 @@ def medium_dict(medium: Medium) -> SceneDict:
 
 
 def with_square_pixels(camera: Camera) -> Camera:
-    """A calibrated camera with its mean focal length in both directions; one whose focal lengths differ by more stays
-    as it is.
+    """A calibrated camera with its mean focal length in both directions; a camera whose focal lengths differ by more
+    than ``MAX_UNEVEN`` stays unchanged.
 
-    Scenes are drawn with it: at a hundred pixels from its principal point a picture moves by some hundredths of a
-    pixel.
+    Scenes use this camera: a hundred pixels from its principal point an image moves by a few hundredths of a pixel.
     """
     (fx, skew, cx), (zero, fy, cy), last = camera.K
     if abs(fx / fy - 1) > MAX_UNEVEN:
@@ -57,10 +57,11 @@ def with_square_pixels(camera: Camera) -> Camera:
 
 
 def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
-    """A pinhole camera with a box filter, so that a pixel is the mean radiance over its area.
+    """Pinhole camera with a box filter, so that a pixel is the mean radiance over its area.
 
     Raises:
-        CaptureInputError: Mitsuba's perspective camera has square pixels and no skew.
+        CaptureInputError: the camera has skew or pixels that are not square, which Mitsuba's perspective camera cannot
+            render.
     """
     K, pose = np.asarray(camera.K), np.asarray(camera.camera_from_world)
     if abs(K[0, 0] / K[1, 1] - 1) > 1e-4 or abs(K[0, 1]) > 1e-6 * K[0, 0]:
@@ -93,10 +94,13 @@ def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
 
 
 def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> SceneDict:
-    """The enamel surface's BSDF: nothing, or the thin-boundary plug-in that ships with the asset.
+    """BSDF of the enamel's surface: no boundary, or the thin-boundary plug-in that ships with the asset.
 
     Args:
-        stain: picture of what the surface takes of light that passes, 1 - a_t; over nothing it is a mask before black.
+        boundary: the boundary model.
+        ior: refractive index of the inside relative to the outside.
+        stain: picture of the absorbed share of transmitted light, 1 - a_t; without a boundary it becomes a mask before
+            black.
     """
     texture = (
         None
@@ -121,11 +125,11 @@ def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> 
 
 
 TeethFiles = Mapping[str, tuple[Path, Path | None]]
-"""By name of the tooth: PLY files of its enamel's outer surface and of its dentin, if any."""
+"""PLY files by name of the tooth: the enamel's outer surface, and the dentin's where there is any."""
 
 
 def lit_scene(light_mm: Sequence[Any], intensity: Any) -> SceneDict:
-    """A scene of nothing but a point light, and how it is rendered."""
+    """Scene with the integrator and a point light only."""
     return {
         "type": "scene",
         "integrator": {"type": "prbvolpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH},
@@ -151,7 +155,8 @@ def nested_scene(
     Enamel lies between a tooth's two surfaces, dentin inside the inner one.
 
     Args:
-        stains: by name of the tooth, as in ``boundary_dict``; its outer PLY then has texture coordinates.
+        stains: stain pictures by name of the tooth, as in ``boundary_dict``; the tooth's outer PLY file then has
+            texture coordinates.
     """
     scene = lit_scene(light_mm, intensity) | {"medium_enamel": medium_dict(tissue.enamel)}
     if any(dentin is not None for _, dentin in teeth.values()):
@@ -167,7 +172,7 @@ def nested_scene(
 
 
 def surface_dict(path: Path, bsdf: SceneDict) -> SceneDict:
-    """A PLY file's triangles, flat."""
+    """Flat-shaded triangles of a PLY file."""
     return {"type": "ply", "filename": path.as_posix(), "face_normals": True, "bsdf": bsdf}
 
 
@@ -179,8 +184,8 @@ def load_scene(scene: SceneDict) -> Any:
 
 
 def _with_transforms(node: Any) -> Any:
-    # Dictionaries here hold plain arrays, so that they can be written as XML without Mitsuba; loading needs its own
-    # transform type.
+    # Replace plain arrays by Mitsuba's transform type, which loading needs. The dictionaries hold plain arrays, so that
+    # they can be written as XML without Mitsuba.
     import mitsuba as mi
 
     if isinstance(node, dict):
@@ -191,7 +196,9 @@ def _with_transforms(node: Any) -> Any:
 def render_batches(
     scene: Any, sensor: int, samples: int, seed: int, batches: int = 16
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Image (H, W) and the variance of its mean from independent batches of ``samples / batches`` paths per pixel."""
+    """Image (H, W) and the variance (H, W) of its mean, from independent batches of ``samples / batches`` paths per
+    pixel.
+    """
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""Teeth, gums and the wall of the mouth as a scene for stock Mitsuba; one colour channel."""
+"""Scene of teeth, gums and the wall of the mouth for stock Mitsuba; one colour channel."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ SurfaceFiles = Mapping[str, Path]
 def write_mouth_surfaces(
     folder: Path, teeth: tuple[Tooth, ...], gums: Mesh | None, cavity: Mesh | None
 ) -> dict[str, Path]:
-    """Write the surfaces between media, none of which overlap; what is empty has no file.
+    """Write the surfaces between media, which do not overlap; an empty surface has no file.
 
     Raises:
-        MeshError: a tooth reaches into another one's dentin, or a surface cannot be cut.
+        MeshError: a tooth overlaps the dentin of another, or a surface cannot be cut.
     """
     parts = separate(teeth, gums)
     meshes = {"gums": parts.gums} | ({} if cavity is None else {"cavity": cavity})
@@ -59,10 +59,12 @@ def mouth_scene(
     gums_ior: float = 1.33,
     samples: Any = 64,
 ) -> SceneDict:
-    """Scene of a mouth under one point light, as ``nested_scene``.
+    """Scene of a mouth under one point light; for the other arguments see ``mitsuba_scene.nested_scene``.
 
     Args:
+        files: surfaces that ``write_mouth_surfaces`` wrote.
         fdi: FDI numbers in the order of the mouth's teeth.
+        gums_ior: refractive index of the gums.
     """
     scene = lit_scene(light_mm, intensity)
     for number, tissue in zip(fdi, mouth.teeth, strict=True):

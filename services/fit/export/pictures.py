@@ -1,4 +1,4 @@
-"""Linear radiance to pictures that people judge: tone mapping, signed residuals, sequential maps, PNG bytes."""
+"""Pictures of linear radiance for people: tone mapping, signed residuals, sequential maps, PNG bytes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ DIVERGING = (
     (0.75, (230, 130, 40)),
     (1.0, (140, 45, 4)),
 )
-"""Blue to orange through near-white: distinct for all common colour-vision deficiencies and in grey by its ends'
-darkness."""
+"""Blue to orange through near-white: distinct for all common colour-vision deficiencies; in grey the ends are darker
+than the centre."""
 SEQUENTIAL = (
     (0.0, (68, 1, 84)),
     (0.25, (59, 82, 139)),
@@ -29,7 +29,7 @@ SEQUENTIAL = (
 )
 """Viridis at five stops (van der Walt and Smith 2015): perceptually uniform, safe for colour-vision deficiencies."""
 RESIDUAL_OF_WHITE = 0.25
-"""Residuals are drawn from minus to plus this fraction of the picture's white."""
+"""Fraction of the picture's white at which the colours of residuals end, on either side."""
 MASKED = (128, 128, 128)
 
 ColourStops = tuple[tuple[float, tuple[int, int, int]], ...]
@@ -37,7 +37,7 @@ ColourStops = tuple[tuple[float, tuple[int, int, int]], ...]
 
 @dataclass(frozen=True)
 class Picture:
-    """One photo of the capture beside the fit's render of it, linear radiance (H, W, C)."""
+    """One photograph of the capture and the fit's render of it, linear radiance (H, W, C)."""
 
     camera: str
     light: str
@@ -45,18 +45,18 @@ class Picture:
     photo: NDArray[np.floating]
     render: NDArray[np.floating]
     valid: NDArray[np.bool_]
-    """(H, W), True where the pixel was compared."""
+    """Mask (H, W) of the compared pixels."""
 
     @property
     def residual(self) -> NDArray[np.float64]:
-        """Render minus photo, (H, W, C), 0 where not valid."""
+        """Render minus photograph (H, W, C), 0 where not valid."""
         difference = np.asarray(self.render, dtype=np.float64) - np.asarray(self.photo, dtype=np.float64)
         return np.where(self.valid[..., None], difference, 0.0)
 
 
 def white_level(radiance: NDArray[np.floating], valid: NDArray[np.bool_], percentile: float = 99.0) -> float:
-    """Radiance that is shown as white: a high percentile of the valid pixels, so that one hot pixel does not darken the
-    picture.
+    """Radiance that is shown as white: a high percentile of the valid pixels, so that a single hot pixel does not
+    darken the picture.
     """
     values = np.asarray(radiance)[valid]
     values = values[np.isfinite(values)]
@@ -65,7 +65,7 @@ def white_level(radiance: NDArray[np.floating], valid: NDArray[np.bool_], percen
 
 
 def tone_map(radiance: NDArray[np.floating], white: float) -> Image8:
-    """Linear radiance (H, W) or (H, W, C) to sRGB bytes (H, W, 3), IEC 61966-2-1; one channel becomes grey, values
+    """Bytes (H, W, 3) in sRGB (IEC 61966-2-1) of linear radiance (H, W) or (H, W, C); one channel becomes grey, values
     above ``white`` clip.
     """
     linear = np.clip(np.nan_to_num(np.asarray(radiance, dtype=np.float64)) / white, 0.0, 1.0)
@@ -74,7 +74,7 @@ def tone_map(radiance: NDArray[np.floating], white: float) -> Image8:
 
 
 def as_rgb(image: Image8) -> Image8:
-    """Bytes with one, two or three channels as (H, W, 3); a missing third channel is black."""
+    """RGB bytes (H, W, 3) of an image with one, two or three channels; a missing third channel is black."""
     channels = image[..., None] if image.ndim == 2 else image
     if channels.shape[-1] == 1:
         return np.repeat(channels, 3, axis=-1)
@@ -83,14 +83,16 @@ def as_rgb(image: Image8) -> Image8:
 
 
 def colour_map(fraction: NDArray[np.floating], stops: ColourStops) -> Image8:
-    """Fractions 0 to 1 (clipped) to bytes by linear interpolation between colour stops."""
+    """Bytes (..., 3) of fractions 0 to 1 (clipped), by linear interpolation between colour stops."""
     positions = [position for position, _ in stops]
     planes = [np.interp(np.nan_to_num(fraction), positions, [colour[k] for _, colour in stops]) for k in range(3)]
     return np.round(np.stack(planes, axis=-1)).astype(np.uint8)
 
 
 def signed_map(residual: NDArray[np.floating], limit: float, valid: NDArray[np.bool_]) -> Image8:
-    """Residual (H, W) or (H, W, C; its channel mean) in -limit (blue) to +limit (orange); grey where not valid."""
+    """Picture of a residual (H, W), or of the channel mean of (H, W, C), from -limit (blue) to +limit (orange); grey
+    where not valid.
+    """
     values = np.asarray(residual, dtype=np.float64)
     values = values.mean(axis=-1) if values.ndim == 3 else values
     picture = colour_map(0.5 + 0.5 * values / limit, DIVERGING)
@@ -99,20 +101,22 @@ def signed_map(residual: NDArray[np.floating], limit: float, valid: NDArray[np.b
 
 
 def scalar_map(values: NDArray[np.floating], limits: tuple[float, float]) -> Image8:
-    """A quantity (H, W) between two limits; grey where not finite."""
+    """Picture of a quantity (H, W) between two limits; grey where it is not finite."""
     picture = colour_map((np.asarray(values) - limits[0]) / (limits[1] - limits[0]), SEQUENTIAL)
     picture[~np.isfinite(values)] = MASKED
     return picture
 
 
 def enlarge(image: Image8, least_px: int = 240) -> Image8:
-    """Repeat pixels by a whole factor until the larger side has at least ``least_px``, so that pixels stay pixels."""
+    """Repeat pixels by a whole factor until the larger side has at least ``least_px``, so that the pixels
+    stay sharp.
+    """
     factor = max(1, -(-least_px // max(image.shape[:2])))
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def png_bytes(image: Image8) -> bytes:
-    """Bytes (H, W, 3) as a PNG file."""
+    """PNG file of bytes (H, W, 3)."""
     from PIL import Image
 
     stream = io.BytesIO()
@@ -121,12 +125,12 @@ def png_bytes(image: Image8) -> bytes:
 
 
 def data_uri(image: Image8) -> str:
-    """Bytes (H, W, 3) as a ``data:`` address for a page that opens alone."""
+    """``data:`` address of bytes (H, W, 3), for a page without other files."""
     return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
 
 
 def png16_bytes(values: NDArray[np.floating]) -> bytes:
-    """A grey PNG of 16 bits from values (H, W) of 0 to 1, linear."""
+    """Grey PNG file of 16 bits from linear values (H, W) of 0 to 1."""
     from PIL import Image
 
     stream = io.BytesIO()

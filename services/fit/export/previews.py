@@ -1,4 +1,4 @@
-"""Pictures of a fit: previews while it runs, render beside photograph for the report."""
+"""Pictures of a fit: previews while it runs, and renders beside photographs for the report."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ PICTURES = "pictures.npz"
 
 
 def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
-    """Images to show: per camera the brightest fitted and the brightest held-out one, by camera name and index among
-    the lights anyone sees.
+    """Images to show: for each camera the brightest fitted and the brightest held-out image, as camera name and index
+    among the lights with a valid pixel.
     """
     seen = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views], axis=0))
     shown = []
@@ -51,8 +51,8 @@ def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
 def pictures_of(
     evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]
 ) -> tuple[Picture, ...]:
-    """Put pixel lists back into images; the last axis is the channel, in the order of ``evaluations``."""
-    # A fit of every n-th pixel is shown as the smaller picture it is, not as dots.
+    """Pictures from lists of pixels; the last axis is the channel, in the order of ``evaluations``."""
+    # Show a fit of every n-th pixel as a smaller picture and not as separate dots.
     every = min(
         (spacing(pixels) for evaluation in evaluations.values() for pixels, _ in evaluation.renders.values()), default=1
     )
@@ -79,7 +79,7 @@ def pictures_of(
 
 
 def spacing(pixels: NDArray[np.int32]) -> int:
-    """The n of pixels (N, 2) that are every n-th of an image; 1 where they are too few to tell."""
+    """Spacing n of pixels (N, 2) that are every n-th of an image; 1 where there are too few to determine it."""
     steps = [np.diff(np.unique(axis)) for axis in pixels.T]
     return max(int(np.gcd.reduce(np.concatenate(steps))), 1)
 
@@ -87,8 +87,8 @@ def spacing(pixels: NDArray[np.int32]) -> int:
 def write_preview(
     root: Path, step: StepReport, evaluation: Evaluation, manifest: PreparedManifest, views: tuple[ViewStack, ...]
 ) -> list[dict[str, object]]:
-    """Write render, photograph and residual of one image as PNG; returns the preview event's data, paths relative to
-    ``root``.
+    """Write render, photograph and residual of up to two images as PNG, one fitted and one held out; return the preview
+    events' data, with paths relative to ``root``.
     """
     pictures = pictures_of({step.channel: evaluation}, manifest, {step.channel: views})
     chosen = [p for p in pictures if not p.held_out][:1] + [p for p in pictures if p.held_out][:1]
@@ -120,7 +120,7 @@ def write_pictures(
     manifest: PreparedManifest,
     views: Mapping[str, tuple[ViewStack, ...]],
 ) -> None:
-    """Keep the final pictures, linear, in the fit's folder."""
+    """Store the final pictures, in linear radiance, in the fit's folder."""
     arrays: dict[str, NDArray[np.generic]] = {}
     for k, picture in enumerate(pictures_of(evaluations, manifest, views)):
         arrays |= {
@@ -141,8 +141,8 @@ def read_pictures(
     thickness: ThicknessMap | None = None,
     stains: ToothStains | None = None,
 ) -> ReportPictures:
-    """What the report shows; the thickness of enamel and stains where it is about one tooth, both as the first camera
-    sees them.
+    """Pictures for the report. For a single tooth they include the enamel's thickness and the stains, both as the first
+    camera sees them.
     """
     with np.load(folder / PICTURES, allow_pickle=False) as stored:
         count = sum(name.endswith(".name") for name in stored.files)

@@ -1,4 +1,6 @@
-"""One HTML file that opens alone: what was measured, how well, and where it fails."""
+"""Report of a fit as one self-contained HTML file: the measured parameters, their uncertainty, and where the
+fit fails.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,7 @@ LEAF_LABELS = {
 }
 SHAPE_LABELS = ("buccal", "proximal", "occlusal")
 LEADING = ("sigma_s_reduced", "alpha_reduced", "sigma_a")
-"""What images fix best comes first."""
+"""Quantities that images determine best and that lead the report."""
 THIN_CAVEAT = (
     "The surface was modelled as a thin layer that does not bend light (teeth 2018). Its internal diffuse reflectance"
     " is 0.111 where a real surface of index 1.631 has 0.666, so fitted absorption 1 − α comes out 3 to 6 times too"
@@ -65,15 +67,15 @@ THIN_CAVEAT = (
 
 @dataclass(frozen=True)
 class ReportPictures:
-    """What the report shows as images."""
+    """Pictures of the report."""
 
     channels: tuple[str, ...]
     pictures: tuple[Picture, ...]
-    """One fitted and one held-out light per camera is enough."""
+    """Photographs and renders; one fitted and one held-out light per camera suffice."""
     thickness: ThicknessMap | None = None
-    """Of the enamel, seen by one camera."""
+    """Thickness of the enamel as one camera sees it."""
     camera: str = ""
-    """Which, also of the stains."""
+    """Name of the camera of the thickness map and of the stains."""
     stains: NDArray[np.floating] | None = None
     """Transmittance of the stains (H, W, C), NaN off the tooth; see ``export.stains.stain_image``."""
     stained: tuple[str, ...] = ()
@@ -86,6 +88,9 @@ def write_report(
     """Write the report as one HTML file without any outside reference.
 
     Args:
+        path: receives the report.
+        report: the fit's report.
+        pictures: the pictures to show.
         history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``,
             ``stage`` and ``channel``.
         context: ``title``, ``boundary``, ``ior`` and ``provenance`` (a dict of label -> text); all optional.
@@ -154,7 +159,8 @@ def _duration(seconds: float) -> str:
 
 
 def _triptych(picture: Picture) -> dict[str, Any]:
-    # Photo and render share one tone curve; its white comes from the photo alone, so that a wrong render cannot hide.
+    # Use one tone curve for photograph and render; its white comes from the photograph alone, so that a wrong render
+    # stays visible.
     white = white_level(picture.photo, picture.valid)
     residual = picture.residual
     compared = picture.valid[..., None] & np.isfinite(picture.photo)
@@ -179,7 +185,7 @@ def _triptych(picture: Picture) -> dict[str, Any]:
 
 
 def _charts(history: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    # Steps that look at one tooth of a jaw alone are not on the scale of the whole.
+    # Leave out steps that fit one tooth of a jaw alone, because their scale differs from that of the whole jaw.
     history = [entry for entry in history if entry.get("tooth") is None]
     channels = list(dict.fromkeys(str(entry.get("channel", "")) for entry in history))
 
@@ -204,7 +210,7 @@ def _charts(history: list[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def _stages(history: list[dict[str, Any]]) -> list[dict[str, str]]:
-    # What each stage of each channel brought: its last step.
+    # Result of each stage of each channel: its last step.
     last: dict[tuple[str, str], dict[str, Any]] = {}
     for entry in history:
         if entry.get("stage") and entry.get("tooth") is None:
@@ -248,13 +254,13 @@ def _is_leading(name: str) -> bool:
 
 
 def _source_label(name: str) -> str:
-    # Of a jaw's tooth, such as "11.enamel.sigma_a", by its number.
+    # Label of a parameter; one of a jaw's tooth, such as "11.enamel.sigma_a", begins with the tooth's number.
     fdi, _, own = name.partition(".")
     return f"{fdi} {_group(own).lower()}, {_label(own)}" if fdi.isdigit() else f"{_group(name)}, {_label(name)}"
 
 
 def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:
-    # One line per tooth and channel: how well it is explained, and what images fix best.
+    # One row per tooth and channel: its image errors, and the parameters that images determine best.
     names = [f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in LEADING[:2]]
     return [
         {
@@ -273,7 +279,8 @@ def _tooth_rows(teeth: dict[str, ToothReport]) -> list[dict[str, Any]]:
 
 
 def _correlations(correlations: dict[str, Correlation]) -> list[dict[str, Any]]:
-    # Of one coordinate alone there is nothing to show. Blue goes together, orange against each other, on either ground.
+    # Leave out channels with one coordinate only. Blue marks positive and orange negative correlation, on light and
+    # dark pages.
     def cell(value: float, own: bool) -> tuple[str, str]:
         colour = "80, 140, 220" if value > 0 else "230, 140, 60"
         return ("1", "none") if own else (f"{value:+.2f}".replace("-", "−"), f"rgba({colour}, {0.45 * abs(value):.2f})")
@@ -316,7 +323,7 @@ def _label(name: str) -> str:
 
 
 def cell(estimate: Estimate | None) -> dict[str, str]:
-    """A number as the tables of a report show it: value, ± and flag."""
+    """Cells of a number in the report's tables: value, standard error and flag."""
     if estimate is None:
         return {"value": "", "se": "", "flag": ""}
     if estimate.se is None:
@@ -327,7 +334,7 @@ def cell(estimate: Estimate | None) -> dict[str, str]:
 
 
 def _decimals(se: float) -> int:
-    # Two significant digits of the standard error.
+    # Number of decimals that gives two significant digits of the standard error.
     return int(np.clip(1 - math.floor(math.log10(se)), 0, 8)) if se > 0 and math.isfinite(se) else 4
 
 
@@ -349,8 +356,8 @@ def _thickness(pictures: ReportPictures) -> dict[str, Any] | None:
 
 
 def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
-    # One map per channel from the darkest texel seen to a clean surface; of few channels that is plainer than one in
-    # colour.
+    # One map per channel, from the darkest visible texel to a clean surface; with few channels separate maps are
+    # clearer than one in colour.
     if pictures.stains is None or not np.isfinite(pictures.stains).any():
         return None
     low = float(np.floor(10 * np.nanmin(pictures.stains)) / 10)
@@ -368,7 +375,7 @@ def _stains(pictures: ReportPictures) -> dict[str, Any] | None:
 
 
 def gradient(stops: ColourStops) -> str:
-    """Colour stops as those of a gradient in CSS."""
+    """Colour stops in the syntax of a CSS gradient."""
     return ", ".join(f"rgb{colour} {100 * position:g}%" for position, colour in stops)
 
 

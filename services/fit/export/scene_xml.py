@@ -1,4 +1,4 @@
-"""Write a scene dictionary as Mitsuba's XML, with parameters that the command line or ``mi.load_file`` may set."""
+"""Writer of a scene dictionary as Mitsuba's XML, with parameters that the command line or ``mi.load_file`` may set."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ TAGS = {
     "prbvolpath": "integrator",
     "point": "emitter",
 }
-"""Kind of object that each plug-in used here is."""
+"""Kind of object of each plug-in that the scenes use."""
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
 @dataclass(frozen=True)
 class SceneParameter:
-    """A value the user may set when loading: ``mi.load_file(path, name=value)``."""
+    """Value that the user may set when loading: ``mi.load_file(path, name=value)``."""
 
     name: str
     default: float
 
 
 def write_scene(path: Path, scene: SceneDict) -> None:
-    """Write the scene; file names in it stay as they are, so give them relative to ``path``."""
+    """Write the scene. File names in it stay unchanged, so give them relative to ``path``."""
     root = ET.Element("scene", version=FORMAT)
     parameters: dict[str, float] = {}
     _collect(scene, parameters)

@@ -1,6 +1,4 @@
-"""Fitted stains on their way out: kept beside the fit, written as textures of the asset, drawn as a camera sees
-them.
-"""
+"""Export of fitted stains: stored with the fit, written as textures of the asset, and drawn in a camera's view."""
 
 from __future__ import annotations
 
@@ -19,13 +17,13 @@ STAINS = "stains.npz"
 
 
 def keep_stains(folder: Path, stains: ToothStains) -> None:
-    """Write them into a fit's folder."""
+    """Store stain textures in a fit's folder."""
     arrays = {f"texture.{channel}": stain.transmittance for channel, stain in stains.textures.items()}
     np.savez_compressed(folder / STAINS, allow_pickle=False, corners_uv=stains.corners_uv, **arrays)
 
 
 def kept_stains(folder: Path) -> ToothStains | None:
-    """What ``keep_stains`` wrote; None where nothing was."""
+    """Stain textures that ``keep_stains`` stored; None where there are none."""
     if not (folder / STAINS).is_file():
         return None
     with np.load(folder / STAINS, allow_pickle=False) as stored:
@@ -38,8 +36,8 @@ def kept_stains(folder: Path) -> ToothStains | None:
 
 
 def write_textures(folder: Path, stains: ToothStains) -> dict[str, Path]:
-    """Write ``stain_<channel>.npy``, a_t as fitted, and ``stain_<channel>.png``, what it takes, 1 - a_t in 16 bits;
-    returns the pictures by channel.
+    """Write ``stain_<channel>.npy``, the fitted a_t, and ``stain_<channel>.png``, the absorbed share 1 - a_t in 16
+    bits; return the pictures' paths by channel.
     """
     written = {}
     for channel, stain in stains.textures.items():
@@ -50,7 +48,9 @@ def write_textures(folder: Path, stains: ToothStains) -> dict[str, Path]:
 
 
 def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.float64]:
-    """a_t at the surface point that each pixel sees, (H, W, C) in the textures' order; NaN off the tooth."""
+    """Transmittance a_t at the surface point that each pixel shows, (H, W, C) in the textures' order; NaN off the
+    tooth.
+    """
     from services.fit.transport.rays import RayScene, pixel_rays
 
     hits = RayScene(outer).first_hits(*pixel_rays(camera))
@@ -58,7 +58,7 @@ def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.
     image = np.full((height * width, len(stains.textures)), np.nan)
     corners = outer.vertices_mm[outer.faces[hits.face[hits.hit]]]
 
-    # Barycentric weights by areas of the three triangles that a point makes with the edges.
+    # Barycentric weights from the areas of the three triangles that a point forms with the edges.
     def doubled_area(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 

@@ -1,4 +1,4 @@
-"""Files that go into the asset as they are.
+"""Files that are copied into the asset unchanged.
 
-They import nothing of this project: whoever has the asset and Mitsuba can run them.
+They import nothing of this project: they run wherever the asset and Mitsuba are.
 """

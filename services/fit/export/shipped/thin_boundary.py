@@ -1,7 +1,7 @@
 """A thin dielectric boundary for Mitsuba 3: transmitted light does not bend; F is air-to-ior Fresnel at |cos| from both
 sides (teeth 2018, Eq. 1 and 2).
 
-A texture ``stain`` takes its share of what passes, and nothing of what is reflected.
+A texture ``stain`` absorbs its share of the transmitted light and nothing of the reflected light.
 
 Usage: ``mi.set_variant(...)``, then ``thin_boundary.register()``, then load the scene.
 """
@@ -13,7 +13,7 @@ import mitsuba as mi
 
 
 def register() -> None:
-    """Make ``<bsdf type="thin_boundary">`` known to Mitsuba's current variant."""
+    """Register ``<bsdf type="thin_boundary">`` with Mitsuba's current variant."""
 
     class ThinBoundary(mi.BSDF):  # type: ignore[misc]  # mitsuba has no types
         def __init__(self, props):  # type: ignore[no-untyped-def]
