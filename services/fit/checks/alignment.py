@@ -39,6 +39,7 @@ MIN_SE_MM = 0.01
 """Least standard error that is reported, in mm: other errors of an offset than noise, such as that of its pixels, are
 larger."""
 MIN_PIXELS = 16
+"""Least number of pixels for which an offset is sought."""
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 PIXELS = 100
 """Number of pixels of each view, spread evenly."""
 VIEW_ANGLE = np.radians(60)
+"""Angle in rad by which candidate views are turned from the first camera."""
 WORTH = 0.1
 """Least relative reduction of an error, including the prediction's own uncertainty, for which a candidate is
 recommended."""

@@ -30,9 +30,10 @@ from services.fit.export.previews import write_pictures, write_preview
 from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack
 
 CHECKPOINT = "fit-checkpoint"
+"""Folder, in the job's folder, of the journal and of the input files of the fit's tasks."""
 NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", "store", *SLAB_OPTIONS})
-"""Options that do not change a fit's result; the capture's content enters the fingerprint by the digests of its files.
-"""
+"""Options that do not change a fit's result; the capture's content enters the fingerprint by the digests of
+its files."""
 ALWAYS_NAMED = frozenset(
     [
         "kind",

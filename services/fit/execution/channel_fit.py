@@ -129,8 +129,8 @@ class ChannelFit(Generic[Optics]):
 
 @dataclass(kw_only=True)
 class Stages(ABC, Generic[Optics]):
-    """Stages of one channel's fit; everything costly goes through the journal, under keys that begin with the seeds'
-    channel.
+    """Stages of one channel's fit; every costly result is recorded in the journal, under a key that begins with the
+    seeds' channel.
     """
 
     files: ChannelFiles

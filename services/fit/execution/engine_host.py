@@ -30,6 +30,7 @@ from services.fit.execution.engine_process import EngineProcess
 ENGINE = "services.fit.transport.engine:Engine"
 """Default engine, as ``module:class``; imported only in the process that renders."""
 SCENES_KEPT = 4
+"""Largest number of built scenes that a process keeps."""
 WATCH_S = 0.25
 """Interval in seconds at which a waiting task checks the child's memory and the cancel flag."""
 

@@ -184,8 +184,8 @@ class Timed(NamedTuple):
 
     value: Any
     seconds: float
-    """Worker time in seconds of this task and of the earlier tasks whose results it took; these are counted here alone.
-    """
+    """Worker time in seconds of this task and of the earlier tasks whose results it took; these are counted
+    here alone."""
     tasks: int
 
 

@@ -21,6 +21,7 @@ otherwise the shares would depend on the duration of the fits' blocks: a replay 
 of 10 and 30 s gave 58 and 42 % with it, and 61 and 39 % with half of it. It is short against a fit, because otherwise a
 fit that was idle for a while would have the workers alone for long afterwards."""
 BOARD = "dentine-shares"
+"""Key of the fits' levels in the scheduler's metadata."""
 TELL_S = 5.0
 """Shortest time between two publications of a fit's level, in seconds."""
 
@@ -30,7 +31,7 @@ class Share:
 
     Args:
         weight: the fit's share relative to other fits'.
-        clock: returns a time in seconds that never goes back.
+        clock: returns a monotonic time in seconds.
     """
 
     def __init__(self, weight: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:

@@ -28,6 +28,7 @@ from services.core.errors import FencedError
 from services.core.store import write_atomic
 
 FORMAT_VERSION = 2
+"""Version of the format that is written."""
 
 
 class Journal:

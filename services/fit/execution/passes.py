@@ -138,8 +138,8 @@ def compare_task(
     by_cells: bool = True,
     new_errors: Errors | None = None,
 ) -> tuple[LossChange, TraceRow]:
-    """Render a block at two points with the same two seeds and compare their losses, by means of cells or pixel by
-    pixel.
+    """Render a block at two points with the same two seeds and compare their losses, from the means of cells or pixel
+    by pixel.
 
     Args:
         new: tissue at the second point.

@@ -40,6 +40,7 @@ EXACT_STEPS = (3, 2)
 GRADIENT_G = 0.0
 """Mean cosine of the similar media in which gradients are rendered, as Jacobians are."""
 SURE_Z = 3.0
+"""Standard errors by which the gain of a texture has to exceed that of fitted noise."""
 
 
 def stain_task(
@@ -76,8 +77,8 @@ class StainStage:
     """Paths per pixel of every pass."""
     pause: Callable[[], None]
     tell: Callable[[str, int, Tissue, str], None]
-    """Called after every step with the stage, the number of the step in it, the tissue and a sentence on the outcome.
-    """
+    """Called after every step with the stage, the number of the step in it, the tissue and a sentence on
+    the outcome."""
 
     def run(self, tissue: Tissue, refit: Callable[[Tissue, int, bool], Tissue]) -> Tissue | None:
         """Fit the texture of a tooth whose media are fitted.

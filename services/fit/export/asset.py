@@ -11,11 +11,11 @@
     rig.json                   cameras, lights and channels by name
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number,
                                ``11.enamel.sigma``
-    errors.json                fitted and held-out image error, whether the fit converged, correlations, what the
-                               capture tells; of a jaw's teeth too
-    NOT-CONVERGED.txt          only where it did not: what to do
-    render.py                  renders the scenes; thin_boundary.py is the surface model that Mitsuba lacks, for
-                               boundary thin
+    errors.json                fitted and held-out image error, whether the fit converged, correlations, which
+                               quantities the capture determines; for a jaw's teeth too
+    NOT-CONVERGED.txt          only where the fit did not converge: advice on what to do
+    render.py                  renders the scenes
+    thin_boundary.py           surface model that Mitsuba lacks, only for the boundary model ``thin``
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from services.core.records import Boundary
 from services.fit.optics.parameters import Medium, Tissue
 
 MAX_DEPTH = 5000
+"""Largest depth of a path."""
 ROULETTE_DEPTH = 100
 """Path depth at which Russian roulette starts: paths in enamel scatter hundreds of times, and an earlier start costs
 more variance than it saves."""

@@ -31,6 +31,7 @@ SEQUENTIAL = (
 RESIDUAL_OF_WHITE = 0.25
 """Fraction of the picture's white at which the colours of residuals end, on either side."""
 MASKED = (128, 128, 128)
+"""Colour (sRGB bytes) of pixels that were not compared."""
 
 ColourStops = tuple[tuple[float, tuple[int, int, int]], ...]
 

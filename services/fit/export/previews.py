@@ -30,7 +30,9 @@ from services.fit.inputs.stain_uv import ToothStains
 
 Array = NDArray[np.float64]
 PREVIEWS = "previews"
+"""Folder of the previews, in the job's folder."""
 PICTURES = "pictures.npz"
+"""File of the final pictures, in the fit's folder."""
 
 
 def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:

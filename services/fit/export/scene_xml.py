@@ -13,6 +13,7 @@ from services.core.store import write_atomic
 from services.fit.export.mitsuba_scene import SceneDict
 
 FORMAT = "3.0.0"
+"""Version of Mitsuba's scene format."""
 TAGS = {
     "ply": "shape",
     "null": "bsdf",

@@ -14,6 +14,7 @@ from services.fit.inputs.stain_uv import ToothStains, bilinear_texels
 from services.fit.optics.parameters import Stain
 
 STAINS = "stains.npz"
+"""File of the stain textures, in the fit's folder."""
 
 
 def keep_stains(folder: Path, stains: ToothStains) -> None:

@@ -35,6 +35,7 @@ LINEAR_REACH = 0.1
 """Length scale of an error for the lengths of steps; images are exactly linear in an error."""
 
 MAX_ERROR = 10.0
+"""Largest absolute value of an error, in its unit."""
 
 
 def kind_of_error(name: str) -> str:

@@ -26,6 +26,7 @@ from services.fit.solve.estimates import estimates
 from services.fit.tooth.driver import shape_covariance
 
 STATES = ("fitted", "tied", "failed")
+"""States of a tooth's start, the best first."""
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ In whitened coordinates y, x = T y, in which the usable curvature J~'WJ~ + Lambd
 =======  ===============================================================================================================
 D        J~'W Sigma W J~, the noise of the measurements; s >= 1 is the factor by which residuals exceed it
 C        Monte Carlo covariance of the final gradient, by pixels (``normal_equations``)
-Lambda   the weak prior's precision, which alone speaks where the data are silent
-M        the response of the answer, 1 where Jacobians are the images' own (``solve.closing``)
-S        what held mean cosines shift (``solve.closing``)
-N        what noise in M does to steps p that were taken by it, diag(sum_b var(M_ab) p_b^2)
-r        what is left of the step to the minimum, where the fit ended short of it: M^-1 (gradient + Lambda (x - mean))
+Lambda   precision of the weak prior, which alone determines directions without data
+M        response of the solution, 1 where Jacobians are the images' own (``solve.closing``)
+S        covariance of the gradient by the errors of held mean cosines and moved bodies (``solve.closing``)
+N        variance of steps p that used M by the noise in M, diag(sum_b var(M_ab) p_b^2)
+r        remaining step to the minimum, where the fit ended before it: M^-1 (gradient + Lambda (x - mean))
 =======  ===============================================================================================================
 
 Where the instrument's errors are coordinates, their prior is then used in full (``solve.recombination``), which moves
@@ -58,8 +58,8 @@ class Uncertainty:
     faults: tuple[Fault, ...] = ()
     """Instrument errors that the images show to be faults of the calibration."""
     is_whole: bool = True
-    """Whether the full use of the prior of the instrument's errors moved x no farther than one linear model is valid.
-    """
+    """Whether the full use of the prior of the instrument's errors moved x no farther than one linear model
+    is valid."""
 
     def standard_error(self, slope: Array) -> float:
         """Standard error of a quantity with gradient ``slope`` (F,) with respect to x."""

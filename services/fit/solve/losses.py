@@ -36,6 +36,7 @@ CAUCHY = 2.385
 """Tuning constant c of the Cauchy loss: 95 % of least squares' efficiency under Gaussian noise (Holland and Welsch
 1977)."""
 MEDIAN_OF_NORMAL = 0.6745
+"""Median of the absolute value of a standard normal number."""
 MIN_RESIDUAL = 0.1
 """Smallest residual of l1 and relative_l1, as a share of the residual's own standard deviation; smaller residuals count
 as this one."""

@@ -35,6 +35,7 @@ CLEAN_SD = 0.5
 NEIGHBOUR_SD = 0.2
 """Prior standard deviation of the difference in depth between neighbouring texels."""
 MOMENTUM = 0.25
+"""Share of the last step that a step with momentum adds."""
 SLOWER_AFTER = 3
 """Number of exact steps after which a step is half as long."""
 LONGEST_STEP = 0.7

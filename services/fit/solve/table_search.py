@@ -23,6 +23,7 @@ REDUCED_DENSITIES = (0.2, 0.4, 0.7, 1.1, 1.6, 2.3, 3.3, 4.8)
 """Reduced scattering coefficients sigma (1 - g), per mm: the literature's span for enamel and dentin. The grid is in
 the reduced coefficient and not in sigma, so that every render costs no more than needed."""
 ANISOTROPIES = (0.0, 0.7)
+"""Mean cosines g of the table's renders."""
 KAPPA = (1.0, 3.0)
 """Range of -log10(1 - alpha). The upper limit is where absorption becomes invisible; beyond it the fit would start on a
 plateau."""

@@ -48,11 +48,15 @@ from services.fit.solve.gauss_newton import Options, Solution
 from services.fit.solve.losses import is_reweighted
 
 ALL_LEAVES = ("sigma", "alpha", "g1", "beta", "g2")
+"""Parameters of a medium with two lobes."""
 SIMILAR_G = 0.0
+"""Mean cosine of the similar media."""
 START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 """Densities of enamel and dentin relative to the homogeneous tooth's: dentin scatters more in every source of the
 literature table."""
 HOMOGENEOUS_STEPS = 4
+"""Largest number of steps of the homogeneous tooth before layers, and of each refit of the media but the last in the
+stain stage."""
 EXACT_SAMPLES = 4
 """Paths per pixel at the begin of the exact stages, relative to those of the start, for three views; they double where
 noise requires it."""
@@ -67,6 +71,7 @@ STAIN_SAMPLES = 2
 """Least number of paths per pixel in a step of the stains, relative to those of the start; never fewer than the media
 needed in the end."""
 START_STEPS = 2
+"""Largest number of steps from each start."""
 ADAM_BURST = 10
 """Number of Adam steps between two journal entries and reports, each of which costs an evaluation of all images."""
 
