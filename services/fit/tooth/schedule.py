@@ -5,7 +5,7 @@ stage         free                                             media     ends
 ============  ===============================================  ========  ===============================================
 search        table over albedo x density x anisotropy         exact     best point
 homogeneous   sigma, alpha shared by both media                similar   converged, or a few steps
-start.k       sigma, alpha of both media, from several ratios  similar   two steps each; the least loss goes on
+start.k       sigma, alpha of both media, from several ratios  similar   two steps each; the least loss continues
 layered       the same                                         similar   converged, or max_steps
 shape         the same and the dentin's blend weights          exact     converged, or max_steps; where they are fitted
 exact         the same                                         exact     converged, or max_steps
@@ -58,11 +58,11 @@ HOMOGENEOUS_STEPS = 4
 """Largest number of steps of the homogeneous tooth before layers, and of each refit of the media but the last in the
 stain stage."""
 EXACT_SAMPLES = 4
-"""Paths per pixel at the begin of the exact stages, relative to those of the start, for three views; they double where
-noise requires it."""
+"""Paths per pixel at the beginning of the exact stages, relative to those of the start, for three views; they double
+where noise requires it."""
 MIN_EXACT_SAMPLES = 32
-"""Least number of paths per pixel at the begin of the exact stages, where the limit allows it. With fewer, comparisons
-of full images decide little: a large stack takes longer from 11 to its limit of 21 than at 21 alone."""
+"""Least number of paths per pixel at the beginning of the exact stages, where the limit allows it. With fewer,
+comparisons of full images decide little: a large stack takes longer from 11 to its limit of 21 than at 21 alone."""
 SEARCH_SAMPLES = 64
 """Least number of paths per pixel in the search, which renders only a few hundred pixels."""
 REWEIGHTINGS = 2
