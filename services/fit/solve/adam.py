@@ -28,8 +28,8 @@ ADVICE_MORE_STEPS = "Adam still moved at its last step; raise adam_steps, or cho
 
 @dataclass(frozen=True)
 class Gradient:
-    """Stochastic gradient (F,) of the data's loss F = 1/2 sum w r^2, and the loss, both unbiased by the residual's
-    Monte Carlo noise.
+    """Stochastic gradient (F,) of the data's loss F = 1/2 sum w r^2, and the loss; the residual's Monte Carlo noise
+    biases neither.
     """
 
     gradient: Array

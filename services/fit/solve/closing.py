@@ -156,8 +156,9 @@ class Response:
 def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
     """Shrink the measured response towards the identity, which is the response that the usable curvature implies.
 
-    Derivatives J~ of the tissue have no component along those of the instrument's errors, which y eliminates, so M = [1
-    + E, 0; G, 1]: errors follow the tissue by G, and the tissue's solution is as it would be without them.
+    Derivatives J~ of the tissue have no component along those of the instrument's errors, which the whitened
+    coordinates eliminate, so M = [1 + E, 0; G, 1]: errors follow the tissue by G, and the tissue's solution is as it
+    would be without them.
 
     Args:
         sums: the closing measurement.

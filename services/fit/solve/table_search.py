@@ -115,7 +115,7 @@ def search_node(
     powers = bin_powers(alpha, edges)
 
     # <C,R> and <C,C> are polynomials in the same powers, so no image is formed per albedo; products of two seeds keep
-    # <C,C> unbiased by noise.
+    # noise from biasing <C,C>.
     bins = len(edges) - 1
     cross, gram, total = np.zeros(bins), np.zeros((bins, bins)), 0.0
     for (first, second), seen in zip(orders, observed, strict=True):

@@ -262,7 +262,7 @@ class ChannelSchedule(Stages[Tissue]):
         return self._uniform(similar_medium(Medium(start.sigma, start.alpha, g1=start.g), HELD_G))
 
     def _search(self) -> table_search.Candidate:
-        # Render once per node and block with two seeds, so that <C,C> is unbiased by noise; every albedo follows from
+        # Render once per node and block with two seeds, so that noise does not bias <C,C>; every albedo follows from
         # these renders.
         nodes, edges = table_search.nodes(), table_search.order_edges()
         passes = replace(self.passes, blocks=self.files.search_blocks)
