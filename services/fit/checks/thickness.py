@@ -27,9 +27,9 @@ class UncertainThickness:
     """Enamel thickness at N points with its standard error, mm."""
 
     values_mm: NDArray[np.float64]
-    """(N,)"""
+    """Thickness (N,)."""
     errors_mm: NDArray[np.float64]
-    """(N,)"""
+    """Standard error (N,)."""
     mean_mm: float
     mean_error_mm: float
     """Standard error of the mean over all points. The points' errors are correlated, so it is hardly smaller than

@@ -94,7 +94,7 @@ class Differentiation:
         """Derivatives (F, L N) with respect to the tissue's coordinates, for each of the seeds; scores use the task's
         media.
 
-        All seeds are rendered with a surface before it is moved again.
+        Every surface is rendered with all seeds before it is moved again.
 
         Args:
             parts: for a jaw, the part of the scene that each pixel shows.

@@ -28,7 +28,7 @@ delay."""
 
 
 class Executor(Protocol):
-    """Runs tasks."""
+    """Executor of tasks on engine hosts."""
 
     def submit(self, key: str, task: Task, *args: Any) -> Any:
         """Start ``task(host, *args)``; returns a handle that later submits and ``gather`` take."""
