@@ -1,1 +1,1 @@
-"""Jobs, routes, dashboard, and the pipeline that strings the stages together."""
+"""The server: REST routes, jobs and their queue, and the dashboard."""

@@ -1,4 +1,4 @@
-"""The ASGI application; everything it needs is given to it."""
+"""The ASGI application of the server, built from settings that are passed in."""
 
 from __future__ import annotations
 
@@ -24,31 +24,39 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 PHANTOMS = "phantoms"
-"""In the data folder: mouths of demonstrations, each rendered once. Whatever is removed there is made again."""
+"""Folder below the data folder for the virtual mouths of demonstrations. Each mouth is rendered once, and one that is
+removed is rendered again."""
 STATIC = Path(__file__).parent / "dashboard" / "static"
 DARKENERS = 8
-"""Threads that do nothing but ALL OFF, so that nothing that hangs keeps anybody from darkness: as many as may be asked
-for at once."""
+"""Number of threads that only carry out ALL OFF, so that no other request that hangs can delay it. As many ALL OFF
+requests can run at once."""
 CANCELLERS = 4
-"""Threads that cancel jobs. Each of them may wait for the database, which ALL OFF does only once it is dark."""
+"""Number of threads that cancel jobs. They are separate from the threads of ALL OFF because each may wait for the
+database, which ALL OFF does only once the dome is dark."""
 OPERATORS = 8
-"""Threads that ask a dome for its state and light single lights. A dome that hangs holds each for half a minute."""
+"""Number of threads that read the state of a dome, switch single lights and run preflights. A dome that does not answer
+holds a thread for half a minute, during a preflight for five minutes."""
 UNBUILT = STATIC.with_name("unbuilt")
-"""The page that says how the dashboard is built."""
+"""Folder of the page that says how to build the dashboard. It is served where the dashboard is not built."""
 
 
 def is_dashboard_built() -> bool:
-    """Whether this installation has the dashboard's bundle."""
+    """Whether this installation contains the built dashboard."""
     return (STATIC / "app.js").exists()
 
 
 def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[StageName, str] = DOORS) -> FastAPI:
-    """Build the application over ``settings.data``; its lifespan frames the time in which jobs run.
+    """Build the application that serves the data folder ``settings.data``. Jobs run while its lifespan is active.
+
+    ``app.state.darken`` of the result asks everything that lights a dome to stop. It can be called from any thread and
+    waits for nothing else.
 
     Args:
-        run: in place of the stages and their workers. ``app.state.darken`` asks all that lights a dome to stop, from
-            any thread, and waits for nothing but that.
-        doors: where each stage is entered.
+        run: function that runs one job; it replaces the stages and their workers.
+        doors: ``module:function`` of stages that are entered elsewhere than a job's kind says.
+
+    Raises:
+        SettingsError: access is open and the address is not loopback, or the database belongs to another data folder.
     """
     from fastapi import FastAPI
     from starlette.staticfiles import StaticFiles
@@ -107,7 +115,8 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
         ThreadPool(1),
     )
     parsers = ThreadPool(1)
-    # What darkens a dome shares no thread with anything else, its audit included; nor do a dome's state and its lights.
+    # ALL OFF runs in threads that nothing else uses, and the audit rows of all requests that darken a dome are written
+    # by a thread of their own. Reading the state of a dome and switching its lights have their own threads too.
     darkeners, dark_auditors = ThreadPool(DARKENERS), ThreadPool(1)
     cancellers, operators = ThreadPool(CANCELLERS), ThreadPool(OPERATORS)
     feed = EventFeed(jobs.repository, readers.ask)
@@ -116,7 +125,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         dome.start()
-        if run is None and doors is DOORS:  # stages of others need other packages
+        if run is None and doors is DOORS:  # the check covers the packages of the standard stages alone
             workers.begin_check()
         jobs.start()
         tasks = [asyncio.create_task(feed.run()), asyncio.create_task(observation.webhook_sender.run())]
@@ -126,7 +135,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            closing = ThreadPool(1)  # a thread of its own, as all others may hang; darkness first
+            closing = ThreadPool(1)  # a new thread, as all others may hang; the dome goes dark first
             everybody = (darkeners, cancellers, readers, openers, lookers, auditors, dark_auditors, operators, parsers)
             for close in (darken, *(pool.close for pool in everybody), jobs.close, workers.close):
                 await closing.ask(close)

@@ -1,6 +1,6 @@
-"""Which data folder a database belongs to.
+"""Checks that a database and a data folder belong together.
 
-With another one a server would run jobs without their captures, and give receipts for files that it never had.
+With another data folder a server would run jobs without their captures, and give receipts for files that it never had.
 """
 
 from __future__ import annotations
@@ -16,19 +16,22 @@ from services.core.store import write_atomic
 from services.pipeline.database import metadata, parse_database_url, with_password_file, writing
 
 FILE = "folder.id"
-"""In the data folder, with a number drawn when it was first used; a copy of the folder is the folder."""
+"""Name of a file in the data folder that holds a random number, drawn when the folder was first used. A copy of the
+folder has the same number and counts as the same folder."""
 
 PASSWORD_FILE = "database.password"  # noqa: S105 - a name
-"""In the data folder, which workers see too: the password of a database whose URL brought one along."""
+"""Name of a file in the data folder, which workers can read too, with the password of a database whose URL contained
+one."""
 
 data_folder_table = sql.Table("data_folder", metadata, sql.Column("id", sql.Text, primary_key=True))
 
 
 def require_own_folder(engine: sql.Engine, data: Path) -> None:
-    """Refuse, and close, a database of another data folder; one that belongs to none becomes this one's.
+    """Refuse a database of another data folder and close it. A database that belongs to no folder is assigned to this
+    one.
 
     Raises:
-        SettingsError: it belongs to another folder.
+        SettingsError: the database belongs to another folder.
     """
     file = data / FILE
     if not file.exists():
@@ -48,8 +51,8 @@ def require_own_folder(engine: sql.Engine, data: Path) -> None:
 
 
 def keep_password_apart(url: str, data: Path) -> str:
-    """The URL without its password, which is put into a private file of the data folder: the URL travels inside tasks,
-    no secret does.
+    """Return the URL without its password, and write the password to a private file of the data folder. The URL travels
+    inside tasks, which must carry no secret.
     """
     password = parse_database_url(url).password
     if password is None:

@@ -1,4 +1,6 @@
-"""What lets others see what happens: composes routes, metrics, readiness and webhooks over one server's jobs."""
+"""Composes what makes one server observable: the routes of job history, health, metrics and webhooks, and the request
+log.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,13 @@ from services.pipeline.dask_tls import Certificates
 
 
 class Observation:
-    """Belongs to one application; ``webhooks.sender`` is to be run while the application lives."""
+    """The observable side of one application. ``webhook_sender.run`` is to be run while the application lives.
+
+    Args:
+        readers: threads that query the database.
+        openers: threads that read the files of jobs.
+        certificates, workers: as in ``Readiness``.
+    """
 
     def __init__(
         self,
@@ -48,10 +56,12 @@ class Observation:
         self.webhook_sender = WebhookSender(deliveries, policy)
 
     def include_routes(self, app: FastAPI) -> None:
-        """Add every route of this room."""
+        """Add the routes of job history, health, metrics and webhooks to the application."""
         for router in self._routers:
             app.include_router(router)
 
     def watch_requests(self, app: FastAPI) -> None:
-        """Log and count requests; add this last, so that it sees also what others refuse."""
+        """Log and count all requests. Call this after all other middleware is added, so that requests which that
+        middleware refuses are counted too.
+        """
         app.add_middleware(RequestLog, metrics=RequestMetrics(self._registry))

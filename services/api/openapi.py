@@ -1,7 +1,7 @@
-"""The description of the REST API that is kept beside the code: ``python -m services.api.openapi`` writes it again
-after a change.
+"""Writes the OpenAPI description of the REST API to ``openapi.json``: ``python -m services.api.openapi``.
 
-Whoever changes a route sees in one file what changes for clients, and a test fails until it is written.
+Run it after every change of a route. The file shows in one place what changes for clients, and a test fails until it is
+up to date.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STORED = Path(__file__).with_name("openapi.json")
 
 
 def describe() -> dict[str, Any]:
-    """The description as the server gives it, without the version of the package."""
+    """Return the description as the server gives it, with version ``v1`` instead of the version of the package."""
     with tempfile.TemporaryDirectory() as folder:
         described = asyncio.run(_described(create_app(ServerSettings(data=Path(folder)), lambda *_: None)))
     described["info"]["version"] = "v1"
@@ -29,7 +29,7 @@ def describe() -> dict[str, Any]:
 
 
 async def _described(app: FastAPI) -> dict[str, Any]:
-    # Within its lifespan, at whose end the application closes what it opened.
+    # Describe the application within its lifespan, at the end of which it closes what it opened.
     async with app.router.lifespan_context(app):
         return app.openapi()
 

@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 
 
 def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[StageName, str] = DOORS) -> None:
-    """Serve until SIGINT or SIGTERM; prints its address on standard output once it listens.
+    """Serve until SIGINT or SIGTERM arrives. The address is printed on standard output once the server listens.
 
-    ``run`` and ``doors`` as in ``create_app``.
+    ``run`` and ``doors`` are those of ``create_app``.
 
     Raises:
-        PlatformError: the port is taken, another server uses the data folder, it cannot be written, or the api extra is
-            not installed.
+        PlatformError: the port is taken, another server uses the data folder, the data folder or the database cannot be
+            used, or the api extra is not installed.
         SettingsError: other machines reach the server and access is open, or the database belongs to another data
             folder.
     """
@@ -86,7 +86,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
 
 
 def _tell_setup_link(settings: ServerSettings, port: int) -> None:
-    """Write to the log how to make the first token, where there is none."""
+    """Log the link that makes the first token, if there is no token yet."""
     engine = open_database(settings.database_url)
     try:
         secret = SetupLinks(engine).issue()
@@ -114,11 +114,11 @@ def _telling_what_cannot_be_written(data: Path) -> Iterator[None]:
 
 
 def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
-    """Have a signal darken the domes before open requests are waited for."""
+    """Make the server darken the domes as soon as a signal arrives, before it waits for open requests."""
     leave = server.handle_exit
 
     def leave_dark(sig: int, frame: FrameType | None) -> None:
-        # A thread, as whoever is interrupted by a signal may hold any lock.
+        # Darken in a thread of its own, because the code that the signal interrupts may hold any lock.
         threading.Thread(target=darken, name="darken", daemon=True).start()
         leave(sig, frame)
 
@@ -127,8 +127,8 @@ def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
 
 
 def _listen(settings: ServerSettings) -> socket.socket:
-    # asyncio sends small answers at once (TCP_NODELAY) only where the protocol is named; else each waits some 40 ms for
-    # an acknowledgement
+    # Name the protocol, because asyncio sets TCP_NODELAY only then. Without it each small answer waits some 40 ms for
+    # an acknowledgement.
     listener = socket.socket(
         socket.AF_INET6 if ":" in settings.host else socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP
     )
@@ -146,10 +146,10 @@ def _listen(settings: ServerSettings) -> socket.socket:
 
 @contextmanager
 def _sole_server(data: Path) -> Iterator[None]:
-    """Hold the data folder's lock; the system drops it however this process ends."""
+    """Hold the lock of the data folder. The operating system releases it however this process ends."""
     with _telling_what_cannot_be_written(data):
         data.mkdir(parents=True, exist_ok=True)
-        with suppress(PermissionError):  # a folder of somebody else's, which he has closed or opened as he wants it
+        with suppress(PermissionError):  # the folder of another user, who has chosen its permissions
             data.chmod(stat.S_IMODE(data.stat().st_mode) & ~PRIVATE)
         stream = (data / ".lock").open("w")
     with stream:

@@ -1,1 +1,1 @@
-"""What every route shares: bodies, problem documents, files, limits, thread pools, connections."""
+"""HTTP parts that all routes share: request bodies, problem documents, files, limits, thread pools, connections."""

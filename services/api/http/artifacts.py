@@ -1,4 +1,4 @@
-"""Files of a job that may be read from outside, and only those."""
+"""Lists and serves the files of a job that clients may read, and no others."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ ANSWERS = refusals(416) | {
     206: {"description": "The bytes that Range names", "content": {"*/*": {}}},
     304: {"description": "The file is the one that If-None-Match names"},
 }
-"""What the description says of routes that answer with a file."""
+"""OpenAPI responses of the routes that answer with a file."""
 
 MAX_BYTES_AT_ONCE = 2**20
-"""Files and ranges up to here are read in the handler's own thread; longer ones block by block, in a hop to a thread
-each."""
+"""Largest file or range, in bytes, that is read at once in the thread of the handler. Longer ones are read block by
+block, each with a switch to another thread."""
 
 REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:;"
     " frame-ancestors 'none'"
 )
-"""A report or a drawing opens alone and carries all it needs; it may reach nothing, this server included, and no page
-may show it inside itself."""
+"""Content-Security-Policy of HTML reports and SVG drawings. They contain all that they need, so they may load nothing,
+not even from this server, and no page may embed them."""
 
 
 class Artifact(Record):
@@ -53,16 +53,17 @@ class Artifact(Record):
 
 
 def list_artifacts(root: Path) -> list[Artifact]:
-    """Every readable file below a job's folder, sorted by path; arrays inside stores are left out."""
+    """List every readable file below a job's folder, sorted by path. Arrays inside Zarr stores are left out."""
     found = sorted(_walk(root)) if root.is_dir() else []
     return [Artifact(path=str(path), bytes=size_bytes, media_type=_media_type(path)) for path, size_bytes in found]
 
 
 def open_artifact(root: Path, name: str) -> Path:
-    """The file behind an artifact's path; a link, or what lies behind one, is none, as in the list.
+    """Return the file behind an artifact's path. As in the list, a symbolic link and anything behind one is not an
+    artifact.
 
     Raises:
-        UnknownJobError: not a readable file of this job, whatever the path tries.
+        UnknownJobError: the path names no readable file of this job.
     """
     relative = PurePosixPath(name)
     path = root.joinpath(*relative.parts)
@@ -79,7 +80,7 @@ def open_artifact(root: Path, name: str) -> Path:
 
 
 def artifact_response(request: Request, path: Path) -> Response:
-    """The file with an ETag; answers conditional and range requests.
+    """Answer with the file and its ETag; conditional and range requests are supported.
 
     A Range header that cannot be read is ignored (RFC 9110, 14.2).
     """
@@ -110,8 +111,8 @@ def artifact_response(request: Request, path: Path) -> Response:
 
 
 def _ranges(asked: str, size_bytes: int) -> list[tuple[int, int]] | None:
-    """Where each range that a Range header names begins, and what it stops before; None if it is malformed or counts in
-    another unit (RFC 9110, 14.1).
+    """Parse a Range header into pairs of the first byte and the byte after the last one. Returns None if the header is
+    malformed or counts in another unit than bytes (RFC 9110, 14.1).
     """
     unit, _, ranges = asked.partition("=")
     found = [_RANGE.fullmatch(part.strip()) for part in ranges.split(",")]
@@ -127,7 +128,7 @@ def _ranges(asked: str, size_bytes: int) -> list[tuple[int, int]] | None:
 
 def _limits(first: str, last: str, size_bytes: int) -> tuple[int, int]:
     if not first:
-        return max(0, size_bytes - int(last)), size_bytes  # the last so many
+        return max(0, size_bytes - int(last)), size_bytes  # a suffix range: the last bytes of the file
     return int(first), min(int(last) + 1, size_bytes) if last else size_bytes
 
 
@@ -138,7 +139,7 @@ def _read(path: Path, first: int, end: int) -> bytes:
 
 
 def _walk(folder: Path, below: PurePosixPath = PurePosixPath()) -> Iterator[tuple[PurePosixPath, int]]:  # noqa: B008 - immutable
-    """Paths of readable files and their sizes in bytes."""
+    """Yield the paths of readable files, relative to the job's folder, and their sizes in bytes."""
     with os.scandir(folder) as entries:
         for entry in entries:
             relative = below / entry.name

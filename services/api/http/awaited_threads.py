@@ -1,4 +1,4 @@
-"""Functions in threads that are waited for, whatever happens to who asked for them."""
+"""Runs functions in threads and waits for their end even if the caller is cancelled."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ R = TypeVar("R")
 
 
 async def in_thread(function: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
-    """Run a function in a thread and, also when this task is cancelled, return only after it: it has a file, a claim or
-    a connection.
+    """Run a function in a thread and return only after it has ended, also when the calling task is cancelled, because
+    the function holds a file, a lock or a connection.
     """
     running = asyncio.create_task(asyncio.to_thread(function, *arguments, **options))
     try:

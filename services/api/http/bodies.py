@@ -1,7 +1,9 @@
-"""Bodies in JSON: bounded before they are parsed, long ones parsed off the loop, and refused at their first faults.
+"""JSON request bodies: bounded before they are parsed, parsed outside the event loop where they are long, and refused
+at their first faults.
 
-To parse hundreds of thousands of values, or to list as many faults, takes seconds in which the loop serves nobody. A
-thread alone does not help, as parsers keep the interpreter for as long as they run: what they are given must be small.
+Parsing hundreds of thousands of values, or listing as many faults, takes seconds in which the event loop serves nobody.
+A thread alone does not help, because a parser holds the interpreter lock for as long as it runs: its input must be
+small.
 """
 
 from __future__ import annotations
@@ -22,17 +24,18 @@ from services.api.http.thread_pools import ThreadPool
 from services.core.errors import SettingsError
 
 MAX_FAULTS = 100
-"""More are counted, and not listed: whoever sends so many has sent something else than was asked for. No record has so
-many members either."""
+"""Largest number of faults that are listed, and of members of the object at the top of a body. More faults are only
+counted: such a body is not what the route asks for. No record has so many members either."""
 MAX_MEMBERS = 1000
-"""Of any object in a body. The longest are a light's intensities, one a channel."""
+"""Largest number of members of any object in a body. The longest objects are a light's intensities, one a channel."""
 MAX_VALUES = 40_000
-"""In one body: a manifest of five thousand files, the most by default, has twenty thousand."""
+"""Largest number of values in one body. A manifest of five thousand files, the most by default, has twenty thousand."""
 BYTES_PER_VALUE = 20
-"""A body may hold more values than that if it has so many bytes for each. A longer manifest, which the settings may
+"""Bytes per value from which a body may hold more than ``MAX_VALUES`` values. A longer manifest, which the settings may
 allow, has 25 at least: four values a file, of which the SHA-256 alone takes 66 bytes."""
 SHORT_BYTES = 2**14
-"""A body up to here is parsed on the loop, in a millisecond; a longer one waits its turn in a thread."""
+"""Largest body, in bytes, that is parsed on the event loop, which takes a millisecond. A longer one waits its turn in a
+thread."""
 T = TypeVar("T")
 
 
@@ -48,17 +51,18 @@ def _few_faults(value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
 
 
 Sent = Annotated[T, WrapValidator(_few_faults)]
-"""A body of a record's kind. Sequences in it stop at their first fault by themselves (``fail_fast``)."""
+"""Annotation of a request body that is validated as a record. Sequences in it stop at their first fault by themselves
+(``fail_fast``)."""
 
 
 def parse(body: bytes) -> Any:
-    """What JSON in UTF-8 says.
+    """Parse JSON in UTF-8.
 
     Raises:
-        SettingsError: it has more values, or an object in it more members, than anything that is asked for.
-        ValueError, RecursionError: it is no JSON, or nested too deeply.
+        SettingsError: the body has more values, or an object in it more members, than any route asks for.
+        ValueError, RecursionError: the body is not JSON, or nested too deeply.
     """
-    # Every value but the first of its list or object follows a comma, so that this counts no fewer than there are.
+    # Count an upper bound of the values: every value but the first of its list or object follows a comma.
     values, most = sum(map(body.count, (b",", b"[", b"{"))), max(MAX_VALUES, len(body) // BYTES_PER_VALUE)
     if values > most:
         raise SettingsError(
@@ -78,10 +82,10 @@ def _of_few_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class BodyRoute(APIRoute):
-    """A route whose body is parsed and checked by ``app.state.parsers`` where it is long."""
+    """A route whose body is parsed and validated in ``app.state.parsers`` where it is long."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The route's handler, which finds its record made."""
+        """Return the handler of the route, which receives the body as a validated record."""
         handler, field = super().get_route_handler(), self.body_field
         if field is None:
             return handler
@@ -94,7 +98,7 @@ class BodyRoute(APIRoute):
 
         class ReadRequest(Request):
             async def json(self) -> Any:
-                # FastAPI checks what this returns once more, but takes a record as it is.
+                # FastAPI validates the result once more, but accepts a record as it is.
                 parsers: ThreadPool = self.app.state.parsers
                 body = await self.body()
                 return read(body) if len(body) <= SHORT_BYTES else await parsers.ask(read, body)
@@ -102,7 +106,7 @@ class BodyRoute(APIRoute):
         async def answer(request: Request) -> Response:
             try:
                 return await handler(ReadRequest(request.scope, request.receive))
-            except HTTPException as problem:  # FastAPI's for whatever a body's parser raises
+            except HTTPException as problem:  # FastAPI turns every error of a body's parser into this
                 if isinstance(problem.__cause__, SettingsError | RequestValidationError):
                     raise problem.__cause__ from None
                 raise

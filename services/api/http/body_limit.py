@@ -1,5 +1,6 @@
-"""Refuses bodies that are long or slow as they come in, whatever Content-Length says; plain ASGI, so that nothing is
-buffered.
+"""Middleware that refuses request bodies that are too long or too slow while they arrive, whatever Content-Length says.
+
+It is plain ASGI, so that nothing is buffered.
 """
 
 from __future__ import annotations
@@ -17,15 +18,20 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 EXEMPT = "/v1/uploads"
-"""Uploads are long by nature and bound their own size and silence."""
+"""Path of uploads, to which this limit does not apply: they are long by nature and limit their own size and silence."""
 MAX_BODY_S = 60.0
-"""From the head of a request to the end of its body: a connection that is kept busy with a body is one less for others,
-ALL OFF among them."""
+"""Longest time from the head of a request to the end of its body, in s. A connection that is busy with a body is not
+available for other requests, ALL OFF among them."""
 
 
 class BodyLimit:
-    """Counts what is received; beyond the limit the client gets 413, after too long a time 408, and the application a
-    disconnect.
+    """Limits the length and the duration of every request body.
+
+    A body that is too long is answered with status 413 and one that is too slow with 408; the application then receives
+    a disconnect.
+
+    Args:
+        limit_bytes: largest body, in bytes.
     """
 
     def __init__(self, app: ASGIApp, limit_bytes: int) -> None:

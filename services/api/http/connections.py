@@ -1,9 +1,8 @@
-"""The connections of one server: how many there may be, and how long each may keep a request to itself before its head
-is whole.
+"""Limits the connections of one server: their number, and how long each may take to send the head of a request.
 
-Whoever opens connections and sends no whole request, by mistake or to keep others out, loses them: after ``header_s``,
-or at once where a newcomer finds all places taken; those that have sent a request before are closed last. So there is
-always one for ALL OFF.
+A client that opens connections and sends no complete request, by mistake or to keep others out, loses them: after
+``header_s``, or at once when a new connection finds all places taken. Connections that have sent a request before are
+closed last. So there is always a place for ALL OFF.
 """
 
 from __future__ import annotations
@@ -22,22 +21,24 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from services.core.settings import ConnectionLimits
 
 MAX_DESCRIPTORS = 65_536
-"""Asked of the system, which by default gives 1,024: files of jobs and pipes to workers count too."""
+"""Number of open files that is requested from the operating system, which by default allows 1,024. Files of jobs and
+pipes to workers count too."""
 MAX_SHARE = 0.5
-"""Of the descriptors, for connections."""
+"""Largest share of the file descriptors that connections may take."""
 MAX_BACKLOG = 256
-"""Connections that are accepted in one go: more would keep the event loop busy for more than some ten milliseconds."""
+"""Largest number of connections that are accepted in one go. More would keep the event loop busy for more than some ten
+milliseconds."""
 TOLD_EVERY_S = 600.0
-"""How often the log is told of what goes on happening."""
+"""Time in s after which a warning is logged again if its cause persists."""
 SHED = 16
-"""Connections without a request that are closed when descriptors run out."""
+"""Number of connections without a request that are closed when file descriptors run out."""
 _OUT_OF_DESCRIPTORS = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 _TOO_SLOW = b"HTTP/1.1 408 Request Timeout\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
 
 
 class Crowd:
-    """The open connections, and of those the ones without a request, longest waiting first: those that never sent one,
-    and those that did.
+    """The open connections. Those without a request are kept in the order in which they began to wait: ``fresh`` ones
+    have never sent a request, ``served`` ones have.
     """
 
     def __init__(self, limits: ConnectionLimits) -> None:
@@ -48,8 +49,8 @@ class Crowd:
         self._told_at: dict[str, float] = {}
 
     def admit(self, newcomer: BoundedProtocol) -> bool:
-        """Let a connection in, in place of the one that has waited longest where all places are taken; False where all
-        are at work.
+        """Admit a new connection. Where all places are taken, the connection that has waited longest without a request
+        is closed for it; returns False where all connections are at work.
         """
         if len(self.open) >= self.most and not self.shed(1):
             self.tell(
@@ -61,7 +62,7 @@ class Crowd:
         return True
 
     def shed(self, count: int) -> int:
-        """Close so many connections without a request; returns how many there were."""
+        """Close up to ``count`` connections without a request; returns how many were closed."""
         chosen = [*self.fresh, *self.served][:count]
         for one in chosen:
             self.leave(one)
@@ -71,29 +72,29 @@ class Crowd:
         return len(chosen)
 
     def leave(self, one: BoundedProtocol) -> None:
-        """Forget a connection."""
+        """Remove a connection from the open and the waiting ones."""
         self.open.discard(one)
         self.end_wait(one)
 
     def wait(self, one: BoundedProtocol, *, is_fresh: bool) -> None:
-        """Note that a connection has no request."""
+        """Note that a connection waits for a request, and whether it has never sent one (``is_fresh``)."""
         (self.fresh if is_fresh else self.served)[one] = None
 
     def end_wait(self, one: BoundedProtocol) -> None:
-        """Note that it has one, or is closed."""
+        """Note that a connection has a request, or is closed."""
         self.fresh.pop(one, None)
         self.served.pop(one, None)
 
     def tell(self, message: str, *values: object) -> None:
-        """Log something once, and again after a while if it goes on."""
+        """Log a warning, at most once in ``TOLD_EVERY_S``."""
         now = asyncio.get_running_loop().time()
         if now >= self._told_at.get(message, now):
             self._told_at[message] = now + TOLD_EVERY_S
             logging.getLogger(__name__).warning(message, *values)
 
     def handle_exception(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Of the event loop: an accept without descriptors, of which it would tell some hundred times a second, makes
-        room and is told once.
+        """Handle an exception of the event loop. An accept without descriptors, which asyncio would report some hundred
+        times a second, is logged once and closes connections without a request.
         """
         problem = context.get("exception")
         if (
@@ -110,14 +111,14 @@ class Crowd:
 
 
 class BoundedProtocol(H11Protocol):
-    """HTTP/1.1 on one connection of a crowd."""
+    """HTTP/1.1 protocol of one connection of a ``Crowd``."""
 
     def __init__(self, crowd: Crowd, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._crowd, self._limit = crowd, cast("asyncio.TimerHandle | None", None)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """A client has connected."""
+        """Admit the connection of a client, or close it."""
         super().connection_made(transport)
         if self._crowd.admit(self):
             self._await_request()
@@ -131,13 +132,13 @@ class BoundedProtocol(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes have come, which alone prolong nothing."""
+        """Receive bytes. They do not prolong the wait for a request, which ends only with a complete head."""
         super().data_received(data)
         if self._is_at_work:
             self._end_wait()
 
     def on_response_complete(self) -> None:
-        """A request was answered; the next one may come."""
+        """Wait for the next request once one was answered."""
         super().on_response_complete()
         if not self._is_at_work and not self.transport.is_closing():
             self._await_request()
@@ -164,7 +165,7 @@ class BoundedProtocol(H11Protocol):
 
 
 class BoundedServer(uvicorn.Server):
-    """A server over a crowd of connections."""
+    """A uvicorn server whose connections belong to a ``Crowd``."""
 
     def __init__(self, config: uvicorn.Config, limits: ConnectionLimits) -> None:
         self._crowd = Crowd(limits)
@@ -173,13 +174,15 @@ class BoundedServer(uvicorn.Server):
         super().__init__(config)
 
     async def startup(self, sockets: Any = None) -> None:
-        """Begin to listen."""
+        """Begin to listen, with the exception handler of the ``Crowd``."""
         asyncio.get_running_loop().set_exception_handler(self._crowd.handle_exception)
         await super().startup(sockets)
 
 
 def raise_descriptors() -> int:
-    """Let this process have as many open files as the system allows; returns how many."""
+    """Raise the limit of open files of this process as far as the system allows, at most to ``MAX_DESCRIPTORS``;
+    returns the limit.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
     if soft < wanted:

@@ -1,4 +1,4 @@
-"""Answers as JSON, written in the thread of the handler that has made them."""
+"""JSON answers that are serialised in the thread of their handler."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ P = ParamSpec("P")
 
 
 def in_json(handler: Callable[P, Any]) -> Callable[P, Response]:
-    """Let a handler answer 200 with its result as JSON; the description still says what it returns.
+    """Wrap a handler so that it answers 200 with its result as JSON; the OpenAPI description still shows the result's
+    type.
 
-    FastAPI would check the result a second time, in another hop to a thread, and write it on the loop that serves
-    everybody. For results that are records, which were checked when they were made.
+    FastAPI would validate the result a second time, with another switch to a thread, and serialise it on the event loop
+    that serves everybody. This is for results that are records, which were validated when they were made.
     """
     adapter: TypeAdapter[Any] = TypeAdapter(inspect.signature(handler).return_annotation)
 

@@ -1,4 +1,4 @@
-"""Errors as RFC 9457 problem documents; ``code`` is the DentineError's own."""
+"""Errors as RFC 9457 problem documents; ``code`` is that of the ``DentineError``."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ if TYPE_CHECKING:
 
 MEDIA_TYPE = "application/problem+json"
 _PATH_CHARACTERS = "/:@!$&'()*+,;=~"
-"""That a URI's path may hold as they are, besides letters and digits (RFC 3986, 3.3)."""
+"""Characters that a URI's path may hold unescaped, besides letters and digits (RFC 3986, 3.3)."""
 CHECKSUM_MISMATCH = 460
-"""Of the tus protocol, no registered status."""
+"""HTTP status of the tus protocol for a wrong checksum; it is not registered."""
 _PHRASES = {
     413: "Request Entity Too Large",
     414: "Request-URI Too Long",
@@ -66,12 +66,12 @@ _PHRASES = {
     422: "Unprocessable Entity",
     CHECKSUM_MISMATCH: "Checksum Mismatch",
 }
-"""Those that Python 3.13 names anew, after RFC 9110, as they were: a problem's title and code stay the same whatever
-the server runs on."""
+"""Reason phrases that Python 3.13 renames after RFC 9110, in their older form, and the one of tus. So the title and
+code of a problem do not depend on the version of Python."""
 
 
 def phrase_of(status: int) -> str:
-    """The name of an HTTP status, the same on every Python."""
+    """Return the reason phrase of an HTTP status, the same on every version of Python."""
     return _PHRASES.get(status) or HTTPStatus(status).phrase
 
 
@@ -87,7 +87,7 @@ class Problem(Record):
 
     @classmethod
     def of(cls, status: int, code: str, detail: str, path: str, **more: object) -> Self:
-        """The document for a status, one of our codes and a decoded path; ``more`` are the members of a subclass."""
+        """Build the document from a status, an error code and a decoded path; ``more`` are the fields of a subclass."""
         title = phrase_of(status)
         fields = {
             "detail": redacted(detail).encode(errors="backslashreplace").decode(),
@@ -137,14 +137,12 @@ _STATUS: dict[type[DentineError], int] = {
 
 
 def status_of(problem: DentineError) -> int:
-    """The HTTP status that an error means: that of its kind, else of the nearest kind above it, in whatever order they
-    are listed.
-    """
+    """Return the HTTP status of an error: that of its class, else of the nearest base class in the table."""
     return next(_STATUS[kind] for kind in type(problem).__mro__ if kind in _STATUS)
 
 
 def response_of(problem: DentineError, path: str, headers: dict[str, str] | None = None) -> Response:
-    """The answer to a request that raised an error outside the application."""
+    """Build the answer to a request from an error that does not reach the exception handlers of the application."""
     from starlette.responses import Response
 
     status = status_of(problem)
@@ -154,7 +152,7 @@ def response_of(problem: DentineError, path: str, headers: dict[str, str] | None
 
 
 def database_lost(path: str) -> Response:
-    """The answer to a request that the database kept from being answered."""
+    """Build the answer to a request that cannot be served because the database does not answer."""
     from starlette.responses import Response
 
     detail = "The database does not answer; what is stored is kept, try again later."
@@ -163,8 +161,8 @@ def database_lost(path: str) -> Response:
 
 
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """What the description says of routes that may answer so, besides what browser protection, authentication and a
-    lost database answer everywhere.
+    """Return the OpenAPI responses of routes that may answer with these statuses. Those of browser protection,
+    authentication and a lost database are added, as they may occur on every route.
     """
     chosen = sorted({400, 401, 403, 429, 503, *statuses})
     return {
@@ -173,7 +171,7 @@ def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def install(app: FastAPI) -> None:
-    """Answer every error of the application with a problem document, and describe it so."""
+    """Make the application answer every error with a problem document, and say so in its OpenAPI description."""
     from fastapi.exceptions import RequestValidationError
     from fastapi.responses import Response
     from sqlalchemy.exc import DataError, DBAPIError
@@ -183,7 +181,7 @@ def install(app: FastAPI) -> None:
     describe = app.openapi
 
     def describe_refusals() -> dict[str, Any]:
-        # FastAPI describes every body as of the route's own type.
+        # FastAPI describes a problem document with the media type of the route; give it its own.
         described = describe()
         for operation in (one for path in described["paths"].values() for one in path.values()):
             for content in (response.get("content", {}) for response in operation["responses"].values()):
@@ -224,7 +222,7 @@ def install(app: FastAPI) -> None:
         status = HTTPStatus(problem.status_code)
         if (
             status is HTTPStatus.BAD_REQUEST and problem.__cause__ is not None
-        ):  # FastAPI's on a body that is no text; of other malformed bodies it says 422
+        ):  # FastAPI answers 400 to a body that is not text, 422 to other malformed ones
             return answer(
                 request, HTTPStatus.UNPROCESSABLE_ENTITY, "bad-settings", "The body cannot be read; send JSON in UTF-8."
             )
@@ -240,7 +238,7 @@ def install(app: FastAPI) -> None:
 
 
 def _sentence(errors: Sequence[Any]) -> str:
-    """The first validation error, by the option's name."""
+    """Describe the first validation error in one sentence that names the option."""
     first = errors[0]
     name = ".".join(str(part) for part in first["loc"][1:]) or str(first["loc"][0])
     if first["type"] == "extra_forbidden":

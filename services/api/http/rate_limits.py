@@ -1,4 +1,4 @@
-"""How often a caller may ask: moving windows in this process's memory."""
+"""Rate limits of requests: moving windows in the memory of this process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.core.settings import RateSettings
 
 
 class MovingWindow:
-    """Grants each key so many hits within any stretch of time."""
+    """Grants each key at most ``most`` hits within any period of ``seconds``."""
 
     def __init__(self, most: int, seconds: float) -> None:
         self._most, self._seconds = most, seconds
@@ -19,7 +19,7 @@ class MovingWindow:
         self._sweep_at = 0.0
 
     def hit(self, key: str) -> int:
-        """Count a hit and answer 0, or answer how many seconds to wait for the next one that is granted."""
+        """Count a hit and return 0, or return after how many seconds the next hit is granted."""
         now = time.monotonic()
         if now >= self._sweep_at:
             self._hits = {one: hits for one, hits in self._hits.items() if hits[-1] > now - self._seconds}
@@ -34,9 +34,9 @@ class MovingWindow:
 
 
 class Rates:
-    """Counts requests; every method answers how many seconds to wait, 0 where the request may go on.
+    """Counts requests. The methods that count return how many seconds to wait, 0 where the request may go on.
 
-    To be called from one thread.
+    All methods are to be called from the same thread.
     """
 
     def __init__(self, settings: RateSettings) -> None:
@@ -46,7 +46,7 @@ class Rates:
         self._tellings = MovingWindow(1, 60.0)
 
     def count(self, caller: str, *, is_change: bool) -> int:
-        """Count a request of a token or an address."""
+        """Count a request of a token or, without one, of an address."""
         return (self._writes if is_change else self._reads).hit(caller)
 
     def count_refusal(self, address: str) -> int:
@@ -54,12 +54,12 @@ class Rates:
         return self._refusals.hit(address)
 
     def is_worth_telling(self, address: str) -> bool:
-        """True once a minute for an address."""
+        """Whether a refusal of this address is to be audited; true once a minute."""
         return self._tellings.hit(address) == 0
 
 
 def network_of(address: str) -> str:
-    """What is counted as one address: an IPv6 host owns a /64 and may use any of it."""
+    """Return the network that counts as one address. An IPv6 host owns a /64 network and may use any address in it."""
     try:
         ip = ipaddress.ip_address(address)
     except ValueError:

@@ -1,5 +1,6 @@
-"""Gives every request an id, a log line and its place in the metrics, as plain ASGI so that streams pass through
-unbuffered.
+"""Middleware that gives every request an id and a log line, and counts it in the metrics.
+
+It is plain ASGI, so that streams pass through unbuffered.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ if TYPE_CHECKING:
 
 HEADER = "X-Request-ID"
 UNROUTED = "unrouted"
-"""Stands for the route of a request that none took, so that neither logs nor metrics repeat what a stranger asked
-for."""
+"""Name of the route in logs and metrics for a request that no route took, so that they do not repeat what an unknown
+client asked for."""
 
 _WELL_FORMED = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 class RequestLog:
-    """Takes the client's request id if it is well-formed, else makes one; answers with it, logs it, and keeps it in the
-    request's state.
+    """Logs and counts every request under its id: the client's own if it is well-formed, else a new one. The id is sent
+    with the answer and kept in the request's state.
     """
 
     def __init__(self, app: ASGIApp, metrics: RequestMetrics) -> None:
@@ -57,7 +58,7 @@ class RequestLog:
             await self._app(scope, receive, send_named)
         finally:
             duration_s = time.perf_counter() - started_s
-            if not status:  # an exception, which the server answers further out
+            if not status:  # an exception, which an outer layer answers
                 status = 500
                 self._metrics.count(scope["method"], route_of(scope), status, duration_s)
             told = {
@@ -72,7 +73,7 @@ class RequestLog:
 
 
 def method_of(scope: Scope) -> str:
-    """The request's method, ``other`` for one that HTTP does not know: that is whatever a stranger wrote, at any
+    """Return the request's method, or ``other`` for one that HTTP does not define, as a client may send any text of any
     length.
     """
     method: str = scope["method"]
@@ -80,5 +81,5 @@ def method_of(scope: Scope) -> str:
 
 
 def route_of(scope: Scope) -> str:
-    """The template of the route that took the request; never its path or query."""
+    """Return the template of the route that took the request, never its path or query."""
     return getattr(scope.get("route"), "path", None) or UNROUTED

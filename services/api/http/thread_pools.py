@@ -1,4 +1,4 @@
-"""Threads that do short work in order: what only asks the database, and what only appends to it."""
+"""Pools of threads for short work, such as queries of the database and rows that are appended to it."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from typing import Any, ParamSpec, Self, TypeVar
 import sqlalchemy as sql
 
 MAX_READERS = 8
-"""Of a database over a network, where most of the time is waiting."""
+"""Number of threads that read a database over a network, where most of the time is spent waiting."""
 CLOSE_S = 5.0
-"""How long the server's end waits for work that is under way."""
+"""Longest time in s that the end of the server waits for work under way."""
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 class ThreadPool:
-    """So many threads, begun when there is work. What may take long, or waits for others, belongs elsewhere."""
+    """A pool of ``count`` threads, started when there is work. Work that may take long, or waits for other work,
+    belongs elsewhere.
+    """
 
     def __init__(self, count: int) -> None:
         self._pool = ThreadPoolExecutor(count, "short work")
 
     @classmethod
     def reading(cls, engine: sql.Engine) -> Self:
-        """One where the database is a file: it answers sooner than threads wrest the interpreter from each other, which
-        each of them must after every query.
+        """Create a pool that reads the database: one thread where it is a file, as SQLite answers sooner than several
+        threads can hand the interpreter lock to each other, which they must do after every query; else ``MAX_READERS``.
         """
         return cls(1 if engine.dialect.name == "sqlite" else MAX_READERS)
 
     async def ask(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
-        """What the work returns."""
+        """Run the work in the pool and return its result."""
         return await asyncio.get_running_loop().run_in_executor(
             self._pool, partial(copy_context().run, work, *arguments, **options)
         )
 
     def answering(self, handler: Callable[P, R]) -> Callable[P, Coroutine[Any, Any, R]]:
-        """Let a handler be called here, where FastAPI would call it in one of forty threads."""
+        """Wrap a handler so that it runs in this pool, where FastAPI would run it in one of forty threads."""
 
         @wraps(handler)
         async def answer(*arguments: P.args, **options: P.kwargs) -> R:
@@ -49,7 +51,7 @@ class ThreadPool:
         return answer
 
     def close(self) -> None:
-        """Wait for what is under way, but not for what hangs."""
+        """Wait for the work under way, at most ``CLOSE_S``."""
         closing = threading.Thread(target=self._pool.shutdown, name="end of short work", daemon=True)
         closing.start()
         closing.join(CLOSE_S)

@@ -1,4 +1,6 @@
-"""A zip file made while it is sent: stored, not deflated, in pieces that need neither memory nor disk."""
+"""A zip file that is made while it is sent. Its entries are stored without compression, in pieces, so that it takes up
+neither memory nor disk.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,11 @@ from pathlib import Path
 
 PIECE_BYTES = 2**18
 _EARLIEST = (1980, 1, 1, 0, 0, 0)
-"""The first moment that a zip file can name."""
+"""Earliest time that an entry of a zip file can have: year, month, day, hour, minute, second."""
 
 
 def stream_zip(root: Path, names: Iterable[str]) -> Iterator[bytes]:
-    """The bytes of a zip of files below ``root``.
+    """Yield the bytes of a zip file of the named files below ``root``.
 
     A file that vanishes before its turn is left out; one that grows is cut at the size it had.
     """
@@ -41,7 +43,9 @@ def _entry(archive: zipfile.ZipFile, sink: _Sink, path: Path, name: str) -> Iter
 
 
 class _Sink(io.RawIOBase):
-    """Collects what is written until it is taken; cannot seek, so sizes and checksums follow each file's bytes."""
+    """Collects written bytes until they are taken. It cannot seek, so the size and checksum of an entry follow its
+    bytes.
+    """
 
     def __init__(self) -> None:
         self._pieces = bytearray()
@@ -54,7 +58,7 @@ class _Sink(io.RawIOBase):
         return len(piece)
 
     def take(self) -> bytes:
-        """What was written since the last time."""
+        """Return the bytes written since the last call."""
         taken = bytes(self._pieces)
         self._pieces.clear()
         return taken
