@@ -1,1 +1,1 @@
-"""Who asks and what they may do: tokens, sessions, scopes, owners, the audit log, protection of browsers."""
+"""Authentication and authorisation: tokens, sessions, scopes, owners, the audit log, protection of browsers."""

@@ -1,4 +1,4 @@
-"""Finds out whom a request comes from."""
+"""Identifies the caller of a request."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ if TYPE_CHECKING:
 
 
 LOOKERS = 4
-"""Threads that look tokens up: of their own, so that no disk or name server that hangs keeps anybody from ALL OFF."""
+"""Number of threads that look up tokens and owners. They do nothing else, so that no disk or name server that hangs can
+delay ALL OFF."""
 
 
 class Access:
-    """The callers of one server; ``sessions`` is None where access is open."""
+    """Identifies the callers of one server; ``sessions`` is None where access is open."""
 
     def __init__(self, tokens: Tokens, sessions: Sessions | None) -> None:
         self.tokens, self.sessions, self.lookers = tokens, sessions, ThreadPool(LOOKERS)
 
     async def identify(self, request: HTTPConnection) -> Caller:
-        """The caller, by the Authorization header or else by the session cookie.
+        """Return the caller, identified by the Authorization header or else by the session cookie.
 
         Raises:
-            UnauthenticatedError: neither is there, or what is there is not valid.
+            UnauthenticatedError: the request has neither of them, or the one that it has is not valid.
         """
         if self.sessions is None:
             return LOCAL
@@ -58,13 +59,13 @@ class Access:
 
     @staticmethod
     def credential(request: HTTPConnection) -> str | None:
-        """What the caller has presented, whether valid or not."""
+        """Return the token or cookie that the caller has presented, whether valid or not; None without one."""
         authorization = request.headers.get("authorization")
         return request.cookies.get(COOKIE) if authorization is None else authorization.partition(" ")[2].strip()
 
 
 def refuse_open_network(settings: ServerSettings) -> None:
-    """Keep a server without tokens off the network.
+    """Refuse to run a server without tokens on an address that other machines can reach.
 
     Raises:
         SettingsError: access is open and the address is not loopback.

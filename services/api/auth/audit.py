@@ -15,7 +15,8 @@ from services.core.redaction import redacted
 from services.pipeline.database import metadata, writing
 
 ID_LENGTH = 500
-"""More of an artifact's path is not kept: whoever asks for it could make it long."""
+"""Largest number of characters of each stored id. An artifact's path, which the caller chooses, could be of any
+length."""
 
 audit_table = sql.Table(
     "audit",
@@ -32,7 +33,7 @@ audit_table = sql.Table(
     sqlite_autoincrement=True,
 )
 
-_INSERT = audit_table.insert()  # built once: building it takes longer than doing it
+_INSERT = audit_table.insert()  # built once, as building the statement takes longer than executing it
 
 
 class AuditEntry(Record):
@@ -50,7 +51,9 @@ class AuditEntry(Record):
 
 @dataclass
 class AuditedAction:
-    """Something that a caller does; whoever makes the change writes it in the same transaction if that is simple."""
+    """An action of a caller. Code that makes the change also writes the row, in the same transaction, where that is
+    simple.
+    """
 
     action: str
     address: str
@@ -60,7 +63,7 @@ class AuditedAction:
     is_written: bool = False
 
     def write(self, connection: sql.Connection, outcome: int) -> None:
-        """Append the row inside the caller's transaction, unless that was done."""
+        """Append the row inside the caller's transaction, unless it was written already."""
         if not self.is_written:
             ids = {name: redacted(value)[:ID_LENGTH] for name, value in self.ids.items()}
             row = {
@@ -75,19 +78,21 @@ class AuditedAction:
 
 
 class AuditLog:
-    """The audit table."""
+    """Reads and appends the rows of the audit table."""
 
     def __init__(self, engine: sql.Engine) -> None:
         self._engine = engine
 
     def append(self, audited: AuditedAction, outcome: int) -> None:
-        """Append an action that is in no other transaction."""
+        """Append the row of an action in a transaction of its own, unless it was written already."""
         if not audited.is_written:
             with writing(self._engine) as connection:
                 audited.write(connection, outcome)
 
     def page(self, limit: int, before: int | None = None, who: str | None = None) -> list[AuditEntry]:
-        """Newest rows first, those with an id below ``before``."""
+        """Return up to ``limit`` rows, newest first, of those with an id below ``before`` and of the caller named
+        ``who``.
+        """
         query = sql.select(audit_table).order_by(audit_table.c.id.desc()).limit(limit)
         if before is not None:
             query = query.where(audit_table.c.id < before)

@@ -1,6 +1,6 @@
-"""Who may pass to the routes, decided before a byte of the body is read.
+"""Middleware that decides which requests may pass to the routes, before a byte of the body is read.
 
-What passes, and what is refused, is audited here.
+It audits the requests that pass and those that it refuses.
 """
 
 from __future__ import annotations
@@ -34,11 +34,14 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 RECHECK_S = 5.0
-"""A stream of a token that was revoked ends at its first message after this time."""
+"""Time in s after which a stream checks its token again. A stream of a revoked token ends at its first message after
+this time."""
 
 
 class AuthenticationMiddleware:
-    """Finds the caller and the route, counts, compares scopes, audits, and ends streams whose token has ended."""
+    """Identifies the caller and the route, applies the rate limits, compares scopes, audits, and ends streams whose
+    token has ended.
+    """
 
     def __init__(
         self,
@@ -51,7 +54,8 @@ class AuthenticationMiddleware:
         dark_auditors: ThreadPool,
     ) -> None:
         self._app, self._access, self._rates = app, access, rates
-        # Here, before anybody is served: FastAPI builds every route when the routes are first walked, in 0.2 s.
+        # Build the table before the first request: FastAPI builds every route when the routes are first walked, which
+        # takes 0.2 s.
         self._routes: Sequence[GuardedRoute] = guarded_routes(owner.routes)
         self._audit, self._auditors, self._dark_auditors = audit, auditors, dark_auditors
         self._ownership = Ownership(access.tokens.engine)
@@ -81,7 +85,7 @@ class AuthenticationMiddleware:
         await self._pass(request, found.route, audited, receive, send)
 
     async def _refusal(self, request: HTTPConnection, found: Found, audited: AuditedAction) -> Response | None:
-        """The answer to a request that may not pass."""
+        """Return the answer to a request that may not pass; None if it may."""
         path, is_change = request.scope["path"], request.scope["method"] not in SAFE_METHODS
         try:
             caller = await self._access.identify(request)
@@ -108,8 +112,8 @@ class AuthenticationMiddleware:
     async def _hidden(
         self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, audited: AuditedAction
     ) -> Response | None:
-        """The answer to a request that names something of others: the same as if it were not there, and before anything
-        else of it is looked at.
+        """Return the answer to a request that names something of another owner, before anything else of the request is
+        looked at; None if it may pass. The answer is the same as for something that does not exist.
         """
         named = None if caller.viewer.sees_all else self._ownership.named_in(route.template, ids)
         if named is None:
@@ -124,8 +128,8 @@ class AuthenticationMiddleware:
         return response_of(thing.absent(name), request.scope["path"])
 
     async def _stranger_refusal(self, request: HTTPConnection, audited: AuditedAction) -> Response | None:
-        """The answer to somebody with a setup link who may not even try it: each try counts as a request without a
-        valid token.
+        """Return the answer to a caller with a setup link who is over the rate limit; None if the link may be tried.
+        Each try counts as a request without a valid token.
         """
         audited.who, request.scope["audited"] = "setup link", audited
         if wait_s := self._rates.count_refusal(network_of(audited.address)):
@@ -140,9 +144,10 @@ class AuthenticationMiddleware:
     async def _refuse_unknown(
         self, request: HTTPConnection, problem: UnauthenticatedError, audited: AuditedAction
     ) -> Response:
-        """Answer and audit refusals of one address singly up to the limit, and by one row a minute beyond it.
+        """Answer and audit a request without a valid token. Refusals of one address are audited singly up to the rate
+        limit, and by one row a minute beyond it.
 
-        A valid token never gets here.
+        A request with a valid token never gets here.
         """
         credential = Access.credential(request)
         audited.token = public_id(credential) if credential else None
@@ -202,7 +207,7 @@ class AuthenticationMiddleware:
                 raise
 
     async def _is_still_known(self, request: HTTPConnection) -> bool:
-        # While the database is away nobody can say otherwise; the next message asks again.
+        # A database that does not answer cannot say that the token has ended; the next message asks it again.
         try:
             with suppress(SQLAlchemyError):
                 await self._access.identify(request)
@@ -218,7 +223,9 @@ def _is_audited(scope: Scope, route: GuardedRoute | None) -> bool:
 
 
 def _is_public(scope: Scope, found: Found) -> bool:
-    """The liveness route, and whatever only the page's static files can answer."""
+    """Whether a request needs no caller: it asks for the liveness route, or for a path that only the static files of
+    the page can answer.
+    """
     if found.route is not None:
         return found.route.template == LIVENESS
     return not scope["path"].startswith("/v1/") and not found.allowed_methods

@@ -1,4 +1,7 @@
-"""What every answer carries and what no request may do, as plain ASGI so that streams pass through unbuffered."""
+"""Middleware that adds security headers to every answer, and refuses requests that another site may be behind.
+
+It is plain ASGI, so that streams pass through unbuffered.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +40,12 @@ _NOT_KEPT = (b"cache-control", b"no-store")
 
 
 class BrowserProtection:
-    """Adds security headers; refuses other names for this server (DNS rebinding), and changes that another site's page
-    asks a visitor's browser to make.
+    """Adds security headers, and refuses two kinds of requests: those that address this server by a foreign name (DNS
+    rebinding), and changes that the page of another site asks a visitor's browser to make.
 
     Args:
-        names: of this server, as clients use them.
+        names: host names and addresses of this server, as clients use them.
+        secure: whether browsers are told to use TLS only.
     """
 
     def __init__(self, app: ASGIApp, *, names: Iterable[str], secure: bool) -> None:
@@ -49,7 +53,7 @@ class BrowserProtection:
         self._headers = (*_ALWAYS, *((_BY_TLS_ONLY,) if secure else ()))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request; ``secure`` servers tell browsers to come by TLS only."""
+        """Serve one request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -90,9 +94,9 @@ def _name_of(host: str) -> str | None:
 
 
 def _is_foreign(asked: Headers) -> bool:
-    """Whether another site's page may be behind a change.
+    """Whether the page of another site may be behind a change.
 
-    A browser says where a change comes from; one that sends a cookie must.
+    A browser says in Origin or Sec-Fetch-Site where a change comes from; a request with a cookie must say so.
     """
     origin, site = asked.get("origin"), asked.get("sec-fetch-site")
     if origin is not None and _host_of(origin) != asked.get("host"):

@@ -1,6 +1,6 @@
-"""Browser sessions that were ended before their time.
+"""Browser sessions that were ended before they expired.
 
-A cookie that somebody has copied opens nothing once its owner has signed out.
+A copied cookie is worthless once its owner has signed out.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ _ONE = Query(sql.select(ended_session_table.c.sha256).where(ended_session_table.
 
 
 class EndedSessions:
-    """The table of a database, of all servers that share it; a session is named by the SHA-256 of its cookie.
+    """The table of ended sessions, shared by all servers of a database. A session is named by the SHA-256 of its
+    cookie's claim.
 
     Args:
         clock: Unix time.
@@ -36,7 +37,7 @@ class EndedSessions:
         return bool(_ONE.rows(self._engine, of=sha256))
 
     def add(self, sha256: str, expires_s: float) -> None:
-        """End a session, and forget those that would be over by now anyway."""
+        """End a session, and delete the rows of sessions that have expired."""
         table = ended_session_table
         with writing(self._engine) as connection:
             connection.execute(table.delete().where((table.c.expires_s <= self._clock()) | (table.c.sha256 == sha256)))

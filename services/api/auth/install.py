@@ -1,4 +1,4 @@
-"""Puts all that guards the API in front of it."""
+"""Installs the access routes and the middleware that guards the API."""
 
 from __future__ import annotations
 
@@ -21,10 +21,13 @@ from services.core.settings import ServerSettings
 def install(
     app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: ThreadPool, dark_auditors: ThreadPool
 ) -> None:
-    """Add the routes of tokens, sessions and audit, and the gate in front of all routes, which lets ``auditors`` write.
+    """Add the routes of tokens, sessions and audit, and the middleware that limits bodies and authenticates all
+    requests.
 
     Args:
-        dark_auditors: write what darkens a dome, so that its answer waits behind no other change's row.
+        auditors: threads that write audit rows.
+        dark_auditors: threads that write the audit rows of requests that darken a dome, so that their answers wait for
+            no other row.
     """
     sessions = Sessions(read_key(settings.data), settings.session_s) if settings.access == "tokens" else None
     access, audit = Access(Tokens(engine), sessions), AuditLog(engine)

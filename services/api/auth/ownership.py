@@ -1,5 +1,5 @@
-"""Finds the owner of what a request's path names, so that whoever may not see it is told that it is not there, whatever
-the route.
+"""Finds the owner of the job, receipt or capture that a request's path names. A caller who may not see it gets, on
+every route, the answer that it does not exist.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from services.core.errors import DentineError
 from services.pipeline.database import Query
 
 MAX_KNOWN = 20_000
-"""Owners that are kept as they were read, as they never change; some 4 MB."""
+"""Largest number of owners of one kind that are kept in memory, some 4 MB. They are never read again because owners
+never change."""
 _DELETIONS = "/v1/deletions/"
 
 
@@ -23,18 +24,18 @@ def _owner_by(name: sql.Column[str], owner: sql.Column[str]) -> Query:
 
 
 class OwnedKind:
-    """A kind of thing that has an owner and that paths name."""
+    """A kind of object that has an owner and that paths name: jobs, captures or receipts of deletions."""
 
     def __init__(self, name: sql.Column[str], owner: sql.Column[str], absent: Callable[[str], DentineError]) -> None:
         self._query, self.absent = _owner_by(name, owner), absent
         self._known: dict[str, str] = {}
 
     def known_owner(self, name: str) -> str | None:
-        """The owner, if it was looked up before."""
+        """Return the owner if it was looked up before, else None."""
         return self._known.get(name)
 
     def find_owner(self, engine: sql.Engine, name: str) -> str | None:
-        """The owner; None if there is no such thing."""
+        """Look up the owner in the database; None if there is no such object."""
         if not (name.isascii() and name.isalnum()):
             return None
         rows = self._query.rows(engine, of=name)
@@ -47,7 +48,7 @@ class OwnedKind:
 
 
 class Ownership:
-    """The owners in one database."""
+    """The owners of jobs, captures and receipts in one database."""
 
     def __init__(self, engine: sql.Engine) -> None:
         self.engine = engine
@@ -56,7 +57,7 @@ class Ownership:
         self._deletions = OwnedKind(deletion_table.c.job, deletion_table.c.owner, unknown_deletion)
 
     def named_in(self, template: str, ids: Mapping[str, str]) -> tuple[OwnedKind, str] | None:
-        """What of an owner a route's path names; None if nothing."""
+        """Return the kind and the id of the owned object that a route's path names; None if it names none."""
         if "job_id" in ids:
             return (self._deletions if template.startswith(_DELETIONS) else self._jobs), ids["job_id"]
         if "capture" in ids:

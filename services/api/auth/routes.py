@@ -62,7 +62,7 @@ class AuditPage(Record):
 
 
 def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, secure: bool) -> APIRouter:
-    """Routes over the given callers; ``secure`` cookies travel over TLS only."""
+    """Build the routes; ``secure`` makes cookies travel over TLS only."""
     router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 422))
 
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
@@ -128,7 +128,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     def sign_out(request: Request, response: Response) -> None:
         """End the browser session, also for whoever has a copy of its cookie, and take the cookie from the browser."""
         if access.sessions is not None and (cookie := request.cookies.get(COOKIE)) is not None:
-            with suppress(UnauthenticatedError):  # one that is over already
+            with suppress(UnauthenticatedError):  # a session that is over already
                 session = access.sessions.read(cookie)
                 access.tokens.end_session(session.sha256, session.expires_s)
         response.delete_cookie(COOKIE, path="/v1", httponly=True, samesite="strict", secure=secure)

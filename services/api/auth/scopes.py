@@ -1,4 +1,4 @@
-"""Which scope a route needs, declared beside it: ``dependencies=[needs("read")]``.
+"""The scope that a route needs, declared beside the route: ``dependencies=[needs("read")]``.
 
 A route that declares none is closed.
 """
@@ -23,23 +23,26 @@ if TYPE_CHECKING:
     from starlette.routing import BaseRoute
 
 LIVENESS = "/v1/health/live"
-"""The one route that needs no scope: who asks it has no token, and it tells nothing."""
+"""Path of the one route that needs no scope. Its callers have no token, and it discloses nothing."""
 SETUP = "/v1/setup"
-"""Takes a setup link, which stands for no caller; the gate counts and audits who comes with one."""
+"""Path of the route that takes a setup link instead of a token; the authentication middleware counts and audits its
+requests."""
 PAGE = "dashboard"
-"""Name of the mount with the static page, which holds no data."""
+"""Name of the mount of the static page, which holds no data."""
 
 
 class Needs(HTTPBearer):
-    """Refuses callers without a scope; also what the OpenAPI description says of the route."""
+    """Dependency that refuses callers without a scope; the OpenAPI description shows it as the security of the
+    route.
+    """
 
     def __init__(self, scope: Scope, *, audited: bool, darkens: bool) -> None:
         super().__init__(scheme_name="token", auto_error=False)
         self.scope, self.audited, self.darkens = scope, audited, darkens
 
     async def __call__(self, request: Request) -> None:  # type: ignore[override]
-        """Check the caller that the gate has found; the gate has refused already, unless somebody built an application
-        without it.
+        """Check the scope of the caller that the authentication middleware has identified. That middleware has checked
+        the scope too; this protects an application that was built without it.
         """
         require(request.scope.get("caller"), self.scope)
 
@@ -48,19 +51,19 @@ def needs(scope: str, *, audited: bool = False, darkens: bool = False) -> params
     """Declare the one scope that a route needs.
 
     Args:
-        audited: of a route that only reads; changes always are.
-        darkens: whether it darkens a dome, perhaps among other things, so that its row of the audit is written before
-            those of others.
+        audited: whether requests of a route that only reads are audited; changes always are.
+        darkens: whether the route darkens a dome, perhaps among other effects, so that its audit row need not wait for
+            those of other routes.
     """
     known = Scope(scope)
     return params.Security(Needs(known, audited=audited, darkens=darkens), scopes=[known])
 
 
 def require(caller: Caller | None, scope: Scope) -> None:
-    """Let a caller with the scope pass.
+    """Require that a caller has a scope.
 
     Raises:
-        ScopeError: names the missing scope.
+        ScopeError: the caller lacks it; the message names the scope.
     """
     if caller is None or scope not in caller.scopes:
         who = "a caller without a token" if caller is None else f"token {caller.name}"
@@ -73,13 +76,13 @@ async def _viewer(request: Request) -> Viewer:
 
 
 Asker = Annotated[Viewer, Depends(_viewer)]
-"""Parameter of a handler whose answer depends on who asks. What a path names by ``job_id`` or ``capture`` the gate has
-looked after already."""
+"""Annotation of a handler's parameter that receives who asks. The authentication middleware has checked already whether
+the caller may see what the path names by ``job_id`` or ``capture``."""
 
 
 @dataclass(frozen=True)
 class GuardedRoute:
-    """A route of the application and what it declares."""
+    """A route of the application and the scopes that it declares."""
 
     template: str
     methods: frozenset[str]
@@ -88,11 +91,11 @@ class GuardedRoute:
 
     @property
     def needs(self) -> Needs | None:
-        """The declaration, if there is exactly one."""
+        """The declared scope; None unless there is exactly one."""
         return self.declared[0] if len(self.declared) == 1 else None
 
     def admit(self, caller: Caller) -> None:
-        """Let a caller with the route's scope pass.
+        """Require that a caller has the route's scope.
 
         Raises:
             ScopeError: the caller lacks the scope, or has a dark key and the route does more than darken, or the route
@@ -103,7 +106,8 @@ class GuardedRoute:
                 f"Route {self.template} does not declare exactly one scope and is closed; declare it with needs()"
                 " beside the route."
             )
-        # A cancel darkens too, but it ends jobs without a dome as well.
+        # The route that cancels a job darkens a dome too, but is closed to a dark key, as it also ends jobs without a
+        # dome.
         if caller.only_darkens and not (self.needs.darkens and self.needs.scope is Scope.OPERATE_DOME):
             raise ScopeError(
                 "A session's dark key darkens the dome and does nothing else; send the session's cookie, or a token."
@@ -113,7 +117,9 @@ class GuardedRoute:
 
 @dataclass(frozen=True)
 class Found:
-    """The route of a request; none where only the path is known, or nothing at all."""
+    """Result of looking up the route of a request. ``route`` is None where the path is known for other methods alone,
+    which ``allowed_methods`` then holds, or not known at all.
+    """
 
     route: GuardedRoute | None
     ids: dict[str, str]
@@ -121,7 +127,7 @@ class Found:
 
 
 def guarded_routes(routes: Sequence[BaseRoute]) -> list[GuardedRoute]:
-    """Every route of an application but its page, those of included routers and mounted applications too."""
+    """Return every route of an application but its page, with those of included routers and mounted applications."""
     found = []
     for context in iter_route_contexts(routes):
         if isinstance(context.original_route, Mount) and context.name == PAGE:
@@ -141,7 +147,7 @@ def guarded_routes(routes: Sequence[BaseRoute]) -> list[GuardedRoute]:
 
 
 def find_route(routes: Sequence[GuardedRoute], method: str, path: str) -> Found:
-    """The first route that takes a request."""
+    """Find the first route that takes a method and a path."""
     allowed: frozenset[str] = frozenset()
     for route in routes:
         if match := route.pattern.match(path):

@@ -1,14 +1,14 @@
 """Browser sessions: a signed cookie that stands for a token for some hours.
 
-The server keeps nothing but those that were ended; see ``ended_sessions``. ::
+The server stores no sessions but those that were ended; see ``ended_sessions``. ::
 
     dentine_<token id>_<expiry, Unix s>_<random>.<HMAC-SHA256>     version 0.1 had no random part
 
     dark_<token id>_<expiry, Unix s>_<SHA-256 of the cookie's claim>.<HMAC-SHA256>     a session's dark key
 
-A page cannot read its cookie, and what is sent with a cookie waits for one of the browser's six connections, which long
-downloads may all hold. A dark key, which darkens the dome and does nothing else, is sent without the cookie, over a
-connection of its own.
+A page cannot read its cookie, and a request with a cookie waits for one of the browser's six connections, which long
+downloads may all occupy. A dark key, which can only darken the dome, is sent without the cookie, over a connection of
+its own.
 
 The signing key lies beside the database and not in it, so that a copy of the database opens no session.
 """
@@ -31,38 +31,46 @@ from services.core.files.private import write_private
 COOKIE = "dentine-session"
 KEY_FILE = "session.key"
 DARK = "dark_"
-"""What a dark key begins with; no token does."""
+"""Prefix of a dark key; no token has it."""
 _KEY_BYTES = 32
 
 
 @dataclass(frozen=True)
 class Session:
-    """What a valid cookie says."""
+    """The session that a valid cookie or dark key stands for."""
 
     token_id: str
     expires_s: float
     sha256: str
-    """Of the cookie, which names the session without opening it."""
+    """SHA-256 of the cookie's claim. It names the session without opening it."""
 
 
 class Sessions:
-    """Issues and reads session cookies."""
+    """Issues and reads session cookies and dark keys.
+
+    Args:
+        key: secret that signs them.
+        lifetime_s: longest lifetime of a session, in s.
+        clock: Unix time, in s.
+    """
 
     def __init__(self, key: bytes, lifetime_s: float, clock: Callable[[], float] = time.time) -> None:
         self._key, self._lifetime_s, self._clock = key, lifetime_s, clock
 
     def issue(self, token: Token) -> tuple[str, int]:
-        """A session for a valid token, and its lifetime in s; it never outlives the token."""
+        """Return the cookie of a new session for a valid token, and its lifetime in s; a session never outlives its
+        token.
+        """
         now = self._clock()
         expires_s = int(min(now + self._lifetime_s, token.expires_s or float("inf")))
         claim = f"dentine_{token.id}_{expires_s}_{secrets.token_hex(8)}"
         return f"{claim}.{self._sign(claim)}", max(0, expires_s - int(now))
 
     def read(self, cookie: str) -> Session:
-        """The session that a cookie stands for.
+        """Return the session that a cookie stands for.
 
         Raises:
-            UnauthenticatedError: not signed by this server, or over.
+            UnauthenticatedError: the cookie is not signed by this server, or the session is over.
         """
         claim, _, signature = cookie.rpartition(".")
         match = re.fullmatch(r"dentine_([0-9a-f]{12})_([0-9]{1,12})(_[0-9a-f]{16})?", claim)
@@ -71,15 +79,15 @@ class Sessions:
         )
 
     def dark_key(self, session: Session) -> str:
-        """A key that darkens the dome for as long as a session lasts."""
+        """Return the dark key of a session, which can darken the dome for as long as the session lasts."""
         claim = f"{DARK}{session.token_id}_{session.expires_s:.0f}_{session.sha256}"
         return f"{claim}.{self._sign(claim)}"
 
     def read_dark_key(self, key: str) -> Session:
-        """The session that a dark key belongs to.
+        """Return the session that a dark key belongs to.
 
         Raises:
-            UnauthenticatedError: not signed by this server, or over.
+            UnauthenticatedError: the key is not signed by this server, or the session is over.
         """
         claim, _, signature = key.rpartition(".")
         match = re.fullmatch(rf"{DARK}([0-9a-f]{{12}})_([0-9]{{1,12}})_([0-9a-f]{{64}})", claim)
@@ -96,7 +104,7 @@ class Sessions:
 
 
 def read_key(data: Path) -> bytes:
-    """The signing key of a data folder; made on first use, readable by its owner alone."""
+    """Return the signing key of a data folder. It is created on first use, readable by its owner alone."""
     path = data / KEY_FILE
     if not path.exists():
         write_private(path, secrets.token_bytes(_KEY_BYTES))

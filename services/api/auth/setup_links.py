@@ -1,7 +1,7 @@
-"""The first token of a server: a link in its log makes it, so that nobody needs a shell where the server runs.
+"""Setup links: a link in the log of a server makes its first token, so that nobody needs a shell where the server runs.
 
-As long as the token table is empty, each start of a server writes one link to the log. It holds for an hour, and the
-first one that is used makes an administrator's token and ends them all. The database keeps a link's hash alone.
+As long as the token table is empty, each start of a server writes one link to the log. A link is valid for an hour. The
+first one that is used makes an administrator's token and ends all of them. The database stores only the hash of a link.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from services.core.settings import ServerSettings
 from services.pipeline.database import metadata, writing
 
 LIFETIME_S = 3600.0
-"""How long a link holds: long enough to find it in the log, too short to be found in an old one."""
+"""Lifetime of a link in s: long enough to find it in the log, too short to be of use in an old log."""
 NAME = "administrator"
-"""Of the token that a link makes."""
+"""Name of the token that a link makes."""
 
 setup_link_table = sql.Table(
     "setup_link",
@@ -35,7 +35,7 @@ setup_link_table = sql.Table(
 
 
 class SetupLinks:
-    """The links of a database, of all servers that share it.
+    """The setup links of a database, shared by all its servers.
 
     Args:
         clock: Unix time.
@@ -45,7 +45,7 @@ class SetupLinks:
         self._engine, self._clock = engine, clock
 
     def issue(self) -> SecretStr | None:
-        """The secret of a new link, or None where there is a token, whether it still holds or not."""
+        """Create a link and return its secret; None where a token exists, whether that token is still valid or not."""
         secret = secrets.token_urlsafe(32)
         with writing(self._engine) as connection:
             if _has_token(connection):
@@ -57,11 +57,11 @@ class SetupLinks:
         return SecretStr(secret)
 
     def redeem(self, secret: str, audited: AuditedAction) -> IssuedToken:
-        """The administrator's token that a link stands for; no link holds after this.
+        """Create the administrator's token in exchange for a link; no link is valid afterwards.
 
         Raises:
-            SetupLinkError: it was used, has expired or is unknown, or there is a token by now; the message does not
-                tell which.
+            SetupLinkError: the link was used, has expired or is unknown, or a token exists already; the message does
+                not say which.
         """
         presented = _hash(secret)
         with writing(self._engine) as connection:
@@ -70,7 +70,7 @@ class SetupLinks:
             ).all()
             is_known = (
                 sum(hmac.compare_digest(presented, one) for one in held) > 0
-            )  # all of them, so that the time tells nothing
+            )  # every link is compared, so that the time taken discloses nothing
             if not is_known or _has_token(connection):
                 what = "This setup link was used, has expired or is unknown"
                 raise SetupLinkError(
@@ -82,10 +82,11 @@ class SetupLinks:
 
 
 def setup_address(settings: ServerSettings, port: int) -> str:
-    """Where people reach the page: the public URL, else the first further name by TLS, else this machine's own address.
+    """Return the address of the page: the public URL, else the first further host name with TLS, else loopback on this
+    machine.
 
     Args:
-        port: that the server listens on.
+        port: port that the server listens on.
     """
     if settings.public_url is not None:
         return settings.public_url.rstrip("/")

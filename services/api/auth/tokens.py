@@ -1,10 +1,10 @@
-"""Tokens: who may call, and what for. The database holds their hashes; the token itself is shown once.
+"""Tokens say who may call the API, and for what. The database holds their hashes; the token itself is shown once.
 
 ::
 
     dentine_<id>_<secret>     id: public, 48 bits, finds the row; secret: 256 random bits
 
-A secret of 256 random bits needs no slow hash: SHA-256 of it cannot be searched.
+A secret of 256 random bits needs no slow hash: nobody can find it from its SHA-256 by trying.
 """
 
 from __future__ import annotations
@@ -34,15 +34,17 @@ from services.core.owners import LOCAL_VIEWER, Viewer, owner_of_token
 from services.pipeline.database import Query, metadata, writing
 
 TRUSTED_S = 1.0
-"""How long a server goes on trusting a token that it has looked up; one that is revoked at this server ends at once."""
+"""Time in s for which a server trusts a token without looking it up again. A token that is revoked at this server ends
+at once, at others within this time."""
 MAX_TRUSTED = 1000
 LAST_USE_STEP_S = 3600.0
-"""The last use is noted once in this time, so that reading stays reading."""
+"""Shortest time in s between two updates of the last use of a token, so that a request which only reads seldom
+writes."""
 DAY_S = 86400.0
 NAME = "[A-Za-z0-9][A-Za-z0-9.-]{0,63}"
 """Pattern of a token's name."""
 ID = "[0-9a-f]{12}"
-"""Pattern of a token's id, which no name has, so that either names one token."""
+"""Pattern of a token's id. No name matches it, so that a text means either an id or a name."""
 
 token_table = sql.Table(
     "token",
@@ -107,18 +109,18 @@ class IssuedToken(Token):
 
 @dataclass(frozen=True)
 class Caller:
-    """Whom a request comes from."""
+    """The caller of a request."""
 
     name: str
     scopes: frozenset[Scope]
     token: Token | None = None
     by_session: bool = False
     only_darkens: bool = False
-    """Whether it has shown a session's dark key."""
+    """Whether the caller has presented the dark key of a session, which may only darken the dome."""
 
     @cached_property
     def viewer(self) -> Viewer:
-        """What it may see."""
+        """What the caller may see."""
         if self.token is None:
             return LOCAL_VIEWER
         return Viewer(
@@ -129,18 +131,18 @@ class Caller:
 
     @classmethod
     def of(cls, token: Token, *, by_session: bool = False, only_darkens: bool = False) -> Caller:
-        """The caller that a valid token stands for."""
+        """Return the caller that a valid token stands for."""
         scopes = frozenset[Scope]().union(*(scope.included for scope in token.scopes))
         return cls(token.name, scopes, token, by_session, only_darkens)
 
 
 LOCAL = Caller("local", frozenset(Scope))
-"""Whoever is on this machine where access is open."""
+"""The caller of every request where access is open."""
 
 
 class _Credential(NamedTuple):
-    """A token's hash, or a session's, else the id of its token: an id is public, so one must never pass for the
-    other.
+    """Key of a trusted token: the hash of the token, or else the hash of a session's cookie or, without a session, the
+    id of the token. The two are separate fields because an id is public and must never pass for a hash.
     """
 
     sha256: str | None
@@ -152,8 +154,8 @@ class _Credential(NamedTuple):
 
 
 class _Trust(NamedTuple):
-    """A token that was looked up, how long to trust it, and how many were revoked at this server before the look-up
-    began: after another one it is void.
+    """A token that was looked up, until when it is trusted (in ticks, s), and the number of revocations and ended
+    sessions at this server before the look-up began. A later one makes it void.
     """
 
     token: Token
@@ -162,11 +164,11 @@ class _Trust(NamedTuple):
 
 
 class Tokens:
-    """The token table.
+    """The table of tokens.
 
     Args:
-        clock: Unix time; tokens expire by it.
-        ticks: seconds that no step of the clock changes; trust ends by them.
+        clock: Unix time in s, by which tokens expire.
+        ticks: time in s that is not affected by steps of the clock, by which trust ends.
     """
 
     def __init__(
@@ -185,14 +187,15 @@ class Tokens:
         audited: AuditedAction,
         group: str | None = None,
     ) -> IssuedToken:
-        """Make a token; the result is the only place where its secret is.
+        """Create a token. Only the result holds its secret.
 
         Args:
-            group: owns what it makes; None: nobody but the token itself and administrators see that.
+            group: owner of the jobs and captures that the token makes; None: only the token itself and administrators
+                see them.
 
         Raises:
-            InputError: the name is malformed or belongs to a living token, the group's is malformed, or there is no
-                scope.
+            InputError: the name is malformed or belongs to a valid token, the name of the group is malformed, or no
+                scope is given.
         """
         if not re.fullmatch(NAME, name) or name == LOCAL.name or re.fullmatch(ID, name):
             what = (
@@ -215,7 +218,7 @@ class Tokens:
             return insert_token(connection, name, wanted, now, expires_s, audited, group)
 
     def list(self) -> list[Token]:
-        """Every token, newest first, revoked and expired ones too."""
+        """Return every token, newest first, with revoked and expired ones."""
         with self.engine.connect() as connection:
             return [
                 Token(**_fields(row))
@@ -225,10 +228,11 @@ class Tokens:
             ]
 
     def revoke(self, token_id: str, audited: AuditedAction) -> Token:
-        """End a token now, by its id, else by the name of one that is not revoked; ending it again changes nothing.
+        """Revoke a token, named by its id or else by the name of one that is not revoked. Revoking it again changes
+        nothing.
 
         Raises:
-            UnknownTokenError: there is none.
+            UnknownTokenError: there is no such token.
         """
         now = self._clock()
         with writing(self.engine) as connection:
@@ -256,8 +260,8 @@ class Tokens:
         return Token(**_fields(row))
 
     def trusted(self, *, presented: str | None = None, session_of: str | None = None) -> Token | None:
-        """What ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, a moment ago; asks
-        nobody.
+        """Return the token that ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, if it
+        is still trusted, else None. The database is not asked.
         """
         found = self._trusted.get(_Credential.of(presented, session_of))
         return (
@@ -267,10 +271,10 @@ class Tokens:
         )
 
     def authenticate(self, presented: str) -> Token:
-        """The token that was presented.
+        """Look up the token that was presented.
 
         Raises:
-            UnauthenticatedError: it is malformed, unknown, expired or revoked; the message does not tell which.
+            UnauthenticatedError: the token is malformed, unknown, expired or revoked; the message does not say which.
         """
         revocations, row = self._revocations, self._find(public_id(presented) or "")
         is_same = hmac.compare_digest(_hash(presented), row["sha256"] if row else _hash(""))
@@ -280,18 +284,18 @@ class Tokens:
         return self._trust(_Credential.of(presented), row, revocations)
 
     def end_session(self, sha256: str, expires_s: float) -> None:
-        """End a session now: at this server with the next request, at others within ``TRUSTED_S``."""
+        """End a session: at this server with the next request, at others within ``TRUSTED_S``."""
         self.ended_sessions.add(sha256, expires_s)
         self._revocations += 1
 
     def living(self, token_id: str, session: str | None = None) -> Token:
-        """The token with this id, for a session that it has opened.
+        """Look up the valid token with this id, for a session that was opened with it.
 
         Args:
-            session: SHA-256 of its cookie.
+            session: SHA-256 of the claim of the session's cookie.
 
         Raises:
-            UnauthenticatedError: the token has expired or was revoked since, or the session was ended.
+            UnauthenticatedError: the token has expired or was revoked, or the session was ended.
         """
         revocations, row = self._revocations, self._find(token_id)
         if session is not None and self.ended_sessions.has(session):
@@ -320,7 +324,7 @@ class Tokens:
             with (
                 suppress(sql.exc.OperationalError),
                 writing(self.engine) as connection,
-            ):  # a full disk must not refuse a reader
+            ):  # a full disk must not make a request fail that only reads
                 connection.execute(token_table.update().where(token_table.c.id == row["id"]).values(last_used_s=now))
 
 
@@ -333,7 +337,7 @@ def insert_token(
     audited: AuditedAction,
     group: str | None = None,
 ) -> IssuedToken:
-    """Add a token, and the audit's row of it, inside the caller's transaction."""
+    """Insert a token and its audit row inside the caller's transaction."""
     token_id = secrets.token_hex(6)
     secret = SecretStr(f"dentine_{token_id}_{secrets.token_urlsafe(32)}")
     row = {
@@ -351,7 +355,9 @@ def insert_token(
 
 
 def public_id(credential: str) -> str | None:
-    """The public part of a token or session, whether valid or not."""
+    """Return the id within a token, session cookie or dark key, whether that is valid or not; None if it is
+    malformed.
+    """
     match = re.match(r"(?:dentine|dark)_([0-9a-f]{12})_", credential)
     return match[1] if match else None
 
