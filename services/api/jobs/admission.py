@@ -1,6 +1,7 @@
-"""Which jobs may start, and what the others wait for: a place beside the ones that run, disk, memory, a dome, workers.
+"""Decides which queued jobs may start, and what the others wait for: a place beside the running jobs, disk, memory, a
+dome or workers.
 
-What disk or memory the machine does not have in all is refused when a job is submitted.
+A job that needs more disk or memory than the machine has in total is refused when it is submitted.
 """
 
 from __future__ import annotations
@@ -25,54 +26,54 @@ from services.core.records import JobSpec
 from services.core.store import MANIFEST
 
 DISK_PER_CAPTURE = 6.0
-"""Bytes that a job stores per byte of its capture: the demo's stores 4.8 MB of 0.85 MB, of which compressed images are
-most."""
+"""Bytes that a job stores per byte of its capture. The job of the demonstration stores 4.8 MB of 0.85 MB, most of them
+compressed images."""
 MIN_DISK_BYTES = 64 * 2**20
-"""What a job stores of a small capture: pictures, checkpoint and asset."""
+"""Bytes that a job stores however small its capture is: pictures, checkpoint and asset."""
 RIG_CAPTURE_BYTES = 2 * 2**30
-"""A capture that a rig is about to take."""
+"""Assumed size in bytes of a capture that a rig is about to take."""
 DEMO_CAPTURE_BYTES = 2**20
-"""What the demonstration's rig takes: 0.3 MB were measured."""
+"""Assumed size in bytes of the capture that the demonstration's rig takes; 0.3 MB were measured."""
 WORKER_BYTES = 3 * 2**29
-"""Memory of one worker and its rendering process in a jaw's fit; 1.1 GiB were measured."""
+"""Memory in bytes of one worker and its rendering process in the fit of a jaw; 1.1 GiB were measured."""
 MAX_FILES = 5_000
-"""Of a capture that are looked at."""
+"""Largest number of files of a capture whose sizes are added up."""
 _DESCRIPTIONS = ("capture.json", "raw.toml", "slab.json", MANIFEST, f"capture/{MANIFEST}")
-"""One of these makes a folder a capture, or a job that holds one."""
+"""Files of which one marks a folder as a capture, or as a job that holds one."""
 KEPT_FREE_BYTES = 256 * 2**20
-"""Disk that no job may count on."""
+"""Bytes of disk that are kept free and that no job may count on."""
 AT_ONCE = 4
-"""Jobs that run side by side unless the settings say otherwise. Each further one ends none of them sooner, as they
-share the same workers, and holds memory; but two long jaws should not keep a short tooth waiting, and while one job is
-prepared or solves, another one keeps the workers busy."""
+"""Largest number of jobs that run side by side, unless the settings say otherwise. A further job ends none of them
+sooner, as they share the same workers, and takes memory; but two long jaws should not keep a short tooth waiting, and
+while one job is prepared or solves, another one keeps the workers busy."""
 RETRY_S = 10.0
-"""How long a job waits after it was paused."""
+"""Time in s that a job waits after it was paused."""
 
 
 def turn(job: Job) -> tuple[int, int]:
-    """Queued jobs start in this order: those of higher priority first, among equals the oldest."""
+    """Sort key for the order in which queued jobs start: those of higher priority first, among equals the oldest."""
     return rank(job.spec.priority), job.number
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What a job is predicted to take."""
+    """Disk and memory that a job is predicted to need."""
 
     disk_bytes: int
     memory_bytes: int
 
 
 def predict(spec: JobSpec) -> Needs:
-    """Prediction from the size of the capture and the number of workers."""
+    """Predict the needs of a job from the size of its capture and its number of workers."""
     rigs = DEMO_CAPTURE_BYTES if spec.is_demo else RIG_CAPTURE_BYTES
     size = rigs if spec.capture is None else _stored_bytes(spec.capture)
     return Needs(MIN_DISK_BYTES + round(DISK_PER_CAPTURE * size), WORKER_BYTES * spec.workers)
 
 
 def _stored_bytes(folder: Path) -> int:
-    # What lies on the disk, of as many files as a capture may have. What is no capture, such as '/', is refused by its
-    # stage and not walked through here. Nor does a folder that cannot be listed, as on a mount that went away, keep
-    # other jobs from starting.
+    # Add up the disk blocks of at most as many files as a capture may have. A folder that is no capture, such as '/',
+    # is not walked through here; its stage refuses it. A folder that cannot be listed, as on a mount that went away,
+    # does not keep other jobs from starting.
     total = 0
     with suppress(OSError):
         if not any((folder / one).is_file() for one in _DESCRIPTIONS):
@@ -86,22 +87,22 @@ def _stored_bytes(folder: Path) -> int:
 
 @dataclass(frozen=True)
 class Machine:
-    """What there is."""
+    """Disk and memory of the machine."""
 
     free_disk_bytes: int
     disk_bytes: int
     memory_bytes: int | None
-    """None where workers run elsewhere."""
+    """Total memory in bytes; None where the workers run on other machines."""
 
     @classmethod
     def of(cls, folder: Path, *, has_workers: bool = True) -> Machine:
-        """This machine, and the disk of a folder."""
+        """Measure this machine, with the disk of a folder."""
         disk = shutil.disk_usage(folder)
         return cls(disk.free, disk.total, psutil.virtual_memory().total if has_workers else None)
 
 
 _TURN = ("Waits for a place", "Waits for the dome")
-"""How the sentences begin that say that a job's turn has not come."""
+"""Beginnings of the reasons which say that the turn of a job has not come."""
 
 
 @dataclass
@@ -111,22 +112,23 @@ class _Running:
     number: int
     needs: Needs
     dome: str | None
-    """Address of the dome that it captures with."""
+    """Address of the dome that the job captures with; None where it does not capture."""
     has_place: bool
-    """False while it only captures."""
+    """Whether the job counts among those that share the workers; False while it only captures."""
     begun_s: float
     sharing_then_s: float
-    """``Admission._sharing_s`` when it began."""
+    """Value of ``Admission._sharing_s`` when the job began."""
 
 
 class Admission:
-    """Holds jobs back; remembers why.
+    """Holds jobs back and remembers why.
 
     Args:
-        look: what the machine has now.
-        at_once: most jobs that run side by side. A capture needs no place: it has a worker of its own, and a person
-            waits.
-        lacks: why no worker can capture (True) or run other stages (False); None if one can.
+        look: returns the disk and memory that the machine has now.
+        clock: time in s that no step of the system clock changes.
+        at_once: largest number of jobs that run side by side. A capture needs no place: it has a worker of its own, and
+            a person waits.
+        lacks: returns why no worker can capture (for True) or run other stages (for False); None if one can.
     """
 
     def __init__(
@@ -149,12 +151,12 @@ class Admission:
 
     @property
     def sharing(self) -> int:
-        """How many jobs share the workers now."""
+        """Number of jobs that share the workers now."""
         with self._lock:
             return len(self._placed())
 
     def beside(self, job_id: str) -> float:
-        """How many jobs shared the workers while a job ran, itself included; mean until now."""
+        """Mean number of jobs that have shared the workers since a job began, itself included."""
         with self._lock:
             self._sum_sharing()
             job = self._running[job_id]
@@ -162,10 +164,10 @@ class Admission:
             return max((self._sharing_s - job.sharing_then_s) / lasted_s, 1.0) if lasted_s > 0 else 1.0
 
     def refuse_too_large(self, spec: JobSpec) -> None:
-        """Refuse what this machine could never run.
+        """Refuse a job that this machine could never run.
 
         Raises:
-            JobTooLargeError: it needs more disk or memory than there is in all.
+            JobTooLargeError: the job needs more disk or memory than the machine has in total.
         """
         needs, machine = predict(spec), self._look()
         if needs.disk_bytes > machine.disk_bytes - KEPT_FREE_BYTES:
@@ -182,10 +184,11 @@ class Admission:
             )
 
     def begin_round(self, job_ids: Iterable[str]) -> None:
-        """Forget what the last look found, and jobs that wait no more: cancelled, deleted or another server's.
+        """Forget the findings of the last round, and the jobs that no longer wait because they were cancelled, deleted
+        or taken by another server.
 
         Args:
-            job_ids: those that wait, in the order in which ``holds`` will be asked of them.
+            job_ids: the jobs that wait, in the order in which ``holds`` will be called for them.
         """
         waiting = set(job_ids)
         with self._lock:
@@ -195,8 +198,8 @@ class Admission:
                     del known[job_id]
 
     def holds(self, job_id: str, spec: JobSpec, *, is_to_capture: bool = False) -> bool:
-        """Whether a queued job must wait; ``reason`` then says why, without waiting, as the disk of a capture may
-        hang.
+        """Whether a queued job must wait. ``reason`` says why afterwards; it does not look again, because the disk of a
+        capture may hang.
         """
         reason = self._obstacle(job_id, spec, is_to_capture=is_to_capture)
         with self._lock:
@@ -214,7 +217,9 @@ class Admission:
             self._running[job_id] = _Running(number, needs, dome, not is_to_capture, self._summed_to_s, self._sharing_s)
 
     def takes_place(self, job_id: str) -> bool:
-        """Whether a job that has captured may go on; it then counts as any other."""
+        """Whether a job that has captured may go on with its other stages; if so, it takes a place like any other
+        job.
+        """
         memory_bytes = self._look().memory_bytes
         with self._lock:
             job = self._running[job_id]
@@ -225,15 +230,15 @@ class Admission:
             return job.has_place
 
     def end(self, job_id: str) -> None:
-        """Count a job no longer."""
+        """Remove a job from those that run."""
         with self._lock:
             self._sum_sharing()
             del self._running[job_id]
             self._stalled.pop(job_id, None)
 
     def look_for_stalled(self) -> None:
-        """Find the running jobs whose next task no worker can take; ``stalled`` then says why, until a later look finds
-        one that can.
+        """Find the running jobs whose next task no worker can take. ``stalled`` then says why, until a later look finds
+        a worker that can.
         """
         with self._lock:
             captures = {job_id: job.dome is not None for job_id, job in self._running.items()}
@@ -243,7 +248,7 @@ class Admission:
             self._stalled = {job_id: f"Waits for workers: {why}" for job_id, why in still.items() if why is not None}
 
     def pause(self, job_id: str, problem: DentineError) -> None:
-        """Let a job wait that could not go on."""
+        """Make a job wait for ``RETRY_S`` because a problem has stopped it."""
         what = (
             "disk" if isinstance(problem, DiskFullError) else "store" if isinstance(problem, StoreError) else "workers"
         )
@@ -262,7 +267,7 @@ class Admission:
             return None if besides_turn and reason is not None and reason.startswith(_TURN) else reason
 
     def _obstacle(self, job_id: str, spec: JobSpec, *, is_to_capture: bool) -> str:
-        # What costs least to find first. Nothing slow is done under the lock.
+        # Look for the obstacle that costs least to find first. Nothing slow is done under the lock.
         with self._lock:
             if job_id in self._running:
                 return "Waits until its earlier run has ended."
@@ -281,7 +286,7 @@ class Admission:
         if self._first_in_line:
             return self._first_in_line
         if short := self._no_memory(needs, machine.memory_bytes):
-            # Whoever asks for much would never get it if all that ask for less went before.
+            # A job that needs much memory would never start if all that need less went before it.
             self._first_in_line = "Waits behind a job that is before it and waits for memory."
         return short
 
@@ -317,7 +322,8 @@ class Admission:
         return f"Waits for memory: {_named(placed)}; {what}."
 
     def _no_disk(self, needs: Needs, machine: Machine) -> str:
-        # A running job counts in full, also what it has written already: it is not looked at again how much that is.
+        # A running job counts with all the disk that it was predicted to need, because what it has written already is
+        # not measured again.
         kept = sum(job.needs.disk_bytes for job in self._running.values())
         if machine.free_disk_bytes >= needs.disk_bytes + kept + KEPT_FREE_BYTES:
             return ""

@@ -1,4 +1,4 @@
-"""Removes a job's folder so that it can be shown that nothing is left."""
+"""Removes a job's folder completely, and records what was removed, for the receipt."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from services.core.store import write_atomic
 
 @dataclass(frozen=True)
 class Erased:
-    """What was removed."""
+    """Number, size and digest of the files that were removed."""
 
     files: int
     bytes: int
@@ -25,13 +25,14 @@ class Erased:
 
 
 def erase(folder: Path) -> Erased:
-    """Remove a job's folder, everything below it and what its stages keep on S3 servers; an absent one counts as empty.
+    """Remove a job's folder, everything below it and what its stages keep on S3 servers; an absent folder counts as
+    empty.
 
-    A removal that was cut short is gone on with, and counts from its beginning.
+    A removal that was interrupted is continued, and its result counts the files that were there at its beginning.
 
     Raises:
-        StoreError: something could not be read or removed, or what is removed not be noted.
-        PlatformError: what speaks to an S3 server is not installed.
+        StoreError: a file could not be read or removed, or the record of the removed files could not be written.
+        PlatformError: the package that speaks to S3 servers is not installed.
     """
     listing = _listing(folder)
     try:
@@ -40,7 +41,7 @@ def erase(folder: Path) -> Erased:
             write_atomic(listing, json.dumps(asdict(_measure(folder))).encode())
         discard_remote(folder, "*/*.zarr")
         while folder.exists():
-            with suppress(FileNotFoundError):  # gone meanwhile, by whomever
+            with suppress(FileNotFoundError):  # removed by another process meanwhile
                 shutil.rmtree(folder)
         return Erased(**json.loads(listing.read_text()))
     except OSError as problem:
@@ -49,7 +50,7 @@ def erase(folder: Path) -> Erased:
 
 
 def forget_listing(folder: Path) -> None:
-    """Remove what ``erase`` noted of the folder, once a receipt is kept."""
+    """Remove the record that ``erase`` wrote beside the folder, once the receipt is stored."""
     _listing(folder).unlink(missing_ok=True)
 
 

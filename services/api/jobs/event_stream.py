@@ -1,5 +1,7 @@
-"""Event streams: one query finds which jobs have new events, and one read serves all streams that are equally far,
-however many there are.
+"""Streams of job events to clients.
+
+One query finds the jobs that have new events, and one read serves all streams of a job that have reached the same
+event, however many they are.
 """
 
 from __future__ import annotations
@@ -23,12 +25,14 @@ from services.api.jobs.repository import Repository
 from services.client.errors import UnknownJobError
 
 PERIOD_S = 0.2
+"""Time in s between two looks for new events."""
 PING_S = 15.0
-"""A silent stream says that it lives this often, and looks whether its job still does."""
+"""Time in s after which a stream without events sends a comment, to show that it is alive, and checks whether its job
+still exists."""
 MAX_EVENTS = 1000
-"""Read and sent at once."""
+"""Largest number of events that are read and sent at once."""
 MAX_EPOCHS = 64
-"""Remembered; a stream that was stalled for longer reads again."""
+"""Number of epochs that are remembered. A stream that was stalled for longer reads its events again."""
 EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {
@@ -41,32 +45,34 @@ EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
         }
     }
 }
-"""What the API's description says of a stream."""
+"""OpenAPI responses of the routes that answer with a stream of events."""
 
 
 UNBUFFERED = MappingProxyType({"X-Accel-Buffering": "no"})
 
 
 class EventStream(StreamingResponse):
-    """Server-sent events. FastAPI's own goes through three tasks per stream, and sends events one by one."""
+    """Response with server-sent events. FastAPI's own goes through three tasks per stream, and sends events one by
+    one.
+    """
 
     media_type = "text/event-stream"
 
 
 @dataclass(frozen=True)
 class EventBatch:
-    """Events of a job after some id, as they are sent."""
+    """Events of a job after some id, encoded as they are sent."""
 
     text: bytes
     last_id: int
     ended: JobState | None
-    """The state in which the job ended, where these are its last events: a final one, or that it is being deleted."""
+    """State in which the job ended, where these are its last events: a final state, or DELETING. Else None."""
     is_full: bool
-    """Whether more may have happened already."""
+    """Whether the batch is full, so that there may be more events already."""
 
     @property
     def text_with_end(self) -> bytes:
-        """As a stream of this job alone sends it."""
+        """The batch as a stream of this job alone sends it, with event ``end`` after the last event."""
         if self.ended is None:
             return self.text
         return self.text + format_sse_event(event="end", data_str=f'"{self.ended}"')
@@ -74,26 +80,27 @@ class EventBatch:
 
 @dataclass
 class Epoch:
-    """From one growth of the event table to the next.
+    """The period from one growth of the event table to the next.
 
-    Streams walk from epoch to epoch, so that they miss none while they send.
+    Streams walk from epoch to epoch, so that they miss no event while they send.
     """
 
     number: int
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     jobs: frozenset[str] = frozenset()
-    """Those that have new events, once it has ended."""
+    """Jobs that have new events; known once the epoch has ended."""
     reads: dict[tuple[str, int], asyncio.Task[EventBatch]] = field(default_factory=dict)
-    """Under way, by job and the id after which they read."""
+    """Reads that are under way, by job and the id after which they read."""
 
 
 class EventFeed:
     """Follows the event table while ``run`` runs.
 
-    Made before the first stream, so that no event falls between what that has read and what is looked for.
+    It is created before the first stream, so that no event falls between those that the stream has read and those that
+    ``run`` looks for.
 
     Args:
-        ask: calls a reader in a thread.
+        ask: calls a function that reads the database in a thread.
     """
 
     def __init__(
@@ -103,10 +110,12 @@ class EventFeed:
         self._epochs = deque([Epoch(0)], MAX_EPOCHS)
 
     async def run(self) -> None:
-        """Look for growth until cancelled. Events come from other processes too, so only the table knows."""
+        """Look for new events until cancelled. Other processes append events too, so that only the table knows them
+        all.
+        """
         while True:
             newest: dict[str, int] = {}
-            with suppress(sql.exc.SQLAlchemyError):  # streams outlast a database that is away for a while
+            with suppress(sql.exc.SQLAlchemyError):  # streams go on after a database was away for a while
                 newest = await self._ask(partial(self._repository.newest_events, self._newest))
             if newest:
                 self._newest = max(newest.values())
@@ -117,8 +126,8 @@ class EventFeed:
             await asyncio.sleep(PERIOD_S)
 
     async def answer(self, job_id: str, after: int) -> Response:
-        """A job's events after an id as a response: a stream, or at once where the job has ended and few are left to
-        tell.
+        """Answer with a job's events after an id: with a stream, or with a complete response where the job has ended
+        and its remaining events fit into one batch.
 
         Raises:
             UnknownJobError: there is no such job.
@@ -132,11 +141,11 @@ class EventFeed:
     async def follow(
         self, job_id: str, after: int, opening: tuple[Epoch, EventBatch] | None = None
     ) -> AsyncIterator[bytes]:
-        """A job's events after an id as server-sent events, replayed and then live, to the one with its final state or
-        the job's deletion.
+        """Yield a job's events after an id as server-sent events: first those of the past, then new ones as they come,
+        up to the job's final state or its deletion.
 
         Args:
-            opening: was read already.
+            opening: the epoch and the first batch, where they were read already.
         """
         while True:
             epoch = self._epochs[-1] if opening is None else opening[0]
@@ -145,7 +154,7 @@ class EventFeed:
             except UnknownJobError:
                 return
             except sql.exc.SQLAlchemyError:
-                batch = EventBatch(b"", after, ended=None, is_full=False)  # the next ping's look makes up for it
+                batch = EventBatch(b"", after, ended=None, is_full=False)  # the next ping's read makes up for it
             opening = None
             if told := batch.text_with_end:
                 yield told
@@ -165,11 +174,15 @@ class EventFeed:
                 epoch = following
 
     async def follow_several(self, after: Mapping[str, int]) -> AsyncIterator[bytes]:
-        """Events of several jobs in one stream, each after an id, replayed and then live.
+        """Yield the events of several jobs in one stream, each after an id: first those of the past, then new ones as
+        they come.
 
-        The stream ends once all of them have ended or are deleted. A browser has six connections to a server; a stream
-        for each job that it shows would leave none for anything else. Each job ends with event 'end', whose data names
-        it and its final state, null for a job that is not there.
+        The stream ends once all jobs have ended or are deleted. A browser has six connections to a server; a stream for
+        each job that it shows would leave none for anything else. Each job ends with event ``end``, whose data names
+        the job and its final state, null for a job that does not exist.
+
+        Args:
+            after: id of the last event that the client knows, by job.
         """
         reached, due, epoch = dict(after), set(after), self._epochs[-1]
         while reached:
@@ -181,7 +194,7 @@ class EventFeed:
                     del reached[job_id]
                     continue
                 except sql.exc.SQLAlchemyError:
-                    continue  # the next ping's look makes up for it
+                    continue  # the next ping's read makes up for it
                 if batch.text:
                     yield batch.text
                 if batch.ended is not None:
@@ -207,15 +220,18 @@ class EventFeed:
             due &= reached.keys()
 
     def _after(self, epoch: Epoch) -> Epoch | None:
-        """The epoch after one that has ended; None if it is not remembered.
+        """Return the epoch after one that has ended; None if it is no longer remembered.
 
-        Epochs do not know it, or a stalled stream would keep all that came after.
+        Epochs hold no reference to their successor, because a stalled stream would then keep all later epochs in
+        memory.
         """
         back = self._epochs[-1].number - epoch.number
         return self._epochs[-back] if back <= len(self._epochs) else None
 
     async def _read(self, epoch: Epoch, job_id: str, after: int) -> EventBatch:
-        """Read what happened up to this epoch at least; whoever asks the same in the same epoch shares the read."""
+        """Read a job's events up to this epoch at least. Callers that ask for the same events in the same epoch share
+        one read.
+        """
         key = (job_id, after)
         if key not in epoch.reads:
             epoch.reads[key] = asyncio.create_task(self._ask(partial(_read, self._repository, job_id, after)))
@@ -224,7 +240,7 @@ class EventFeed:
 
 
 def _read(repository: Repository, job_id: str, after: int) -> EventBatch:
-    state = repository.get(job_id).state  # before its events: those of a final state are then among them
+    state = repository.get(job_id).state  # read before the events, so that they include that of a final state
     events = repository.events_of(job_id).read(after, MAX_EVENTS)
     told = b"".join(format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events)
     is_full = len(events) == MAX_EVENTS
@@ -233,5 +249,5 @@ def _read(repository: Repository, job_id: str, after: int) -> EventBatch:
 
 
 def end_of(job_id: str, state: JobState | None) -> bytes:
-    """What a stream of several jobs tells of one that has ended, with no state of one that is not there."""
+    """Encode event ``end`` of one job in a stream of several; ``state`` is None for a job that does not exist."""
     return format_sse_event(event="end", data_str=json.dumps({"job": job_id, "state": state}))

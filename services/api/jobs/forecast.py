@@ -1,10 +1,10 @@
-"""How long something will take, learned from how long it took before.
+"""Predicts how long something takes from how long it took before; pure functions without I/O.
 
-Pure; few observations make the range wide, not wrong. Logarithms of durations are taken as linear in what describes a
-job: ``log T = a + x·b + e``, ``e`` normal. With a flat prior on ``a``, a normal one on ``b`` whose width goes with the
-noise, the next duration's logarithm follows Student's t (the conjugate linear model; Gelman et al., Bayesian Data
-Analysis, 14.2 and 14.8). A job that differs from all the earlier ones, or that follows few of them, so gets a wide
-range by itself. What has lasted for some time already is conditioned on having done so.
+The logarithm of a duration is modelled as linear in the features of a job: ``log T = a + x·b + e`` with normal noise
+``e``. With a flat prior on ``a`` and a normal prior on ``b`` whose width is proportional to the noise, the logarithm of
+the next duration follows Student's t (the conjugate linear model; Gelman et al., Bayesian Data Analysis, 14.2 and
+14.8). Few observations, or a job that differs from all earlier ones, therefore give a wide range and not a wrong one.
+For a case that has lasted for some time already, the distribution is conditioned on that.
 """
 
 from __future__ import annotations
@@ -19,43 +19,46 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating]
 
 SHARE = 0.8
-"""Of all cases that a range is to hold."""
+"""Share of all cases that a range is to contain."""
 MIN_OBSERVATIONS = 5
-"""Observations below which nothing is said."""
+"""Smallest number of observations from which something is predicted."""
 OUTLIVED = 0.02
-"""Share of cases below which those that lasted as long are too few to learn from."""
+"""Survival probability of the elapsed time below which nothing is predicted, because too few cases last as long."""
 SLOPE_VARIANCE = 25.0
-"""Of each slope, over that of the noise: at a noise of 10 %, slopes within 0.5 of what was expected."""
+"""Prior variance of each slope, relative to the variance of the noise: at a noise of 10 %, one standard deviation of a
+slope is 0.5."""
 NOISE = 0.1
-"""Relative noise that is added with the weight of one observation, so that a few equal durations do not make a range of
-no width."""
+"""Relative noise that is added with the weight of one observation, so that a few equal durations do not give a range of
+width zero."""
 
 PERSISTENCE = 0.5
-"""Expected share of the last case's surprise in the next one: a machine that others use too stays as busy for a
-while."""
+"""Prior mean of the share of the last case's residual that recurs in the next case: a machine that others use too stays
+as busy for a while."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One earlier case."""
+    """Features and duration of one earlier case."""
 
     features: tuple[float, ...]
-    """Logarithms of what describes it."""
+    """Logarithms of the quantities that describe the case."""
     seconds: float
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """Distribution of a duration: its logarithm is Student's t."""
+    """Predictive distribution of a duration: its logarithm follows Student's t."""
 
     centre: float
     """Logarithm of the median, in s."""
     spread: float
+    """Scale of Student's t."""
     degrees: int
+    """Degrees of freedom."""
 
     def remaining_s(self, elapsed_s: float = 0.0, share: float = SHARE) -> tuple[float, float] | None:
-        """Range that holds what remains after ``elapsed_s`` in a share of all cases; None if too few cases last that
-        long.
+        """Return the range in s that contains the remaining duration after ``elapsed_s`` in a ``share`` of all cases;
+        None if too few cases last that long.
         """
         lasting = 1.0 if elapsed_s <= 0 else survival((math.log(elapsed_s) - self.centre) / self.spread, self.degrees)
         if lasting < OUTLIVED:
@@ -68,11 +71,11 @@ class Outlook:
 
 
 def foresee(past: Sequence[Observation], features: Sequence[float], slopes: Sequence[float]) -> Outlook | None:
-    """Outlook of a case with these features; None with fewer than ``MIN_OBSERVATIONS`` observations.
+    """Predict the duration of a case with these features; None with fewer than ``MIN_OBSERVATIONS`` observations.
 
     Args:
-        past: oldest first, as what was unexpected of one case is expected to go on in part in the next.
-        slopes: expected ones, by how much log T grows with each feature.
+        past: observations, oldest first, because a part of the residual of one case is expected to recur in the next.
+        slopes: prior means of the slopes, by which log T grows with each feature.
     """
     if len(past) < MIN_OBSERVATIONS:
         return None
@@ -106,7 +109,9 @@ def _regress(x: Array, y: Array, slopes: Sequence[float]) -> _Regression:
 
 
 def survival(t: float, degrees: int) -> float:
-    """P(T > t) of Student's t with a whole number of degrees of freedom (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
+    """Return P(T > t) of Student's t with a whole number of degrees of freedom (Abramowitz and Stegun, 26.7.3 and
+    26.7.4).
+    """
     angle = math.atan2(t, math.sqrt(degrees))
     sine, square = math.sin(angle), math.cos(angle) ** 2
     term = total = 0.0 if degrees == 1 else (math.cos(angle) if degrees % 2 else 1.0)

@@ -1,4 +1,4 @@
-"""What a job's events add up to: the curve of its fit, its pictures, its log."""
+"""Reads the curve of a fit, its pictures and the log of a job from the job's events."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from services.pipeline.event_log import EventLog, TimedData
 
 PICTURES = ("render", "photo", "residual")
 ENTRY_BYTES = 512
-"""What a curve that is kept takes beside its text and its channel: key, tuples, its place in the mapping."""
+"""Memory in bytes that a kept curve takes besides its text and its channel: its key, tuples and place in the
+mapping."""
 
 
 class LogLine(Record):
@@ -81,14 +82,14 @@ class PreviewPage(Record):
 
 
 def read_log(log: EventLog, after: int, limit: int, stage: StageName | None, attempt: int | None) -> LogPage:
-    """One page of what the stages said."""
+    """Return one page of the log messages of the stages."""
     events = log.read(after, limit + 1, kind="log", stage=stage, attempt=attempt)
     lines = [LogLine(**{name: getattr(event, name) for name in LogLine.model_fields}) for event in events[:limit]]
     return LogPage(lines=lines, next_after=lines[-1].id if lines else after, is_last=len(events) <= limit)
 
 
 def read_previews(log: EventLog, job_id: str, after: int, limit: int) -> PreviewPage:
-    """One page of the pictures that the fit wrote."""
+    """Return one page of the pictures that the fit wrote."""
     events = log.read(after, limit + 1, kind="preview")
     previews = [_preview(event, job_id) for event in events[:limit]]
     return PreviewPage(
@@ -97,8 +98,8 @@ def read_previews(log: EventLog, job_id: str, after: int, limit: int) -> Preview
 
 
 def read_history(log: EventLog, points: int, channel: str | None = None) -> History:
-    """Steps of every channel, evenly thinned to ``points`` each, the first and the last kept; a step that a later
-    attempt repeats replaces the earlier one.
+    """Return the steps of every channel, evenly thinned to ``points`` each, with the first and the last step kept. A
+    step that a later attempt repeats replaces the earlier one.
     """
     thinned: dict[str, _Thinned] = {}
     for told in log.data_of("step"):
@@ -109,13 +110,12 @@ def read_history(log: EventLog, points: int, channel: str | None = None) -> Hist
 
 
 class Histories:
-    """Curves as JSON.
+    """Cache of curves as JSON.
 
-    Rows of the event table are never changed, so that a curve is read again only after its job's newest event is
-    another one.
+    Rows of the event table never change, so that a curve is read again only once its job has a newer event.
 
     Args:
-        most_bytes: what is kept at most; those that were asked for longest ago go first.
+        most_bytes: largest size of the cache in bytes; the curves that were read longest ago are dropped first.
     """
 
     def __init__(self, most_bytes: int = 2**24) -> None:
@@ -124,7 +124,7 @@ class Histories:
         self._lock = threading.Lock()
 
     def read(self, log: EventLog, points: int, channel: str | None = None) -> bytes:
-        """What ``read_history`` tells."""
+        """Return the result of ``read_history`` as JSON."""
         key, newest = (log.job, points, channel), log.newest_id()
         with self._lock:
             if (kept := self._kept.get(key)) is not None and kept[0] == newest:
@@ -149,8 +149,8 @@ def _kept_bytes(channel: str | None, text: bytes) -> int:
 
 
 class _Thinned:
-    """Every n-th step of a channel, n doubling as steps come, so that a long fit needs no more memory than a short
-    one.
+    """Every n-th step of a channel. The stride n doubles as steps come, so that a long fit needs no more memory than a
+    short one.
     """
 
     def __init__(self, points: int) -> None:
@@ -160,7 +160,7 @@ class _Thinned:
         self._last: TimedData | None = None
 
     def add(self, event: TimedData) -> None:
-        """Take in a step."""
+        """Add a step."""
         if self._first is None or event.data["step"] <= self._first.data["step"]:
             self._first = event
         if self._last is None or event.data["step"] >= self._last.data["step"]:
@@ -172,7 +172,7 @@ class _Thinned:
             self._kept = {step: kept for step, kept in self._kept.items() if step % self._stride == 0}
 
     def events(self) -> list[TimedData]:
-        """What is left, in the order of steps."""
+        """Return the steps that are kept, in their order."""
         ends = {event.data["step"]: event for event in (self._first, self._last) if event is not None}
         return [event for _, event in sorted((self._kept | ends).items())]
 

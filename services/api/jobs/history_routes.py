@@ -1,4 +1,4 @@
-"""Routes that show what a job did and does, and the presets.
+"""Routes of the log, the curve, the pictures and the files of a job, and of the presets.
 
 Annotations are evaluated here, because FastAPI reads them.
 """
@@ -29,7 +29,12 @@ After = Annotated[int, Query(ge=0, le=MAX_ID, description="id of the last one th
 
 
 def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -> APIRouter:
-    """Routes over the given jobs; ``openers`` read their files."""
+    """Build the routes.
+
+    Args:
+        readers: threads that query the database.
+        openers: threads that read the files of jobs.
+    """
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
     histories = Histories()
 

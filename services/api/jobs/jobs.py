@@ -1,4 +1,4 @@
-"""What can be done with jobs."""
+"""Use cases of jobs: submit, cancel, retry and delete them, and tell how far they are."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from services.pipeline.stages import request_cancel, stages_of
 
 DAY_S = 86400.0
 MAX_RUNNING = 1000
-"""More jobs are not run at once: each is one thread of a server."""
+"""Upper bound of the number of jobs under way: each of them takes one thread of a server."""
 
 
 class StageProgress(Record):
@@ -55,10 +55,10 @@ class StageProgress(Record):
 
 
 class Jobs:
-    """Use-cases over one data folder; ``start`` and ``close`` frame the time in which jobs run.
+    """Use cases of jobs over one data folder. Jobs run between ``start`` and ``close``.
 
     Args:
-        lacks: see ``Admission``.
+        lacks: returns why no worker can run a stage; see ``Admission``.
 
     Raises:
         SettingsError: the database belongs to another data folder.
@@ -104,11 +104,11 @@ class Jobs:
         self._deleting = threading.Lock()
 
     def start(self) -> None:
-        """Queue again what an earlier server left unfinished, then run jobs."""
+        """Start to run jobs. Jobs that an earlier server left unfinished are queued again."""
         self._runner.start(alone=self._is_alone)
 
     def stop(self) -> None:
-        """Ask the running jobs to stop, and wait for nothing: what they light goes dark at once."""
+        """Ask the running jobs to stop, without waiting for them; the domes that they light go dark at once."""
         self._runner.stop()
 
     def close(self) -> None:
@@ -118,15 +118,15 @@ class Jobs:
         self.repository.close()
 
     def take_turn(self, job_id: str) -> None:
-        """See ``Runner``."""
+        """Require a place for the next stage of a job that has captured; see ``Runner.take_turn``."""
         self._runner.take_turn(job_id)
 
     def folder(self, job_id: str) -> Path:
-        """Where a job's stages and results lie."""
+        """Return the folder of a job's stages and results."""
         return self._data / "jobs" / job_id
 
     def locate(self, spec: JobSpec) -> JobSpec:
-        """A job's options with the files of what the server stores for it."""
+        """Return a job's options with the paths of the files that the server stores for it."""
         return self.calibrations.locate(self.captures.locate(spec))
 
     def submit(
@@ -137,14 +137,14 @@ class Jobs:
         name: str | None = None,
         viewer: Viewer = LOCAL_VIEWER,
     ) -> Creation:
-        """Queue a job, under a label where it is given one.
+        """Queue a job, with a label if one is given.
 
         Raises:
-            SettingsError: a path is relative, absent or may not be named, nor its store, or an uploaded capture is not
-                committed or somebody else's.
+            SettingsError: a path is relative, absent or not allowed, its store is not allowed, an uploaded capture is
+                not committed or somebody else's, or another option is not acceptable.
             JobTooLargeError: the machine could never run it.
-            ExposureLimitError: its rig's exposure passes the dose of a light. JobStateError: the key belongs to another
-                job.
+            ExposureLimitError: one exposure of its rig is over the largest dose of one light. JobStateError: the key
+                belongs to another job.
         """
         spec = self.calibrations.by_content(spec, viewer)
         if key is not None and (earlier := self.repository.submitted(spec, key, viewer)) is not None:
@@ -165,7 +165,7 @@ class Jobs:
             self.server_paths.require("calibration", spec.calibration)
         self._admission.refuse_too_large(
             self.locate(spec)
-        )  # before other submissions have to wait, as it walks through the capture
+        )  # before the lock below, as it walks through the capture and others would wait
         with self.captures.keeping(spec, viewer):
             creation = self.repository.create(spec, key, request_id, name, viewer)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
@@ -179,10 +179,11 @@ class Jobs:
             UnknownJobError: there is no such job. JobStateError: it has ended.
         """
         if self.repository.get(job_id).state is JobState.RUNNING:
-            # Darkness before the record of it: whoever reads the database never waits, whoever writes may for seconds.
+            # Darken before the cancellation is recorded: reading the database never waits, writing to it may take
+            # seconds.
             self._tell_to_stop(job_id)
         if self.repository.apply(job_id, Trigger.CANCEL).instruction is Instruction.STOP:
-            self._tell_to_stop(job_id)  # again, as a job that was just begun forgets what was told before
+            self._tell_to_stop(job_id)  # again, as a job that has just begun withdraws an earlier request
         return self.repository.get(job_id)
 
     def _tell_to_stop(self, job_id: str) -> None:
@@ -192,11 +193,11 @@ class Jobs:
             logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
 
     def retry(self, job_id: str) -> Job:
-        """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from what it
-        had published and is still good.
+        """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from its
+        published results that are still valid.
 
         Raises:
-            UnknownJobError: there is no such job. JobStateError: there is nothing to do again.
+            UnknownJobError: there is no such job. JobStateError: its state does not allow a retry.
         """
         is_revised = self.repository.get(job_id).state is JobState.SUCCEEDED and is_stale(self.folder(job_id))
         self.repository.apply(job_id, Trigger.REVISE if is_revised else Trigger.RETRY)
@@ -208,19 +209,19 @@ class Jobs:
 
         Raises:
             UnknownJobError: there is no such job. JobStateError: it has not ended.
-            StoreError: a file, or what it keeps on an S3 server, could not be removed; delete it again.
+            StoreError: a file, or an object on an S3 server, could not be removed; delete the job again.
         """
         self.repository.apply(job_id, Trigger.DELETE)
         with self._deleting:
             with suppress(UnknownJobError):
-                return self.repository.deletion(job_id)  # a round found the deletion begun and has finished it
+                return self.repository.deletion(job_id)  # a round of the runner has finished this deletion
             erased = erase(self.folder(job_id))
             receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest)
             forget_listing(self.folder(job_id))
             return receipt
 
     def capturing(self) -> list[Job]:
-        """Jobs under way, of any server of the database, whose capture is not published yet."""
+        """Return the jobs under way, of any server of the database, whose capture is not published yet."""
         return self._to_capture(
             self.repository.page(MAX_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING)))
         )
@@ -237,9 +238,9 @@ class Jobs:
         )
 
     def cancel_captures(self) -> list[Job]:
-        """Cancel every job that captures or will capture next; returns them as they were."""
+        """Cancel every job that captures or will capture next; returns these jobs in their state before."""
         cancelled, capturing = [], self.capturing()
-        for job in capturing:  # all of them before the first is recorded, as each may have a dome of its own
+        for job in capturing:  # all before the first is recorded, as each may have a dome of its own
             self._tell_to_stop(job.id)
         for job in self._to_capture(self.repository.queued()) + capturing:
             with suppress(JobStateError):
@@ -251,7 +252,8 @@ class Jobs:
         """Why a queued job does not start, or a running one does not go on; None if nothing keeps it."""
         if job.state not in {JobState.RUNNING, JobState.QUEUED}:
             return None
-        # Not both of either: a job that is read as running may have been paused since.
+        # Ask only for the obstacle of the state that was read: a job that was read as running may have been paused
+        # since.
         look = self._admission.stalled if job.state is JobState.RUNNING else self._admission.reason
         if (reason := look(job.id)) is not None:
             return self.server_paths.tell(reason, self.locate(job.spec))
@@ -274,7 +276,7 @@ class Jobs:
         return [_stage_progress(job, stage, latest.get(stage)) for stage in stages_of(job.spec, latest)]
 
     def free_bytes(self) -> int:
-        """Free space where jobs are stored."""
+        """Free disk space in bytes where jobs are stored."""
         return Machine.of(self._data).free_disk_bytes
 
     def is_running(self) -> bool:
@@ -285,7 +287,7 @@ class Jobs:
         return [job for job in jobs if job.spec.rig is not None and not is_published(self.folder(job.id), "capture")]
 
     def _tidy(self) -> None:
-        # Finish deletions that were cut short, and delete what has been kept long enough.
+        # Finish deletions that were interrupted, and delete jobs that ended longer ago than they are to be kept.
         oldest_s = 0.0 if self._keep_days is None else time.time() - self._keep_days * DAY_S
         for job_id in self.repository.ended_before(oldest_s):
             try:

@@ -13,12 +13,14 @@ DELETING    -                      -                   -                   -    
 ==========  =====================  ==================  ==================  =====================  =================
 
 Further: SUBMITTED -queue-> QUEUED, launch; CANCELLING -stopped-> CANCELLED; FAILED and CANCELLED -retry-> QUEUED,
-launch; SUCCEEDED -revise-> QUEUED, launch, where its masks were changed; RUNNING -pause-> QUEUED, launch. What has
-ended can be deleted: -delete-> DELETING, erase; so can what is DELETING, as the erasing itself may have been cut short.
+launch; SUCCEEDED -revise-> QUEUED, launch, where its masks were changed; RUNNING -pause-> QUEUED, launch; CANCELLING
+-pause-> CANCELLED. A job that has ended can be deleted: -delete-> DELETING, erase; so can a job that is DELETING, as
+the erasure itself may have been interrupted.
 
-``lose`` says that no process works on the job any more, as after a crash: whatever ran is queued again and resumes from
-what it had published. ``pause`` says that it cannot go on for now, for lack of disk. A job that ends before it notices
-a cancel has succeeded: the state tells what happened, not what was wished.
+``lose`` says that no process works on the job any more, as after a crash: a job that ran is queued again and resumes
+from its published results. ``pause`` says that the job cannot go on for now, for lack of a place, disk, a writable
+store or workers. A job that ends before it notices a cancel has succeeded: the state tells what happened, not what was
+wished.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ class Trigger(StrEnum):
 
 
 class Instruction(StrEnum):
-    """What whoever applied the transition must now do."""
+    """What the caller of a transition must do next."""
 
     NOTHING = "nothing"
     LAUNCH = "launch"
@@ -76,7 +78,7 @@ class Instruction(StrEnum):
 
 @dataclass(frozen=True)
 class Transition:
-    """The state reached and what to do about it."""
+    """The state that is reached, and the instruction for the caller."""
 
     state: JobState
     instruction: Instruction = Instruction.NOTHING
@@ -119,10 +121,10 @@ TABLE: Mapping[tuple[JobState, Trigger], Transition] = MappingProxyType(
 
 
 def apply(state: JobState, trigger: Trigger) -> Transition:
-    """The transition that a trigger causes.
+    """Return the transition that a trigger causes.
 
     Raises:
-        JobStateError: the state does not know the trigger.
+        JobStateError: the state does not take the trigger.
     """
     try:
         return TABLE[state, trigger]

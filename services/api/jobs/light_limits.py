@@ -1,6 +1,6 @@
-"""How far a job may go with a dome: what the server allows, whatever the job asks for.
+"""The server's limits of light for the domes that its jobs capture with.
 
-There is a person's face in the dome.
+They hold whatever a job asks for, because a person's face is in the dome.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class LightLimits:
         """Refuse a rig that the server does not allow, before anything is connected to or lit.
 
         Raises:
-            SettingsError: its dome, level or exposure is not allowed. ExposureLimitError: one of its exposures passes
-                the dose of a light.
+            SettingsError: its dome, level or exposure is not allowed. ExposureLimitError: one of its exposures is over
+                the largest dose of one light.
         """
         settings = self._settings
         if rig.dome not in settings.allowed_addresses:
@@ -51,7 +51,7 @@ class LightLimits:
             raise ExposureLimitError(f"{what}; lower rig.level or rig.exposure_s.")
 
     def lowered(self, spec: JobSpec) -> JobSpec:
-        """A job's options with the limits of its rig lowered to the server's where they were higher.
+        """Return a job's options with the limits of its rig lowered to the server's where they were higher.
 
         Raises:
             SettingsError, ExposureLimitError: as ``require``, for a job that was accepted under other settings.

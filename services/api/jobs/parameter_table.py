@@ -1,4 +1,4 @@
-"""What a job has measured, as a table that a spreadsheet opens."""
+"""The parameters that a job has estimated, as a CSV table for spreadsheets."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from services.client.errors import JobStateError
 from services.core.results import Estimate
 
 COLUMNS = ("job", "channel", "parameter", "value", "se", "unit", "determined")
-"""``se`` is one standard error, empty where nothing was fitted. With the job, tables of several jobs go one below
-another."""
+"""Columns of the table. ``se`` is one standard error, empty where nothing was fitted. The column with the job allows to
+append the tables of several jobs to each other."""
 _FORMULA_MARKS = ("=", "+", "-", "@", "'")
-"""Spreadsheets compute what begins so. A channel's name comes with the capture, so it is shown and not computed."""
+"""First characters at which a spreadsheet takes a cell for a formula. The name of a channel comes with the capture, so
+it is marked as text and not computed."""
 _TABLES: TypeAdapter[dict[str, dict[str, Estimate]]] = TypeAdapter(dict[str, dict[str, Estimate]])
 
 
 def parameter_table(job_id: str, path: Path) -> str:
-    """The parameters of a job as CSV (RFC 4180), one row a channel and parameter, numbers as exact as they are stored.
+    """Return the parameters of a job as CSV (RFC 4180), one row per channel and parameter, with numbers as exact as
+    they are stored.
 
     Args:
         path: the job's ``parameters.json``.

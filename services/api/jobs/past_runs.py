@@ -1,6 +1,6 @@
-"""How jobs that succeeded went: when they reached each tenth of each stage.
+"""Past runs of jobs that succeeded: when each run reached each tenth of each stage.
 
-Kept in a table of its own, as a fit's events are many.
+They have a table of their own because a fit has many events.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from services.pipeline.database import metadata, writing
 from services.pipeline.event_log import EventLog, event_table
 
 NEWEST = 40
-"""Runs that are learned from: enough for a range, few enough to follow a machine that changes."""
+"""Number of past runs that are learned from: enough for a range, few enough to follow a machine that changes."""
 
 TENTHS = 10
+"""Number of equal parts of a stage at whose beginnings the time is recorded."""
 
 past_run_table = sql.Table(
     "past_run",
@@ -38,7 +39,7 @@ past_run_table = sql.Table(
 
 
 class Course(Record):
-    """One run from its start to its success, without a break."""
+    """Times of one run from its start to its success, without an interruption."""
 
     machine: str = Field(description="class of the machines that ran its stages")
     reached_s: dict[StageName, tuple[float, ...]] = Field(
@@ -51,20 +52,20 @@ class Course(Record):
 
 
 class PastRun(Record):
-    """What is learned from one job."""
+    """Size and times of one past job."""
 
     size: JobSize
     course: Course
 
 
 def tenth_of(done: float) -> int:
-    """How many tenths are done; the last one only ends with the stage."""
+    """Return how many tenths of a stage are done at a fraction ``done``; the last tenth ends only with the stage."""
     return min(int(TENTHS * done + 1e-9), TENTHS - 1)
 
 
 def course_of(events: Iterable[JobEvent]) -> Course | None:
-    """The course that events tell of, oldest first; None if the job did not succeed, was interrupted, or the clock
-    stepped back.
+    """Derive the course of a run from its events, oldest first; None if the job did not succeed, was interrupted, or
+    the clock stepped back.
     """
     began_s = ended_s = None
     machines, reached = set[str](), dict[StageName, list[float]]()
@@ -103,13 +104,15 @@ def course_of(events: Iterable[JobEvent]) -> Course | None:
 
 
 class PastRuns:
-    """The table of one database."""
+    """The table of past runs in one database."""
 
     def __init__(self, engine: sql.Engine) -> None:
         self._engine = engine
 
     def record(self, job_id: str, method: str, size: JobSize, beside: float = 1.0) -> None:
-        """Learn from a job that has succeeded, if it ran without a break."""
+        """Record the run of a job that has succeeded, if it was not interrupted; ``beside`` is the mean number of jobs
+        that shared the workers during the run, this one included.
+        """
         course = course_of(EventLog(self._engine, job_id).every())
         if course is None:
             return
@@ -129,14 +132,14 @@ class PastRuns:
                 connection.execute(past_run_table.insert().values(row | {"ended_s": ended_s}))
 
     def alike(self, method: str, machine: str) -> list[PastRun]:
-        """The newest runs of jobs that did the same on the same class of machine, oldest first."""
+        """Return the newest runs of jobs of the same method on the same class of machine, oldest first."""
         alike = (past_run_table.c.method == method) & (past_run_table.c.machine == machine)
         query = sql.select(past_run_table).where(alike).order_by(past_run_table.c.ended_s.desc()).limit(NEWEST)
         with self._engine.connect() as connection:
             return [_run(row) for row in reversed(connection.execute(query).mappings().all())]
 
     def newest_machine(self) -> str | None:
-        """Class of the machine on which a job succeeded last."""
+        """Return the class of the machine on which a job succeeded last."""
         query = sql.select(past_run_table.c.machine).order_by(past_run_table.c.ended_s.desc()).limit(1)
         with self._engine.connect() as connection:
             return connection.scalar(query)

@@ -1,4 +1,4 @@
-"""Records of jobs: as the API shows them, and as those who run them hold them."""
+"""Records of jobs, as the API shows them and as the runner uses them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Failure(Record):
 
     @classmethod
     def of(cls, problem: DentineError, stage: StageName | None) -> Self:
-        """The failure that an error means."""
+        """Describe an error as the failure of a job."""
         return cls(
             code=problem.code,
             message=problem.message,
@@ -63,7 +63,7 @@ class Job(Record):
     )
 
     def seen_by(self, viewer: Viewer) -> Job:
-        """The same as somebody may see it: without the folders on the server, for one who may not use them."""
+        """Return the job as a viewer may see it: without the folders on the server, for one who may not use them."""
         return self if viewer.uses_paths else self.model_copy(update={"spec": without_folders(self.spec)})
 
 
@@ -82,7 +82,7 @@ class Deletion(Record):
 
 @dataclass(frozen=True)
 class Creation:
-    """What a submission led to."""
+    """Result of a submission: the job, and whether it is new."""
 
     job: Job
     is_new: bool
@@ -90,7 +90,7 @@ class Creation:
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to run a job for a while."""
+    """The right to run a job for a while; ``number`` counts the leases of the job."""
 
     job: Job
     number: int

@@ -1,7 +1,7 @@
-"""Jobs beside the event table; a change of state and its event are one transaction.
+"""Stores jobs in the database, beside the event table; a change of state and its event are one transaction.
 
-Whoever runs a job holds its lease: a number, one more than any before, and a time until which it is his. A lease that
-is not renewed is lost, and what its holder still says of the job is refused.
+The server that runs a job holds a lease: a number, one more than that of any lease before, and a time at which it
+expires. A lease that is not renewed is lost, and later reports of its holder about the job are refused.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from services.pipeline.event_log import (
 )
 
 KNOWN_JOBS = 1024
-"""Jobs, and their options, that are kept as they were read."""
+"""Largest number of parsed jobs, and of their options, that are kept in memory."""
 
 
 _IS_UNFINISHED = (job_table.c.state == JobState.RUNNING.value) | (job_table.c.state == JobState.QUEUED.value)
-# Built once, as what follows: building a query takes longer than asking it.
+# These queries are built once, because building a query takes longer than executing it.
 _JOBS = sql.select(*(job_table.c[name] for name in Job.model_fields if name in job_table.c))
 _ONE = Query(_JOBS.where(job_table.c.id == sql.bindparam("of")))
 _WITH_KEY = Query(_JOBS.where(job_table.c.key == sql.bindparam("of_key")))
@@ -59,7 +59,9 @@ _INSERT = job_table.insert()
 
 @lru_cache(64)
 def _listing(only: JobFilter, *, is_first: bool) -> Query:
-    """The newest ``most`` jobs, those with a number below ``before`` unless it is the first page."""
+    """Build the query of the newest ``most`` jobs; unless it is the first page, of those with a number below
+    ``before``.
+    """
     query = (
         _JOBS.where(*only.conditions())
         .order_by(job_table.c.number.desc())
@@ -69,10 +71,10 @@ def _listing(only: JobFilter, *, is_first: bool) -> Query:
 
 
 class Repository:
-    """The database of a server, brought to this version's tables when it is opened.
+    """The jobs in the database of a server. Its tables are upgraded to this version when it is opened.
 
     Args:
-        clock: Unix time; servers that share a database must agree on it to within a lease's length.
+        clock: Unix time in s; servers that share a database must agree on it to within the length of a lease.
     """
 
     def __init__(self, url: str, clock: Callable[[], float] = time.time) -> None:
@@ -158,36 +160,36 @@ class Repository:
         return self._verdicts.judged([self._only(_ONE.rows(self.engine, of=job_id), job_id)])[0]
 
     def seen(self, job_ids: Iterable[str], viewer: Viewer) -> set[str]:
-        """Those of the jobs that are there and that somebody may see."""
+        """Return the ids of those jobs that exist and that a viewer may see."""
         found = (_ONE.rows(self.engine, of=job_id) for job_id in job_ids)
         return {job.id for job in self._jobs(rows[0] for rows in found if rows) if viewer.may_see(job.owner)}
 
     def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
-        """Newest jobs first, those with a number below ``before``."""
+        """Return up to ``limit`` jobs, newest first, of those with a number below ``before``."""
         values = {"most": limit} | ({} if before is None else {"before": before})
         return self._verdicts.judged(
             self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values))
         )
 
     def unfinished(self) -> list[Job]:
-        """Jobs that run or wait, those that have waited longest first."""
+        """Return the jobs that run or wait, in the order of their submission."""
         return self._jobs(_UNFINISHED.rows(self.engine))
 
     def begun(self) -> dict[str, Begun]:
-        """How far the stages are of each job that runs or waits and was begun."""
+        """Return how far the stages are of each job that runs or waits and was begun, by job."""
         return begun(_BEGUN.rows(self.engine))
 
     def queued(self) -> list[Job]:
-        """Jobs that wait, those that have waited longest first."""
+        """Return the jobs that wait, in the order of their submission."""
         query = _JOBS.where(job_table.c.state == JobState.QUEUED).order_by(job_table.c.number)
         with self.engine.connect() as connection:
             return self._jobs(connection.execute(query))
 
     def lease(self, job_id: str, holder: str, seconds: float) -> Lease:
-        """Start a queued job.
+        """Start a queued job under a new lease of so many ``seconds``.
 
         Raises:
-            UnknownJobError: there is no such job. JobStateError: it is not queued, any more perhaps.
+            UnknownJobError: there is no such job. JobStateError: it is not queued.
         """
         with writing(self.engine) as connection:
             self._apply(connection, job_id, Trigger.START)
@@ -197,7 +199,7 @@ class Repository:
             return Lease(self._find(connection, job_id), number)
 
     def renew(self, lease: Lease, seconds: float) -> bool:
-        """Keep a lease; False if somebody else has the job by now."""
+        """Extend a lease; False if another holder has the job by now."""
         held = (lease_table.c.job == lease.job.id) & (lease_table.c.number == lease.number)
         with writing(self.engine) as connection:
             return bool(
@@ -205,10 +207,10 @@ class Repository:
             )
 
     def settle(self, lease: Lease, trigger: Trigger, failure: Failure | None = None) -> Transition:
-        """Apply what the holder of a lease says of its job, and end the lease.
+        """Apply the trigger that the holder of a lease reports of its job, and end the lease.
 
         Raises:
-            FencedError: somebody else has the job by now. JobStateError: its state does not take the trigger.
+            FencedError: another holder has the job by now. JobStateError: its state does not take the trigger.
         """
         with writing(self.engine) as connection:
             if (newest := self._lease_number(connection, lease.job.id)) != lease.number:
@@ -228,23 +230,24 @@ class Repository:
             return self._apply(connection, job_id, trigger, failure)
 
     def tell(self, job_id: str, message: str) -> None:
-        """Append a sentence to the events of a job that waits, if it still does."""
+        """Append a sentence to the events of a job, if the job still waits."""
         is_waiting = sql.select(job_table.c.id).where(job_table.c.id == job_id, job_table.c.state == JobState.QUEUED)
         with writing(self.engine) as connection:
             if connection.scalar(is_waiting) is not None:
                 insert_event(connection, job_id, 0, kind="log", message=message)
 
     def lose(self) -> list[str]:
-        """Tell every job under way that no process works on it any more."""
+        """Apply ``lose`` to every job under way, as no process works on it any more; returns their ids."""
         return self._lose(sql.true())
 
     def lose_expired(self, keep: Iterable[Lease] = (), length_s: float = math.inf) -> list[str]:
-        """Tell those that have no lease, or one that ran out.
+        """Apply ``lose`` to the jobs under way that have no lease, or an expired one; returns their ids.
 
         Args:
-            keep: hold whatever the clock says: the caller's own, who knows that it works on those jobs.
-            length_s: of every lease. One that ends more than twice as far ahead was taken before the clock stepped
-                back, and counts as run out.
+            keep: leases that hold whatever the clock says: the caller's own, as the caller knows that it works on those
+                jobs.
+            length_s: length of every lease in s. A lease that ends more than twice as far ahead was taken before the
+                clock stepped back, and counts as expired.
         """
         now_s = self._clock()
         held: sql.ColumnElement[bool] = lease_table.c.until_s.between(now_s, now_s + 2 * length_s)
@@ -263,7 +266,7 @@ class Repository:
         return ids
 
     def forget(self, job_id: str, files: int, size: int, digest: str) -> Deletion:
-        """Remove what is stored of a job whose files are gone, and keep a receipt.
+        """Delete the rows of a job whose files are gone, and store a receipt.
 
         Raises:
             UnknownJobError: there is no such job. JobStateError: it is not being deleted.
@@ -272,7 +275,7 @@ class Repository:
             job = self._find(connection, job_id)
             if job.state is not JobState.DELETING:
                 raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
-            collect_changes(connection, self._clock())  # as the events go with the job
+            collect_changes(connection, self._clock())  # before the events are deleted with the job
             receipt = Deletion(
                 job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest
             )
@@ -282,7 +285,7 @@ class Repository:
             return receipt
 
     def deletion(self, job_id: str) -> Deletion:
-        """The receipt of a deleted job.
+        """Return the receipt of a deleted job.
 
         Raises:
             UnknownJobError: no job of this id was deleted.
@@ -296,7 +299,9 @@ class Repository:
         return Deletion(**{name: row[name] for name in Deletion.model_fields})
 
     def ended_before(self, time_s: float) -> list[str]:
-        """Jobs that ended before a time, oldest first, and those whose deletion was begun."""
+        """Return the ids of the jobs that ended before a time and of those whose deletion was begun, in the order of
+        their submission.
+        """
         ended = job_table.c.state.in_([state for state in JobState if state.is_final]) & (
             job_table.c.changed_s < time_s
         )
@@ -309,20 +314,20 @@ class Repository:
             return list(connection.scalars(query))
 
     def events_of(self, job_id: str) -> EventLog:
-        """The job's events."""
+        """Return the event log of a job."""
         return EventLog(self.engine, job_id)
 
     def address_of(self, lease: Lease) -> EventAddress:
-        """Where another process appends the job's events."""
+        """Return the address under which another process appends the events of a leased job."""
         return EventAddress(self._url, lease.job.id, lease.number, lease.job.request_id)
 
     def newest_event(self) -> int:
-        """Id of the last event of any job."""
+        """Return the id of the last event of any job; 0 if there is none."""
         with self.engine.connect() as connection:
             return connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
 
     def newest_events(self, after: int) -> dict[str, int]:
-        """Jobs with events after an id, and the id of the last one of each."""
+        """Return the jobs that have events after an id, each with the id of its last event."""
         return {str(job): int(newest) for job, newest in _NEWEST_EVENTS.rows(self.engine, after=after)}
 
     def _lease_number(self, connection: sql.Connection, job_id: str) -> int:

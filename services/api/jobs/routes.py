@@ -1,4 +1,4 @@
-"""The REST routes below ``/v1``.
+"""REST routes of jobs, their events and artifacts, the options, the OpenAPI description and liveness.
 
 Annotations are evaluated here, because FastAPI reads them and they name local dependencies.
 """
@@ -30,11 +30,12 @@ from services.core.records import JobName, JobSpec, KindName
 from services.pipeline.database import MAX_ID
 
 LOOK_S = 2.0
-"""How long the answer about a job waits for the disks of captures, which tell how long jobs take."""
+"""Longest time in s that the answer about a job waits for the disks of captures, which are read to predict how long
+jobs take."""
 
 
 MAX_STREAMED = 64
-"""Jobs in one stream of events."""
+"""Largest number of jobs in one stream of events."""
 _PLACE = "a job's id, and after a colon the id of its last event that is known already"
 Place = Annotated[str, StringConstraints(pattern=r"^[0-9a-zA-Z]{1,40}(:[0-9]{1,9})?$")]
 
@@ -45,7 +46,7 @@ class Submission(JobSpec):
     name: JobName | None = Field(default=None, description="label of the job, for people")
 
     def spec(self) -> JobSpec:
-        """The options alone."""
+        """Return the options without the label."""
         return JobSpec.model_construct(
             self.model_fields_set - {"name"}, **{name: getattr(self, name) for name in JobSpec.model_fields}
         )
@@ -85,12 +86,14 @@ class Health(Record):
 def build_router(
     jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: ThreadPool, lookers: ThreadPool, cancellers: ThreadPool
 ) -> APIRouter:
-    """Routes over the given jobs.
+    """Build the routes.
 
     Args:
-        openers: read their files.
-        lookers: read their captures, which may hang.
-        cancellers: cancel.
+        feed: follows the event table.
+        readers: threads that query the database.
+        openers: threads that read the files of jobs.
+        lookers: threads that read captures, whose disks may hang.
+        cancellers: threads that cancel jobs.
     """
     router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())

@@ -1,4 +1,4 @@
-"""The threads of a server that run queued jobs side by side, and look after those that nobody runs any more."""
+"""Runs queued jobs side by side, each in a thread of the server, and queues jobs again whose server has died."""
 
 from __future__ import annotations
 
@@ -31,27 +31,30 @@ from services.pipeline.logs import log_context
 from services.pipeline.stages import first_stage, request_cancel, withdraw_cancel
 
 RunJob = Callable[[JobSpec, Path, EventAddress], object]
-"""Runs a job in a folder to its end, events to the given table; raises what a stage raises."""
+"""Function that runs a job in a folder to its end, with its events to the given address; it raises what a stage
+raises."""
 
 LEASE_S = 60.0
-"""How long a job stays with a server that no longer answers."""
+"""Length of a lease in s: a job stays so long with a server that no longer answers."""
 ROUND_S = 10.0
-"""How often leases are renewed, lost ones found and waiting jobs looked at again."""
+"""Time in s between two rounds, in which leases are renewed, lost ones are found and waiting jobs are looked at
+again."""
 
 
 class WaitsForItsTurnError(Exception):
-    """A job has captured, and there is no place for the rest of it yet."""
+    """A job has captured, and there is no place yet for its other stages."""
 
 
 class Runner:
     """Runs jobs between ``start`` and ``close``, each in a thread of its own.
 
     Args:
-        folder: of a job by its id.
-        locate: a job's options with the folder of an uploaded capture.
-        on_round: called every so often.
-        on_success: called with a job that has succeeded, and how many on average ran while it did.
-        tell: why a job failed or waits, as those who look at jobs may read it.
+        folder: returns the folder of a job by its id.
+        locate: returns a job's options with the folder of an uploaded capture.
+        on_round: called in every round.
+        on_success: called with a job that has succeeded, and the mean number of jobs that shared the workers while it
+            ran.
+        tell: returns the reason why a job failed or waits in a form that everybody who sees the job may read.
     """
 
     def __init__(
@@ -82,8 +85,8 @@ class Runner:
         self._threads = [threading.Thread(target=part, name=name) for name, part in parts.items()]
 
     def start(self, *, alone: bool) -> None:
-        """Begin; ``alone`` says that no other server shares the database, so that whatever is under way there was left
-        by one that died.
+        """Start the threads. ``alone`` says that no other server shares the database, so that jobs under way there were
+        left by a server that died.
         """
         if alone:
             self._repository.lose()
@@ -92,7 +95,7 @@ class Runner:
             thread.start()
 
     def stop(self) -> None:
-        """Ask the running jobs to stop, and wait for nothing; they stay queued and resume when a server starts
+        """Ask the running jobs to stop, without waiting for them. They stay queued and resume when a server starts
         again.
         """
         self._closing.set()
@@ -100,11 +103,11 @@ class Runner:
         for lease in self._leases():
             try:
                 request_cancel(self._folder(lease.job.id))
-            except OSError as problem:  # of one job's folder, which keeps no other from going dark
+            except OSError as problem:  # a fault of one folder must not keep others from going dark
                 logging.getLogger(__name__).warning("job %s cannot be told to stop: %s", lease.job.id, problem)
 
     def close(self) -> None:
-        """Stop the running jobs cooperatively, and wait for that."""
+        """Stop the running jobs cooperatively, and wait for their end."""
         self.stop()
         for thread in self._threads:
             if thread.ident is not None:
@@ -114,11 +117,12 @@ class Runner:
             thread.join()
 
     def wake(self) -> None:
-        """There is something to run."""
+        """Wake the thread that starts jobs."""
         self._wake.set()
 
     def take_turn(self, job_id: str) -> None:
-        """Called before each stage that follows a job's capture, in the job's own thread.
+        """Require a place for a stage that follows a job's capture; called before each such stage in the job's own
+        thread.
 
         Raises:
             WaitsForItsTurnError: all places are taken.
@@ -148,7 +152,7 @@ class Runner:
                 logging.getLogger(__name__).exception("starting jobs failed; trying again in %g s", ROUND_S)
 
     def _start_what_may(self) -> None:
-        # In turn; those that wait for disk or workers let others pass.
+        # Go through the queued jobs in turn; those that wait for disk or workers let others pass.
         queued = sorted(self._repository.queued(), key=turn)
         self._admission.begin_round(job.id for job in queued)
         self._told_obstacles = {
@@ -173,8 +177,9 @@ class Runner:
             thread.start()
 
     def _tell_obstacle(self, job_id: str, located: JobSpec) -> None:
-        # Told as an event, so that whoever watches the job knows at once; once for each kind of obstacle, as its
-        # numbers change all the time. That others are before it is nothing to act on.
+        # Write the obstacle as an event, so that clients that watch the job see it at once; once for each kind of
+        # obstacle, as its numbers change all the time. That others are first in line is not written, as nobody can act
+        # on it.
         reason = self._admission.reason(job_id, besides_turn=True)
         kind = None if reason is None else reason.partition(":")[0]
         if kind != self._told_obstacles.get(job_id):
@@ -218,7 +223,7 @@ class Runner:
                 request_cancel(self._folder(lease.job.id))
 
     def _make_rounds(self) -> None:
-        # A thread of its own, as a deletion of many files takes longer than a lease lasts.
+        # The rounds have a thread of their own, because a deletion of many files takes longer than a lease lasts.
         while not self._closing.wait(ROUND_S):
             try:
                 self._on_round()
@@ -246,7 +251,7 @@ class Runner:
             trigger, failure = Trigger.FAIL, Failure.of(problem, self._stage(job))
         except Exception as problem:
             if not is_begun:
-                raise  # nothing of the job broke; whoever leases it next may have better luck
+                raise  # the job itself did not break; its next lease may go well
             logging.getLogger(__name__).exception("Job broke.")
             message = (
                 f"Stage {self._stage(job)} broke with {type(problem).__name__}: {problem}; please report it with the"
@@ -280,8 +285,8 @@ class Runner:
                 request_cancel(folder)
 
     def _after_cancel(self, job: Job) -> Trigger:
-        # A user's, this server's end, or nobody's: whoever cancels tasks in Dask itself finds the job going on, but not
-        # at once and over and over.
+        # The cancel came from a user, from the end of this server, or from neither: tasks can also be cancelled in Dask
+        # itself. Then the job goes on, but after a pause, so that this does not repeat over and over at once.
         if patiently(lambda: self._repository.get(job.id).state) is JobState.CANCELLING:
             return Trigger.STOPPED
         if self._closing.is_set():

@@ -1,8 +1,8 @@
 """Which folders of the server and which S3 stores a job may name.
 
-Folders are those below the roots that the settings allow, and none where callers need tokens and no root is set. Stores
-are those that the settings name and what lies below them, on every server: whoever submits a job else chose where the
-server's own credentials write.
+The folders are those below the roots that the settings allow, and none where callers need tokens and no root is set.
+The stores are, on every server, those that the settings name and those below them: otherwise whoever submits a job
+would choose where the server's own credentials write.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class ServerStores:
     """The S3 stores that a server's jobs may name.
 
     Raises:
-        SettingsError: a setting is no such URL. PlatformError: there is one, and what speaks to S3
-            servers is not installed.
+        SettingsError: a setting is not the URL of a store. PlatformError: stores are set, and the package that speaks
+            to S3 servers is not installed.
     """
 
     def __init__(self, settings: ServerSettings) -> None:
@@ -41,7 +41,7 @@ class ServerStores:
         """Refuse a job whose store is not allowed, before anything is connected to.
 
         Raises:
-            SettingsError: it is not.
+            SettingsError: the store is not allowed.
         """
         if spec.store is not None and not any(f"{spec.store}/".startswith(f"{one}/") for one in self._allowed):
             known = ", ".join(self._allowed) or "none"
@@ -55,8 +55,9 @@ class ServerPaths:
     """The paths that a server's jobs may name.
 
     Args:
-        roots: folders below which they lie; None allows any path.
-        data: the server's own folder, in which nothing may be named: it holds what belongs to others.
+        roots: folders below which the paths must lie; None allows any path.
+        data: the server's own folder. Where there are roots, nothing in it may be named, because it holds what belongs
+            to others.
 
     Raises:
         SettingsError: a root is not absolute.
@@ -72,15 +73,14 @@ class ServerPaths:
 
     @classmethod
     def of(cls, settings: ServerSettings) -> ServerPaths:
-        """Those that the settings allow."""
+        """Create the check from the settings."""
         named = tuple(Path(one.strip()) for one in settings.job_roots.split(",") if one.strip())
         return cls(None if settings.access == "open" and not named else named, settings.data)
 
     def require(self, option: str, path: Path, remedy: str = "check the path") -> None:
-        """Refuse a path that means nothing on the server, or may not be named; ``remedy`` says what to do about one
-        that is absent.
+        """Refuse a path that is relative, not allowed or absent; ``remedy`` says what to do about an absent one.
 
-        What may not be named is refused in the same words whether it is there or not.
+        A path that is not allowed is refused in the same words whether it exists or not.
 
         Raises:
             SettingsError: it is relative, lies below no root, or is absent.
@@ -97,7 +97,7 @@ class ServerPaths:
             raise SettingsError(f"Option '{option}': {path} does not exist on the server; {remedy}.")
 
     def tell(self, sentence: str, located: JobSpec) -> str:
-        """Why a job failed, without the server's folders where some of those who read it may not name them."""
+        """Return a sentence about a job without the server's folders, if some of its readers may not name them."""
         return sentence if self._roots is None else told_without_folders(sentence, located, self._data)
 
     def _is_allowed(self, path: Path) -> bool:
@@ -105,7 +105,9 @@ class ServerPaths:
 
 
 def without_folders(spec: JobSpec) -> JobSpec:
-    """A job's options with the names alone of what lies in folders of the server, for whoever may not use those."""
+    """Return a job's options with only the last part of every path to a folder of the server, for viewers who may not
+    use those folders.
+    """
     changes: dict[str, object] = {
         name: Path(path.name)
         for name in ("capture", "calibration")
@@ -117,12 +119,13 @@ def without_folders(spec: JobSpec) -> JobSpec:
 
 
 def told_without_folders(text: str, located: JobSpec, data: Path) -> str:
-    """A sentence about a job without the folders on the server that its files lie in: those who read it need not be
-    those who may name them.
+    """Remove the server's folders, in which the files of a job lie, from a sentence about the job: not everybody who
+    reads it may name them.
 
     Args:
-        located: the job's options with the files of what the server stores.
-        data: the server's own folder, in which ``captures/ID`` and ``jobs/ID`` are as everybody calls them.
+        located: the job's options with the paths of the files that the server stores.
+        data: the server's own folder. The paths below it, ``captures/ID`` and ``jobs/ID``, are known to everybody and
+            stay.
     """
     named = (located.capture, located.calibration, located.rig.mouth if located.rig is not None else None)
     folders = [
@@ -135,9 +138,9 @@ def told_without_folders(text: str, located: JobSpec, data: Path) -> str:
 
 
 def _resolved(path: Path) -> Path | None:
-    # With all links followed; None for what cannot be a path, such as a loop of links.
+    # Follow all links; None for a path that cannot exist, such as a loop of links.
     try:
-        str(path).encode()  # what has no name in Unicode could not be stored
+        str(path).encode()  # a path that is not valid Unicode could not be stored
         return path.resolve()
     except (OSError, ValueError, RuntimeError):
         return None

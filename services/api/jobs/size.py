@@ -1,4 +1,4 @@
-"""How large a job is, as far as its time goes, and which jobs do the same to something of another size."""
+"""The size of a job, from which its duration is predicted, and its method, by which jobs are compared."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from services.core.geometry import Record
 from services.core.records import JobSpec
 
 DEMO_VALUES = 16_896
-"""Of the demonstration: 8 lights in 3 images of about 21 by 33 pixels, one channel."""
+"""Number of values that the demonstration fits: 8 lights in 3 images of about 21 by 33 pixels, one channel."""
 _METHOD = ("kind", "boundary", "dentin", "loss", "solver", "prior", "stains", "lobes", "advise", "workers", "device")
-"""Options that change what is done; the others change how much of it, or nothing that lasts."""
+"""Options that make up the method of a job. The others change only its size, or nothing that takes time."""
 
 
 class JobSize(Record):
-    """What a job's time is predicted from."""
+    """Quantities from which the duration of a job is predicted."""
 
     pixels: int = Field(ge=1, description="values that are fitted, over all cameras, lights and channels")
     samples: int = Field(ge=1, description="paths per pixel and pass at the start")
@@ -29,12 +29,12 @@ class JobSize(Record):
 
     @property
     def features(self) -> tuple[float, ...]:
-        """Logarithms."""
+        """Natural logarithms of the three quantities."""
         return math.log(self.pixels), math.log(self.samples), math.log(self.steps)
 
 
 def size_of(spec: JobSpec, describe: Describe = describe) -> JobSize | None:
-    """Size of a job from the description of its capture; None where that cannot be read."""
+    """Return the size of a job from the description of its capture; None where the description cannot be read."""
     if spec.is_demo:
         return _sized(spec, DEMO_VALUES)
     try:
@@ -54,7 +54,7 @@ def _sized(spec: JobSpec, values: int) -> JobSize:
 
 
 def method_of(spec: JobSpec) -> str:
-    """The same text for jobs that do the same."""
+    """Return a text that is the same for jobs of the same method."""
     return json.dumps(
         spec.model_dump(mode="json", include=set(_METHOD)) | {"captures": spec.rig is not None}, sort_keys=True
     )
@@ -62,8 +62,8 @@ def method_of(spec: JobSpec) -> str:
 
 @lru_cache(maxsize=256)
 def _images(describe: Describe, folder: Path, _version: tuple[Path, int]) -> tuple[int, int]:
-    """Pixels of all images together, and channels; known of a description whose file and time of change are the
-    same.
+    """Return the pixels of all images together, and the number of channels. The result is cached as long as the
+    description has the same file and time of change (``_version``).
     """
     found = describe(folder)
     return found.image_px, len(found.calibration.channels)

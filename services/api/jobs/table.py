@@ -1,4 +1,4 @@
-"""The tables of jobs and of the receipts of deleted ones, and what jobs are found by."""
+"""The tables of jobs and of the receipts of deleted ones, and the filter of job lists."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ deletion_table = sql.Table(
 
 
 def unknown_job(job_id: str) -> UnknownJobError:
-    """What is told of a job that is not there, or is somebody else's."""
+    """Return the error for a job that does not exist or belongs to another owner."""
     return UnknownJobError(f"There is no job {job_id}; list the jobs to see their ids.")
 
 
 def unknown_deletion(job_id: str) -> UnknownJobError:
-    """What is told of a receipt that is not there, or is somebody else's."""
+    """Return the error for a receipt that does not exist or belongs to another owner."""
     return UnknownJobError(f"No job {job_id} was deleted; check its id.")
 
 
 class JobFilter(Record):
-    """Which jobs to list; what is left out allows any."""
+    """Filter of job lists; a field that is left out allows any job."""
 
     states: tuple[JobState, ...] = ()
     kind: KindName | None = None
@@ -71,13 +71,13 @@ class JobFilter(Record):
     by_name: bool = Field(default=False, description="whether source is looked for in the path's last part alone")
 
     def seen_by(self, viewer: Viewer) -> JobFilter:
-        """The same, of what somebody may see."""
+        """Return the filter, restricted to what a viewer may see."""
         return self.model_copy(
             update={"owner": None if viewer.sees_all else viewer.owner, "by_name": not viewer.uses_paths}
         )
 
     def conditions(self) -> Iterator[sql.ColumnElement[bool]]:
-        """What a row of the job table must fulfil."""
+        """Yield the conditions that a row of the job table must fulfil."""
         if self.states:
             yield sql.or_(
                 *(job_table.c.state == state.value for state in sorted(set(self.states)))

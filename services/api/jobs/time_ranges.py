@@ -30,11 +30,13 @@ from services.pipeline.event_log import Begun, EventLog
 from services.pipeline.stages import stages_of
 
 SIZE_SLOPE = 0.5
-"""Expected growth of a duration's logarithm with that of each size: between none and proportion."""
+"""Prior mean of the slope of a duration's logarithm over that of each size: half way between no dependence (0) and
+proportionality (1)."""
 
 SHORTEST_S = 1e-3
+"""Shortest duration in s of which a logarithm is taken."""
 WIDEST = 100.0
-"""Ratio of a range's limits beyond which it says nothing."""
+"""Largest ratio of a range's limits. A wider range says nothing and is not given."""
 
 
 class TimeRange(Record):
@@ -48,10 +50,15 @@ class TimeRange(Record):
     reason: str | None = Field(default=None, description="why there is no range")
 
     def after(self, running: Sequence[Self], ahead: Sequence[Self], places: int) -> Self:
-        """The range of what begins when a place is free for it: jobs end that run, and those ahead of it have had
-        theirs.
+        """Return the range of a job that begins once the running jobs and those ahead of it leave a place free.
 
-        Lower limits go with lower ones and upper with upper, as on a busy machine all jobs are late together.
+        Lower limits are added to lower ones and upper to upper ones, because on a busy machine all jobs are late
+        together.
+
+        Args:
+            running: ranges of the jobs that run.
+            ahead: ranges of the queued jobs that start before this one.
+            places: largest number of jobs that run side by side.
         """
         if self.low_s is None or self.high_s is None:
             return self
@@ -66,7 +73,7 @@ class TimeRange(Record):
 
 
 def _start_s(running_s: list[float], ahead_s: list[float], places: int) -> float:
-    """When a place is free: each of those ahead takes the one that is free first."""
+    """Return in how many s a place is free, when each job ahead takes the place that is free first."""
     free_s = sorted(running_s)[max(len(running_s) - places, 0) :] + [0.0] * (places - len(running_s))
     heapq.heapify(free_s)
     for lasts_s in ahead_s:
@@ -76,29 +83,29 @@ def _start_s(running_s: list[float], ahead_s: list[float], places: int) -> float
 
 @dataclass(frozen=True)
 class Position:
-    """Where a job is: which tenth of which stage it has reached last."""
+    """Progress of a job: the stage, and the tenth of it, that it has reached last."""
 
     stage: StageName | None = None
-    """None before the first one."""
+    """None before the first stage."""
     tenth: int = 0
     since_s: float = 0.0
-    """How long ago."""
+    """Time in s since the job reached this position."""
     took_s: float | None = None
-    """How long the run had taken until then; None where past runs do not compare."""
+    """Time in s that the run had taken until then; None where it cannot be compared with past runs."""
 
 
 def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastRun], beside: float = 1.0) -> TimeRange:
-    """Range of what remains from a position, from past runs.
+    """Predict the remaining duration of a job at a position, from past runs.
 
     Args:
-        job_size: the features of its size.
-        runs: oldest first.
-        beside: how many jobs are expected to share the workers, this one included.
+        job_size: features of its size, see ``JobSize.features``.
+        runs: past runs, oldest first.
+        beside: number of jobs that are expected to share the workers, this one included.
     """
     job_size = *job_size, math.log(beside)
     compared = [run for run in runs if position.stage is None or position.stage in run.course.reached_s]
     pairs = [_split(run, position) for run in compared]
-    # What was needed so far tells of what is left by as much as it was a part of the whole.
+    # Weight the time taken so far by the mean share of their whole duration that past runs had taken at this position.
     weight = (
         0.0
         if position.took_s is None or not pairs
@@ -132,21 +139,21 @@ def _features(run: PastRun) -> tuple[float, ...]:
 
 
 def _split(run: PastRun, position: Position) -> tuple[float, float]:
-    """How long a run had taken until a position, and took from there."""
+    """Return how long a past run had taken until a position, and how long it took from there, in s."""
     reached_s = 0.0 if position.stage is None else run.course.reached_s[position.stage][position.tenth]
     return max(reached_s, SHORTEST_S), max(run.course.total_s - reached_s, SHORTEST_S)
 
 
 class TimeRanges:
-    """Ranges over one server's jobs.
+    """Time ranges of the jobs of one server.
 
     Args:
-        locate: a job's options with the folder of an uploaded capture.
-        waits_for: what a queued job waits for that does not come by other jobs' ends.
-        machine: class of the machine that runs jobs; None where that is not known before they do.
-        places: most jobs that run side by side.
-        running: how many share the workers now.
-        describe: reads what a capture says of itself.
+        locate: returns a job's options with the folder of an uploaded capture.
+        waits_for: returns what a queued job waits for other than the end of other jobs; None if nothing.
+        machine: class of the machine that runs jobs; None where it is known only once they run.
+        places: largest number of jobs that run side by side.
+        running: returns how many jobs share the workers now.
+        describe: reads the description of a capture.
     """
 
     def __init__(
@@ -163,7 +170,9 @@ class TimeRanges:
         self._places, self._running, self._describe = places, running, describe
 
     def learn(self, job: Job, beside: float = 1.0) -> None:
-        """Remember how a job went that has succeeded, and how many on average ran while it did."""
+        """Record the run of a job that has succeeded; ``beside`` is the mean number of jobs that shared the workers
+        meanwhile.
+        """
         if (size := size_of(self._locate(job.spec), self._describe)) is not None:
             self._repository.past_runs.record(job.id, method_of(job.spec), size, beside)
 
@@ -189,7 +198,7 @@ class TimeRanges:
         return own.after(earlier[: len(running)], earlier[len(running) :], self._places)
 
     def _own(self, job: Job, stages: Begun, past: _Past, beside: float) -> TimeRange:
-        # Without the jobs before it.
+        # This is the range without the time for the jobs that go first.
         if (waits_for := self._waits_for(job)) is not None:
             return TimeRange(reason=waits_for)
         position = _position(job, stages.latest, self._repository.events_of(job.id))
@@ -207,8 +216,8 @@ class TimeRanges:
 
 
 class _Past:
-    """Past runs while one range is told: jobs in a queue are mostly alike, and what is asked for one is known for the
-    others.
+    """Cache of past runs for the time in which one range is calculated, as the jobs in a queue are mostly of the same
+    method.
     """
 
     def __init__(self, repository: Repository) -> None:
@@ -216,7 +225,7 @@ class _Past:
         self._alike: dict[tuple[str, str], list[PastRun]] = {}
 
     def alike(self, method: str, machine: str) -> list[PastRun]:
-        """The newest runs of jobs that did the same on the same class of machine, oldest first."""
+        """Return the newest runs of jobs of the same method on the same class of machine, oldest first."""
         if (method, machine) not in self._alike:
             self._alike[method, machine] = self._runs.alike(method, machine)
         return self._alike[method, machine]
@@ -228,8 +237,8 @@ class _Past:
 
 
 def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position | None:
-    """Where a job is; None within a stage that was begun more than once, as past jobs do not tell how much of it is
-    left.
+    """Return the position of a job; None within a stage that was begun more than once, as past runs do not tell how
+    much of it is left.
     """
     stages = stages_of(job.spec, [event.stage for event in latest])
     if job.state is JobState.QUEUED:
@@ -248,7 +257,7 @@ def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position |
         stage, tenth = last.stage, tenth_of(last.done or 0.0)
         reached_s = log.reached_s(stage, last.attempt, tenth / TENTHS) or reached_s
     is_whole = all(event.attempt == 1 and event.time_s >= job.changed_s for event in latest)
-    is_compared = is_whole and (stage, tenth) != (stages[0], 0)  # until then nothing was done that tells a pace
+    is_compared = is_whole and (stage, tenth) != (stages[0], 0)  # before that nothing was done that tells a pace
     return Position(
         stage,
         tenth,
@@ -258,5 +267,5 @@ def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position |
 
 
 def _following(stages: tuple[StageName, ...], event: JobEvent) -> StageName:
-    """The stage after the one of an event, which itself is the last one's."""
+    """Return the stage after that of an event; after the last stage, the last one again."""
     return stages[min(stages.index(event.stage) + 1, len(stages) - 1)] if event.stage in stages else stages[0]

@@ -1,6 +1,7 @@
-"""How well the fits of jobs went.
+"""Verdicts on how well the fits of jobs went.
 
-Read from the events with which they finished, as many jobs are listed at once and their folders may hang.
+They are read from the events with which fits finish, not from the folders of jobs, because many jobs are listed at once
+and a folder may hang.
 """
 
 from __future__ import annotations
@@ -20,16 +21,17 @@ from services.core.verdict import VERDICT
 from services.pipeline.event_log import event_table
 
 MAX_KEPT = 1024
-"""Verdicts that are kept as they were read: as many as the jobs that are."""
+"""Largest number of verdicts that are kept in memory, the same as of jobs."""
 
 
 _UNREAD: Any = object()
 
 
 class Verdicts:
-    """Of the jobs of one database.
+    """The verdicts on the jobs of one database.
 
-    A fit that has succeeded is judged once; one that runs again succeeds at another time.
+    They are kept by job and time of success: a fit that has succeeded is judged once, and one that runs again succeeds
+    at another time.
     """
 
     def __init__(self, engine: sql.Engine) -> None:
@@ -37,7 +39,7 @@ class Verdicts:
         self._kept: OrderedDict[tuple[str, float], Verdict | None] = OrderedDict()
 
     def judged(self, jobs: Sequence[Job]) -> list[Job]:
-        """Jobs with the verdicts of those that have succeeded."""
+        """Return the jobs, those that have succeeded with their verdicts."""
         succeeded = {(job.id, job.changed_s) for job in jobs if job.state is JobState.SUCCEEDED}
         kept = {key: verdict for key in succeeded if (verdict := self._kept.get(key, _UNREAD)) is not _UNREAD}
         if missing := succeeded - kept.keys():
