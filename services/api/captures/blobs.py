@@ -1,9 +1,9 @@
-"""Contents by their SHA-256 below one folder, and files on their way to become such.
+"""Stores the contents of uploaded files by their SHA-256, and the files that are not complete yet.
 
 ::
 
     blobs/ab/cdef…               a verified content, for its owner alone and read-only
-    partial/<capture>/<number>   what has been received of one file
+    partial/<capture>/<number>   the bytes of one file that are received so far
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class PartialFile:
-    """The end of a file that is being received; whatever lies beyond ``offset`` is cut off first."""
+    """A file that is being received, open to append. Bytes beyond ``offset`` are cut off first."""
 
     def __init__(self, path: Path, offset: int, write: Write) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,7 +59,7 @@ class PartialFile:
             raise _disk_full(problem) from problem
 
     def sync(self) -> None:
-        """Return once everything written would survive a power cut."""
+        """Return once all written bytes would survive a power cut."""
         try:
             os.fsync(self._descriptor)
         except OSError as problem:
@@ -67,38 +67,38 @@ class PartialFile:
 
 
 class Blobs:
-    """The contents that a server holds."""
+    """The contents in the data folder of a server."""
 
     def __init__(self, data: Path, write: Write = os.write) -> None:
         self._blobs, self._partial, self._write = data / "blobs", data / "partial", write
 
     def path(self, sha256: str) -> Path:
-        """Where a content lies, or would."""
+        """Return the path of a content, whether it is there or not."""
         return self._blobs / sha256[:2] / sha256[2:]
 
     def holds(self, sha256: str, size_bytes: int) -> bool:
-        """Whether the content is here."""
+        """Whether a content of this size is stored."""
         try:
             return self.path(sha256).stat().st_size == size_bytes
         except FileNotFoundError:
             return False
 
     def received_bytes(self, capture: str, number: int) -> int:
-        """How much of a partial file is on disk, recorded or not."""
+        """Return how many bytes of a partial file are on the disk, recorded or not."""
         try:
             return self._partial_path(capture, number).stat().st_size
         except FileNotFoundError:
             return 0
 
     def open_partial(self, capture: str, number: int, offset: int) -> PartialFile:
-        """Go on with a file after its first ``offset`` bytes."""
+        """Open a partial file, to append after its first ``offset`` bytes."""
         return PartialFile(self._partial_path(capture, number), offset, self._write)
 
     def adopt(self, capture: str, number: int, sha256: str) -> bool:
-        """Make a received file a content if it has this SHA-256, else discard it; returns which.
+        """Store a received file as a content if it has this SHA-256, else discard it; returns whether it was stored.
 
-        It stays a partial file too, to be discarded once its content is recorded as known: a server that dies before
-        that finds it whole.
+        The partial file stays. The caller discards it once the content is recorded as known, so that after a crash in
+        between the file is found complete.
         """
         partial, final = self._partial_path(capture, number), self.path(sha256)
         with partial.open("rb") as stream:
@@ -115,14 +115,14 @@ class Blobs:
         return True
 
     def discard_partial(self, capture: str, number: int | None = None) -> None:
-        """Forget what was received of one file, or of all files of a capture."""
+        """Delete the received bytes of one file, or of all files of a capture."""
         if number is None:
             shutil.rmtree(self._partial / capture, ignore_errors=True)
         else:
             self._partial_path(capture, number).unlink(missing_ok=True)
 
     def remove(self, sha256: str) -> None:
-        """Forget a content."""
+        """Delete a content."""
         self.path(sha256).unlink(missing_ok=True)
 
     def _partial_path(self, capture: str, number: int) -> Path:
@@ -130,7 +130,7 @@ class Blobs:
 
 
 def sync_folders(*folders: Path) -> None:
-    """Make names in these folders survive a power cut."""
+    """Make the names in these folders survive a power cut."""
     for folder in folders:
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,4 @@
-"""What can be done with uploaded captures. The database owns offsets and states, the disk the contents; see ``blobs``.
+"""Use cases of uploaded captures. The database holds offsets and states, the disk the contents; see ``blobs``.
 
 ::
 
@@ -46,12 +46,12 @@ from services.core.records import JobSpec
 from services.core.settings import UploadLimits
 
 FOLDER = "captures"
-"""Below the data folder; a job names an uploaded capture as ``captures/<id>``."""
+"""Folder of captures below the data folder. A job names an uploaded capture as ``captures/<id>``."""
 
 
 @dataclass(frozen=True)
 class CaptureCreation:
-    """What a manifest led to."""
+    """Result of announcing a capture: the capture, and whether it is new."""
 
     capture: CaptureDetail
     is_new: bool
@@ -63,7 +63,14 @@ def is_uploaded(path: Path) -> bool:
 
 
 class Captures:
-    """Use-cases over one data folder; one instance per data folder."""
+    """Use cases of captures in one data folder; there must be one instance per data folder.
+
+    Args:
+        now_s: returns Unix time in s.
+        free_bytes: returns the free disk space of the data folder in bytes.
+        write: writes bytes to a file descriptor and returns how many, like ``os.write``.
+        reader: reads the contents of files.
+    """
 
     def __init__(
         self,
@@ -85,11 +92,11 @@ class Captures:
     def create(
         self, manifest: UploadManifest, key: str | None = None, viewer: Viewer = LOCAL_VIEWER
     ) -> CaptureCreation:
-        """Open a capture, or find the one that this manifest or idempotency key has led its owner to already.
+        """Open a capture, or find the one that its owner has opened already with this manifest or idempotency key.
 
         Raises:
-            UploadError: a path that no capture may hold; TooLargeError: over a limit. CaptureStateError: the key
-                belongs to another manifest.
+            UploadError: a path that no capture may hold. TooLargeError: over a limit. CorruptUploadError: two files of
+                one SHA-256 differ in size. CaptureStateError: the key belongs to another manifest.
             DiskFullError: too little free disk for it.
         """
         self._require_limits(manifest)
@@ -124,11 +131,11 @@ class Captures:
         return CaptureDetail(**found.model_dump(), path=f"{FOLDER}/{capture}", missing_bytes=missing, files=files)
 
     def calibration(self, capture: str) -> Calibration:
-        """What a committed capture says of its cameras and lights.
+        """Return the cameras and lights of a committed capture.
 
         Raises:
-            UnknownCaptureError: there is no such capture. CaptureStateError: it is not committed. CaptureInputError: it
-                says nothing.
+            UnknownCaptureError: there is no such capture. CaptureStateError: it is not committed. CaptureInputError:
+                its description cannot be read.
         """
         if (state := self._table.get(capture).state) is not CaptureState.COMMITTED:
             raise CaptureStateError(
@@ -137,17 +144,20 @@ class Captures:
         return self._reader.describe(self._data / FOLDER / capture).calibration
 
     def page(self, limit: int, before: int | None = None, viewer: Viewer = LOCAL_VIEWER) -> CapturePage:
-        """Newest captures first, of those that somebody may see."""
+        """Return up to ``limit`` captures that a viewer may see, newest first, of those with a number below
+        ``before``.
+        """
         found = self._table.page(limit + 1, before, None if viewer.sees_all else viewer.owner)
         return CapturePage(captures=found[:limit], next_before=found[limit - 1].number if len(found) > limit else None)
 
     def commit(self, capture: str) -> list[FileFault]:
-        """Publish the capture's folder if nothing is missing or wrong, else return what is.
+        """Publish the capture's folder, or return the files that are missing, corrupt or refused.
 
         Committing again changes nothing.
 
         Raises:
-            ExpiredError: the capture expired. LockedError: a file is still being sent.
+            ExpiredError: the capture expired. LockedError: a file is still being sent. DiskFullError: the folder cannot
+                be published.
         """
         if self._table.get(capture).state is CaptureState.COMMITTED:
             return []
@@ -187,14 +197,14 @@ class Captures:
             self._table.delete(capture)
 
     def sweep(self) -> None:
-        """Let captures expire that were not committed in time, and forget long expired ones."""
+        """Expire the captures that were not committed in time, and delete those that expired long ago."""
         with self._guard:
             now_s = self._now_s()
             for capture in self._table.in_state(CaptureState.OPEN, now_s):
                 if not self._claims.any_of(capture.id):
                     self._retire(capture.id)
             for capture in self._table.in_state(CaptureState.EXPIRED, now_s + self._limits.open_for_s):
-                self._retire(capture.id)  # again, should a server have died in it
+                self._retire(capture.id)  # again, in case a server died in the middle of it
                 if capture.expires_s < now_s - self._limits.open_for_s:
                     self._table.delete(capture.id)
 
@@ -204,7 +214,7 @@ class Captures:
         other paths pass.
 
         Raises:
-            SettingsError: no such capture that whoever submits may see, or it is not committed.
+            SettingsError: there is no such capture that the viewer may see, or it is not committed.
         """
         option, path = ("capture", spec.capture) if spec.rig is None else ("rig.mouth", spec.rig.mouth)
         with self._guard:
@@ -224,7 +234,9 @@ class Captures:
             yield
 
     def locate(self, spec: JobSpec) -> JobSpec:
-        """The job with the folder of an uploaded capture, or of an uploaded mouth of its rig, instead of its name."""
+        """Return the job with the folder of its uploaded capture, or of the uploaded mouth of its rig, instead of the
+        name.
+        """
         if spec.rig is not None and is_uploaded(spec.rig.mouth):
             return spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": self._data / spec.rig.mouth})})
         if spec.capture is None or not is_uploaded(spec.capture):
@@ -283,8 +295,8 @@ class Captures:
             ) from problem
 
     def _retire(self, capture: str) -> None:
-        """Make it expired, then remove its folder, and every content that no other capture has; repeatable at any
-        point.
+        """Mark a capture as expired, then remove its folder and every content that no other capture has. After an
+        interruption at any point this can be repeated.
         """
         self._table.change_state(capture, CaptureState.EXPIRED)
         folder = self._data / FOLDER / capture

@@ -1,4 +1,4 @@
-"""What is looked at in a received file before its capture is accepted: what it declares, never what it decodes to."""
+"""Checks the contents of received files before their capture is accepted, by what they declare; nothing is decoded."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from services.core.settings import UploadLimits
 from services.core.slab.folder import SlabFolder
 
 MAX_TIMES_PACKED = 1100
-"""Deflate packs at most 1032 to 1; a header that declares more than this times the file's size belongs to a bomb or a
-torn file."""
+"""Largest ratio of the size that an image declares to the size of its file. Deflate packs at most 1032 to 1, so a
+larger ratio belongs to a decompression bomb or a torn file."""
 _ITEM_BYTES = {
     "bool": 1,
     "int8": 1,
@@ -36,10 +36,10 @@ _PIXEL_BYTES, _SLAB_PIXEL_BYTES = 4, 8
 
 
 def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[str]) -> str | None:
-    """What is wrong with one file's content, one sentence, None if nothing is.
+    """Describe in one sentence what is wrong with the content of one file; None if nothing is.
 
     Args:
-        path: where the content lies.
+        path: path of the content on this machine.
         name: its path in the capture.
         names: paths of all files of the capture.
     """

@@ -1,4 +1,6 @@
-"""What the server itself needs to know of a capture: its cameras, lights and size, and nothing of its images."""
+"""Reads the description of a capture, from which the server needs the cameras, the lights and the size; images are not
+read.
+"""
 
 from __future__ import annotations
 
@@ -16,29 +18,33 @@ from services.core.settings import UploadLimits
 from services.core.store import MANIFEST
 
 MAX_DESCRIPTION_BYTES = 4 * 2**20
-"""Of a JSON file that is parsed: five thousand images with the longest names, under a thousand lights, take a third of
-it."""
+"""Largest description that is parsed, in bytes. Five thousand images with the longest names, under a thousand lights,
+take a third of it."""
 MAX_CAMERAS = 1000
-"""More than any rig has; with as many lights, what is told of a capture stays below a megabyte."""
+"""Largest number of cameras of a capture, more than any rig has. With as many lights, a ``Described`` stays below a
+megabyte."""
 _PLACES = ("capture.json", DESCRIPTION, MANIFEST, f"capture/{MANIFEST}")
 
 
 class Described(Record):
-    """A capture in short."""
+    """Cameras, lights and size of a capture."""
 
     calibration: Calibration
     image_px: int
-    """Pixels of all its images together."""
+    """Number of pixels of all its images together."""
 
 
 class CaptureReader(Protocol):
-    """Reads what others have written: in this process, or in one of bounded memory and time."""
+    """Reads files that others have written, in this process or in one of bounded memory and time."""
 
     def content_faults(
         self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        """Names of files, which are given with where they lie, and what is wrong with their contents; see
-        ``contents``.
+        """Yield the names of faulty files, each with the fault of its content; see ``contents``.
+
+        Args:
+            files: path on this machine and name in the capture of each file.
+            names: names of all files of the capture.
         """
 
     def describe(self, capture: Path) -> Described:
@@ -65,15 +71,16 @@ Describe = Callable[[Path], Described]
 
 
 def description_file(capture: Path) -> Path | None:
-    """Where a capture, or a job that holds one, says what it is; None if nowhere."""
+    """Return the file with the description of a capture, or of the one that a job holds; None if there is none."""
     return next((path for name in _PLACES if (path := capture / name).is_file()), None)
 
 
 def describe(capture: Path) -> Described:
-    """What a folder capture or a published one says of itself.
+    """Read the description of a folder capture or of a published one.
 
     Raises:
-        CaptureInputError: it cannot be read, or says too much. CorruptStoreError: it was published and is damaged.
+        CaptureInputError: the description cannot be read or is too large. CorruptStoreError: the capture was published
+            and is damaged.
     """
     path = description_file(capture)
     if path is not None and (size := path.stat().st_size) > MAX_DESCRIPTION_BYTES:

@@ -1,4 +1,4 @@
-"""Who is busy with which file, within this process: it is the only server of its data folder."""
+"""Locks on the files of captures. They hold within this process, which is the only server of its data folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from services.client.errors import LockedError
 
 
 class FileLocks:
-    """Files of captures that some request is working on."""
+    """The files of captures that some request is working on."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
@@ -18,10 +18,10 @@ class FileLocks:
 
     @contextmanager
     def claim(self, capture: str, number: int) -> Iterator[None]:
-        """Have a file to oneself.
+        """Hold the lock of a file.
 
         Raises:
-            LockedError: another request has it.
+            LockedError: another request holds it.
         """
         with self._guard:
             if (capture, number) in self._taken:

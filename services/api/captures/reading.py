@@ -1,6 +1,6 @@
-"""The processes that read what uploads hold, so that no file of anybody takes the server's memory or its time.
+"""Reads uploaded files in processes of bounded memory and time, so that no file can take those of the server.
 
-They are started when there is something to read and live on; one that takes too long or dies is replaced. See
+The processes are started on demand and used again; one that takes too long or dies is replaced. See
 ``reading_process``.
 """
 
@@ -25,16 +25,17 @@ from services.core.errors import CaptureInputError, DentineError, PlatformError
 from services.core.settings import UploadLimits
 
 PROCESSES = 2
-"""That read side by side; whoever finds both at work waits."""
+"""Number of processes that read side by side. A request that finds all of them at work waits."""
 MAX_BYTES = 96 * 2**20
-"""Memory of one beyond the 45 MB that it has at its start. The description of five thousand images under a thousand
-lights takes 37 MB."""
+"""Memory in bytes of one process beyond the 45 MB that it has at its start. The description of five thousand images
+under a thousand lights takes 37 MB."""
 MAX_S = 60.0
-"""For one file, of which the largest takes a second on a machine that is not busy."""
+"""Longest time in s for one file that is parsed, or for one batch of others. The largest file takes a second on a
+machine that is not busy."""
 MAX_ANSWER_BYTES = 4 * 2**20
-"""Four times what the cameras and lights of the largest rig take."""
+"""Largest answer of a process in bytes: four times what the cameras and lights of the largest rig take."""
 BATCH = 256
-"""Files of which only headers are read that are asked for at once."""
+"""Number of files in one request, where only the headers of files are read."""
 _PARSED = frozenset({".json", ".toml"})
 
 
@@ -43,10 +44,10 @@ class CostlyFileError(Exception):
 
 
 class ReadingProcess:
-    """One of them, asked by one thread at a time."""
+    """One reading process, used by one thread at a time."""
 
     def __init__(self) -> None:
-        # Nothing of the server's environment goes along, such as a token or a database's password.
+        # Pass on nothing of the server's environment, as it may hold a token or the password of the database.
         environment = {
             "PATH": os.defpath,
             "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
@@ -63,10 +64,12 @@ class ReadingProcess:
             start_new_session=True,
         )
         self.close = weakref.finalize(self, _end, self._process)
-        """Ends it, also where nobody asks for that."""
+        """Ends the process, also when this object is no longer referenced."""
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any] | None:
-        """The answer; None where it died or took too long, and is to be closed."""
+        """Send a request and return the answer; None where the process has died or taken too long, and is to be
+        closed.
+        """
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(json.dumps(request).encode() + b"\n")
@@ -104,7 +107,7 @@ class ReadApart:
     def content_faults(
         self, files: Sequence[tuple[Path, str]], limits: UploadLimits, names: frozenset[str]
     ) -> Iterator[tuple[str, str]]:
-        """Names of files and what is wrong with their contents; ends with the first that cannot be told of within the
+        """Yield the names of faulty files and their faults; ends with the first file that cannot be read within the
         bounds.
         """
         parsed, others = list[tuple[Path, str]](), list[tuple[Path, str]]()
@@ -135,10 +138,10 @@ class ReadApart:
             )
 
     def describe(self, capture: Path) -> Described:
-        """What a capture says of itself; see ``descriptions``.
+        """Read the description of a capture; see ``descriptions``.
 
         Raises:
-            CaptureInputError, CorruptStoreError: it cannot be read, or not within the bounds.
+            CaptureInputError, CorruptStoreError: the description cannot be read, or not within the bounds.
         """
         try:
             return Described.model_validate(self._ask({"capture": str(capture)}, str(capture))["described"])
@@ -146,7 +149,7 @@ class ReadApart:
             raise CaptureInputError(str(problem)) from problem
 
     def close(self) -> None:
-        """End all that read nothing; the others end with what they read."""
+        """End the idle processes; the others end after their current request."""
         with self._lock:
             self._is_closed, idle, self._idle = True, self._idle, []
         for one in idle:
@@ -158,7 +161,7 @@ class ReadApart:
                 process = self._idle.pop() if self._idle else None
             began = time.monotonic()
             answer = process.ask(request) if process is not None else None
-            if answer is None and time.monotonic() - began < MAX_S:  # none was there, or it had died while nobody asked
+            if answer is None and time.monotonic() - began < MAX_S:  # none was idle, or the idle one had died
                 if process is not None:
                     process.close()
                 process = _started()

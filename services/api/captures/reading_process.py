@@ -1,7 +1,8 @@
-"""``python -m services.api.captures.reading_process BYTES``: reads what others have written, in so much memory.
+"""Reads files that others have written: ``python -m services.api.captures.reading_process BYTES``.
 
-Requests and answers are lines of JSON. What a file makes of it ends with this process: too much memory, too much time,
-a fault in a parser. It can write to no file and leaves no dump.
+``BYTES`` is the memory that it may take beyond that at its start. Requests and answers are lines of JSON. Whatever a
+file causes ends with this process: too much memory, too much time, a fault in a parser. The process can write to no
+file and leaves no core dump.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from services.core.errors import DentineError
 from services.core.settings import UploadLimits
 
 GROWN_BYTES = 64 * 2**20
-"""Whoever has taken so much more than at its start ends after its answer, as the memory of what was parsed stays with
-the process."""
+"""Growth in bytes of the memory since the start beyond which the process ends after its answer, because the memory of
+what was parsed stays with the process."""
 
 
 def main(most_bytes: int) -> None:
-    """Answer requests until the pipe is closed."""
+    """Answer requests until the pipe is closed, or the memory has grown by ``GROWN_BYTES``."""
     _bound(most_bytes)
     start_bytes = _peak_bytes()
     for line in sys.stdin.buffer:

@@ -1,7 +1,8 @@
-"""The bytes of one request on their way to disk, with bounded memory.
+"""Writes the bytes of one upload request to disk, with bounded memory.
 
-Blocks are written behind the recorded offset, made durable, and only then recorded. A request with a checksum is
-recorded as a whole once the checksum holds; without one, what came before the connection broke is kept.
+Blocks are appended after the recorded offset, made durable, and only then recorded. A request with a checksum is
+recorded as a whole once the checksum is verified; without a checksum, the bytes that came before the connection broke
+are kept.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from services.core.errors import DentineError, DiskFullError
 
 BLOCK_BYTES = 2**20
 RECORD_BYTES = 64 * 2**20
-"""A long request is recorded every so often, so that a dead server loses no more of it."""
+"""Number of bytes after which a long request is recorded, so that a server that dies loses no more of it."""
 DRAIN_BYTES = 16 * 2**20
-"""Of a refused request so much is read and dropped, so that its client reads the answer and not a broken pipe."""
+"""Number of bytes of a refused request that are read and dropped, so that its client reads the answer and not a broken
+pipe."""
 
 
 class SilenceError(Exception):
@@ -36,7 +38,7 @@ class SilenceError(Exception):
 
 @dataclass(frozen=True)
 class Received:
-    """What a request led to."""
+    """Offset of an upload after a request, and the expiry of its capture as Unix time in s."""
 
     offset: int
     expires_s: float
@@ -89,7 +91,7 @@ async def _append(uploads: Uploads, upload: Upload, body: AsyncIterator[bytes], 
 
 
 def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
-    """Open the file where its next bytes go, to be closed with ``opened``, also if whoever asked has gone meanwhile."""
+    """Open the file at its next byte. It is closed with ``opened``, also if the request is cancelled meanwhile."""
     try:
         return opened.enter_context(uploads.open_partial(upload))
     except OSError as problem:
@@ -110,7 +112,7 @@ class _Tail:
         self.buffer = bytearray()
 
     def flush(self) -> None:
-        """Write what is buffered."""
+        """Write the buffered bytes."""
         block, self.buffer = bytes(self.buffer), bytearray()
         file = self._upload.row.file
         if self._written + len(block) > file.bytes:
@@ -126,13 +128,17 @@ class _Tail:
             self.record()
 
     def record(self) -> Received:
-        """Make durable and known what is written."""
+        """Make the written bytes durable and record them."""
         self._partial.sync()
         self._recorded = self._written
         return Received(self._written, self._uploads.record(self._upload, self._written))
 
     def require_checksum(self) -> None:
-        """Refuse bytes that were altered on their way."""
+        """Refuse bytes that were altered on their way.
+
+        Raises:
+            ChecksumError: the bytes do not have the checksum that was sent with them.
+        """
         if (
             self._hash is not None
             and self._checksum is not None

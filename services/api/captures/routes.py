@@ -23,6 +23,7 @@ from services.client.errors import IncompleteCaptureError
 from services.pipeline.database import MAX_ID
 
 SWEEP_S = 600.0
+"""Time in s between two searches for captures that have expired."""
 
 
 class IncompleteCapture(Problem):
@@ -32,7 +33,9 @@ class IncompleteCapture(Problem):
 
 
 def build_captures_router(captures: Captures) -> APIRouter:
-    """Routes over the given captures, uploads of their files included; while it lives, captures expire."""
+    """Build the routes of captures and of the uploads of their files. While their lifespan is active, captures
+    expire.
+    """
 
     @asynccontextmanager
     async def sweeping(_app: Any) -> AsyncIterator[None]:

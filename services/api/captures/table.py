@@ -1,4 +1,4 @@
-"""Uploaded captures and their files in the database."""
+"""The database tables of uploaded captures and of their files."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _BATCH = 500
 
 @dataclass(frozen=True)
 class FileRow:
-    """One file as recorded."""
+    """One row of the table of files."""
 
     capture: str
     number: int
@@ -59,13 +59,13 @@ class FileRow:
     is_created: bool
     """Whether a client has asked for an upload of it and not terminated it."""
     is_corrupt: bool
-    """Whether its content was received once and was wrong."""
+    """Whether its content was received completely and did not have the SHA-256 of the manifest."""
     is_known: bool = False
     """Whether its owner has sent the whole content, for this capture or another one, and it was verified."""
 
 
 def unknown_capture(capture: str) -> UnknownCaptureError:
-    """What is told of a capture that is not there, or is somebody else's."""
+    """Return the error for a capture that does not exist or belongs to another owner."""
     return UnknownCaptureError(f"There is no capture {capture!r}; list the captures to see their ids.")
 
 
@@ -76,7 +76,8 @@ class CaptureTable:
         self._engine = engine
 
     def find(self, manifest: str, key: str | None) -> Capture | None:
-        """The capture of this manifest or of this idempotency key, both as its owner's.
+        """Find the capture of this manifest or of this idempotency key; both texts contain the owner. None if there is
+        none.
 
         Raises:
             CaptureStateError: the key belongs to another manifest.
@@ -103,7 +104,14 @@ class CaptureTable:
         expires_s: float,
         owner: str = DEFAULT_GROUP,
     ) -> Capture:
-        """Add an open capture; of each file it is told whether its owner has sent the content already."""
+        """Insert an open capture and its files.
+
+        Args:
+            digest: identifies the manifest and its owner.
+            known: whether the owner has sent the content already, for each file.
+            created_s: Unix time.
+            expires_s: Unix time.
+        """
         identity = secrets.token_hex(8)
         files = [
             {
@@ -154,7 +162,9 @@ class CaptureTable:
         return _capture(row)
 
     def page(self, limit: int, before: int | None, owner: str | None = None) -> list[Capture]:
-        """Newest captures first, those with a number below ``before``; everybody's unless an owner is named."""
+        """Return up to ``limit`` captures, newest first, of those with a number below ``before``; those of all owners
+        unless one is named.
+        """
         query = sql.select(capture_table).order_by(capture_table.c.number.desc()).limit(limit)
         if owner is not None:
             query = query.where(capture_table.c.owner == owner)
@@ -164,7 +174,7 @@ class CaptureTable:
             return [_capture(row) for row in connection.execute(query).mappings()]
 
     def files(self, capture: str) -> list[FileRow]:
-        """A capture's files in the manifest's order."""
+        """Return the files of a capture in the order of its manifest."""
         query = sql.select(file_table).where(file_table.c.capture == capture).order_by(file_table.c.number)
         with self._engine.connect() as connection:
             return [_file(row) for row in connection.execute(query).mappings()]
@@ -211,7 +221,7 @@ class CaptureTable:
                 )
 
     def known(self, contents: Iterable[str], owner: str) -> set[str]:
-        """Those contents that an owner has sent whole."""
+        """Return those contents, by SHA-256, that an owner has sent completely."""
         wanted, found = sorted(set(contents)), set[str]()
         own = sql.select(capture_table.c.id).where(capture_table.c.owner == owner)
         with self._engine.connect() as connection:
@@ -224,7 +234,7 @@ class CaptureTable:
         return found
 
     def mark_known(self, sha256: str, capture: str) -> None:
-        """Record that every file of this content is received, in the captures that belong to the owner of one."""
+        """Record a content as received for every file that has it, in all captures of the owner of ``capture``."""
         owner = sql.select(capture_table.c.owner).where(capture_table.c.id == capture).scalar_subquery()
         own = sql.select(capture_table.c.id).where(capture_table.c.owner == owner)
         values = {"received_bytes": file_table.c.bytes, "is_corrupt": False, "is_known": True}
@@ -242,18 +252,18 @@ class CaptureTable:
             connection.execute(capture_table.update().where(capture_table.c.id == capture).values(values))
 
     def delete(self, capture: str) -> None:
-        """Forget a capture and its files."""
+        """Delete the rows of a capture and of its files."""
         with writing(self._engine) as connection:
             connection.execute(file_table.delete().where(file_table.c.capture == capture))
             connection.execute(capture_table.delete().where(capture_table.c.id == capture))
 
     def delete_files(self, capture: str) -> None:
-        """Forget a capture's files."""
+        """Delete the rows of the files of a capture."""
         with writing(self._engine) as connection:
             connection.execute(file_table.delete().where(file_table.c.capture == capture))
 
     def in_state(self, state: CaptureState, expiring_before_s: float) -> list[Capture]:
-        """Captures of a state whose expiry lies before a time."""
+        """Return the captures in a state that expire before a time."""
         query = sql.select(capture_table).where(
             capture_table.c.state == state, capture_table.c.expires_s < expiring_before_s
         )
@@ -261,7 +271,7 @@ class CaptureTable:
             return [_capture(row) for row in connection.execute(query).mappings()]
 
     def outstanding_bytes(self) -> int:
-        """Bytes that open captures have still to receive."""
+        """Return how many bytes all open captures have still to receive."""
         missing = sql.func.sum(file_table.c.bytes - file_table.c.received_bytes)
         query = (
             sql.select(missing)
@@ -272,7 +282,7 @@ class CaptureTable:
             return int(connection.scalar(query) or 0)
 
     def unreferenced(self, contents: Iterable[str], besides: str) -> set[str]:
-        """Those contents that no file of another capture has."""
+        """Return those contents that no file of a capture other than ``besides`` has."""
         wanted = sorted(set(contents))
         used: set[str] = set()
         with self._engine.connect() as connection:
@@ -286,7 +296,7 @@ class CaptureTable:
         return set(wanted) - used
 
     def job_with(self, path: str) -> str | None:
-        """Id of a job that names this capture."""
+        """Return the id of a job that names this capture; None if there is none."""
         query = sql.select(job_table.c.id).where(job_table.c.spec.like(f'%"{path}"%')).limit(1)
         with self._engine.connect() as connection:
             return connection.scalar(query)

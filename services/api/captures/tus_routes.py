@@ -1,4 +1,4 @@
-"""tus 1.0 below ``/v1/uploads``: one file of a capture each.
+"""Routes of the upload protocol tus 1.0 below ``/v1/uploads``; each upload is one file of a capture.
 
 Annotations are evaluated here, because FastAPI reads them.
 """
@@ -24,7 +24,7 @@ FileNumber = Annotated[int, Path(ge=0, le=MAX_ID, description="number of the fil
 
 
 class TusRoute(APIRoute):
-    """Names the protocol's version in every answer, refusals included."""
+    """A route that names the version of the protocol in every answer, refusals included."""
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -46,7 +46,7 @@ def require_version(
 
 
 def build_tus_router(uploads: Uploads) -> APIRouter:
-    """Routes over the given uploads."""
+    """Build the routes over the given uploads."""
     router = APIRouter(
         prefix="/v1/uploads",
         route_class=TusRoute,

@@ -1,6 +1,6 @@
-"""One file of a capture on its way here: what is recorded of it, and what may be done next.
+"""The upload of one file of a capture: its recorded state, and the steps that the state allows.
 
-``receiving`` moves the bytes, ``tus_routes`` speaks.
+``receiving`` moves the bytes, ``tus_routes`` speaks the protocol.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from services.core.settings import UploadLimits
 
 
 def upload_path(capture: str, number: int) -> str:
-    """Where a file of a capture is sent to."""
+    """Return the path to which a file of a capture is sent."""
     return f"/v1/uploads/{capture}/{number}"
 
 
@@ -28,17 +28,19 @@ class Upload:
 
     row: FileRow
     offset: int
-    """Bytes that are here and need not be sent again."""
+    """Number of bytes that are received and need not be sent again."""
     expires_s: float
 
     @property
     def missing_bytes(self) -> int:
-        """Still to come."""
+        """Number of bytes that are still to be sent."""
         return self.row.file.bytes - self.offset
 
 
 class Uploads:
-    """Offsets are recorded only once their bytes are durable, so a dead server loses no acknowledged byte."""
+    """The uploads of one server. An offset is recorded only once its bytes are durable, so that a server that dies
+    loses no acknowledged byte.
+    """
 
     def __init__(
         self, table: CaptureTable, blobs: Blobs, claims: FileLocks, limits: UploadLimits, now_s: Callable[[], float]
@@ -47,11 +49,11 @@ class Uploads:
         self._table, self._blobs, self._now_s = table, blobs, now_s
 
     def create(self, capture: str, path: str, size_bytes: int, viewer: Viewer = LOCAL_VIEWER) -> Upload:
-        """Ask to send one file of a capture that whoever asks may see; asking again changes nothing.
+        """Create the upload of one file of a capture that the viewer may see. Creating it again changes nothing.
 
         Raises:
-            UnknownCaptureError: no such capture or file. CorruptUploadError: its size is another. ExpiredError,
-                CaptureStateError: the capture is not open.
+            UnknownCaptureError: no such capture or file. CorruptUploadError: its size is not that of the manifest.
+                ExpiredError, CaptureStateError: the capture is not open.
         """
         if not viewer.may_see(self._table.get(capture).owner):
             raise unknown_capture(capture)
@@ -66,7 +68,7 @@ class Uploads:
         return self.find(capture, row.number)
 
     def find(self, capture: str, number: int) -> Upload:
-        """A created upload and how far it is.
+        """Return an upload that was created, with its offset.
 
         Raises:
             UnknownCaptureError: no such capture or file, or no upload of it. ExpiredError: the capture expired.
@@ -80,10 +82,10 @@ class Uploads:
         return Upload(row, self.received_bytes(row), self._table.get(capture).expires_s)
 
     def begin(self, capture: str, number: int, offset: int) -> Upload:
-        """What to receive next at this offset; hold the file's claim.
+        """Return the upload if its next byte is at this offset. The caller must hold the file's lock.
 
         Raises:
-            OffsetError: the next byte is another one. CaptureStateError: the capture is committed.
+            OffsetError: the offset of the next byte is another one. CaptureStateError: the capture is committed.
         """
         self.require_open(capture)
         upload = self.find(capture, number)
@@ -95,20 +97,22 @@ class Uploads:
         return upload
 
     def open_partial(self, upload: Upload) -> PartialFile:
-        """Where its next bytes go."""
+        """Open the file of an upload at its next byte."""
         return self._blobs.open_partial(upload.row.capture, upload.row.number, upload.offset)
 
     def record(self, upload: Upload, offset: int) -> float:
-        """Record what is durably on disk; returns when the capture now expires."""
+        """Record up to which offset bytes are durably on disk; returns the new expiry of the capture as Unix time in
+        s.
+        """
         expires_s = self._now_s() + self.limits.open_for_s
         self._table.change_file(upload.row.capture, upload.row.number, expires_s, received_bytes=offset)
         return expires_s
 
     def finish(self, row: FileRow) -> None:
-        """Verify a file of which every byte is received; hold its claim.
+        """Verify a file of which every byte is received. The caller must hold its lock.
 
         Raises:
-            CorruptUploadError: its SHA-256 is another; what was received is discarded.
+            CorruptUploadError: its SHA-256 is not that of the manifest; the received bytes are discarded.
         """
         file = row.file
         if not self.is_known(row) and not self._blobs.adopt(row.capture, row.number, file.sha256):
@@ -121,7 +125,7 @@ class Uploads:
         self._blobs.discard_partial(row.capture, row.number)
 
     def terminate(self, capture: str, number: int) -> None:
-        """Discard what was received of a file, and its upload.
+        """Discard the received bytes of a file, and its upload.
 
         Raises:
             LockedError: it is being sent. CaptureStateError: the capture is committed.
@@ -135,15 +139,15 @@ class Uploads:
             )
 
     def is_known(self, row: FileRow) -> bool:
-        """Whether the whole content is here and verified, and its owner has sent it.
+        """Whether the content is stored and verified, and the owner of the capture has sent it.
 
-        A content that others have sent must be sent again: who knows its SHA-256 alone shall neither get it nor learn
-        that it is here.
+        A content that only others have sent must be sent again: somebody who knows nothing but its SHA-256 must neither
+        get it nor learn that it is stored.
         """
         return row.is_known and self._blobs.holds(row.file.sha256, row.file.bytes)
 
     def received_bytes(self, row: FileRow) -> int:
-        """As recorded, but never more than the disk holds."""
+        """Return the recorded number of received bytes, but never more than the disk holds."""
         if self.is_known(row):
             return row.file.bytes
         return min(row.received_bytes, self._blobs.received_bytes(row.capture, row.number))
