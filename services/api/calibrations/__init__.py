@@ -1,1 +1,1 @@
-"""Calibrations that captures and jobs name."""
+"""Calibrations that are stored under names and that jobs refer to."""

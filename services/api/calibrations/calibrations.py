@@ -1,10 +1,10 @@
-"""Calibrations by name. A name, once put, never means another content; jobs refer to the content.
+"""Calibrations by name. The content of a name never changes; jobs refer to the content.
 
 ::
 
     calibrations/<id>.json             the content; its id is the SHA-256 of these bytes
     calibrations/names/<name>.json     which content a name means in the default group
-    calibrations/owners/<owner>/<name>.json    and to another owner: each has names of his own
+    calibrations/owners/<owner>/<name>.json    and to another owner, who has names of its own
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from services.core.records import JobSpec
 from services.core.store import read_record, write_atomic, write_record
 
 FOLDER = "calibrations"
-"""Below the data folder; a job names a calibration as ``calibrations/<id>``."""
+"""Folder of calibrations below the data folder. A job names a calibration as ``calibrations/<id>``."""
 NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}"
 _ID = re.compile(r"[0-9a-f]{64}")
 
 
 class StoredName(Record):
-    """What a name means, as it is stored."""
+    """The content that a name means, as it is stored."""
 
     name: str
     id: str = Field(description="SHA-256 of its content: the same for the same cameras, lights and channels")
@@ -69,24 +69,28 @@ class CalibrationDetail(NamedCalibration):
 
 @dataclass(frozen=True)
 class CalibrationCreation:
-    """What a put led to."""
+    """Result of putting a calibration: its details, and whether its name is new."""
 
     detail: CalibrationDetail
     is_new: bool
 
 
 class Calibrations:
-    """Use-cases over one data folder."""
+    """Use cases of the calibrations in one data folder.
+
+    Args:
+        now_s: returns Unix time in s.
+    """
 
     def __init__(self, data: Path, now_s: Callable[[], float] = time.time) -> None:
         self._folder, self._now_s = data / FOLDER, now_s
 
     def put(self, name: str, calibration: Calibration, viewer: Viewer = LOCAL_VIEWER) -> CalibrationCreation:
-        """Store a calibration under a name of whoever puts it. Putting the same again changes nothing.
+        """Store a calibration under a name of the viewer's owner. Putting the same again changes nothing.
 
         Raises:
-            CaptureInputError: names or channels contradict each other. CalibrationTakenError: the name means another
-                content.
+            CaptureInputError: names or channels of the calibration contradict each other. CalibrationTakenError: the
+                name exists with another content.
         """
         require_consistent(calibration, f"Calibration {name}")
         content = (calibration.model_dump_json(indent=1) + "\n").encode()
@@ -113,21 +117,24 @@ class Calibrations:
         return CalibrationCreation(self._detail(known, calibration), is_new)
 
     def list(self, viewer: Viewer = LOCAL_VIEWER) -> list[NamedCalibration]:
-        """Those that somebody may see, newest first."""
+        """Return the calibrations that a viewer may see, newest first."""
         return [self._judged(entry) for entry in self._entries(viewer)]
 
     def get(self, name: str, viewer: Viewer = LOCAL_VIEWER) -> CalibrationDetail:
-        """One calibration, by its name: one's own first, for those who see all.
+        """Return a calibration by its name; for a viewer who sees all, that of the viewer's own owner first.
 
         Raises:
-            UnknownCalibrationError: there is none of this name that he may see.
+            UnknownCalibrationError: there is none of this name that the viewer may see.
         """
         entry = self._named(name, viewer)
         return self._detail(entry, read_record(self._content(entry.id), Calibration))
 
     def by_content(self, spec: JobSpec, viewer: Viewer = LOCAL_VIEWER) -> JobSpec:
-        """The job with the id of what it calls ``calibrations/<name>``, so that it means the same for ever; others as
-        they are.
+        """Return the job with the id of the content instead of the name in ``calibrations/<name>``, so that it means
+        the same for ever; other jobs are returned as they are.
+
+        Raises:
+            SettingsError: there is none of this name that the viewer may see.
         """
         path = spec.calibration
         if path is None or not is_stored(path) or _ID.fullmatch(path.name):
@@ -138,16 +145,16 @@ class Calibrations:
             raise SettingsError(f"Option 'calibration': {problem.message}") from problem
 
     def require(self, path: Path, viewer: Viewer = LOCAL_VIEWER, *, accepted: bool = True) -> None:
-        """Refuse the option of a job that names a calibration that is not here, is somebody else's, or is beyond its
-        limits.
+        """Refuse the option of a job that names a calibration which does not exist, belongs to another owner, or is
+        beyond its limits.
 
         Args:
             path: ``calibrations/<id>``.
-            viewer: who asks.
-            accepted: also take one that is beyond its limits.
+            viewer: who submits the job.
+            accepted: whether a calibration beyond its limits is accepted.
 
         Raises:
-            SettingsError: there is none of this id that he may see, or it is not to be used.
+            SettingsError: there is none of this id that the viewer may see, or it is beyond its limits.
         """
         entries = [entry for entry in self._entries(viewer) if entry.id == path.name]
         is_id = _ID.fullmatch(path.name) is not None and self._content(path.name).is_file()
@@ -159,7 +166,7 @@ class Calibrations:
             raise SettingsError(f"Option 'calibration': {refusal(bad.name, bad.broken or ())}")
 
     def locate(self, spec: JobSpec) -> JobSpec:
-        """The job with a stored calibration's file instead of its id."""
+        """Return the job with the file of a stored calibration instead of its id."""
         if spec.calibration is None or not is_stored(spec.calibration):
             return spec
         return spec.model_copy(update={"calibration": self._content(spec.calibration.name)})
@@ -186,7 +193,7 @@ class Calibrations:
         return self._folder / "names" if owner == DEFAULT_GROUP else self._folder / "owners" / owner
 
     def _seen(self, viewer: Viewer) -> tuple[Path, ...]:
-        # Folders of names, one's own first.
+        # Return the folders of names that a viewer may see, that of the viewer's own owner first.
         own, others = (
             self._names(viewer.owner),
             [self._names(DEFAULT_GROUP), *sorted((self._folder / "owners").glob("*"))],
@@ -197,7 +204,7 @@ class Calibrations:
         return self._folder / f"{calibration_id}.json"
 
     def _take_name(self, entry: StoredName) -> bool:
-        # A hard link is made once, whichever request is first.
+        # Creating a hard link is atomic, so that exactly one of several requests takes a name.
         written = self._folder / f".{secrets.token_hex(8)}"
         write_record(written, entry)
         try:

@@ -1,4 +1,4 @@
-"""What calibration jobs made, to be put under names."""
+"""Reads the calibrations that jobs have made, to be stored under names."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ KIND = "calibration"
 
 
 def made_by(jobs: Jobs, job_id: str) -> Calibration:
-    """The record of a calibration job.
+    """Return the calibration that a job has made.
 
     Raises:
-        UnknownJobError: there is no such job. JobStateError: it makes no calibration, or has made none yet.
-            CorruptStoreError: its files are not as they were published.
+        UnknownJobError: there is no such job. JobStateError: the job makes no calibration, or has made none yet.
+            CorruptStoreError: the files of the job are not as they were published.
     """
     job = jobs.repository.get(job_id)
     if job.spec.kind != KIND:

@@ -28,10 +28,10 @@ Name = Annotated[str, PathParameter(pattern=f"^{NAME}$", description="1 to 60 le
 def build_calibrations_router(
     calibrations: Calibrations, captures: Captures, jobs: Jobs, openers: ThreadPool
 ) -> APIRouter:
-    """Routes over the given calibrations, those that captures bring along, and those that jobs made.
+    """Build the routes of stored calibrations, of those in captures, and of those that jobs have made.
 
     Args:
-        openers: read the files of jobs.
+        openers: threads that read the files of jobs.
     """
     router = APIRouter(prefix="/v1", route_class=BodyRoute, tags=["calibrations"], responses=refusals(404, 409, 422))
 

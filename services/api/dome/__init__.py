@@ -1,1 +1,1 @@
-"""The dome by hand: look, one light, ALL OFF, preflight."""
+"""Manual operation of the dome: its state, one light, ALL OFF, preflight."""

@@ -1,6 +1,6 @@
-"""What can be done with the dome by hand: look, ALL OFF, one light, preflight.
+"""Use cases of the dome by hand: its state, ALL OFF, one light, preflight.
 
-What drives it is a process of its own; see ``process``.
+A process of its own drives the dome; see ``process``.
 """
 
 from __future__ import annotations
@@ -27,11 +27,15 @@ from services.core.records import Number, RigSpec, Unit, Whole
 from services.core.settings import DomeSettings
 
 ANSWER_S = 30.0
+"""Longest time in s that a command takes, unless it is a preflight or the first attempt of ALL OFF."""
 PREFLIGHT_S = 300.0
+"""Longest time in s that a preflight takes."""
 OFF_S = 5.0
-"""A process that has not switched off by then is ended, and another one does it."""
+"""Time in s after which a process that has not switched off is ended, and another one switches off."""
 BUSY_S = 1.0
+"""Time in s that a command by hand waits for another one to end before it is refused."""
 LONGEST_LIGHT_S = 30.0
+"""Longest time in s that a light can be switched on for by one request."""
 
 
 class LightRequest(Record):
@@ -73,7 +77,7 @@ class PreflightResult(Record):
 
 
 class Dome:
-    """Use-cases over the server's dome; ``start`` and ``close`` frame the time in which it is worked."""
+    """Use cases of the server's dome, between ``start`` and ``close``."""
 
     def __init__(self, settings: DomeSettings, jobs: Jobs) -> None:
         self._settings, self._limits = settings, LightLimits(settings)
@@ -81,7 +85,7 @@ class Dome:
         self._driving = threading.Lock()
 
     def start(self) -> None:
-        """Start the process, so that the first ALL OFF need not wait for it."""
+        """Start the process that drives the dome, so that the first ALL OFF need not wait for it."""
         if self._address is not None:
             try:
                 self._process.start()
@@ -89,31 +93,32 @@ class Dome:
                 logging.getLogger(__name__).warning("%s", problem)
 
     def close(self) -> None:
-        """Leave the dome dark."""
+        """End the process, which leaves the dome dark."""
         self._process.close()
 
     def state(self, viewer: Viewer = LOCAL_VIEWER) -> DomeState:
-        """What the controller says; nothing waits for it and it disturbs no capture.
+        """Read the state from the controller. This disturbs no capture, and no other command waits for it.
 
         Raises:
-            UnknownDomeError: this server has none. RigError: it does not answer.
+            UnknownDomeError: this server has no dome. RigError: the dome does not answer.
         """
         status = _status(self._ask(ANSWER_S, do="status"))
         shown, others = _shown(self._jobs.capturing(), viewer)
         return DomeState(address=self._address or "", status=status, capturing=shown, others_capturing=others)
 
     def all_off(self, viewer: Viewer = LOCAL_VIEWER) -> AllOff:
-        """Switch every light off and stop every capture; waits for nobody who has the dome.
+        """Switch every light off and stop every capture, without waiting for whatever is using the dome.
 
-        The dome refuses light from then on. Captures are cancelled as well, queued ones too, as whichever begins next
-        would arm the dome anew; then the dome is stopped again, for one that has done so meanwhile.
+        The dome refuses light from then on. Captures are cancelled as well, queued ones too, because the next one that
+        begins would arm the dome again. Then the dome is switched off once more, in case a capture has armed it
+        meanwhile.
 
         Raises:
-            UnknownDomeError: this server has none. RigError: darkness could not be confirmed.
+            UnknownDomeError: this server has no dome. RigError: darkness could not be confirmed.
         """
         with ThreadPoolExecutor(1, "stop captures") as stopping:
-            # Beside each other: captures may have other domes, and neither a dome nor a database that hangs keeps the
-            # other from being told.
+            # Do both at the same time: captures may have other domes, and a dome or a database that hangs must not keep
+            # the other one from being asked.
             stopped = stopping.submit(self._stop_captures)
             with suppress(DentineError):
                 self._switch_off()
@@ -122,11 +127,11 @@ class Dome:
         return AllOff(status=status, stopped=shown, others_stopped=others)
 
     def light(self, wanted: LightRequest, viewer: Viewer = LOCAL_VIEWER) -> DomeStatus:
-        """Switch one light on for a while.
+        """Switch one light on for a limited time.
 
         Raises:
-            UnknownDomeError: this server has none. DomeBusyError: a capture or a preflight has it. SettingsError: no
-                such light. RigError and its kinds.
+            UnknownDomeError: this server has no dome. DomeBusyError: a capture or a preflight uses a dome.
+                SettingsError: the level is above the limit, or there is no such light. RigError and its kinds.
         """
         if wanted.level > self._settings.max_level:
             raise SettingsError(
@@ -137,10 +142,10 @@ class Dome:
             return _status(self._ask(ANSWER_S, do="light", **wanted.model_dump()))
 
     def dark(self) -> DomeStatus:
-        """Switch the light off that was switched on by hand; a capture is left alone.
+        """Switch off the light that was switched on by hand; a capture is not affected.
 
         Raises:
-            UnknownDomeError: this server has none. DomeBusyError: a preflight has it. RigError and its kinds.
+            UnknownDomeError: this server has no dome. DomeBusyError: a preflight uses it. RigError and its kinds.
         """
         return _status(self._ask(ANSWER_S, do="dark"))
 
@@ -148,8 +153,8 @@ class Dome:
         """Light every light for a moment and look through the cameras.
 
         Raises:
-            UnknownDomeError: this server has none. DomeBusyError: a capture has it. SettingsError, CaptureInputError:
-                the rig. RigError and its kinds.
+            UnknownDomeError: this server has no dome. DomeBusyError: a capture or another preflight uses a dome.
+                SettingsError, CaptureInputError: the rig is refused. RigError and its kinds.
         """
         if "dome" in rig.model_fields_set and rig.dome != self._address:
             raise SettingsError(f"'dome': this server works the dome at {self._address} and no other; leave it out.")
@@ -160,7 +165,7 @@ class Dome:
             return PreflightResult(findings=self._ask(PREFLIGHT_S, do="preflight", rig=rig).findings)
 
     def make_way(self) -> None:
-        """End a light by hand before a capture begins; a preflight is awaited."""
+        """Switch off a light that was switched on by hand, before a capture begins; a preflight is waited for."""
         with self._driving:
             if self._process.is_running:
                 with suppress(DentineError):
@@ -168,7 +173,8 @@ class Dome:
 
     @contextmanager
     def _driven_by_hand(self, viewer: Viewer) -> Iterator[None]:
-        # Held while the question is asked whether a capture runs: one that begins afterwards makes its way after us.
+        # Hold the lock while looking for running captures: a capture that begins afterwards waits for it in
+        # ``make_way``.
         if not self._driving.acquire(timeout=BUSY_S):
             raise DomeBusyError("The dome is busy with a preflight; wait for it, or press ALL OFF.")
         try:
@@ -216,7 +222,7 @@ class Dome:
 
 
 def _shown(jobs: Sequence[Job], viewer: Viewer) -> tuple[tuple[str, ...], int]:
-    """Ids of those jobs that somebody may see, and how many others there are."""
+    """Return the ids of those jobs that a viewer may see, and the number of the others."""
     shown = tuple(job.id for job in jobs if viewer.may_see(job.owner))
     return shown, len(jobs) - len(shown)
 

@@ -1,5 +1,6 @@
-"""The process that works the dome for this server; ``services.capture.console`` by name, as it is not installed with
-every server.
+"""Runs the process that drives the dome for this server.
+
+It is started as ``services.capture.console``, by name, as that is not installed with every server.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ END_S = 10.0
 
 
 class DomeProcess:
-    """Started when it is first needed and again after it died.
+    """The process that drives the dome. It is started when it is first needed, and again after it has died.
 
-    It ends dark with the pipe to it, however this process ends. A thread of its own writes to the pipe, as a process
-    that no longer reads lets whoever writes wait: nobody else does, and the lock is free for ``kill``.
+    When the pipe to it closes, it switches the dome dark and ends, so that this happens however the server ends. A
+    thread of its own writes to the pipe, because writing blocks while the process does not read: no other thread waits
+    for that, and the lock stays free for ``kill``.
     """
 
     def __init__(self, settings: DomeSettings) -> None:
@@ -38,15 +40,15 @@ class DomeProcess:
 
     @property
     def is_running(self) -> bool:
-        """Whether there is one; what is not running holds no light."""
+        """Whether the process runs; one that does not run holds no light."""
         return self._process is not None and self._process.poll() is None
 
     def ask(self, timeout_s: float, **command: Any) -> DomeAnswer:
-        """Have a command carried out, beside whatever else is being carried out.
+        """Have a command carried out, in parallel with the commands under way.
 
         Raises:
-            DentineError: what the command ended in. TimeoutError: no answer in time. PlatformError: the packages of the
-                dome are not installed.
+            DentineError: the error that the command ended with. TimeoutError: there was no answer in time.
+                PlatformError: the packages of the dome are not installed.
         """
         asked = DomeCommand.model_validate({"number": next(self._numbers)} | command)
         future: Future[DomeAnswer] = Future()
@@ -64,7 +66,7 @@ class DomeProcess:
         return answer
 
     def start(self) -> None:
-        """Start it if it is not running, so that nobody waits for that later.
+        """Start the process if it does not run, so that no later command waits for that.
 
         Raises:
             PlatformError: the packages of the dome are not installed.
@@ -78,7 +80,7 @@ class DomeProcess:
             self._end(0.0)
 
     def close(self) -> None:
-        """Have it end dark."""
+        """Let the process switch the dome dark and end."""
         with self._lock:
             self._end(END_S)
 
@@ -101,7 +103,7 @@ class DomeProcess:
         if importlib.util.find_spec("pymodbus") is None:
             raise PlatformError("The dome's packages are not installed on the server; install dentine[capture].")
         command = [sys.executable, "-m", DOOR, self._settings.model_dump_json()]
-        # A session of its own: Ctrl-C must not reach it before the server has closed its pipe.
+        # The process has a session of its own, because Ctrl-C must not reach it before the server has closed its pipe.
         self._process = subprocess.Popen(  # noqa: S603
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
@@ -117,7 +119,7 @@ def _speak(
     commands: queue.SimpleQueue[DomeCommand | None],
     waiting: dict[int, Future[DomeAnswer]],
 ) -> None:
-    """Write every command, then close the pipe, which is what ends the process."""
+    """Write every command, then close the pipe, which makes the process end."""
     assert process.stdin is not None
     for command in iter(commands.get, None):
         try:

@@ -12,7 +12,7 @@ from services.core.records import RigSpec
 
 
 def build_dome_router(dome: Dome, darkeners: ThreadPool, operators: ThreadPool) -> APIRouter:
-    """Routes over the given dome; ``darkeners`` do nothing but switch off, ``operators`` all else."""
+    """Build the routes over the given dome. ALL OFF runs in ``darkeners``, all else in ``operators``."""
     router = APIRouter(prefix="/v1/dome", route_class=BodyRoute, tags=["dome"], responses=refusals(404, 409, 422, 502))
 
     @router.get("", dependencies=[needs("operate-dome")])

@@ -1,6 +1,6 @@
-"""What Prometheus may scrape, in a registry of the application's own.
+"""Metrics for Prometheus, in a registry of the application's own.
 
-Labels take only values that the program itself names.
+Labels take only values that the program itself defines.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class RequestMetrics:
 
 
 def build_registry(engine: sql.Engine, readiness: Readiness, free_bytes: Callable[[], int]) -> CollectorRegistry:
-    """A registry over one server's database; requests are added by ``RequestMetrics``."""
+    """Build the registry of one server; the metrics of requests are added by ``RequestMetrics``."""
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
     registry.register(ServiceCollector(engine, readiness, free_bytes))
@@ -63,7 +63,9 @@ def build_registry(engine: sql.Engine, readiness: Readiness, free_bytes: Callabl
 
 
 class ServiceCollector(Collector):
-    """Asks the database at every scrape, in a few queries on indices; tells that it is down instead of failing."""
+    """Collects the metrics of jobs from the database at every scrape, in a few queries on indices. Where the database
+    is down, it reports that instead of failing.
+    """
 
     def __init__(self, engine: sql.Engine, readiness: Readiness, free_bytes: Callable[[], int]) -> None:
         self._engine, self._readiness, self._free_bytes = engine, readiness, free_bytes
@@ -71,14 +73,14 @@ class ServiceCollector(Collector):
         self._steps, self._counted_to = 0, self._newest_event()
 
     def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
-        """All families."""
+        """Yield all families of metrics."""
         checks = self._readiness.checks()
         yield _gauge("dentine_up", "1 where the part works", "part", ((check.name, check.ok) for check in checks))
         ok = {check.name: check.ok for check in checks}
         with suppress(OSError):
             yield GaugeMetricFamily("dentine_disk_free_bytes", "Free space where jobs are stored", self._free_bytes())
         if ok["database"]:
-            with suppress(sql.exc.SQLAlchemyError):  # went down since it was checked
+            with suppress(sql.exc.SQLAlchemyError):  # the database went down since the check
                 yield from self._of_database()
 
     def _of_database(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
@@ -108,7 +110,7 @@ class ServiceCollector(Collector):
         )
 
     def _count_steps(self) -> int:
-        """Only rows that are new since the last scrape are looked at."""
+        """Return how many steps fits have taken since this server started; only rows since the last scrape are read."""
         with self._counting, self._engine.connect() as connection:
             newest = connection.scalar(sql.select(sql.func.max(event_table.c.id))) or 0
             fresh = event_table.c.id.between(self._counted_to + 1, newest)
@@ -128,7 +130,7 @@ def _counts(connection: sql.Connection, query: sql.Select[Any]) -> dict[str, int
 
 
 def _running_stages() -> sql.Select[Any]:
-    """How many jobs are in each stage, from the last staged event of each job that runs."""
+    """Build the query of how many jobs are in each stage, from the last event with a stage of each job that runs."""
     of_job = event_table.alias()
     last = (
         sql.select(of_job.c.id)

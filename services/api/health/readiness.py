@@ -1,4 +1,4 @@
-"""Whether a submitted job would run: each thing that it needs is tried, not assumed."""
+"""Checks whether a submitted job would run; everything that it needs is tried, not assumed."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from services.pipeline.event_log import event_table
 from services.pipeline.workers import require_scheduler
 
 PROBE_S = 1.0
-"""How long the database may take to grant a write."""
+"""Longest time in s that the database may take to grant a write."""
 STORE_PROBE_S = 3.0
-"""How long the store may take for a small file."""
+"""Longest time in s that the store may take to write a small file."""
 _BLOCK = bytes(4096)
 
 CheckName = Literal["database", "scheduler", "workers", "store", "disk"]
@@ -38,15 +38,16 @@ class Check(Record):
 
 
 class Readiness:
-    """Tries what a job needs.
+    """Tries everything that a job needs.
 
     Args:
         jobs_folder: where jobs are stored.
-        is_running: whether queued jobs are run.
-        free_bytes: free space where jobs are stored.
+        is_running: returns whether queued jobs are run.
+        free_bytes: returns the free disk space in bytes where jobs are stored.
         scheduler: address of the workers' scheduler; None where workers are the server's own.
-        certificates: what to show it; None without TLS.
-        workers: tells how many workers can run stages, and raises where none can; None where jobs need none.
+        certificates: TLS certificates for the scheduler; None without TLS.
+        workers: returns a sentence on how many workers can run stages, and raises where none can; None where jobs need
+            none.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class Readiness:
         self._prober, self._store_prober = ThreadPoolExecutor(1, "readiness"), ThreadPoolExecutor(1, "store-readiness")
 
     def checks(self) -> tuple[Check, ...]:
-        """Try everything; none of it raises."""
+        """Try everything; a check that fails is returned and does not raise."""
         tries: tuple[tuple[CheckName, Callable[[], str]], ...] = (
             ("database", self._database),
             ("scheduler", self._scheduler),
@@ -163,8 +164,8 @@ def _check(name: CheckName, attempt: Callable[[], str]) -> Check:
 
 
 def _identity(engine: sql.Engine) -> tuple[int, int] | None:
-    """Device and inode of a SQLite file, None where there is none: open connections would go on with a removed file
-    unawares.
+    """Return the device and inode of a SQLite file; None where there is no file. They show that it was removed or
+    replaced, which open connections would not notice.
     """
     if engine.dialect.name != "sqlite" or engine.url.database is None:
         return None
@@ -176,5 +177,5 @@ def _identity(engine: sql.Engine) -> tuple[int, int] | None:
 
 
 def _cause(problem: sql.exc.SQLAlchemyError) -> str:
-    """What the driver said, without the statement and its values."""
+    """Return the message of the driver, without the statement and its values."""
     return str(getattr(problem, "orig", None) or type(problem).__name__)

@@ -1,4 +1,4 @@
-"""Routes that tell how the server is. Annotations are evaluated here, because FastAPI reads them."""
+"""Routes of readiness and metrics. Annotations are evaluated here, because FastAPI reads them."""
 
 from http import HTTPStatus
 
@@ -26,7 +26,7 @@ class NotReady(Problem):
 
 
 def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> APIRouter:
-    """Routes over the given checks and metrics."""
+    """Build the routes over the given checks and metrics."""
     router = APIRouter(prefix="/v1", tags=["health"], responses=refusals())
 
     @router.get(

@@ -1,4 +1,4 @@
-"""Route that tells what workers do. Annotations are evaluated here, because FastAPI reads them."""
+"""Route of the states of workers. Annotations are evaluated here, because FastAPI reads them."""
 
 from fastapi import APIRouter
 
@@ -11,7 +11,7 @@ from services.pipeline.workers import Workers
 
 
 def build_workers_router(workers: Workers, repository: Repository) -> APIRouter:
-    """Routes over the given workers."""
+    """Build the route over the given workers."""
     router = APIRouter(prefix="/v1", tags=["workers"], responses=refusals())
 
     @router.get("/workers", dependencies=[needs("read")])

@@ -1,4 +1,4 @@
-"""What the workers of jobs do, as their scheduler tells it, and how many jobs they got done."""
+"""The states of workers as their scheduler reports them, and how many jobs have succeeded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from services.pipeline.workers import NOT_STARTED, TOLD, Workers
 
 HOUR_S, DAY_S = 3600.0, 86400.0
 _TASK = re.compile(rf"({'|'.join(get_args(StageName))})-(\w+)-[0-9a-f]{{8}}(-.*)?")
-"""Key of a stage's task, or of one that it has made; see ``pipeline``."""
+"""Pattern of the key of a stage's task, or of a task that the stage has made; see ``pipeline``."""
 _SUCCEEDED = Query(
     sql.select(
         sql.func.count(),
@@ -68,7 +68,8 @@ class WorkerList(Record):
 
 
 def list_workers(workers: Workers, repository: Repository, viewer: Viewer = LOCAL_VIEWER) -> WorkerList:
-    """Ask the scheduler and the database; jobs that somebody may not see have no id.
+    """List the workers, from the scheduler, and count the jobs that succeeded, from the database. Jobs that the viewer
+    may not see have no id.
 
     Raises:
         SchedulerLostError: the scheduler does not answer.
@@ -120,7 +121,7 @@ def _states(
 
 
 def _tasks(keys: Iterable[re.Match[str]], is_seen: Callable[[str], bool]) -> tuple[WorkerTask, ...]:
-    """Each stage once, of however many parts of it the worker has."""
+    """Return each stage once, of however many tasks the worker has."""
     found = dict.fromkeys((key[1], key[2]) for key in keys)
     return tuple(
         WorkerTask.model_validate({"stage": stage, "job": job if is_seen(job) else None}) for stage, job in found

@@ -1,4 +1,4 @@
-"""Masks as PNG: what a sent one must be, checked without building an image, and the picture of stored bits."""
+"""Masks as PNG: checks a mask that was sent without building an image, and encodes stored masks."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _PIECE_BYTES = 2**18
 
 
 def require_mask(content: bytes, camera: Camera) -> None:
-    """Let a whole grey PNG of the camera's size pass, of 1 or 8 bits a pixel.
+    """Require a complete grey PNG of the camera's size with 1 or 8 bits a pixel.
 
     Raises:
-        MaskError: what is wrong with it.
+        MaskError: the content is something else; the message says what is wrong.
     """
     try:
         _require_header(png_header(content), camera)
@@ -43,8 +43,8 @@ def _require_header(header: PngHeader, camera: Camera) -> None:
 
 
 def _require_rows(content: bytes, camera: Camera) -> None:
-    # Inflates little more than the header promises, in pieces, as a mask may grow a thousandfold; every row begins with
-    # the number of its filter.
+    # Inflate in pieces and stop soon after the size that the header declares, as a mask may grow a thousandfold. Every
+    # row begins with one byte, the number of its filter.
     (width, height), depth = camera.size, png_header(content).depth
     expected_bytes = height * (1 + -(-width * depth // 8))
     inflater, inflated_bytes, place = zlib.decompressobj(), 0, len(PNG_SIGNATURE)
@@ -72,7 +72,7 @@ def _require_rows(content: bytes, camera: Camera) -> None:
 
 
 def picture_of(bits: NDArray[np.uint8]) -> bytes:
-    """A grey PNG of 8 bits a pixel, of an array (height, width)."""
+    """Encode an array of shape (height, width) as a grey PNG of 8 bits a pixel."""
     height, width = bits.shape
     rows = b"".join(b"\0" + row.tobytes() for row in bits)
     parts = (

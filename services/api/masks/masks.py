@@ -1,4 +1,4 @@
-"""What can be done with a job's masks by hand."""
+"""Use cases of the masks of a job that are drawn by hand."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from services.core.records import PreparedManifest
 from services.core.store import StoredArray, is_published, open_stage, write_atomic
 
 MAX_PREPARED_PX = 2**26
-"""Of a camera whose prepared mask is shown: 67 million, more than any camera of a dome has. Some 5 bytes a pixel are in
-memory meanwhile."""
+"""Largest number of pixels of a camera whose prepared mask is shown: 67 million, more than any camera of a dome has.
+Encoding takes some 5 bytes of memory a pixel."""
 _AT_WORK = frozenset({JobState.RUNNING, JobState.CANCELLING, JobState.DELETING})
 
 
@@ -46,14 +46,14 @@ class MaskList(Record):
 
 
 class Masks:
-    """Use-cases over the jobs of a server."""
+    """Use cases of masks over the jobs of a server."""
 
     def __init__(self, jobs: Jobs) -> None:
         self._jobs = jobs
         self._drawing = threading.Lock()  # one picture in memory at a time
 
     def list(self, job: Job) -> MaskList:
-        """A job's masks by hand."""
+        """Return a job's masks by hand."""
         root = self._jobs.folder(job.id)
         masks = tuple(
             Mask(camera=camera, light=light, bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
@@ -62,7 +62,7 @@ class Masks:
         return MaskList(masks=masks, is_stale=is_stale(root))
 
     def get(self, job: Job, camera: str, light: str) -> Path:
-        """The file of a mask by hand.
+        """Return the file of a mask by hand.
 
         Raises:
             UnknownMaskError: there is none.
@@ -76,11 +76,11 @@ class Masks:
         return path
 
     def put(self, job: Job, camera: str, light: str, content: bytes) -> None:
-        """Store a mask without metadata, in place of an earlier one.
+        """Store a mask, without its metadata, in place of an earlier one.
 
         Raises:
-            MaskError: it is no mask of this camera. UnknownMaskError: no such camera or light. JobStateError: the job
-                is at work.
+            MaskError: the content is no mask of this camera. UnknownMaskError: there is no such camera or light.
+                JobStateError: the job is at work.
         """
         require_mask(content, self._camera(job, camera, light))
         self._require_rest(job)
@@ -89,7 +89,7 @@ class Masks:
         write_atomic(path, plain_png(content))
 
     def delete(self, job: Job, camera: str, light: str) -> None:
-        """Take a mask back.
+        """Remove a mask.
 
         Raises:
             UnknownMaskError: there is none. JobStateError: the job is at work.
@@ -98,11 +98,11 @@ class Masks:
         self.get(job, camera, light).unlink()
 
     def prepared(self, job: Job, camera: str, light: str) -> bytes:
-        """A PNG of the bits of ``MaskBit`` that the preparation has set, 0 where the fit may look.
+        """Return a PNG with the bits of ``MaskBit`` that the preparation has set, 0 where the fit may use the pixel.
 
         Raises:
-            UnknownMaskError: nothing is prepared, or no such camera or light. MaskError: the camera has too many
-                pixels.
+            UnknownMaskError: nothing is prepared, or there is no such camera or light. MaskError: the camera has too
+                many pixels.
         """
         root = self._jobs.folder(job.id)
         if not is_published(root, "prepared"):

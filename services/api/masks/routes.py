@@ -17,7 +17,7 @@ _BODY = {"requestBody": {"required": True, "content": {PNG: {"schema": {"type": 
 
 
 def build_masks_router(jobs: Jobs, masks: Masks) -> APIRouter:
-    """Routes over the given masks."""
+    """Build the routes over the given masks."""
     router = APIRouter(prefix="/v1/jobs/{job_id}/masks", tags=["masks"], responses=refusals(404, 409, 413, 422))
 
     def find_job(job_id: str) -> Job:
