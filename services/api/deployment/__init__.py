@@ -1,1 +1,1 @@
-"""Secrets of a deployment and the change of its passwords."""
+"""The secrets of a deployment, and the change of its database password."""

@@ -1,4 +1,4 @@
-"""Gives the database a new password while everything runs."""
+"""Changes the password of the database while the system runs."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from services.pipeline.database import open_database, parse_database_url, read_p
 def change_database_password(url: str, file: Path) -> None:
     """Change the password in the database, then in the file.
 
-    The new one is written beside the file first, so that none is lost if this is cut short between the two: the next
-    call tries it.
+    The new password is written beside the file first, so that it is not lost if this is interrupted between the two
+    changes: the next call tries it.
 
     Raises:
         SettingsError: the database is not Postgres, or the file is absent. PlatformError: the database refuses both

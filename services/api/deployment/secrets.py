@@ -1,5 +1,5 @@
-"""What the parts of one system know of each other and nobody else does: an authority with its certificate for all
-parts, and the database's password.
+"""The secrets that the parts of one system share: a certificate authority, the certificate that it has issued for all
+parts, and the password of the database.
 
 ::
 
@@ -28,21 +28,22 @@ from services.core.files.private import write_private
 AUTHORITY_LIFE = timedelta(days=3650)
 CERTIFICATE_LIFE = timedelta(days=365)
 RENEW_BEFORE = timedelta(days=60)
-"""A certificate with less life than this is made anew when the system starts: a system that is restarted twice a
-quarter never meets its end."""
+"""Remaining life of a certificate below which it is made anew when the system starts: a system that is restarted twice
+a quarter never meets its end."""
 CLOCK_STEP = timedelta(minutes=5)
-"""How far the clocks of hosts may differ when a certificate is new."""
+"""Largest difference between the clocks of hosts at which a new certificate is valid on all of them."""
 PASSWORD_BYTES = 24
+"""Number of random bytes in a password of the database."""
 READABLE_BY_ALL = 0o444
-"""Of the password's file: the database runs as another user than the parts that ask it. The folder is what keeps others
-out."""
+"""File mode of the password's file and of certificates: the database runs as another user than the parts that ask it.
+The folder keeps others out."""
 
 
 def make_missing(folder: Path, *, renew: bool = False) -> list[str]:
-    """Make what is absent or will soon have ended; ``renew`` makes the certificate of the parts anew in any case.
+    """Make the secrets that are absent or end soon; ``renew`` makes the certificate of the parts anew in any case.
 
     Returns:
-        What was made, in words.
+        Names of the secrets that were made.
 
     Raises:
         SettingsError: a file that is there is no certificate or key of the kind that this program makes.
@@ -64,7 +65,7 @@ def make_missing(folder: Path, *, renew: bool = False) -> list[str]:
 
 
 def write_password(path: Path, password: str) -> None:
-    """Write the database's password where its readers find it."""
+    """Write the password of the database to the file from which its users read it."""
     write_private(path, f"{password}\n".encode(), READABLE_BY_ALL)
 
 
@@ -84,7 +85,7 @@ def _certificate(path: Path) -> x509.Certificate:
 
 
 def _signing_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    with suppress(ValueError, TypeError):  # TypeError: it wants a passphrase
+    with suppress(ValueError, TypeError):  # TypeError: the key needs a passphrase
         key = serialization.load_pem_private_key(path.read_bytes(), None)
         if isinstance(key, ec.EllipticCurvePrivateKey):
             return key
@@ -123,7 +124,7 @@ def _make_certificate(authority: Path, folder: Path) -> None:
     builder = _builder(_name("dentine part"), issuer.subject, key, CERTIFICATE_LIFE)
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
     builder = builder.add_extension(identifier, critical=False)
-    # The key first: whoever reads both in between finds that they do not belong together, and tries again.
+    # Write the key first: a reader of both in between finds that they do not belong together, and tries again.
     _write_key(folder / "tls.key", key)
     write_private(folder / "tls.crt", _pem(builder.sign(signer, hashes.SHA256())), READABLE_BY_ALL)
     write_private(folder / "ca.crt", _pem(issuer), READABLE_BY_ALL)

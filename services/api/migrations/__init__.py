@@ -1,4 +1,4 @@
-"""Brings a database to the tables of this version, one numbered step after another; what is stored is kept."""
+"""Upgrades a database to the tables of this version, one numbered step after another, and keeps the stored data."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from services.core.errors import PlatformError
 from services.pipeline.database import writing
 
 FIRST = "0001"
-"""The tables that databases had before they were numbered."""
+"""Revision of the tables in databases that record no revision."""
 
 
 def upgrade(engine: sql.Engine, to: str = "head") -> None:
-    """Take all steps that are missing, up to one, and close what was opened for that.
+    """Take all missing steps up to revision ``to``, and close the connections that were opened for that.
 
-    Servers that start together wait for each other.
+    Servers that start at the same time wait for each other.
 
     Raises:
         PlatformError: the database cannot be reached, or refuses the password.

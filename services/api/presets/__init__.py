@@ -23,7 +23,7 @@ class Preset(Record):
 
 @cache
 def list_presets() -> list[Preset]:
-    """All of them, by name; read once, as they belong to the package."""
+    """Return all presets, sorted by name. They are read once, as they belong to the package."""
     files = (file for file in resources.files(__name__).iterdir() if file.name.endswith(".toml"))
     return sorted(
         (Preset(name=file.name.removesuffix(".toml"), **tomllib.loads(file.read_text())) for file in files),
@@ -32,10 +32,10 @@ def list_presets() -> list[Preset]:
 
 
 def find_preset(name: str) -> Preset:
-    """One of them.
+    """Return the preset of a name.
 
     Raises:
-        UnknownPresetError: there is none of this name.
+        UnknownPresetError: there is no preset of this name.
     """
     presets = {preset.name: preset for preset in list_presets()}
     if name not in presets:

@@ -1,4 +1,6 @@
-"""Where webhooks may go: names are resolved first, what they resolve to is checked, and only that is connected to."""
+"""Checks the addresses of webhooks: a name is resolved first, its addresses are checked, and only those are connected
+to.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +20,22 @@ IpAddress = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 _HOST = re.compile(r"[A-Za-z0-9_.:-]+")
 _ASKERS = ThreadPoolExecutor(16, "names")
-"""Ask name servers, as many at once as there are receivers; nothing else waits for one that does not answer."""
+"""Threads that ask name servers, as many as receivers are served at once; nothing else waits for a name server that
+does not answer."""
 _NAT64 = ipaddress.IPv6Network("64:ff9b::/96")
+"""Network of IPv6 addresses whose last 32 bits are the IPv4 address to which they are translated (RFC 6052)."""
 _EXAMPLES = ipaddress.IPv6Network("3fff::/20")
-"""For documentation (RFC 9637); Python 3.12 takes it for public."""
+"""Network for documentation (RFC 9637), which Python 3.12 takes for public."""
 _ISATAP = frozenset({0x0000_5EFE, 0x0200_5EFE})
-"""Of the last 64 bits the first 32, which say that an IPv4 address follows to which packets are tunnelled (RFC
-5214)."""
+"""Values of the first 32 of the last 64 bits of an IPv6 address which say that an IPv4 address follows, to which
+packets are tunnelled (RFC 5214)."""
 
 
 @dataclass(frozen=True)
 class AddressPolicy:
-    """``allow_private`` opens private, link-local and loopback addresses, and to those also plain http."""
+    """The addresses to which webhooks may go. ``allow_private`` allows private, link-local and loopback addresses, and
+    plain http to those.
+    """
 
     allow_private: bool = False
 
@@ -37,7 +43,8 @@ class AddressPolicy:
         """Check what can be known without asking a name server.
 
         Raises:
-            WebhookAddressError: not a web address, not https, a login in it, or a forbidden address.
+            WebhookAddressError: the URL is not a web address, is not https, contains a login or a fragment, or names a
+                forbidden address.
         """
         try:
             parts = httpx.URL(url)
@@ -63,8 +70,8 @@ class AddressPolicy:
         """Check an address before it is connected to.
 
         Raises:
-            WebhookAddressError: it is not public and the settings do not allow that, or plain http would leave for a
-                public one.
+            WebhookAddressError: the address is not public and the settings do not allow that, or plain http would go to
+                a public one.
         """
         if not is_public(address):
             if not self.allow_private or address.is_multicast or address.is_unspecified:
@@ -76,7 +83,7 @@ class AddressPolicy:
             raise WebhookAddressError(f"A webhook to the public address {address} must be https.")
 
     async def resolve(self, host: str, port: int, scheme: str) -> list[str]:
-        """Addresses of a host, all of them checked.
+        """Resolve a host and check all its addresses.
 
         Raises:
             WebhookAddressError: one of them is refused, or the name has none.

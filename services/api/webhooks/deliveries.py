@@ -1,6 +1,6 @@
-"""Deliveries to webhooks: what is due, what was tried, and what comes of it.
+"""Deliveries to webhooks: which are due, which attempts were made, and with which outcome.
 
-A delivery that is tried is claimed for a while: if the process dies meanwhile it falls due again.
+A delivery is claimed for the time of an attempt: if the process dies meanwhile, it falls due again.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from services.core.geometry import Record
 from services.pipeline.database import writing
 
 DISABLE_AFTER_S = 5 * DAY_S
+"""Time in s without a success after which a webhook that fails is switched off."""
 KEEP_S = 30 * DAY_S
-"""How long the log keeps what is settled."""
+"""Time in s for which the log keeps deliveries that are settled."""
 CLAIM_S = 60.0
+"""Time in s for which a delivery is claimed."""
 
 
 class Attempt(Record):
@@ -53,7 +55,7 @@ class Delivery(Record):
 
 @dataclass(frozen=True)
 class Claim:
-    """A delivery to be tried now, and by nobody else for ``CLAIM_S``."""
+    """A delivery to be attempted now, by nobody else for ``CLAIM_S``."""
 
     delivery: int
     webhook: str
@@ -72,16 +74,16 @@ class Deliveries:
         self._engine = engine
 
     def collect(self, now_s: float) -> int:
-        """Add deliveries for what changed since the last time; returns how many."""
+        """Add deliveries for the changes of state since the last call; returns how many."""
         with self._engine.connect() as connection:
             if not has_news(connection):
-                return 0  # watching costs no writes
+                return 0  # looking for changes costs no write
         with writing(self._engine) as connection:
             _forget(connection, now_s - KEEP_S)
             return collect_changes(connection, now_s)
 
     def claim(self, now_s: float, busy: Collection[str], most: int) -> list[Claim]:
-        """Take the oldest due delivery of each webhook that is not busy."""
+        """Claim the oldest due delivery of each webhook that is not busy, of at most ``most`` webhooks."""
         is_due = (
             delivery_table.c.state == DeliveryState.PENDING,
             delivery_table.c.next_try_s <= now_s,
@@ -110,9 +112,11 @@ class Deliveries:
             ]
 
     def settle(self, claim: Claim, attempt: Attempt, retry_s: float, *, is_gone: bool = False) -> None:
-        """Log a try; after a failed one plan the next in ``retry_s``, or give up.
+        """Log an attempt; after a failed one plan the next in ``retry_s``, or give the delivery up.
 
-        ``is_gone``: the receiver wants no more.
+        Args:
+            retry_s: time in s until the next attempt.
+            is_gone: whether the receiver has answered that it wants no more messages.
         """
         now_s = attempt.time_s + attempt.duration_s
         with writing(self._engine) as connection:
@@ -152,7 +156,7 @@ class Deliveries:
             log.warning("Webhook switched off: %s", note, extra=origin)
 
     def page(self, webhook_id: str, limit: int, before: int | None = None) -> list[Delivery]:
-        """A webhook's deliveries, newest first, those with an id below ``before``.
+        """Return up to ``limit`` deliveries of a webhook, newest first, of those with an id below ``before``.
 
         Raises:
             UnknownWebhookError: there is no such webhook.
@@ -188,7 +192,7 @@ class Deliveries:
             return _delivery(connection, _find(connection, webhook_id, delivery_id))
 
     def redeliver(self, webhook_id: str, delivery_id: int, now_s: float) -> Delivery:
-        """Queue a delivery again, under the same message id, with a new day to try it."""
+        """Queue a delivery again, under the same message id, to be attempted for another ``TRY_FOR_S``."""
         with writing(self._engine) as connection:
             row = _find(connection, webhook_id, delivery_id)
             values = {"state": DeliveryState.PENDING, "tries": 0, "next_try_s": now_s, "deadline_s": now_s + TRY_FOR_S}
@@ -207,7 +211,7 @@ def _reason_to_stop(failing_s: float, *, is_gone: bool) -> str:
 
 
 def _forget(connection: sql.Connection, before_s: float) -> None:
-    """Drop what was settled long ago."""
+    """Delete settled deliveries that were created before a time, with their attempts."""
     old = sql.select(delivery_table.c.id).where(
         delivery_table.c.created_s < before_s, delivery_table.c.next_try_s.is_(None)
     )

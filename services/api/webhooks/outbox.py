@@ -1,8 +1,8 @@
-"""From the event table to what is to be delivered. Everything here runs inside the caller's transaction.
+"""Makes deliveries to webhooks from the event table. Everything here runs inside the caller's transaction.
 
 A cursor says how far the event table was read; it moves in the same transaction that adds the deliveries, so that a
-restart neither loses nor repeats one. That rests on event ids becoming visible in their order, for which
-``database.writing`` lets one writer in at a time.
+restart neither loses nor repeats one. That requires that event ids become visible in their order, for which
+``database.writing`` admits one writer at a time.
 """
 
 from __future__ import annotations
@@ -19,12 +19,15 @@ from services.pipeline.event_log import event_table
 
 DAY_S = 86_400.0
 TRY_FOR_S = DAY_S
+"""Time in s for which a delivery is attempted."""
 _BATCH = 500
 _READER = "webhooks"
 
 
 def has_news(connection: sql.Connection) -> bool:
-    """Whether to read the event table: a state changed, or it grew so far that the cursor should follow."""
+    """Whether the event table is to be read: a state has changed, or the table has grown so far that the cursor should
+    follow.
+    """
     cursor = _cursor(connection)
     return bool(_changes(connection, cursor, 1)) or _newest(connection) - cursor >= _BATCH
 
@@ -67,12 +70,12 @@ def insert_delivery(connection: sql.Connection, webhook_id: str, message: str, p
 
 
 def message_body(kind: str, time_s: float, data: dict[str, Any]) -> str:
-    """A payload as Standard Webhooks recommends it."""
+    """Encode a payload in the form that Standard Webhooks recommends."""
     return json.dumps({"type": kind, "timestamp": datetime.fromtimestamp(time_s, UTC).isoformat(), "data": data})
 
 
 def states_of(row: Any) -> tuple[JobState, ...]:
-    """The states that a subscription's row names."""
+    """Return the states that the row of a subscription names."""
     return tuple(JobState(state) for state in json.loads(row["states"]))
 
 

@@ -25,7 +25,7 @@ class DeliveryPage(Record):
 
 
 def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRouter:
-    """Routes over the given subscriptions and their log."""
+    """Build the routes over the given subscriptions and their log of deliveries."""
     router = APIRouter(
         prefix="/v1/webhooks",
         route_class=BodyRoute,

@@ -1,5 +1,5 @@
-"""Sends what is due to webhooks, signed as Standard Webhooks says, one message at a time to each and many receivers at
-once.
+"""Sends due deliveries to webhooks, signed as Standard Webhooks says: one message at a time to each receiver, to many
+receivers at once.
 """
 
 from __future__ import annotations
@@ -25,23 +25,28 @@ from services.api.webhooks.webhooks import KEY_PREFIX
 from services.client.errors import WebhookAddressError
 
 PERIOD_S = 0.5
+"""Time in s between two looks for due deliveries."""
 MAX_AT_ONCE = 16
+"""Largest number of receivers that are served at once."""
 CONNECT_S = 5.0
+"""Longest time in s that connecting to a receiver may take."""
 TOTAL_S = 10.0
-"""From resolving the name to the head of the answer; well below the time that a delivery is claimed for."""
+"""Longest time in s from resolving the name to the head of the answer; well below the time for which a delivery is
+claimed."""
 FIRST_RETRY_S = 10.0
+"""Mean time in s between the first attempt and the second."""
 
 
 def sign(secret: str, message: str, timestamp: int, payload: str) -> str:
-    """The header ``webhook-signature``."""
+    """Return the value of the header ``webhook-signature``."""
     key = base64.b64decode(secret.removeprefix(KEY_PREFIX))
     digest = hmac.digest(key, f"{message}.{timestamp}.{payload}".encode(), hashlib.sha256)
     return f"v1,{base64.b64encode(digest).decode()}"
 
 
 def retry_s(tries: int, draw: float) -> float:
-    """How long to wait after so many tries: doubling from 10 s, jittered by ``draw`` in [0, 1) to between half and one
-    and a half of it.
+    """Return the time in s to wait after so many attempts: doubling from 10 s, and varied by ``draw`` in [0, 1) to
+    between half and one and a half times that.
     """
     return float(FIRST_RETRY_S * 2.0 ** (tries - 1) * (0.5 + draw))
 
@@ -50,9 +55,9 @@ class WebhookSender:
     """Sends while ``run`` runs.
 
     Args:
-        clock: Unix time; what is due depends on it.
-        draw: jitter, uniform in [0, 1).
-        tls: whom to trust; default: the usual authorities.
+        clock: returns Unix time in s, by which deliveries fall due.
+        draw: returns a random number, uniform in [0, 1), that varies the waiting times.
+        tls: TLS context with the trusted authorities; None for the usual ones.
     """
 
     def __init__(
@@ -70,7 +75,7 @@ class WebhookSender:
         self._tls = tls
 
     async def run(self) -> None:
-        """Send until cancelled. What is on its way then falls due again when its claim ends."""
+        """Send until cancelled. A delivery that is on its way then falls due again when its claim ends."""
         sending: dict[str, asyncio.Task[None]] = {}
         limits = httpx.Limits(
             max_keepalive_connections=0
@@ -125,8 +130,8 @@ class WebhookSender:
             )
 
     async def _post(self, http: httpx.AsyncClient, claim: Claim) -> int:
-        """Connect to a checked address under the name that the certificate must prove; the answer's body is not
-        read.
+        """Post a message and return the status of the answer, whose body is not read. The connection goes to a checked
+        address, under the name that the certificate must prove.
         """
         url, timestamp = httpx.URL(claim.url), int(self._clock())
         host = url.raw_host.decode()

@@ -1,4 +1,4 @@
-"""Tables of webhooks: who subscribed, what is to be delivered, what was tried, and how far the event table was read."""
+"""Tables of webhooks: subscriptions, deliveries, attempts, and how far the event table was read."""
 
 from __future__ import annotations
 

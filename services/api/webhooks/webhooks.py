@@ -1,4 +1,4 @@
-"""Who wants to be told of which changes of state, and where."""
+"""Subscriptions of webhooks to the changes of jobs' states."""
 
 from __future__ import annotations
 
@@ -87,10 +87,10 @@ class Webhooks:
         self._engine, self._policy = engine, policy
 
     def create(self, request: WebhookRequest) -> NewWebhook:
-        """Subscribe to what happens from now on.
+        """Create a subscription to the changes from now on.
 
         Raises:
-            WebhookAddressError: the address is refused. JobStateError: there are too many.
+            WebhookAddressError: the address is refused. JobStateError: there are ``MAX_WEBHOOKS`` already.
         """
         self._policy.check_url(request.url)
         secret = KEY_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode()
@@ -140,7 +140,7 @@ class Webhooks:
             values["states"] = _states(change.states)
         with writing(self._engine) as connection:
             find_webhook(connection, webhook_id)
-            collect_changes(connection, time.time())  # what happened before is told as it was asked for then
+            collect_changes(connection, time.time())  # earlier changes are delivered by the earlier subscription
             if change.active is True:
                 values |= {"active": True, "failing_since_s": None, "note": ""}
             if values:
@@ -150,7 +150,7 @@ class Webhooks:
             return Webhook(**_fields(find_webhook(connection, webhook_id)))
 
     def delete(self, webhook_id: str) -> None:
-        """Remove a subscription with its log.
+        """Remove a subscription with its log of deliveries.
 
         Raises:
             UnknownWebhookError: there is none with this id.
@@ -164,7 +164,7 @@ class Webhooks:
 
 
 def find_webhook(connection: sql.Connection, webhook_id: str) -> Any:
-    """The row of a subscription.
+    """Return the row of a subscription.
 
     Raises:
         UnknownWebhookError: there is none with this id.
@@ -176,7 +176,7 @@ def find_webhook(connection: sql.Connection, webhook_id: str) -> Any:
 
 
 def switch_off(connection: sql.Connection, webhook_id: str, note: str) -> None:
-    """Make a subscription inactive and give up what is pending for it."""
+    """Make a subscription inactive and give up its pending deliveries."""
     connection.execute(webhook_table.update().where(webhook_table.c.id == webhook_id).values(active=False, note=note))
     pending = delivery_table.update().where(
         delivery_table.c.webhook == webhook_id, delivery_table.c.state == DeliveryState.PENDING

@@ -1,4 +1,4 @@
-"""What jobs are found by, the request that submitted them, and webhooks."""
+"""Columns by which jobs are found, the request that submitted a job, and the tables of webhooks."""
 
 import json
 

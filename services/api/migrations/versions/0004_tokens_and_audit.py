@@ -1,4 +1,4 @@
-"""Tokens of callers, and what they did."""
+"""Tokens of callers, and the audit log of their actions."""
 
 import sqlalchemy as sql
 from alembic import op

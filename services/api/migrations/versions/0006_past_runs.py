@@ -1,4 +1,4 @@
-"""How jobs that succeeded went, to predict others from."""
+"""Past runs of jobs that succeeded, from which the time of others is predicted."""
 
 import sqlalchemy as sql
 from alembic import op
@@ -7,7 +7,7 @@ revision, down_revision = "0006", "0005"
 
 
 def upgrade() -> None:
-    """Create the table; jobs of earlier versions did not tell on which machines they ran."""
+    """Create the table. It begins empty, because jobs of earlier versions did not record on which machines they ran."""
     op.create_table(
         "past_run",
         sql.Column("job", sql.Text, primary_key=True),

@@ -1,4 +1,4 @@
-"""Where a job is among its events, without reading all of them."""
+"""Indices by which the progress of a job is found without reading all its events."""
 
 from alembic import op
 

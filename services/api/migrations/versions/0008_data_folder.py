@@ -1,4 +1,4 @@
-"""Which data folder the jobs' files are in."""
+"""The data folder that holds the files of the jobs."""
 
 import sqlalchemy as sql
 from alembic import op

@@ -1,6 +1,6 @@
 """Owners of jobs, receipts and captures, groups of tokens, and sessions that were ended.
 
-What was there before belongs to the default group, as do its tokens.
+Earlier jobs, receipts, captures and tokens belong to the default group.
 """
 
 import sqlalchemy as sql
@@ -22,7 +22,7 @@ def upgrade() -> None:
         keyed = sql.table(table, sql.column("key"))
         op.execute(keyed.update().where(keyed.c.key.is_not(None)).values(key=f"{DEFAULT}/" + keyed.c.key))
         op.create_index(f"{table}_of_owner", table, ["owner", "number"])
-    # Whether a content was received, and not only known to be here because somebody else has sent it.
+    # This column says whether the owner has sent a content, as opposed to somebody else.
     op.add_column("capture_file", sql.Column("is_known", sql.Boolean, nullable=False, server_default=sql.false()))
     files = sql.table("capture_file", sql.column("is_known"), sql.column("received_bytes"), sql.column("bytes"))
     op.execute(files.update().where(files.c.received_bytes == files.c.bytes).values(is_known=sql.true()))
