@@ -1,4 +1,4 @@
-"""Checks the contents of received files before their capture is accepted, by what they declare; nothing is decoded."""
+"""Checks the contents of received files before their capture is accepted, by what they declare; no image is decoded."""
 
 from __future__ import annotations
 

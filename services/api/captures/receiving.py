@@ -103,7 +103,7 @@ def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
 
 
 class _Tail:
-    """The end of an upload within one request."""
+    """Appends the bytes of one request to an upload: they are buffered, then written, then recorded."""
 
     def __init__(self, uploads: Uploads, upload: Upload, partial: PartialFile, checksum: Checksum | None) -> None:
         self._uploads, self._upload, self._partial, self._checksum = uploads, upload, partial, checksum

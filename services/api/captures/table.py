@@ -76,8 +76,8 @@ class CaptureTable:
         self._engine = engine
 
     def find(self, manifest: str, key: str | None) -> Capture | None:
-        """Find the capture of this manifest or of this idempotency key; both texts contain the owner. None if there is
-        none.
+        """Find the capture of this manifest or of this idempotency key; both are specific to one owner. None if there
+        is none.
 
         Raises:
             CaptureStateError: the key belongs to another manifest.

@@ -36,7 +36,7 @@ def change_database_password(url: str, file: Path) -> None:
             role = connection.dialect.identifier_preparer.quote(parsed.username or "")
             connection.exec_driver_sql(
                 f"ALTER ROLE {role} PASSWORD '{read_password(planned)}'"
-            )  # of letters, digits, - and _
+            )  # quotes suffice: it consists of letters, digits, - and _
     except sql.exc.OperationalError as problem:
         raise PlatformError(
             f"The database at {parsed.host} does not take a new password ({_reason(problem)}); check that it runs."

@@ -126,7 +126,7 @@ class BoundedProtocol(H11Protocol):
             transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection is closed."""
+        """Remove the connection, which is closed."""
         self._end_wait()
         self._crowd.leave(self)
         super().connection_lost(exc)

@@ -1,6 +1,6 @@
 """A job's life as a pure state machine: (state, trigger) -> (state, instruction).
 
-There is no I/O here: the repository persists, the runner obeys.
+There is no I/O here: the repository stores the state, and its callers carry out the instruction.
 
 ==========  =====================  ==================  ==================  =====================  =================
 state       cancel                 start               succeed             fail                   lose

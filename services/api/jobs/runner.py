@@ -148,7 +148,7 @@ class Runner:
             self._wake.clear()
             try:
                 self._start_what_may()
-            except Exception:  # of the database or the data folder
+            except Exception:  # a fault of the database or the data folder
                 logging.getLogger(__name__).exception("starting jobs failed; trying again in %g s", ROUND_S)
 
     def _start_what_may(self) -> None:
@@ -192,7 +192,7 @@ class Runner:
         try:
             with log_context(job=job.id, request_id=job.request_id):
                 self._run_one(lease)
-        except Exception:  # of the database or the data folder; the job is lost when its lease runs out
+        except Exception:  # a fault of database or data folder; the job is lost when its lease ends
             logging.getLogger(__name__).exception("job %s broke off; it is queued again within %g s", job.id, LEASE_S)
         finally:
             with self._lock:
