@@ -1,12 +1,12 @@
-/** The public REST API, as far as this page uses it. */
+/** The part of the public REST API that this page uses. */
 
 import { clearTheWay } from "./follow";
 import { inLane } from "./lanes";
 import type { OptionSchema } from "./optionField";
 
-/** A dome that is watched and has not told its state by then has not told it. */
+/** Time in ms after which a request for the state of a dome that is watched is given up. */
 const DOME_PATIENCE_MS = 3000;
-/** The same for one that is asked for the first time: a simulated dome's process is started by that. */
+/** The same in ms for a dome that is asked for the first time, as a simulated dome then starts its process. */
 export const FIRST_PATIENCE_MS = 20_000;
 
 export type JobState =
@@ -20,7 +20,7 @@ export interface Figure {
 
 /** How well a fit went: the report's own judgement and numbers. */
 export interface Verdict {
-  /** One sentence, the worst first. */
+  /** One sentence that names the worst fault first. */
   headline: string;
   converged: boolean;
   is_above_limit: boolean;
@@ -44,7 +44,7 @@ export interface Job {
   failure: { code: string; message: string; stage: string | null } | null;
   /** Label that a person gave it. */
   name: string | null;
-  /** Of a job that succeeded; null where an earlier version fitted it. */
+  /** Verdict on the fit of a job that succeeded; null before, and where an earlier version fitted it. */
   verdict: Verdict | null;
 }
 
@@ -56,7 +56,7 @@ export interface Stage {
   message: string;
 }
 
-/** How long until a job ends; without limits where `reason` says why. */
+/** How long until a job ends, in s; both limits are null where `reason` says why. */
 export interface TimeRange {
   low_s: number | null;
   high_s: number | null;
@@ -66,7 +66,7 @@ export interface TimeRange {
 
 export interface JobDetail extends Job {
   stages: Stage[];
-  /** Why a queued job does not start. */
+  /** Why a queued job does not start, or a running one does not go on; null if nothing keeps it. */
   waits_for: string | null;
   /** Null unless the job waits or runs. */
   remaining: TimeRange | null;
@@ -99,10 +99,10 @@ export interface NamedCalibration {
   name: string;
   state: "good" | "old" | "beyond its limits" | "not known";
   created_s: number;
-  /** When it was made, ISO 8601. */
+  /** When it was calibrated, ISO 8601; null where it does not say. */
   made: string | null;
   valid_days: number | null;
-  /** Limits that it does not keep, in words. */
+  /** Limits that it exceeds, in words; null where it was held to none. */
   broken: string[] | null;
 }
 
@@ -129,11 +129,11 @@ export interface Estimate {
   se: number | null;
   unit: string;
   determined: boolean;
-  /** What the standard error is made of, largest first; absent where an earlier version fitted. */
+  /** Parts of the standard error by source, largest first; absent where an earlier version fitted. */
   se_parts?: Record<string, number>;
 }
 
-/** channel -> parameter name -> estimate */
+/** Estimates by channel and parameter name. */
 export type Parameters = Record<string, Record<string, Estimate>>;
 
 export interface Artifact {
@@ -150,12 +150,12 @@ export interface JobPage {
 export interface Worker {
   name: string;
   host: string;
-  /** Stages that it runs, wholly or in part, or will run next. */
+  /** Stages that the worker runs, wholly or in part, or will run next. */
   tasks: { stage: string; job: string | null }[];
   /** Whether captures, and whether all other stages, may run there. */
   has_dome: boolean;
   runs_stages: boolean;
-  /** What it cannot do of what it was started for; empty where nothing is wrong. */
+  /** What the worker was started for and cannot do; empty where nothing is wrong. */
   fault: string;
   memory_bytes: number;
   memory_limit_bytes: number | null;
@@ -163,7 +163,7 @@ export interface Worker {
 
 export interface Workers {
   workers: Worker[];
-  /** How many there are, or why there are none yet. */
+  /** How many workers there are, or why there are none yet. */
   sentence: string;
   succeeded_last_hour: number;
   succeeded_last_day: number;
@@ -174,7 +174,8 @@ export interface Session {
   scopes: string[];
   is_open: boolean;
   /**
-   * Opens ALL OFF and nothing else; null where the server asks nobody for a token, or the token may not work the dome.
+   * Key that allows ALL OFF and nothing else; null where the server asks nobody for a token, or the token may not work
+   * the dome.
    */
   dark_key: string | null;
 }
@@ -191,14 +192,14 @@ export interface DomeStatus {
   interlock_closed: boolean;
   emergency_stop: boolean;
   supply_on: boolean;
-  /** ALL OFF holds: no light goes on until somebody starts anew. */
+  /** Whether ALL OFF is in force: no light goes on until somebody starts anew. */
   stopped: boolean;
   faults: string[];
   /** Lights that emit now. */
   lit: number[];
-  /** Of each bank. */
+  /** Temperature of each bank of lights, in °C. */
   temperature_degc: number[];
-  /** Of each bank. */
+  /** Current of each bank of lights, in mA. */
   current_ma: number[];
 }
 
@@ -217,7 +218,7 @@ export interface AllOff {
   others_stopped: number;
 }
 
-/** The server answers, but not with what was asked for; the message is its sentence. */
+/** The server refuses a request; the message is the sentence of its answer. */
 export class Refusal extends Error {
   constructor(
     sentence: string,
@@ -227,10 +228,13 @@ export class Refusal extends Error {
   }
 }
 
-/** The server does not know who asks; a token is needed. */
+/** The server does not know the caller; a token is needed. */
 export class Unauthenticated extends Refusal {}
 
-/** Whether the same may be answered later: nobody answers, too much was asked, or the server is in trouble. */
+/**
+ * Whether the same request may succeed later: the server cannot be reached, there were too many requests, or it failed
+ * itself.
+ */
 export function mayPass(problem: unknown): boolean {
   return (
     problem instanceof TypeError || (problem instanceof Refusal && (problem.status === 429 || problem.status >= 500))
@@ -282,7 +286,7 @@ export const listPresets = (): Promise<Preset[]> => ask("/presets");
 export const getPreset = (name: string): Promise<Preset> => ask(`/presets/${name}`);
 export const listCaptures = (): Promise<{ captures: Capture[] }> => ask("/captures?limit=500");
 export const listCalibrations = (): Promise<NamedCalibration[]> => ask("/calibrations");
-/** Puts what a calibration job made under a name. */
+/** Store the calibration that a job has made under a name. */
 export const keepCalibration = (job: string, name: string): Promise<NamedCalibration> =>
   ask(`/jobs/${job}/calibration/${encodeURIComponent(name)}`, "PUT");
 export const submitJob = (wanted: object): Promise<Job> => ask("/jobs", "POST", {}, wanted);
@@ -294,11 +298,10 @@ export const getDome = (patienceMs = DOME_PATIENCE_MS): Promise<DomeState> =>
   inLane(() => request("/dome", { signal: AbortSignal.timeout(patienceMs) }));
 
 /**
- * ALL OFF waits for no lane, and the stream of events makes room for it. It is sent without the cookie, by the
- * session's
- * dark key where the server asks for tokens: browsers keep connections with and without cookies apart, so that this one
- * is free whatever else is under way, downloads too. Where the key does not do, the cookie is tried: darkening twice is
- * harmless.
+ * Switch every light off. The request waits for no lane, and the stream of events closes to free a connection for it.
+ * Where the server asks for tokens it is sent without the cookie and with the dark key of the session: browsers keep
+ * connections with and without cookies apart, so that this one is free whatever else is under way, downloads too. Where
+ * the key fails, the cookie is tried: darkening twice is harmless.
  */
 export async function allOff(session: Session | null): Promise<AllOff> {
   clearTheWay();

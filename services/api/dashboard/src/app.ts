@@ -1,6 +1,6 @@
 /**
- * The page: a list of jobs and the job that the address names, or the dome; a form for a token where the server asks
- * for one.
+ * The page: a list of jobs, and beside it the job that the address names, or the dome. Where the server asks for a
+ * token, a form for it.
  */
 
 import { getSession, mayPass, type Session, sentenceOf, signOut, Unauthenticated } from "./api";
@@ -34,21 +34,24 @@ const domeLink = find<HTMLAnchorElement>("dome");
 const list = new JobList(jobs);
 const workers = find("workers");
 const workerList = new WorkerList(workers);
-/** Kept, as an upload goes on in it while another view is shown. */
+/** This view is kept, because an upload in it goes on while another view is shown. */
 const newJob = new NewJobView();
 const newLink = find<HTMLAnchorElement>("new");
 let view: View | null = null;
 let listTrouble = "";
 let viewTrouble = "";
 let isSignedOut = false;
-/** Whether the next refresh opens the address: nothing was opened yet, or what was failed in a way that may pass. */
+/**
+ * Whether the next refresh opens the view of the address: none was opened yet, or opening it failed in a way that may
+ * pass.
+ */
 let isViewDue = true;
 let isAccountDue = true;
-/** Settled once it is known what the token may do, or that this cannot be known now. */
+/** Settled once it is known what the token may do, or once the server has failed to say so. */
 let accountShown: Promise<void> = Promise.resolve();
-/** How often an address was opened, so that an older opening gives way to a newer one. */
+/** Number of times that an address was opened, by which an older opening gives way to a newer one. */
 let openings = 0;
-/** Null until the server has told. */
+/** The session of this browser; null until the server has answered. */
 let session: Session | null = null;
 let unkept: HTMLElement | null = null;
 
@@ -115,12 +118,12 @@ async function open(): Promise<void> {
   }
 }
 
-/** Whether the token may do something; while that is not known, the server's answer tells. */
+/** Whether the token has a scope. While that is not known this is true, and the server refuses what it may not do. */
 function may(scope: string): boolean {
   return session === null || session.is_open || session.scopes.includes("admin") || session.scopes.includes(scope);
 }
 
-/** Why nothing of an address is shown, as its every button would be refused; empty if some may be pressed. */
+/** Return why the view of an address is not shown, as all its buttons would be refused; empty if some would not. */
 function lackingFor(hash: string): string {
   if (hash === DOME && !may("operate-dome"))
     return "This token may not work the dome; sign in with one that has the scope operate-dome.";
@@ -133,7 +136,7 @@ function lackingFor(hash: string): string {
   return "";
 }
 
-/** What an address names; null if nothing. */
+/** Return the view of an address; null if there is none. */
 function viewOf(hash: string, id: string): View | null {
   if (hash === DOME) return new DomeView(showViewConnection, () => session);
   if (hash === NEW) return newJob;
@@ -156,7 +159,7 @@ function mark(link: HTMLAnchorElement, isHere: boolean): void {
   else link.removeAttribute("aria-current");
 }
 
-/** Where a job was deleted: the newest one that is left. */
+/** Show the newest job that is left, after a job was deleted. */
 async function showNewest(): Promise<void> {
   leave();
   show();
@@ -172,7 +175,7 @@ function leave(): void {
   showConnection();
 }
 
-/** A sentence that stands there already is not told again. */
+/** Show a problem. A sentence that is shown already is not set again, so that screen readers do not repeat it. */
 function showProblem(sentence: string): void {
   if (main.textContent !== sentence) show(element("p", { class: "failure", role: "alert" }, sentence));
 }
@@ -212,7 +215,7 @@ async function showAccount(): Promise<void> {
   account.replaceChildren(`${session.name} `, button);
 }
 
-/** Put something into the main part, below a token that its owner has not kept yet. */
+/** Show content in the main part, below a token that its owner has not stored yet. */
 function show(...content: HTMLElement[]): void {
   main.replaceChildren(...(unkept ? [unkept] : []), ...content);
 }

@@ -1,4 +1,7 @@
-/** Render against photograph with a slider between, and the residual beside; earlier steps stay as a film strip. */
+/**
+ * Comparison of render and photograph with a slider between them, and the residual beside. Earlier steps stay as a film
+ * strip.
+ */
 
 import { artifactUrl, type JobEvent } from "./api";
 import { element } from "./element";
@@ -14,7 +17,7 @@ interface Preview {
   render: string;
   photo: string;
   residual: string;
-  /** Ends of the residual's colours, in words. */
+  /** Labels of both ends of the residual's colour scale. */
   least: string;
   most: string;
 }

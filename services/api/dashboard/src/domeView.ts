@@ -1,6 +1,6 @@
 /**
- * The dome by hand: ALL OFF, what the controller says, one light for alignment, preflight. Asks the controller again
- * every second.
+ * The dome by hand: ALL OFF, the state of the controller, one light for alignment, preflight. The controller is asked
+ * again every second.
  */
 
 import {
@@ -19,9 +19,9 @@ import { element } from "./element";
 import { LightGrid } from "./lightGrid";
 
 const ASK_AGAIN_MS = 1000;
-/** Older than this, what was heard of the dome is shown as unknown. */
+/** Age in ms beyond which the last state of the dome is shown as unknown. */
 const STALE_MS = 3000;
-/** Whoever has pressed ALL OFF is told after this time that nothing has answered. */
+/** Time in ms after which the page says that ALL OFF has had no answer. */
 const OFF_PATIENCE_MS = 1000;
 const EMERGENCY = "Press the dome's emergency stop, or cut its power.";
 const LONGEST_LIGHT_S = 30;
@@ -55,7 +55,7 @@ export class DomeView {
   private deeds = 0;
   private timer = 0;
   private clock = 0;
-  /** When the dome last told its state, and what it was. */
+  /** When the dome last reported its state (`performance.now()`, ms), and that state in words. */
   private heardMs: number | null = null;
   private lastState = "";
   private isStopped = false;
@@ -167,7 +167,7 @@ export class DomeView {
     this.look.disabled = false;
   }
 
-  /** Do something by hand; what is refused is told, and so is nothing else than the newest. */
+  /** Carry out an action by hand. If it is refused the reason is shown; messages of earlier actions are removed. */
   private async act(action: () => Promise<void>): Promise<void> {
     this.refusal.hidden = true;
     this.done.textContent = "";
@@ -191,14 +191,14 @@ export class DomeView {
     try {
       const dome = document.hidden ? null : await getDome();
       if (this.isStopped) return;
-      if (dome && deeds === this.deeds) this.take(dome); // not what was asked before something was done by hand
+      if (dome && deeds === this.deeds) this.take(dome); // an answer from before the last action is out of date
       this.onConnection(true);
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
       if (this.isStopped) return;
       const isLost = problem instanceof TypeError;
       this.onConnection(!isLost);
-      // Who does not answer in time is forgotten once what he said is old.
+      // After a timeout the state stays until it is too old (showAge).
       if (!(problem instanceof DOMException)) this.forget();
       tell(this.silence, problem);
       this.silence.hidden = isLost || problem instanceof DOMException;
@@ -206,7 +206,7 @@ export class DomeView {
     this.askLater();
   }
 
-  /** Show nothing as if it were known. */
+  /** Show the state as unknown. */
   private forget(): void {
     this.state.textContent = "unknown";
     this.state.dataset["state"] = "FAILED";
@@ -215,7 +215,7 @@ export class DomeView {
     this.facts.replaceChildren();
   }
 
-  /** How long ago the dome was last heard; what it said then is not shown as if it were true now. */
+  /** Show how long ago the dome was last heard; a state that is too old is shown as past and not as present. */
   private showAge(): void {
     if (this.heardMs === null) {
       this.heard.textContent = "not heard yet";
@@ -286,7 +286,7 @@ export class DomeView {
   }
 }
 
-/** What stands there already is not told again. */
+/** Show a problem. A sentence that is shown already is not set again, so that screen readers do not repeat it. */
 function tell(where: HTMLElement, problem: unknown): void {
   where.hidden = false;
   if (where.textContent !== sentenceOf(problem)) where.textContent = sentenceOf(problem);

@@ -1,4 +1,4 @@
-/** Builds page elements from data; text is always text, never markup. */
+/** Builds page elements from data; text is always inserted as text, never as markup. */
 
 type Child = Node | string | null;
 

@@ -1,23 +1,30 @@
 /**
- * One stream of events for all pages of a browser, which opens six connections to a server and no more: a stream for
- * each page would leave none for ALL OFF. Runs in a shared worker, or in the page itself where there is none.
+ * One stream of events for all pages of a browser. A browser opens no more than six connections to a server, so that a
+ * stream for each page would leave none for ALL OFF. Runs in a shared worker, or in the page itself where there are
+ * none.
  */
 
 const REOPEN_MS = 3000;
-/** Pages that open or leave a job at about the same time share one opening of the stream. */
+/**
+ * Time in ms before the stream is opened, so that pages that open or leave a job at about the same time share one
+ * opening.
+ */
 const GATHER_MS = 30;
-/** Each page says so often what it follows; a page that was silent for longer was closed without a word. */
+/**
+ * Time in ms between two reports of a page on the jobs that it follows. A page that was silent for four times as long
+ * was closed without notice.
+ */
 export const TELL_MS = 10_000;
 const SILENCE_MS = 4 * TELL_MS;
-/** So long the stream stays closed for ALL OFF, so that a connection is free. */
+/** Time in ms for which the stream stays closed for ALL OFF, so that a connection is free. */
 const CLEAR_MS = 2000;
 
 /**
- * What a page says: which jobs it follows, each after the id of an event that it knows, or that all connections are
- * needed.
+ * Message of a page: the jobs that it follows, each with the id of the last event that it knows, or that all
+ * connections are needed.
  */
 export type Wish = { follow: [job: string, after: number][] } | { clear: true };
-/** What it is told. `text` is an event as JSON; `state` is null of a job that is not there. */
+/** Message to a page. `text` is an event as JSON; `state` is null for a job that does not exist. */
 export type News =
   { job: string; id: number; text: string } | { job: string; state: string | null } | { open: boolean };
 
@@ -30,9 +37,9 @@ interface Page {
 export class EventHub {
   private readonly pages = new Map<unknown, Page>();
   private source: EventSource | null = null;
-  /** The jobs of the stream that is open, or was last. */
+  /** The jobs of the stream that is open, or was open last. */
   private streamed = "";
-  /** By job, the id up to which the stream has told, or after which it began. */
+  /** By job, the id of the last event that the stream has delivered, or after which it began. */
   private told = new Map<string, number>();
   private timer = 0;
 
@@ -40,7 +47,7 @@ export class EventHub {
     setInterval(() => this.forgetTheSilent(), TELL_MS);
   }
 
-  /** Take in what a page says. */
+  /** Handle the message of a page. */
   take(page: unknown, wish: Wish, tell: (news: News) => void): void {
     if ("clear" in wish) {
       this.clear();
@@ -57,7 +64,7 @@ export class EventHub {
     this.openSoon(GATHER_MS);
   }
 
-  /** By job, the id after which some page lacks events. */
+  /** By job, the smallest id after which some page lacks events. */
   private places(): Map<string, number> {
     const places = new Map<string, number>();
     for (const page of this.pages.values()) {
@@ -77,7 +84,10 @@ export class EventHub {
     this.streamed = "";
   }
 
-  /** Open a stream of what is followed now, unless it is open already and no page lacks what it has told. */
+  /**
+   * Open a stream of the jobs that are followed, unless it is open already and no page lacks events that it has
+   * delivered.
+   */
   private open(): void {
     const places = this.places();
     const wanted = [...places.keys()].sort().join();
@@ -120,7 +130,7 @@ export class EventHub {
   }
 
   private isBehind(): boolean {
-    // A page that came later, or came back, needs events that have been told already.
+    // A page that opened later, or was shown again, needs events that were delivered already.
     return [...this.places()].some(([job, after]) => after < (this.told.get(job) ?? 0));
   }
 

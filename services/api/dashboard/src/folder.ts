@@ -1,6 +1,9 @@
-/** The files of a folder that was chosen or dropped, by their paths in it; what no capture may hold is left out. */
+/** The files of a folder that was chosen or dropped, by their paths in it, without those that no capture may hold. */
 
-/** As the server's own list: descriptions, images and meshes, and the chunks of arrays. */
+/**
+ * Files that a capture may hold, as in the server's own list: descriptions, images and meshes, and the chunks of
+ * arrays.
+ */
 const OF_A_CAPTURE = /\.(csv|json|jsonl|toml|npy|png|tif|tiff|exr|ply|obj|stl)$/i;
 const CHUNK = /[^/]\.zarr\/(.*\/)?c(\/\d+)+$/;
 
@@ -21,7 +24,10 @@ export function chosen(list: FileList): Folder {
   );
 }
 
-/** What was dropped: one folder, or the files and folders of one. To be called before the drop's event is over. */
+/**
+ * Return the files that were dropped: a folder, or the files and folders in one. It must be called before the drop
+ * event is over.
+ */
 export async function dropped(items: DataTransferItemList): Promise<Folder> {
   const entries = [...items].map((item) => item.webkitGetAsEntry()).filter((entry) => entry !== null);
   const [only] = entries;
@@ -45,7 +51,7 @@ async function walk(entry: FileSystemEntry, above: string): Promise<FolderFile[]
   return [{ path, file: await new Promise<File>((done, fail) => (entry as FileSystemFileEntry).file(done, fail)) }];
 }
 
-/** A reader hands out a hundred entries at a time. */
+/** List the entries of a folder; a reader returns a hundred of them at a time. */
 async function children(folder: FileSystemDirectoryEntry): Promise<FileSystemEntry[]> {
   const reader = folder.createReader();
   const all: FileSystemEntry[] = [];

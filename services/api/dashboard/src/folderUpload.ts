@@ -1,7 +1,7 @@
 /**
- * Uploads a folder: hashes it, tells the server what it holds, and sends by tus what the server lacks. Nothing is kept
- * here: the server knows what it has, so
- * the same folder, chosen again in this page or another one, goes on where an upload broke.
+ * Uploads a folder: hashes its files, sends the server their list, and sends by tus the bytes that the server lacks. No
+ * state is kept here, because the server knows what it has: the same folder, chosen again in this page or another one,
+ * goes on where an upload was interrupted.
  */
 
 import { sha256 } from "@noble/hashes/sha2.js";
@@ -13,7 +13,7 @@ import { inUploadLane } from "./lanes";
 const BLOCK_BYTES = 4 * 2 ** 20;
 const MIN_WAIT_MS = 500;
 const MAX_WAIT_MS = 8000;
-/** How long one file is tried without any of its bytes arriving. */
+/** Time in ms for which one step is tried again while it fails. */
 const PATIENCE_MS = 5 * 60_000;
 const TUS = { "Tus-Resumable": "1.0.0" };
 
@@ -116,7 +116,7 @@ async function append(file: KnownFile, start: number, block: Uint8Array<ArrayBuf
   return offsetAfter("PATCH", file.upload.slice("/v1".length), headers, block);
 }
 
-/** Ask by tus; answers with the offset of the next byte. */
+/** Send a tus request; resolves to the offset of the next byte. */
 async function offsetAfter(
   method: string,
   path: string,
@@ -128,7 +128,7 @@ async function offsetAfter(
   );
   if (!answer.ok) {
     const problem = await answer.json().catch(() => null);
-    // The server has got other bytes than we believed; it is asked how many.
+    // The server has another number of bytes than this page assumed, so 423 makes the next try ask for it.
     const isElsewhere = problem?.code === "upload-offset";
     throw new (answer.status === 401 ? Unauthenticated : Refusal)(
       problem?.detail ?? `The server answered ${answer.status}.`,
@@ -138,7 +138,7 @@ async function offsetAfter(
   return Number(answer.headers.get("Upload-Offset"));
 }
 
-/** Take a step again while what keeps it may pass, at growing intervals. */
+/** Try a step again at growing intervals, while it fails for a reason that may pass. */
 async function patiently<T>(step: () => Promise<T>): Promise<T> {
   const until = Date.now() + PATIENCE_MS;
   for (let wait = MIN_WAIT_MS; ; wait = Math.min(2 * wait, MAX_WAIT_MS)) {

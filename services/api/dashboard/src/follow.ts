@@ -1,4 +1,4 @@
-/** A page's part of the one stream of events that all pages of a browser share; a hidden page follows nothing. */
+/** The part of a page in the one stream of events that all pages of a browser share; a hidden page follows no job. */
 
 import type { JobEvent } from "./api";
 import { EventHub, type News, TELL_MS, type Wish } from "./eventHub";
@@ -14,8 +14,8 @@ const followers = new Map<string, Follower>();
 let send: ((wish: Wish) => void) | null = null;
 
 /**
- * Follow a job's events from the first one to its end; all are told once and in order, whatever happens to the
- * connection.
+ * Follow the events of a job from the first one to its end. Each is delivered once and in order, whatever happens to
+ * the connection.
  */
 export function followEvents(
   job: string,
@@ -24,7 +24,7 @@ export function followEvents(
   onConnection: Follower["onConnection"],
 ): () => void {
   const follower = { newest: 0, onEvent, onEnd, onConnection };
-  if (followers.delete(job)) tell(); // so that it is told anew from the first event
+  if (followers.delete(job)) tell(); // so that the events are delivered again from the first one
   followers.set(job, follower);
   tell();
   return () => {
@@ -34,7 +34,7 @@ export function followEvents(
   };
 }
 
-/** Leave all connections to what is about to be asked. */
+/** Close the stream of events for a while, so that all connections are free for the next request. */
 export function clearTheWay(): void {
   connect()({ clear: true });
 }

@@ -1,4 +1,4 @@
-/** Numbers for people: an uncertain number shows as many digits as its standard error allows. */
+/** Formats numbers for people: an uncertain number has as many digits as its standard error allows. */
 
 import type { Estimate, Figure, Job, TimeRange } from "./api";
 
@@ -9,8 +9,8 @@ export function unitOf(estimate: Estimate): string {
 }
 
 /**
- * The unit of a parameter of a running fit, which tells bare values: lengths occur in coefficients alone, as ``sigma``
- * or ``sigma_s_reduced``.
+ * Return the unit of a parameter of a running fit, whose events carry values without units: only coefficients such as
+ * ``sigma`` or ``sigma_s_reduced`` have a length in their unit.
  */
 export function unitOfName(name: string): string {
   return /(^|\.)sigma(_\w+)?$/.test(name) ? "mm⁻¹" : "";
@@ -24,7 +24,9 @@ export function valueOf(estimate: Estimate): string {
 
 const SOURCES: Record<string, string> = { light_gain: "lights", mean_cosine: "mean cosine" };
 
-/** The sources that make up most of a ±, as shares of its square; empty where they are not known. */
+/**
+ * Return the sources that make up most of a standard error, as shares of its square; empty where they are not known.
+ */
 export function sourcesOf(estimate: Estimate): string {
   const parts = Object.entries(estimate.se_parts ?? {});
   const whole = parts.reduce((sum, [, se]) => sum + se * se, 0);
@@ -39,14 +41,14 @@ export function significant(value: number): string {
   return Number(value.toPrecision(4)).toString();
 }
 
-/** What a badge says of a job, and how it is coloured: that a fit did not converge is no success to whoever looks. */
+/** Return text and colour of the badge of a job. A fit that did not converge is not shown as a success. */
 export function badgeOf(job: Job): { text: string; state: string } {
   if (job.state === "SUCCEEDED" && job.verdict && !job.verdict.converged)
     return { text: "not converged", state: "NOT-CONVERGED" };
   return { text: job.state.toLowerCase(), state: job.state };
 }
 
-/** As the report writes it: two digits of the standard error, one decimal at least. */
+/** Format a relative error as the report does: two digits of the standard error, at least one decimal. */
 export function figureOf(figure: Figure): string {
   if (figure.se === null) return `${(100 * figure.value).toFixed(figure.value >= 0.01 ? 1 : 2)} %`;
   const se = 100 * figure.se;
@@ -54,7 +56,7 @@ export function figureOf(figure: Figure): string {
   return `${(100 * figure.value).toFixed(decimals)} ± ${se.toFixed(decimals)} %`;
 }
 
-/** A length as the report's head writes it: to a hundredth of a millimetre. */
+/** Format a length as the head of the report does: to a hundredth of a millimetre. */
 export function lengthOf(estimate: Estimate): string {
   return `${estimate.value.toFixed(2)}${estimate.se === null ? "" : ` ± ${estimate.se.toFixed(2)}`} ${estimate.unit}`;
 }
@@ -73,7 +75,7 @@ export function when(seconds: number): string {
   return new Date(1000 * seconds).toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
 }
 
-/** What is known of the time until a job ends. */
+/** Describe the time until a job ends. */
 export function remaining(range: TimeRange): string {
   if (range.low_s === null || range.high_s === null) return `No time range: ${range.reason ?? ""}`;
   const [low, lowUnit] = duration(range.low_s);

@@ -1,6 +1,6 @@
 /**
- * What a person does with one job: name, cancel, retry, download, delete, keep the calibration that it made. Deleting
- * asks first, and says what goes.
+ * The actions of a person on one job: name, cancel, retry, download, delete, keep the calibration that it made.
+ * Deleting asks first, and says what is removed.
  */
 
 import {
@@ -22,7 +22,7 @@ const ENDED: readonly JobState[] = ["SUCCEEDED", "FAILED", "CANCELLED"];
 const LONGEST_NAME = 80;
 
 export interface Consequences {
-  /** The job's state has changed; `again` where it was queued again. */
+  /** Called when the job's state has changed; `again` says that it was queued again. */
   changed: (job: Job, again: boolean) => void;
   deleted: () => void;
   refused: (problem: unknown) => void;
@@ -102,7 +102,7 @@ export class JobActions {
     name.select();
   }
 
-  /** A name never means another calibration, so one with a date is offered. */
+  /** The name of a calibration can never be given another content, so a name with a date is offered. */
   private askForCalibration(): void {
     const offered = `rig-${new Date().toISOString().slice(0, 10)}`;
     const name = element("input", {
@@ -146,7 +146,7 @@ export class JobActions {
     });
   }
 
-  /** A question with one way on and one way back; Escape goes back as well. */
+  /** Ask a question with one button to go on and one to go back; Escape goes back as well. */
   private ask(title: string, content: HTMLElement[], go: HTMLButtonElement, action: () => Promise<void>): void {
     const back = element("button", { type: "button" }, "Back");
     const form = element(

@@ -1,11 +1,11 @@
-/** The jobs, newest first; more on demand. */
+/** The list of jobs, newest first; older ones are loaded on demand. */
 
 import { type Job, listJobs, sentenceOf, Unauthenticated } from "./api";
 import { element } from "./element";
 import { badgeOf, when } from "./format";
 
 const PAGE = 50;
-/** The server lists no more at once; what lies below is not asked for again. */
+/** Largest number of jobs that the server lists at once; older ones are not refreshed. */
 const MAX_LISTED = 500;
 
 export class JobList {
@@ -13,7 +13,7 @@ export class JobList {
   private readonly more = element("button", { type: "button" }, "Older jobs");
   private readonly refusal = element("p", { class: "failure", role: "alert" });
   private readonly empty = element("p", { class: "soft" }, "No job yet.");
-  /** Newest first, without a gap. */
+  /** The jobs that are shown, newest first and without a gap. */
   private jobs: Job[] = [];
   private showsOlder = false;
   private isLoading = false;
@@ -33,7 +33,7 @@ export class JobList {
     for (const link of this.items.querySelectorAll("a")) this.mark(link);
   }
 
-  /** Load what is shown again, as older jobs change too; returns the newest one's id. */
+  /** Load the jobs that are shown again, as older jobs change too; returns the id of the newest one. */
   async refresh(): Promise<string | null> {
     const { jobs, next_before: last } = await listJobs(
       this.showsOlder ? Math.min(Math.max(this.jobs.length, PAGE), MAX_LISTED) : PAGE,

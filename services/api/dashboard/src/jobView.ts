@@ -1,4 +1,4 @@
-/** One job, live: fed by its event stream, completed from its artifacts when it ends. */
+/** One job, live: updated from its stream of events, and completed from its artifacts when it ends. */
 
 import {
   type Artifact,
@@ -47,7 +47,7 @@ export class JobView {
   private isSlab = false;
   private readonly filesRefusal = element("p", { class: "failure", role: "alert" });
   private readonly files = element("ul", { class: "files" });
-  /** Of a jaw: the tooth that is looked at alone, null for all together; undefined before the first step. */
+  /** The tooth of a jaw that the steps fit alone; null where they fit all together, undefined before the first step. */
   private tooth: number | null | undefined;
   private areFilesDue = false;
   private isStopped = false;
@@ -136,11 +136,14 @@ export class JobView {
     if (event.kind === "step") this.takeStep(event);
     if (event.kind === "preview") this.comparison.add(event);
     if (event.kind === "finished") void this.showFiles();
-    // What is said of no stage is why the job waits.
+    // A log message without a stage says why the job waits.
     if (event.kind === "state" || (event.kind === "log" && event.stage === null)) void this.refreshState();
   }
 
-  /** Teeth that are looked at alone are shown one at a time, and no more once a step tells of all of them together. */
+  /**
+   * Show a step. Teeth that are fitted alone are shown one at a time, and no longer once a step fits all of them
+   * together.
+   */
   private takeStep(event: JobEvent): void {
     const { channel, parameters } = event.data;
     const tooth = typeof event.data["tooth"] === "number" ? event.data["tooth"] : null;
@@ -156,7 +159,7 @@ export class JobView {
       this.parameters.showStep(name, parameters as Record<string, number>);
   }
 
-  /** The replay tells old states too, so the state itself is always asked for. */
+  /** Ask for the state of the job. The events are no source of it, because they begin with those of the past. */
   private async refreshState(): Promise<void> {
     try {
       const job = await getJob(this.id);
@@ -177,11 +180,11 @@ export class JobView {
     this.showWaiting(job);
   }
 
-  /** What a queued job waits for, and how long a job will take, are no events, so they are asked for again. */
+  /** Show what a job waits for and how long it will take. No event says so, so this is asked for again. */
   private showWaiting(job: JobDetail): void {
     this.waits.hidden = job.waits_for === null;
     this.waits.textContent = job.waits_for ?? "";
-    // Whoever waits for other jobs may know how long; whoever waits for a person does not.
+    // A job that waits for other jobs may have a time range; one that waits for a person has none.
     this.remaining.hidden = job.remaining === null || (job.waits_for !== null && job.remaining.low_s === null);
     this.remaining.textContent = job.remaining ? remaining(job.remaining) : "";
     window.clearTimeout(this.timer);
@@ -218,7 +221,7 @@ export class JobView {
     this.refusal.textContent = sentenceOf(problem);
   }
 
-  /** What is there so far; asked for again later where it cannot be told now. */
+  /** List the files that exist so far; asks again later where the server cannot answer. */
   private async showFiles(): Promise<void> {
     this.areFilesDue = false;
     try {

@@ -1,17 +1,20 @@
 /**
- * How many requests all pages of a browser have under way at once. A browser opens six connections to a server by
- * HTTP/1.1: one is for the stream of events, one for an upload, three for all that is asked, and so one is left for a
- * download. ALL OFF takes no lane and none of them; see allOff.
+ * Limits the requests that all pages of a browser have under way at once. A browser opens six connections to a server
+ * by HTTP/1.1: one is for the stream of events, one for an upload, three (the lanes) for all other requests, and so one
+ * is left for a download. ALL OFF takes no lane and none of these connections; see allOff.
  */
 
 const LANES = 3;
 const UPLOAD = "dentine upload";
 
-/** Of a page that must do without the browser's locks, which are for secure addresses alone. */
+/**
+ * Number of requests under way and those that wait, in a page without the browser's locks, which exist for secure
+ * addresses alone.
+ */
 let running = 0;
 const waiting: (() => void)[] = [];
 
-/** Ask once a lane is free. */
+/** Send a request once a lane is free. */
 export async function inLane<T>(ask: () => Promise<T>): Promise<T> {
   if (!navigator.locks) return inOwnLane(ask);
   for (let lane = 0; lane < LANES; lane += 1) {
@@ -23,12 +26,12 @@ export async function inLane<T>(ask: () => Promise<T>): Promise<T> {
   return navigator.locks.request(name(Math.floor(LANES * Math.random())), ask) as Promise<T>;
 }
 
-/** Send a part of an upload, which may take long, once no other is on its way. */
+/** Send a part of an upload, which may take long, once no other part is on its way. */
 export async function inUploadLane<T>(send: () => Promise<T>): Promise<T> {
   return navigator.locks ? (navigator.locks.request(UPLOAD, send) as Promise<T>) : send();
 }
 
-/** Show a picture, loaded in a lane. A newer one takes its place though it came later. */
+/** Show a picture, loaded in a lane. A picture that still waits for a lane is dropped when another one is asked for. */
 export function showPicture(image: HTMLImageElement, url: string): void {
   image.dataset["wanted"] = url;
   void inLane(async () => {

@@ -1,4 +1,4 @@
-/** The dome's lights as buttons. One of them is in the tab order; arrow keys, Home and End go to the others. */
+/** The lights of the dome as buttons. One of them is in the tab order; arrow keys, Home and End move to the others. */
 
 import { element } from "./element";
 
@@ -15,7 +15,7 @@ export class LightGrid {
     this.root.addEventListener("focusin", (event) => this.reach(event.target as HTMLButtonElement));
   }
 
-  /** Show so many lights and which of them emit. */
+  /** Show `count` lights, and which of them emit. */
   show(count: number, lit: number[]): void {
     if (this.lights.length !== count) {
       this.lights = Array.from({ length: count }, (_, light) => this.button(light));
@@ -24,7 +24,7 @@ export class LightGrid {
     this.lights.forEach((button, light) => button.setAttribute("aria-pressed", `${lit.includes(light)}`));
   }
 
-  /** Show that nobody knows which lights emit; the buttons stay, so that the focus does. */
+  /** Show that it is not known which lights emit. The buttons stay, so that the focus does too. */
   forget(): void {
     for (const button of this.lights) button.removeAttribute("aria-pressed");
   }

@@ -48,15 +48,15 @@ export class LossChart {
   }
 
   /**
-   * Say the result beside the curve, once there is one: renders on the way take few paths, and their errors are less
-   * certain.
+   * Show the result beside the curve once there is one. The renders of single steps take few paths, and their errors
+   * are less certain.
    */
   conclude(verdict: Verdict | null): void {
     this.verdict = verdict;
     if (this.plot) this.draw();
   }
 
-  /** Take in a step of a channel; a step that a later attempt repeats replaces the earlier one. */
+  /** Add a step of a channel; a step that a later attempt repeats replaces the earlier one. */
   add(name: string, event: JobEvent): void {
     const { step, loss, held_out_error: heldOut, held_out_se: heldOutSe } = event.data;
     if (typeof step !== "number") return;

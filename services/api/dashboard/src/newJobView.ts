@@ -61,7 +61,7 @@ export class NewJobView {
     this.isShown = true;
   }
 
-  /** An upload goes on while another view is shown. */
+  /** Leave the view; an upload goes on while another view is shown. */
   stop(): void {
     this.isShown = false;
   }

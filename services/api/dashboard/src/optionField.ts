@@ -1,6 +1,6 @@
 /**
- * One option of a job as a form field, built from its JSON schema: label, input, help with unit, and what is wrong with
- * it.
+ * One option of a job as a form field, built from its JSON schema: label, input, help with unit, and the fault of its
+ * value.
  */
 
 import { element } from "./element";
@@ -19,7 +19,7 @@ export interface OptionSchema {
   exclusiveMinimum?: number;
 }
 
-/** Units are the ends of names. */
+/** Units by the ending of an option's name. */
 const UNITS: Record<string, string> = { _s: "s", _px: "px", _mm: "mm", _deg: "°" };
 
 type Input = HTMLInputElement | HTMLSelectElement | HTMLTextAreaElement;
@@ -61,7 +61,7 @@ export class OptionField {
     this.reset();
   }
 
-  /** Offer values, each with a few words on it; others may be typed all the same. */
+  /** Offer values, each with a few words on it; other values may still be typed. */
   suggest(values: [string, string][]): void {
     const list = element(
       "datalist",
@@ -86,20 +86,20 @@ export class OptionField {
     else this.input.value = value === undefined || value === null ? "" : String(value);
   }
 
-  /** What the job is to be given; undefined where it is the default. */
+  /** Return the value for the job; undefined where it is the default. */
   value(): unknown {
     const value = this.read();
     return JSON.stringify(value) === JSON.stringify(this.schema.default ?? null) ? undefined : value;
   }
 
-  /** Whether the browser finds it good; what it finds wrong stands beside the field. */
+  /** Whether the value is valid in the browser's view; if not, its message is shown beside the field. */
   check(): boolean {
     const good = this.input.checkValidity();
     this.accuse(good ? "" : this.input.validationMessage);
     return good;
   }
 
-  /** Say what is wrong with it, nothing by an empty text. */
+  /** Show the fault of the value beside the field; an empty text removes it. */
   accuse(sentence: string): void {
     this.refusal.textContent = sentence;
     this.input.setAttribute("aria-invalid", sentence ? "true" : "false");
@@ -156,7 +156,7 @@ function build(schema: OptionSchema, id: string): Input {
   return input;
 }
 
-/** 'enamel.sigma = 4.5', one a line; what is no number is sent as it is, so that the server says so. */
+/** Parse lines such as 'enamel.sigma = 4.5'. A value that is no number is sent as it is, so that the server says so. */
 function table(text: string): Record<string, unknown> {
   const rows = text
     .split("\n")

@@ -4,7 +4,10 @@ import type { Parameters } from "./api";
 import { element } from "./element";
 import { significant, sourcesOf, unitOf, unitOfName, valueOf } from "./format";
 
-/** A slab's dictionary may have a hundred atoms. */
+/**
+ * Names of the parameters of single atoms, which the table leaves out: the dictionary of a slab may have a hundred
+ * atoms.
+ */
 const OF_AN_ATOM = /^(atoms|volumes)\./;
 
 export class ParameterTable {
@@ -16,7 +19,7 @@ export class ParameterTable {
   private readonly current = new Map<string, Record<string, number>>();
   private isFinal = false;
 
-  /** Values of a running fit: no uncertainty is known yet, and the table says so. */
+  /** Show the values of a running fit. Their uncertainty is not known yet, and the table says so. */
   showStep(channel: string, values: Record<string, number>): void {
     this.current.set(channel, values);
     if (this.isFinal) return;
@@ -38,7 +41,7 @@ export class ParameterTable {
     this.current.clear();
   }
 
-  /** The published result; `heading` is what stands above a channel's column. */
+  /** Show the published result; `heading` returns the heading of the column of a channel. */
   showResult(result: Parameters, heading: (channel: string) => string = (channel) => channel): void {
     this.isFinal = true;
     const channels = Object.keys(result);
@@ -97,7 +100,7 @@ export class ParameterTable {
   }
 }
 
-/** A name that may be broken after its dots, so that it needs little room on a phone and no word is cut. */
+/** Return a name that may be broken after its dots, so that it needs little room on a phone and no word is cut. */
 function breakable(name: string): (string | HTMLElement)[] {
   return name.split(/(?<=\.)/).flatMap((part, place) => (place ? [element("wbr"), part] : [part]));
 }

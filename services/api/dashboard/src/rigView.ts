@@ -1,4 +1,4 @@
-/** How a rig is connected: what to set and where, and whether the server's dome answers. */
+/** How a rig is connected: which settings it needs and where, and whether the dome of the server answers. */
 
 import {
   FIRST_PATIENCE_MS,
@@ -145,7 +145,7 @@ function section(title: string, ...content: HTMLElement[]): HTMLElement {
   return element("section", {}, element("h3", {}, title), ...content);
 }
 
-/** What is known of each calibration, and what may be done with it. */
+/** Build the table of calibrations: the state of each, and whether jobs may use it. */
 function tableOf(listed: NamedCalibration[]): HTMLElement {
   const head = ["Name", "State", "Made", ""].map((text) => element("th", { scope: "col" }, text));
   const rows = listed.map((one) => {

@@ -1,5 +1,5 @@
 /**
- * What a setup link opens: makes the administrator's token and signs the browser in; the token is shown this once,
+ * The view of a setup link. It makes the administrator's token and signs the browser in; the token is shown this once,
  * beside the page.
  */
 
@@ -35,7 +35,7 @@ export class SetupView {
     this.refusal.hidden = true;
     try {
       const { token } = await setUp(this.secret);
-      history.replaceState(null, "", location.pathname); // the link is void, and need not be seen again
+      history.replaceState(null, "", location.pathname); // the link is no longer valid and need not be shown again
       this.onSuccess(token);
     } catch (problem) {
       this.refusal.hidden = false;
@@ -45,7 +45,7 @@ export class SetupView {
   }
 }
 
-/** The token on a card that stays until its owner has kept it. */
+/** Build a card with the token, which stays until its owner has stored the token. */
 export function tokenCard(token: string, onKept: () => void): HTMLElement {
   const shown = element("code", { class: "token", tabindex: "0" }, token);
   const copied = element("span", { class: "done", role: "status" });
@@ -68,7 +68,7 @@ export function tokenCard(token: string, onKept: () => void): HTMLElement {
   );
 }
 
-/** Copies where the browser lets pages copy, else selects; answers with a sentence. */
+/** Copy the text where the browser allows pages to, else select it; resolves to a sentence for the person. */
 async function copyText(shown: HTMLElement): Promise<string> {
   try {
     await navigator.clipboard.writeText(shown.textContent ?? "");

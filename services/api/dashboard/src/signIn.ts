@@ -1,4 +1,4 @@
-/** Asks for a token. The server answers with a cookie that scripts cannot read; the page keeps nothing. */
+/** Asks for a token. The server answers with a cookie that scripts cannot read; the page stores nothing. */
 
 import { sentenceOf, signIn } from "./api";
 import { element } from "./element";

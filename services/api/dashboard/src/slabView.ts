@@ -1,4 +1,4 @@
-/** A slab's fit: its wavelengths as they are done, and the phase functions that came out. */
+/** The fit of a slab: the wavelengths as they are finished, and the resulting phase functions. */
 
 import { type Artifact, artifactUrl, type JobEvent } from "./api";
 import { element } from "./element";
@@ -17,7 +17,7 @@ export class SlabView {
     { class: "phases" },
     element("p", { class: "soft" }, "No phase function yet; it comes when all wavelengths are done."),
   );
-  /** What is told of each wavelength that is done, by its length in nm. */
+  /** Message of each wavelength that is finished, by the wavelength in nm. */
   private readonly told = new Map<number, string>();
   private shown = "";
 
@@ -34,7 +34,7 @@ export class SlabView {
     );
   }
 
-  /** The report's pictures, once they are there. */
+  /** Show the pictures of the report, once they exist. */
   list(files: Artifact[]): void {
     const names = files
       .map((file) => PICTURE.exec(file.path)?.[1])

@@ -18,7 +18,10 @@ import { bytes, when } from "./format";
 import { OptionField } from "./optionField";
 
 const SOURCES = new Set(["capture", "rig"]);
-/** Groups by the options that they hold; what the schema has besides comes last, so that no option is missing. */
+/**
+ * Titles of groups and the options in them. Options of the schema that are in no group come last, so that none is
+ * missing.
+ */
 const GROUPS: [string, string[]][] = [
   ["What is fitted", ["kind", "fdi", "boundary", "ior", "dentin", "stains", "lobes"]],
   [
@@ -76,7 +79,7 @@ export class SubmitView {
   private demo: Preset["options"] = {};
   private filledForDemo = false;
 
-  /** `chosen`: id of a capture, or "rig"; else the newest capture. */
+  /** `chosen` is the id of a capture, or "rig"; if it is empty, the newest capture is selected. */
   constructor(private readonly chosen: string) {
     this.refusal.hidden = true;
     this.source.addEventListener("change", () => {
@@ -260,7 +263,7 @@ export class SubmitView {
     return { capture: `captures/${this.capture.value}` };
   }
 
-  /** A sentence that begins with an option's name stands beside that option. */
+  /** Show a refusal; a sentence that begins with the name of an option is shown beside that option. */
   private refuse(sentence: string, fields: OptionField[]): void {
     const name = sentence.match(/^(?:Option )?'([\w.]+)'/)?.[1] ?? "";
     const field = fields.find((one) => one.name === name || name.startsWith(`${one.name}.`));

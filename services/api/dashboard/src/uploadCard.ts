@@ -1,6 +1,6 @@
 /**
- * A place for a folder with a capture: dropped or chosen, uploaded with a bar, and gone on with when the same folder
- * comes again.
+ * A place for a folder with a capture: the folder is dropped or chosen, and uploaded with a progress bar. An upload
+ * that was interrupted goes on when the same folder is given again.
  */
 
 import { sentenceOf, Unauthenticated } from "./api";
@@ -49,7 +49,7 @@ export class UploadCard {
       if (event.dataTransfer) void this.upload(dropped(event.dataTransfer.items));
     });
     window.addEventListener("beforeunload", (event) => {
-      if (this.isBusy) event.preventDefault(); // the browser then asks
+      if (this.isBusy) event.preventDefault(); // the browser then asks whether to leave the page
     });
   }
 

@@ -1,4 +1,4 @@
-/** How well a fit went, before all else that is shown of its job: the report's own words and numbers. */
+/** The verdict on a fit in the words and numbers of the report, shown before everything else of the job. */
 
 import type { Verdict } from "./api";
 import { element } from "./element";
@@ -15,7 +15,7 @@ export class VerdictCard {
   show(verdict: Verdict | null): void {
     this.root.hidden = verdict === null;
     const told = JSON.stringify(verdict);
-    if (!verdict || told === this.shown) return; // an alert that stands there already is not told again
+    if (!verdict || told === this.shown) return; // an alert that is shown already is not set again
     this.shown = told;
     const thickness = verdict.enamel_thickness;
     const errors = Object.entries(verdict.channels).map(([channel, error]) => `${channel} ${figureOf(error)}`);

@@ -1,4 +1,4 @@
-/** The workers, what each is doing, and how many jobs they get done. */
+/** The workers, the task of each, and how many jobs they have finished. */
 
 import { listWorkers, sentenceOf, type Worker } from "./api";
 import { element } from "./element";
