@@ -218,7 +218,7 @@ export interface AllOff {
   others_stopped: number;
 }
 
-/** The server refuses a request; the message is the sentence of its answer. */
+/** The server answers with an error; the message is the sentence of its answer. */
 export class Refusal extends Error {
   constructor(
     sentence: string,
