@@ -1,1 +1,4 @@
-"""What crosses a process boundary. Imports no service and nothing heavier than NumPy, pydantic and zarr."""
+"""Records, errors, settings and stores, which cross process boundaries.
+
+This package imports no service and nothing heavier than NumPy, pydantic and zarr.
+"""

@@ -1,4 +1,4 @@
-"""What a job has measured, read from its folder."""
+"""The asset that a job has exported, read from the job's folder."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class Asset:
     """A measured tooth, jaw or material."""
 
     folder: Path
-    """Where the scenes, meshes and scripts lie."""
+    """Folder of the scenes, meshes and scripts."""
     manifest: AssetManifest
     parameters: Mapping[str, Mapping[str, Estimate]]
     """Channel -> name, such as ``enamel.sigma`` -> value, standard error and unit."""
 
     def scene(self, channel: str) -> Path:
-        """The scene of one colour channel, for ``mitsuba.load_file``.
+        """Path of the scene of one colour channel, for ``mitsuba.load_file``.
 
         Raises:
-            CorruptStoreError: the asset has none for this channel.
+            CorruptStoreError: the asset has no scene for this channel.
         """
         path = self.folder / f"scene_{channel}.xml"
         if not path.is_file():
@@ -37,10 +37,10 @@ class Asset:
 
 
 def load_asset(job: str | Path) -> Asset:
-    """The asset of a job, by the job's folder.
+    """Load the asset of a job from the job's folder.
 
     Raises:
-        MissingStageError: the job has exported none. CorruptStoreError: a file is not as it was published.
+        MissingStageError: the job has exported no asset. CorruptStoreError: a file is not as it was published.
     """
     folder, manifest = open_stage(Path(job), "asset", AssetManifest)
     path = Path(job) / PARAMETERS

@@ -1,4 +1,4 @@
-"""Choosing by name, where a name that is not known must not pass for another."""
+"""Lookup of a choice by its name; an unknown name is an error and never stands for a default."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ T = TypeVar("T")
 
 
 def chosen(what: str, name: str, choices: Mapping[str, T]) -> T:
-    """What a name stands for.
+    """Return the choice of a given name.
 
     Args:
-        what: the thing that is chosen, as the message shall call it.
+        what: word for the kind of choice, for the message.
 
     Raises:
-        SettingsError: nothing has that name; the message lists the names that there are.
+        SettingsError: there is no choice of that name; the message lists the known names.
     """
     if name not in choices:
         raise SettingsError(f"{what} {name!r} is not known; known are {', '.join(sorted(choices))}.")

@@ -32,7 +32,7 @@ class DomeStatus(Record):
 
 
 class DomeCommand(Record):
-    """One thing to do, one line on the process's standard input."""
+    """A command to the process that works the dome: one line on its standard input."""
 
     number: int = Field(description="grows; what was asked before an ALL OFF is not done after it")
     do: Literal["status", "off", "light", "dark", "preflight"]
@@ -43,7 +43,7 @@ class DomeCommand(Record):
 
 
 class DomeAnswer(Record):
-    """What came of it, one line on standard output."""
+    """The result of a command: one line on the process's standard output."""
 
     number: int
     status: DomeStatus | None = None

@@ -1,4 +1,4 @@
-"""The exception tree: what more than one room raises. What the service alone raises is in ``services.client.errors``.
+"""The exception tree: errors that more than one package raises. Those of the server are in ``services.client.errors``.
 
 ::
 
@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 Evidence = Mapping[str, str | int | float | None]
-"""What was measured when something failed, quantities with their units in the name."""
+"""Measured values that belong to an error, by name; the name of a quantity ends in its unit."""
 
 
 class DentineError(Exception):
@@ -59,7 +59,7 @@ class DentineError(Exception):
 
     @property
     def evidence(self) -> Evidence:
-        """What was measured when it happened."""
+        """Values measured when the error happened; empty where there are none."""
         return self.args[1] if len(self.args) > 1 else {}
 
 
@@ -146,7 +146,7 @@ class RigError(DentineError):
 
 
 class RigUnreachableError(RigError):
-    """The dome's controller does not answer. What it was last told may hold until its watchdog runs out."""
+    """The dome's controller does not answer. Its last command may stay in effect until its watchdog expires."""
 
     code = "rig-unreachable"
 

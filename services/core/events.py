@@ -1,4 +1,4 @@
-"""What a job tells of itself: the record that travels from a stage to whoever watches."""
+"""The record of one event of a job, which travels from a stage to everybody who follows the job."""
 
 from __future__ import annotations
 

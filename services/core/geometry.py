@@ -22,7 +22,7 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 MAX_NAME_BYTES = 64
-# Controls, halves of a character, and separators of lines and paragraphs
+# Unicode categories: controls, surrogates, and separators of lines and paragraphs
 UNWRITABLE = {"Cc", "Cs", "Zl", "Zp"}
 
 
@@ -37,11 +37,11 @@ def _part_of_a_file_name(name: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_part_of_a_file_name)]
-"""Of a camera, light or channel: pictures and previews carry it in their file names."""
+"""Name of a camera, light or channel. It is part of the file names of pictures and previews."""
 
 
 class Record(BaseModel):
-    """Base of every record at a process edge: frozen, no unknown keys, no NaN."""
+    """Base of every record that crosses a process boundary: frozen, no unknown keys, no NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
 
@@ -70,13 +70,13 @@ class Camera(Record):
         return image[:, :2] / image[:, 2:3], local[:, 2]
 
     def pixel_mm(self, point_mm: NDArray[np.float64]) -> float:
-        """Edge of a pixel at a world point (3,), mm."""
+        """Edge length of a pixel's footprint at a world point (3,), mm."""
         return float(self.project(point_mm[None])[1][0] / self.K[0][0])
 
     def rays(
         self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """World-space origin (3,) and unit directions (N, 3) through pixel coordinates."""
+        """Origin (3,) in mm and unit directions (N, 3), in world space, of the rays through pixel coordinates (N,)."""
         pose = np.asarray(self.camera_from_world)
         local = np.stack([x_px, y_px, np.ones_like(x_px)], axis=-1) @ np.linalg.inv(np.asarray(self.K)).T
         directions = local @ pose[:3, :3]
@@ -99,7 +99,7 @@ class Mesh:
     faces: NDArray[np.int32]
 
     def edge_counts(self) -> NDArray[np.int64]:
-        """How many faces use each undirected edge."""
+        """Number of faces that share each undirected edge, (E,)."""
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         return np.unique(edges, axis=0, return_counts=True)[1]
 
@@ -109,10 +109,10 @@ class Mesh:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
     def require_surface(self, name: str, extent_mm: tuple[float, float] = (2.0, 200.0)) -> None:
-        """Refuse a mesh that has no extent in millimetres or that nothing can hit; it need not be closed.
+        """Refuse a mesh without faces or without a plausible extent in millimetres; it need not be closed.
 
         Raises:
-            MeshError: not finite, without faces, or of an extent that nothing in a mouth has.
+            MeshError: the mesh is not finite, without faces, or of an extent that nothing in a mouth has.
         """
         if not np.isfinite(self.vertices_mm).all():
             raise MeshError(
@@ -129,8 +129,9 @@ class Mesh:
             )
 
     def shell_count(self) -> int:
-        """Into how many parts the surface falls that share no vertex."""
-        # Every vertex takes the least number of its faces' vertices, then of that vertex, until none changes.
+        """Number of connected parts of the surface; different parts share no vertex."""
+        # Every vertex takes the least label of its faces' vertices, and then the label of the vertex that this label
+        # names, until no label changes.
         labels = np.arange(len(self.vertices_mm))
         while True:
             before = labels.copy()
@@ -140,10 +141,10 @@ class Mesh:
                 return len(np.unique(labels[self.faces[:, 0]]))
 
     def require_one_shell(self, name: str) -> None:
-        """Refuse a mesh of several bodies, which may lie in each other.
+        """Refuse a mesh of several connected parts, which may lie inside each other.
 
         Raises:
-            MeshError: says how many there are.
+            MeshError: the mesh has several; the message says how many.
         """
         if (shells := self.shell_count()) > 1:
             raise MeshError(
@@ -155,7 +156,8 @@ class Mesh:
         """Refuse a mesh that cannot bound a medium.
 
         Raises:
-            MeshError: open, inside out, not finite, or of an extent that no tooth or jaw in millimetres has.
+            MeshError: the mesh is open, inside out, not finite, or has an extent that no tooth or jaw has in
+                millimetres.
         """
         self.require_surface(name, extent_mm)
         open_edges = int(np.count_nonzero(self.edge_counts() != 2))
@@ -177,5 +179,5 @@ class Tooth:
 
 
 def teeth_folder(root: Path, fdi: int) -> Path:
-    """Where a capture or prepared folder keeps one tooth's meshes: ``teeth/<FDI>/outer.ply`` and ``dentin.ply``."""
+    """Folder of one tooth's meshes in a capture or prepared folder: ``teeth/<FDI>/outer.ply`` and ``dentin.ply``."""
     return root / "teeth" / str(fdi)

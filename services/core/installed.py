@@ -1,4 +1,4 @@
-"""Importing what an extra of the package brings, with a sentence where that fails."""
+"""Import of packages that an extra of this distribution brings; a failure is an error of one sentence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def require_packages(names: Iterable[str], extra: str) -> None:
     """Import packages.
 
     Raises:
-        PlatformError: one is not installed, or cannot be loaded, such as for want of a library of the system.
+        PlatformError: a package is not installed, or cannot be loaded, for example because it lacks a system library.
     """
     for name in names:
         try:

@@ -1,9 +1,9 @@
-"""The kinds of job: what each goes through, who does it, and which options are its own.
+"""The kinds of job: the stages of each, the functions that run them, and the options that it alone has.
 
 A kind is one entry of ``JOB_KINDS`` and the module that its doors name; its options are fields of ``JobSpec``. An
 installed package adds a kind by an entry point of the group ``dentine.job_kinds`` that leads to a ``JobKind``. Every
-process reads the entry points for itself, so a worker knows the kind where that package is installed, and names the
-ones it knows where not.
+process reads the entry points for itself, so a worker knows an added kind only where its package is installed;
+elsewhere its error lists the kinds that it knows.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 from services.core.stage import StageName
 
 COMMON_OPTIONS = frozenset({"kind", "capture", "seed", "workers", "priority"})
-"""What every kind of job may be told."""
+"""Options that every kind of job has."""
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,15 @@ class JobKind:
     """One kind of job."""
 
     summary: str
-    """What is measured."""
+    """What a job of this kind measures, in a few words."""
     stages: tuple[StageName, ...]
-    """In order, without those that make a capture."""
+    """Stages in their order, without those that make a capture."""
     doors: Mapping[StageName, str]
-    """``module:function`` of each stage; imported by the worker alone."""
+    """Stage -> ``module:function`` that runs it; only workers import it."""
     own_options: frozenset[str] | None
-    """Besides the common ones; None for all that no other kind claims."""
+    """Options besides the common ones; None for all options that no other kind lists as its own."""
     fixed_options: Mapping[str, Any] = field(default_factory=dict)
-    """Options that its fit knows at this value alone."""
+    """Options that have only one possible value in this kind's fit, with that value."""
 
     @property
     def has_rig(self) -> bool:
@@ -53,7 +53,7 @@ _TEETH: Mapping[StageName, str] = {
 _SLAB: Mapping[StageName, str] = {"fit": "services.fit.slab.stage:run", "export": "services.fit.slab.stage:export"}
 
 SLAB_OPTIONS = frozenset({"effort", "dictionary", "particle_index", "particle_absorption"})
-"""What only a slab may be told."""
+"""Options that only a slab has."""
 _OF_A_JAW: Mapping[str, Any] = {
     "fdi": None,
     "lobes": 1,
@@ -64,7 +64,7 @@ _OF_A_JAW: Mapping[str, Any] = {
 }
 
 ENTRY_POINTS = "dentine.job_kinds"
-"""Group of entry points by which installed packages add kinds."""
+"""Name of the group of entry points by which installed packages add kinds."""
 JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
     {
         "tooth": JobKind("one tooth alone", ("prepare", "fit", "export"), _TEETH, None),
@@ -85,16 +85,16 @@ JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
 
 @cache
 def job_kinds() -> Mapping[str, JobKind]:
-    """All kinds that this process knows: this package's, which nobody replaces, and those of installed packages."""
+    """All kinds that this process knows: those of this package, which no other can replace, and those of others."""
     added = {point.name: point.load() for point in entry_points(group=ENTRY_POINTS) if point.name not in JOB_KINDS}
     return MappingProxyType({**JOB_KINDS, **added})
 
 
 def known_kind(name: str) -> str:
-    """The name of a kind, as it was given.
+    """Return the name of a kind unchanged, if there is such a kind.
 
     Raises:
-        ValueError: there is no such kind; the message lists those that there are.
+        ValueError: there is no such kind; the message lists the known ones.
     """
     if name not in job_kinds():
         raise ValueError(f"there is no kind of job '{name}'; the kinds are {', '.join(job_kinds())}")
@@ -102,7 +102,7 @@ def known_kind(name: str) -> str:
 
 
 def foreign_options(kind: str, options: frozenset[str]) -> frozenset[str]:
-    """Those of some options that jobs of this kind do not have."""
+    """Return those of the given options that jobs of this kind do not have."""
     own = job_kinds()[kind].own_options
     others = frozenset().union(*(other.own_options or () for name, other in job_kinds().items() if name != kind))
     return options - COMMON_OPTIONS - own if own is not None else options & others

@@ -1,11 +1,11 @@
-"""Masks by hand: what a person keeps from a job's fit. They lie beside its stages.
+"""Masks drawn by hand: pixels that a person excludes from a job's fit. Their files lie beside the job's stages.
 
 ::
 
     JOB/masks/<camera>@<light>.png     names percent-encoded; light 'all' for every light of the camera
 
-A grey PNG of the camera's size; a pixel that is not 0 is not used. Where the jaws moved between frames it is meant
-where they were in the first one.
+A mask is a grey PNG of the camera's size; its pixels that are not 0 are excluded. Where the jaws moved between frames,
+a mask refers to their position in the first frame.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ LONGEST_NAME = 200
 
 
 def mask_path(root: Path, camera: str, light: str) -> Path:
-    """Where a job keeps the mask of a camera under a light, or under all."""
+    """Path of a job's mask of a camera under one light, or under all lights."""
     return root / FOLDER / f"{quote(camera, safe='')}@{quote(light, safe='')}.png"
 
 
 def read_masks(root: Path) -> Mapping[tuple[str, str], bytes]:
-    """Every mask of a job by camera and light, as it lies on the disk.
+    """Read the masks of a job: (camera, light) -> content of the PNG file.
 
     Raises:
-        CaptureInputError: a file there is no mask by its name.
+        CaptureInputError: a file in the folder does not have the name of a mask.
     """
     found = {}
     for path in sorted((root / FOLDER).glob("[!.]*")):
@@ -45,14 +45,15 @@ def read_masks(root: Path) -> Mapping[tuple[str, str], bytes]:
 
 
 def digest_of(masks: Mapping[tuple[str, str], bytes]) -> str:
-    """Identifies masks by their content; empty where there are none."""
+    """A digest that identifies masks by camera, light and content; empty where there are no masks."""
     rows = sorted((*of, hashlib.sha256(content).hexdigest()) for of, content in masks.items())
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest() if rows else ""
 
 
 def is_stale(root: Path) -> bool:
-    """Whether the job's published preparation was made with other masks than there are now; not where it does not say,
-    as it is damaged.
+    """Whether the job's published preparation was made with other masks than the present ones.
+
+    A preparation whose record cannot be read counts as not stale.
     """
     if not is_published(root, "prepared"):
         return False

@@ -8,33 +8,34 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 DEFAULT_GROUP = "default"
-"""Owns what a server without tokens makes, and what versions before 0.2 have made; their tokens belong to it."""
+"""Group that owns everything made by a server without tokens and by versions before 0.2, whose tokens belong to it."""
 
 
 def owner_of_token(token_id: str) -> str:
-    """The owner that a token without a group is; no group has such a name."""
+    """The owner that stands for a token without a group; no group has such a name."""
     return f"token:{token_id}"
 
 
 @dataclass(frozen=True)
 class Viewer:
-    """Whoever asks, as far as it decides what is shown to him."""
+    """The caller of a request, with the properties that decide what the caller may see."""
 
     owner: str
-    """Of what he makes."""
+    """Owner of everything that the viewer makes."""
     sees_all: bool = False
-    """Whether he may see and use what others own: an administrator, or anybody where no tokens are asked for."""
+    """Whether the viewer may see and use what others own, as administrators may, and anybody where no token is
+    required."""
     uses_paths: bool = True
-    """Whether he may submit, and so may see where on the server captures lie."""
+    """Whether the viewer may submit jobs, and therefore may see the paths of captures on the server."""
 
     def may_see(self, owner: str | None) -> bool:
-        """Whether something of this owner is shown; None: it is not there."""
+        """Whether the viewer may see something that this owner owns; the owner is None where it does not exist."""
         return self.sees_all or owner == self.owner
 
     def key(self, key: str | None) -> str | None:
-        """An idempotency key as it is stored: two owners may choose the same."""
+        """An idempotency key as it is stored: with the owner, because two owners may choose the same key."""
         return None if key is None else f"{self.owner}/{key}"
 
 
 LOCAL_VIEWER = Viewer(DEFAULT_GROUP, sees_all=True)
-"""Whoever is on this machine: the server itself, and callers where access is open."""
+"""The viewer for everybody on this machine: the server itself, and all callers where access is open."""

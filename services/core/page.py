@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def page_template(path: Path) -> Template:
-    """A page's template with the style that all reports share as ``style``."""
+    """Load the template of a page; its variable ``style`` holds the style that all reports share."""
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 

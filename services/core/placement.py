@@ -1,7 +1,8 @@
-"""Which worker may do what, and how those that do the same are shared: Dask resources and priorities by name.
+"""Dask resources and priorities by name: which worker may run a stage, and how jobs share the workers.
 
-A resource here is a mark of what a worker can do, not an amount that is used up: a task that has given its thread back,
-such as the driver of a fit, keeps what it holds. Only the dome is one, so that its worker runs one capture at a time.
+A resource here marks what a worker can do and is not an amount that is used up, because a task that has given its
+thread back, such as the driver of a fit, keeps the resources that it holds. Only the dome has an amount of 1, so that
+its worker runs one capture at a time.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ from types import MappingProxyType
 from services.core.records import Priority
 
 DOME = "DOME"
-"""The worker reaches the dome."""
+"""Resource of a worker that reaches the dome."""
 STAGES = "STAGES"
-"""The worker has shown that it can run every stage but the capture."""
+"""Resource of a worker that has shown that it can run every stage but the capture."""
 UNLIMITED = 1_000_000
-"""How much of a mark a worker has: more than there are tasks on it at once."""
+"""Amount of ``STAGES`` that a worker has: more than the number of tasks that it ever has at once."""
 
 WEIGHTS: Mapping[Priority, float] = MappingProxyType({"low": 0.25, "normal": 1.0, "high": 4.0})
-"""Shares of the workers' time that running fits take, relative to each other."""
+"""Priority -> relative share of the workers' time that a running fit takes."""
 
 
 def rank(priority: Priority) -> int:
-    """Which of two waiting jobs starts first: the one of the lower rank."""
+    """The rank of a priority. Of two waiting jobs the one with the lower rank starts first."""
     return -list(WEIGHTS).index(priority)

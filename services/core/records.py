@@ -1,4 +1,4 @@
-"""Records that cross a process boundary: what a job asks for and what each stage hands on."""
+"""Records that cross a process boundary: a job's options, and the manifests that stages publish."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def _no_stand_in(value: Any) -> Any:
 
 
 Number = Annotated[float, Strict()]
-"""Neither a text nor true or false for a number, so that no light burns at full level because somebody wrote "level":
-true."""
+"""A number that is given as a number: a text, true or false is refused, so that no light burns at full level because
+somebody wrote "level": true."""
 Whole = Annotated[int, BeforeValidator(_no_stand_in)]
-"""The same, but 2.0 is whole too."""
+"""A whole number under the same rule; 2.0 counts as whole."""
 JobName = Annotated[
     str, StringConstraints(strip_whitespace=True, min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")
 ]
@@ -37,11 +37,11 @@ Positive = Annotated[Number, Field(gt=0)]
 Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
 KindName = Annotated[str, AfterValidator(known_kind), WithJsonSchema({"type": "string", "enum": list(JOB_KINDS)})]
-"""Of ``JOB_KINDS``."""
+"""Name of a kind of job: one of ``JOB_KINDS``, or of an installed package."""
 DictionaryName = Annotated[
     str, AfterValidator(known_dictionary), WithJsonSchema({"type": "string", "enum": list(DICTIONARIES)})
 ]
-"""Of ``DICTIONARIES``."""
+"""Name of an entry of ``DICTIONARIES``."""
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
 Priority = Literal["low", "normal", "high"]
 
@@ -106,12 +106,12 @@ class SimulatedCameraSpec(Record):
 
 
 SIMULATED_DOME = "simulated"
-"""In place of a dome's address: one that is started for the capture, on loopback, and lights nobody."""
+"""Value in place of a dome's address: a simulated dome on loopback is started for the capture; no real light is lit."""
 MAX_ON_TIME_S = 60.0
-"""Longest time that a light may be on at once: the controller's strobe counts 65.5 s in its 16 bits, and 2 s of them
-are its margin."""
+"""Longest time, s, for which a light may be on without a break: the controller's strobe counts 65.5 s in its 16 bits,
+and 2 s of them are its margin."""
 DEMO_MOUTH = Path("demo")
-"""Stands for a rig's mouth that a job makes itself: a virtual incisor, rendered by its first stage, so that a
+"""Value in place of a rig's mouth that the job makes itself: its first stage renders a virtual incisor, so that a
 demonstration needs no file anywhere."""
 
 
@@ -147,20 +147,20 @@ class RigSpec(Record):
 
     @property
     def is_simulated(self) -> bool:
-        """Whether no light is lit but on paper."""
+        """Whether the dome is a simulated one, so that no real light is lit."""
         return self.dome == SIMULATED_DOME
 
 
 LIMITS_OF_A_RIG = frozenset({"dome", "watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s"})
-"""Options of a rig that change no frame: where its dome is, and how far it may go."""
+"""Options of a rig that change no frame: the address of its dome and its safety limits."""
 HELD_RANGES = MappingProxyType(
     {"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "beta": (0.0, 1.0), "g1": (-1.0, 1.0), "g2": (-1.0, 1.0)}
 )
-"""Open ranges of what ``JobSpec.held`` may hold; sigma per mm."""
+"""Parameter -> open interval of the values that ``JobSpec.held`` may give it; sigma in 1/mm."""
 
 
 MAX_HELD = 1000
-"""Parameters that a job may hold: more than any model has."""
+"""Largest number of parameters that a job may hold: more than any model has."""
 
 
 class JobSpec(Record):
@@ -307,13 +307,13 @@ class JobSpec(Record):
 
     @property
     def changed_options(self) -> frozenset[str]:
-        """Names of the options that have another value than their default."""
+        """Names of the options whose value differs from their default."""
         fields = JobSpec.model_fields.items()
         return frozenset(name for name, field in fields if getattr(self, name) != field.get_default())
 
     @model_validator(mode="after")
     def _options_of_its_kind(self) -> JobSpec:
-        # Stored options hold every field, so what an option was set to tells, and not whether it was.
+        # A stored job holds every field, so an option counts as given where its value differs from the default.
         if foreign := sorted(foreign_options(self.kind, self.changed_options)):
             own = sorted(JobSpec.model_fields.keys() - foreign_options(self.kind, frozenset(JobSpec.model_fields)))
             raise ValueError(f"a job of kind {self.kind} has no option '{foreign[0]}'; it has {', '.join(own)}")
@@ -344,7 +344,7 @@ class JobSpec(Record):
 
 
 class FrameRecord(Record):
-    """One acknowledged frame of a capture: it is on disk when this row is."""
+    """One acknowledged frame of a capture; wherever this row is on disk, the frame's image is too."""
 
     index: int
     kind: Literal["black", "tracking", "light"]

@@ -1,4 +1,4 @@
-"""What a fit has found, as records: estimates with their ±, the report, the verdict and the exported asset."""
+"""Records of a fit's results: estimates with their standard errors, the report, the verdict and the exported asset."""
 
 from __future__ import annotations
 

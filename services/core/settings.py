@@ -250,7 +250,7 @@ def read_job(path: Path) -> JobSpec:
         raise SettingsError(
             f"Job file {path} nests brackets too deeply; a job's options need three levels at most."
         ) from problem
-    except (ValueError, OSError) as problem:  # numbers beyond all limits, too, and what is no UTF-8
+    except (ValueError, OSError) as problem:  # also raised by numbers beyond all limits, and by bytes that are no UTF-8
         raise SettingsError(f"Job file {path} is not valid TOML: {problem}; correct that line.") from problem
     return job_from_tree(tree, path.parent, str(path))
 

@@ -1,4 +1,4 @@
-"""What a stage sees of the job it belongs to, and nothing more."""
+"""The context of a stage: all that it sees of the job to which it belongs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.core.errors import JobCancelledError
 from services.core.geometry import Record
 
 CANCEL_FLAG = "cancel"
-"""File in a job's folder that asks whoever works on it to stop."""
+"""Name of the file in a job's folder that asks the running stage to stop."""
 StageName = Literal["phantom", "capture", "register", "prepare", "fit", "export"]
 
 
@@ -28,7 +28,7 @@ class StageEvent(Record):
 
 
 class StageContext(Protocol):
-    """Given to ``run(request, context)`` of each stage."""
+    """The context that each stage's ``run(request, context)`` is given."""
 
     @property
     def root(self) -> Path:
@@ -36,13 +36,13 @@ class StageContext(Protocol):
 
     @property
     def attempt(self) -> int:
-        """Number of this lease, from 1; the store refuses writes of an older one."""
+        """Number of this attempt at the stage, from 1; the store refuses writes of an older attempt."""
 
     def report(self, event: StageEvent) -> None:
-        """Tell whoever listens."""
+        """Report an event to everybody who follows the job."""
 
     def raise_if_cancelled(self) -> None:
-        """Raise JobCancelledError once a cancel was asked for. Call between frames and between steps."""
+        """Raise JobCancelledError once a cancellation was requested. Call between frames and between steps."""
 
 
 class LocalContext:
@@ -59,6 +59,6 @@ class LocalContext:
             self._listener(event)
 
     def raise_if_cancelled(self) -> None:
-        """Raise once the flag exists in the job's folder."""
+        """Raise JobCancelledError once the flag file exists in the job's folder."""
         if (self.root / CANCEL_FLAG).exists():
             raise JobCancelledError("The job was cancelled on request; what it had published is kept.")

@@ -1,4 +1,4 @@
-"""The only code that knows how a job lies on disk.
+"""The layout of a job on disk, which no other module knows.
 
 ::
 
@@ -55,14 +55,14 @@ R = TypeVar("R", bound=Record)
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
 CHUNK_PX = 512
-"""Edge of the pieces of an image's file, which are read or left empty at once. Whole rows, or 256 or 1024 px, took
-longer to write a tooth's window; one piece for a whole image takes 1.6 times as long to read it from."""
+"""Edge of an image's chunks, pixels; a chunk is read, or left empty, as a whole. Whole rows, or 256 or 1024 px, took
+longer to write a tooth's window; with one chunk for a whole image, reading the window takes 1.6 times as long."""
 NOTHING_KNOWN: Mapping[str, tuple[int, str]] = MappingProxyType({})
 
 
 def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old or the new content, also after a power cut."""
-    # Random, as threads share a process id and hosts or containers that share a disk may too.
+    # The name is random, because threads share a process id, and so may hosts or containers that share a disk.
     partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
     try:
         with partial.open("xb") as stream:
@@ -86,7 +86,8 @@ def read_record(path: Path, kind: type[R]) -> R:
     """Read a record that a person or a program wrote.
 
     Raises:
-        CaptureInputError: absent, not JSON, or not of this kind; the message names the first wrong field.
+        CaptureInputError: the file is absent, no JSON, or no record of this kind; the message names the first wrong
+            field.
     """
     if not path.is_file():
         raise CaptureInputError(f"{path} does not exist; check the path.")
@@ -102,7 +103,7 @@ class StageWriter:
     """One attempt's right to write one stage."""
 
     def __init__(self, root: Path, stage: str, attempt: int) -> None:
-        """Take the lease.
+        """Take the stage's lease for this attempt.
 
         Raises:
             FencedError: a newer attempt has started this stage.
@@ -121,8 +122,8 @@ class StageWriter:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Hold the stage's lock, so that no other attempt starts or publishes it in between; the system drops it
-        however this process ends.
+        """Hold the stage's lock, so that no other attempt starts or publishes the stage meanwhile; the system releases
+        the lock however this process ends.
         """
         with (self.root / f".{self.stage}.lock").open("w") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX)
@@ -141,7 +142,8 @@ class StageWriter:
         """Make everything in ``folder`` visible at once as ``root/stage``; returns that path.
 
         Args:
-            known: size and SHA-256 of files that whoever wrote them has told; a file of another size is read again.
+            known: size and SHA-256 of files, by name, as their writers computed them; a file of another size is hashed
+                again.
         """
         files = {}
         for path in sorted(
@@ -171,7 +173,7 @@ class StageWriter:
 
 
 def withdraw(root: Path, stage: str) -> None:
-    """Remove a stage's published result, for readers all at once."""
+    """Remove a stage's published result by one rename, so that readers see all of it or nothing."""
     published, retired = Path(root) / stage, Path(root) / f".{stage}.retired"
     discard(retired)
     if published.exists():
@@ -192,7 +194,8 @@ def open_stage(root: Path, stage: str, kind: type[R], *, verify: bool = True) ->
         verify: compare every file's size and SHA-256 with the manifest.
 
     Raises:
-        MissingStageError: nothing published. CorruptStoreError: names the first file that is not as published.
+        MissingStageError: the stage is not published. CorruptStoreError: a file is not as it was published; the message
+            names the first one.
     """
     folder, manifest = Path(root) / stage, _manifest(Path(root), stage)
     if verify:
@@ -208,16 +211,17 @@ def require_intact(root: Path, stage: str) -> None:
     """Compare every file of a published stage with what was published.
 
     Raises:
-        MissingStageError: nothing published. CorruptStoreError: names the first file that is not as published.
+        MissingStageError: the stage is not published. CorruptStoreError: a file is not as it was published; the message
+            names the first one.
     """
     _require_intact(Path(root) / stage, stage, _manifest(Path(root), stage)["files"])
 
 
 def published_record(root: Path, stage: str) -> dict[str, Any]:
-    """What a published stage says of itself, as it is stored.
+    """The record of a published stage as it is stored, without validation.
 
     Raises:
-        MissingStageError: nothing published. CorruptStoreError: it cannot be read.
+        MissingStageError: the stage is not published. CorruptStoreError: the record cannot be read.
     """
     return dict(_manifest(Path(root), stage)["record"])
 
@@ -255,7 +259,7 @@ def _require_intact(folder: Path, stage: str, files: dict[str, Any]) -> None:
 
 
 def _remedy(stage: str) -> str:
-    # What cameras saw cannot be computed again.
+    # A capture's photographs cannot be computed again.
     return (
         "restore it or capture again"
         if stage == "capture"
@@ -273,12 +277,12 @@ def create_array(
     chunk: tuple[int, ...] | None = None,
     codec: Literal["zstd", "lz4"] = "zstd",
 ) -> zarr.Array[Any]:
-    """Create a zarr v3 array, where ``place_of`` says.
+    """Create a zarr v3 array at the place that ``place_of`` gives.
 
-    One writer per shard; ``shard`` is also the chunk unless ``chunk`` divides it.
+    Each shard may have only one writer. ``shard`` is also the shape of a chunk unless ``chunk`` divides it.
 
     Args:
-        codec: lz4 takes a third of zstd's time and 5 % more room for noisy single-precision numbers.
+        codec: compression; lz4 takes a third of zstd's time and 5 % more space for noisy single-precision numbers.
     """
     return zarr.create_array(
         place_of(folder / name),
@@ -293,14 +297,17 @@ def create_array(
 
 
 def image_pieces(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Chunk and shard (rows, columns) of arrays of large images: one file an image, of which a window is read alone."""
+    """Shapes (rows, columns) of chunk and shard for arrays of large images.
+
+    A shard holds a whole image in one file, and chunks let a window of it be read alone.
+    """
     chunk = min(CHUNK_PX, height), min(CHUNK_PX, width)
     rows, columns = (-(-length // edge) * edge for length, edge in zip((height, width), chunk, strict=True))
     return chunk, (rows, columns)
 
 
 def writable_array(path: Path) -> zarr.Array[Any]:
-    """An array that ``create_array`` has made, to be written."""
+    """Open an array that ``create_array`` has made, for writing."""
     return zarr.open_array(place_of(path), mode="r+", zarr_format=3)
 
 
@@ -308,7 +315,7 @@ class StoredArray:
     """An array on disk or on a server, read by indexing.
 
     Raises:
-        CorruptStoreError: there is none, or a chunk of what is asked for is damaged; names the array.
+        CorruptStoreError: the array does not exist, or a requested chunk is damaged; the message names the array.
     """
 
     def __init__(self, path: Path) -> None:
@@ -326,7 +333,7 @@ class StoredArray:
             yield
         except (FileNotFoundError, ValueError, RuntimeError) as problem:
             for selection in asked:
-                # What no array of this shape could be asked for is the caller's mistake, and raised as such.
+                # A selection that no array of this shape has is the caller's mistake; this statement raises its error.
                 np.broadcast_to(np.empty((), dtype=bool), self._array.shape)[selection]
             raise CorruptStoreError(
                 f"{self._path} cannot be read ({problem}); restore it or run its stage again."
@@ -335,10 +342,10 @@ class StoredArray:
 
 @contextmanager
 def telling_disk_faults(root: Path) -> Iterator[None]:
-    """Turn what a disk refuses into the error that says so.
+    """Replace the error of a full or read-only disk by this project's error for it.
 
     Raises:
-        DiskFullError, ReadOnlyStoreError: either passes, and the job goes on from what it had published.
+        DiskFullError, ReadOnlyStoreError: once the cause is removed, the job goes on from what it had published.
     """
     try:
         yield

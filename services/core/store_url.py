@@ -1,4 +1,4 @@
-"""Where on an S3 server a job may keep what it prepares, as it is written in a job and in the server's settings."""
+"""The URL of a place on an S3 server for a job's prepared images, as jobs and the server's settings state it."""
 
 from __future__ import annotations
 
@@ -22,4 +22,5 @@ def _store_url(value: str) -> str:
 
 
 StoreUrl = Annotated[str, AfterValidator(_store_url), WithJsonSchema({"type": "string", "pattern": STORE_URL})]
-"""A place on an S3 server; neither a host nor a key can be written in it, nor a part that leads elsewhere."""
+"""URL of a place on an S3 server. It can contain neither a host nor a key, nor a part such as '..' that leads
+elsewhere."""

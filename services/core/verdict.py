@@ -1,8 +1,8 @@
 """How well a fit went: the one judgement that the report, the page, the API and the command line show.
 
-Whether a job *succeeded* says that its stages ran to their end; whether its fit *converged* says whether to believe the
-numbers. The first is a stored state of the job's life, the second is derived here from the fit's report and is no
-state: a job is retried, deleted and told of by its life alone, and the states that version 0.1 has stored keep their
+That a job *succeeded* means that its stages ran to their end; that its fit *converged* means that the numbers can be
+believed. The first is a stored state of the job. The second is derived here from the fit's report and is no state:
+retries, deletions and notifications depend on the state alone, and the states that version 0.1 has stored keep their
 meaning.
 """
 
@@ -16,17 +16,17 @@ from services.core.results import Figure, FitReport, Verdict
 
 MAX_ERROR = 0.15
 """Relative error on the fitted or on the held-out images of a channel above which a fit is not called converged,
-however its solver ended."""
+whatever its solver reports."""
 _HELD_OUT: Literal["held-out"] = "held-out"
 _FITTED: Literal["fitted"] = "fitted"
 VERDICT = "verdict"
-"""Under this name the event with which a fit finished, and ``errors.json``, hold it."""
+"""Key of the verdict in the event with which a fit finishes, and in ``errors.json``."""
 NOT_CONVERGED_STATUS = 9
 """Exit status of a command whose job ran to its end and did not converge."""
 
 
 def verdict_of(report: FitReport) -> Verdict:
-    """The judgement of a fit."""
+    """Judge a fit by its report."""
     is_tested = bool(report.held_out_error)
     errors, ses = (
         (report.held_out_error, report.held_out_error_se) if is_tested else (report.fit_error, report.fit_error_se)
@@ -51,8 +51,9 @@ def verdict_of(report: FitReport) -> Verdict:
 
 
 def mean_figure(errors: Mapping[str, float], ses: Mapping[str, float]) -> Figure:
-    """The mean of some channels' errors; channels are rendered with paths of their own, so their noise is
-    independent.
+    """The mean of some channels' errors, with its standard error.
+
+    Channels are rendered with separate paths, so their noise is independent.
     """
     count = max(len(errors), 1)
     is_known = bool(errors) and errors.keys() <= ses.keys()
@@ -61,7 +62,7 @@ def mean_figure(errors: Mapping[str, float], ses: Mapping[str, float]) -> Figure
 
 
 def percent(figure: Figure) -> str:
-    """A figure with as many digits as its standard error allows: two of them, one decimal at least."""
+    """A figure in percent, rounded to two significant digits of its standard error, with one to three decimals."""
     if figure.se is None:
         return f"{100 * figure.value:.1f} %" if figure.value >= 0.01 else f"{100 * figure.value:.2f} %"
     se = 100 * figure.se

@@ -1,1 +1,1 @@
-"""What a calibration has measured of a rig, and how sure it is."""
+"""The calibration of a rig: cameras, lights and their uncertainty."""

@@ -1,12 +1,12 @@
-"""Cameras and lights with what a calibration has measured of them beside where they are.
+"""Cameras and lights with the properties that a calibration measures besides their positions.
 
-A camera's radiance from its counts, with q the squared distance of the pixel from the principal point, in units of half
-the image's diagonal and in the image as it was taken:
+The radiance of a pixel follows from its counts, where q is the squared distance of the pixel from the principal point,
+in units of half the image's diagonal and in the image as it was taken:
 
     radiance = (counts - black_counts) / (exposure_s * gain * (1 + a q + b q² + c q³)) * radiance_per_count
 
-Only the product of intensity and radiance can be measured, so the lights' intensities have a mean of 1 in every
-channel.
+Photographs determine the lights' intensities and the cameras' radiance_per_count only up to a common factor, so the
+intensities are scaled to a mean of 1 in every channel.
 """
 
 from __future__ import annotations
@@ -19,12 +19,15 @@ from pydantic import Field, model_validator
 from services.core.geometry import Camera, Light, Matrix3, Record, Vector3
 
 DISTORTION_LENGTHS = frozenset({4, 5, 8, 12, 14})
-"""How many coefficients OpenCV's lens models have."""
+"""Numbers of coefficients of OpenCV's lens models."""
 Positive = Annotated[float, Field(gt=0)]
 
 
 def is_absent(value: object) -> bool:
-    """Keeps the stored form of what an earlier version wrote, whose digest is its name."""
+    """Whether a field is None and is therefore not stored.
+
+    So a record that an earlier version wrote keeps its stored form, and with it the digest that names it.
+    """
     return value is None
 
 
@@ -63,7 +66,10 @@ class CalibratedCamera(Camera):
         return self
 
     def fall_of_light(self, q: float) -> float:
-        """How bright an even source is at squared relative distance q from the principal point; 1 at q = 0."""
+        """Relative brightness of a uniform source at squared relative distance q from the principal point.
+
+        It is 1 at q = 0.
+        """
         a, b, c = self.vignetting or (0.0, 0.0, 0.0)
         return 1 + q * (a + q * (b + q * c))
 
@@ -84,9 +90,7 @@ class CalibratedLight(Light):
     lobe: Lobe | None = Field(default=None, exclude_if=is_absent, description="null for a light that is even")
 
     def towards(self, point_mm: Vector3) -> Light:
-        """The light with the intensity that it has towards a point, and without a lobe; dark where the point lies
-        behind it.
-        """
+        """The light with its intensity towards a point, and without a lobe; the intensity is 0 behind the light."""
         if self.lobe is None:
             return self
         off = [there - here for there, here in zip(point_mm, self.position_mm, strict=True)]

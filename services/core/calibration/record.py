@@ -1,4 +1,4 @@
-"""Where cameras and lights are: what a capture says of it, and what may stand in for that."""
+"""The calibration of cameras and lights: as a capture states it, and as a calibration file replaces it."""
 
 from __future__ import annotations
 
@@ -16,19 +16,23 @@ from services.core.records import CaptureManifest, FolderCapture
 from services.core.store import MANIFEST, open_stage, read_record
 
 CALIBRATION_FILE = "calibration.json"
-"""As a calibration is written, also among the files of the job that made it."""
+"""Name of the file of a calibration, also among the files of the job that made it."""
 RAW_DESCRIPTION = "raw.toml"
-"""Makes a folder of photographs a capture; see ``services.core.raw``."""
+"""Name of the file that makes a folder of photographs a capture; see ``services.core.raw``."""
 MAX_LIGHTS = 1000
-"""Six times the lights of the largest dome that is known here."""
+"""Largest number of lights: six times the lights of the largest dome known to this project."""
 MAX_PIXELS = 2**28
-"""Of one camera: above the largest sensors of one chip (151 million), and an image of one channel still fits a GiB."""
+"""Largest number of pixels of one camera. The largest single-chip sensors have fewer (151 million), and an image of one
+channel still fits into a GiB."""
 MAX_FOCAL_PX = 1e7
-"""Beyond it a pixel is smaller than light resolves."""
+"""Largest focal length and coordinate of the principal point, pixels. With a longer focal length a pixel is smaller
+than light resolves."""
 MAX_DISTANCE_MM = 1e6
-"""A kilometre; a unit other than millimetres does not come out much nearer."""
+"""Largest coordinate of a light, and of the translation of a camera's pose, mm: a kilometre. A rig in micrometres does
+not come out much nearer."""
 MIN_INTENSITY, MAX_INTENSITY = 1e-12, 1e24
-"""Of a light: between them products with distances and albedos stay within single precision."""
+"""Smallest and largest intensity of a light. Between them, products with distances and albedos stay within the range of
+single precision."""
 
 
 class CalibrationLimit(Record):
@@ -74,7 +78,7 @@ class Calibration(Record):
 
     @classmethod
     def of_capture(cls, description: FolderCapture) -> Calibration:
-        """What a capture says of its cameras and lights."""
+        """The calibration that a capture states of its cameras and lights."""
         parts = {"units", "channels", "cameras", "lights", "uncertainty"}
         return cls.model_validate(description.model_dump(include=parts))
 
@@ -84,7 +88,7 @@ def published_capture(capture: Path) -> tuple[Path, str] | None:
     photographs.
 
     Raises:
-        CaptureInputError: it is neither.
+        CaptureInputError: the folder is none of these.
     """
     if any((capture / name).is_file() for name in ("capture.json", RAW_DESCRIPTION)) or not capture.is_dir():
         return None
@@ -98,10 +102,10 @@ def published_capture(capture: Path) -> tuple[Path, str] | None:
 
 
 def read_description(capture: Path) -> FolderCapture:
-    """What a folder capture or a published one says of its cameras and lights.
+    """Read the description of a folder capture or of a published capture, with its cameras and lights.
 
     Raises:
-        CaptureInputError: it cannot be read.
+        CaptureInputError: the description cannot be read.
     """
     published = published_capture(capture)
     if published is None:
@@ -170,7 +174,7 @@ def _require_each_channel(camera: CalibratedCamera, channels: int, origin: str) 
 
 
 def _require_possible(camera: Camera, origin: str) -> None:
-    """Refuse a camera that cannot be one, whatever it looks at."""
+    """Refuse a camera whose size, intrinsic matrix or pose is impossible in any rig."""
     where = f"{origin}: camera {camera.name}"
     width, height = camera.size
     if width * height > MAX_PIXELS:
@@ -198,15 +202,17 @@ def _require_possible(camera: Camera, origin: str) -> None:
 
 
 def recalibrated(description: FolderCapture, calibration: Calibration, path: Path) -> FolderCapture:
-    """The same capture with cameras and lights, by name, of a calibration; it may have more of them than the capture.
+    """The same capture with the cameras and lights of a calibration, matched by name.
+
+    The calibration may have more cameras and lights than the capture.
 
     Args:
-        description: of the capture.
-        calibration: read from a file.
-        path: that file, for messages.
+        description: description of the capture.
+        calibration: the calibration, read from a file.
+        path: path of that file, for messages.
 
     Raises:
-        CaptureInputError: it lacks a camera or light, or is of another image size or other channels.
+        CaptureInputError: the calibration lacks a camera or light, or is for another image size or other channels.
     """
     require_consistent(calibration, f"Calibration {path}")
     if calibration.channels != description.channels:
@@ -240,7 +246,7 @@ def recalibrated(description: FolderCapture, calibration: Calibration, path: Pat
 
 
 def lit_at(description: FolderCapture, point_mm: Vector3) -> FolderCapture:
-    """The same capture with the intensities that its lights have towards a point, as their lobes say.
+    """The same capture with the intensities that its lights have towards a point, according to their lobes.
 
     Raises:
         CaptureInputError: a light shines away from the point.

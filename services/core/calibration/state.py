@@ -14,7 +14,7 @@ SECONDS_A_DAY = 86_400.0
 
 
 def age_days(made: str | None, now_s: float) -> float | None:
-    """Days since a calibration was made; None where it does not say when.
+    """Days since a calibration was made; None where it states no valid date.
 
     Args:
         made: date and time, ISO 8601; without a zone it is taken for UTC.
@@ -32,12 +32,14 @@ def age_days(made: str | None, now_s: float) -> float | None:
 def state_of(
     made: str | None, valid_days: float | None, broken: tuple[str, ...] | None, now_s: float
 ) -> CalibrationState:
-    """One word on a calibration: beyond its limits counts before old; not known where it states neither limits nor a
-    life.
+    """The state of a calibration.
+
+    It is "beyond its limits" rather than "old" where both hold, and "not known" where the calibration states neither
+    limits nor how long it is valid.
 
     Args:
-        made, valid_days: of the record.
-        broken: limits that it does not keep, in words; None where it states none.
+        made, valid_days: fields of the calibration's record.
+        broken: limits that the calibration does not keep, in words; None where it states no limits.
         now_s: Unix time.
     """
     age = age_days(made, now_s)
@@ -49,14 +51,14 @@ def state_of(
 
 
 def broken_limits(calibration: Calibration) -> tuple[str, ...] | None:
-    """The limits that a calibration does not keep, in words; None where it states none."""
+    """The limits that a calibration does not keep, in words; None where it states no limits."""
     if calibration.limits is None:
         return None
     return tuple(_in_words(one) for one in calibration.limits if not one.is_kept)
 
 
 def warning_of_age(calibration: Calibration, name: str, now_s: float) -> str | None:
-    """A sentence on a calibration that is older than it holds, or None."""
+    """A warning about a calibration that is older than its ``valid_days``; None for any other."""
     age = age_days(calibration.made, now_s)
     if age is None or calibration.valid_days is None or age <= calibration.valid_days:
         return None
@@ -82,7 +84,7 @@ def refusal(name: str, broken: tuple[str, ...]) -> str:
 
 
 def warnings_of(calibration: Calibration, name: str, now_s: float) -> tuple[str, ...]:
-    """Sentences on a calibration beyond its limits, or older than it holds, where it is used all the same."""
+    """Warnings about a calibration that is used although it is beyond its limits or older than its ``valid_days``."""
     broken = broken_limits(calibration)
     beyond = f"{_beyond(name, broken)}." if broken else None
     return tuple(one for one in (beyond, warning_of_age(calibration, name, now_s)) if one is not None)

@@ -1,20 +1,21 @@
-"""How wrong a calibration may be: names of the instrument's errors and their covariance, as a capture states them.
+"""The uncertainty of a calibration: names of the instrument's errors and their covariance, as a capture states them.
 
 =============================  ===========================================================  ==================
 name                           what it is                                                   unit
 =============================  ===========================================================  ==================
 gain.CHANNEL                   all photographs are brighter than stated                     relative
-light_gain.LIGHT               a light is, in all channels; with .CHANNEL in one            relative
-flare.CAMERA.CHANNEL           constant light under the mask                                brightest pixel = 1
+light_gain.LIGHT               one light is brighter; with .CHANNEL only in that channel    relative
+flare.CAMERA.CHANNEL           a constant is added to the radiance of all valid pixels      brightest pixel = 1
 teeth.AXIS, dome.AXIS          the scan, or all lights together, moved as one               rad or mm
 camera.CAMERA.AXIS             a camera moved; also its fx, fy, cx, cy                      rad, mm, relative, px
 light.LIGHT.x, .y, .z          one light moved                                              mm
 =============================  ===========================================================  ==================
 
 AXIS is rx, ry, rz (a rotation vector, rad) or tx, ty, tz (mm), in the world's axes; teeth turn about the mean of their
-vertices, the dome about the mean of its lights. Moves of single cameras are read and checked, and no fit uses them yet;
-of single lights' moves a tooth's fit uses, with light_gain, what they do to the light's irradiance at the teeth. The
-brightest pixel of a camera is the greatest radiance among its valid pixels in that channel, over all its photographs.
+vertices, the dome about the mean of its lights. Moves of single cameras are read and checked, but no fit uses them. A
+tooth's fit uses the moves of single lights, together with light_gain, by their effect on the light's irradiance at the
+teeth. The brightest pixel of a camera is the greatest radiance among its valid pixels in that channel, over all its
+photographs.
 """
 
 from __future__ import annotations
@@ -29,11 +30,13 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Record
 
 MAX_ERRORS = 1000
-"""Names that one calibration may state; a dome of 155 lights with three cameras has some 650."""
+"""Largest number of errors that one calibration may name; a dome of 155 lights with three cameras has some 650."""
 MAX_ROTATION_SE_RAD = 0.2
-"""Nobody is unsure of a pose by 11 degrees; who writes a larger number wrote degrees."""
+"""Largest standard error of a rotation, rad. No pose is uncertain by 11 degrees, so a larger number is one in
+degrees."""
 SYMMETRY = 1e-9
-"""Of the largest variance: what two ways of rounding leave between a covariance's halves."""
+"""Largest difference between a covariance and its transpose, as a fraction of the largest variance. Rounding the two
+halves in different ways leaves such differences."""
 TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
 LENS = ("fx", "fy", "cx", "cy")
 
@@ -77,7 +80,7 @@ class CalibrationUncertainty(Record):
 
 
 def error_names(channels: Sequence[str], cameras: Sequence[Camera], lights: Sequence[Light]) -> Iterator[str]:
-    """Every name that a calibration of these may state."""
+    """Every error that a calibration of these channels, cameras and lights may name."""
     yield from (f"gain.{channel}" for channel in channels)
     yield from (f"{thing}.{axis}" for thing in ("teeth", "dome") for axis in TWIST)
     for light in lights:

@@ -1,1 +1,1 @@
-"""Reading and writing what is kept in files: meshes, image headers, folders, private files."""
+"""Reading and writing of files: meshes, scans, arrays, image headers, private files, objects on S3 servers."""

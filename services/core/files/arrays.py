@@ -1,4 +1,4 @@
-"""Read what a .npy file holds without trusting its header."""
+"""Read .npy files without trusting their headers."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ MAX_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 def map_radiance(path: Path, shape: tuple[int, int, int], what: str) -> NDArray[np.floating[Any]]:
-    """Map a .npy file of floating-point numbers (height, width, channels); not a byte of its content is read yet,
-    whatever its header declares.
+    """Map a .npy file of floating-point numbers, (height, width, channels).
+
+    None of the pixels are read yet, whatever size the header declares.
 
     Args:
-        shape: as the camera says; one channel may go without its axis.
-        what: names the file and what it stands for, at the beginning of the message.
+        shape: shape by the camera's description; a file of one channel may lack the last axis.
+        what: the file and its meaning, in words with which an error message begins.
 
     Raises:
-        CaptureInputError: it cannot be read, or holds something else.
+        CaptureInputError: the file cannot be read, or holds something else.
     """
     try:
         image = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (
-        Exception
-    ) as problem:  # a header of another's making raises what it likes: sizes beyond any integer, brackets without end
+    except Exception as problem:
+        # A malformed header can raise any kind of error: sizes beyond any integer, brackets without end.
         reason = str(problem) or type(problem).__name__
         raise CaptureInputError(
             f"{what} cannot be read as npy ({reason}); it may be truncated, so restore or export it again."
@@ -44,7 +44,7 @@ def map_radiance(path: Path, shape: tuple[int, int, int], what: str) -> NDArray[
 
 
 def as_float32(image: NDArray[np.floating[Any]], what: str) -> NDArray[np.float32]:
-    """Read a mapped image.
+    """Read a mapped image into single precision.
 
     Raises:
         CaptureInputError: a finite value is too large for single precision.

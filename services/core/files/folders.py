@@ -1,4 +1,4 @@
-"""Folders that a user names, looked at before anything is done in them."""
+"""Checks of folders that a user names, before anything is written into them."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from services.core.errors import InputError
 
 
 def require_folder(path: Path, option: str) -> None:
-    """Refuse what cannot be a folder for results: it is one that may be written to, or can be made.
+    """Refuse a path that is no folder for results: neither a writable folder, nor one that can be made.
 
     Raises:
-        InputError: it is a file or lies in one, or may not be written to.
+        InputError: the path is a file, lies below a file, or may not be written to.
     """
     try:
         nearest = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
@@ -28,7 +28,7 @@ def require_folder(path: Path, option: str) -> None:
 
 
 def require_outside(path: Path, source: Path | None, option: str) -> None:
-    """Refuse to write results into what they are made from.
+    """Refuse to write results into the folder that they are made from.
 
     Raises:
         InputError: the folder is the source or lies in it.

@@ -1,4 +1,4 @@
-"""How large an image says it is, from its header alone; nothing is decoded."""
+"""Read the size that an image declares, from its header alone; nothing is decoded."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from types import MappingProxyType
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 HEADER_BYTES = 2**20
-"""Whatever a header says beyond this is not believed."""
+"""Number of bytes that are read from the beginning of a file; a header must lie within them."""
 
 
 @dataclass(frozen=True)
 class Declared:
-    """What a header declares."""
+    """The sizes that an image's header declares."""
 
     size: str
-    """In words, such as 4000 x 3000 pixels of 3 channels."""
+    """Size of the image in words, such as 4000 x 3000 pixels of 3 channels."""
     decoded_bytes: int
     file_bytes: int | None = None
     """Size of the file if the format fixes it."""
@@ -38,10 +38,10 @@ class PngHeader:
 
 
 def declared(path: Path, suffix: str) -> Declared | None:
-    """Read an image's header; None where the suffix is no image's.
+    """Read an image's header; None where the suffix is that of no known image format.
 
     Raises:
-        ValueError: it is no image of that format.
+        ValueError: the file is no image of that format.
     """
     if suffix not in _READERS:
         return None
@@ -81,10 +81,10 @@ def _npy(head: bytes) -> Declared:
 
 
 def png_header(head: bytes) -> PngHeader:
-    """What a PNG declares in its first bytes.
+    """Read the header of a PNG from its first bytes.
 
     Raises:
-        ValueError: it is no PNG. struct.error: it is cut off.
+        ValueError: the bytes are not those of a PNG. struct.error: the header is cut off.
     """
     if head[:8] != PNG_SIGNATURE or head[12:16] != b"IHDR":
         raise ValueError("it is no PNG")
@@ -94,14 +94,14 @@ def png_header(head: bytes) -> PngHeader:
 
 def _png(head: bytes) -> Declared:
     header = png_header(head)
-    channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}[header.colour]  # a palette decodes to three
+    channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}[header.colour]  # a palette decodes to three channels
     return _pixels(header.width, header.height, channels, -(-header.depth // 8))
 
 
 @dataclass(frozen=True)
 class TiffLayout:
-    """How a TIFF's directories are written: byte order, ``struct`` formats of a count of entries and of an offset, and
-    where the first one lies.
+    """How a TIFF's directories are written: byte order, ``struct`` formats of a count of entries and of an offset,
+    size of an entry, and position of the first directory.
     """
 
     order: str
@@ -112,10 +112,10 @@ class TiffLayout:
 
 
 def tiff_layout(head: bytes) -> TiffLayout:
-    """What a TIFF says of itself in its first 16 bytes.
+    """Read the layout of a TIFF from its first 16 bytes.
 
     Raises:
-        ValueError: it is no TIFF. struct.error: it is cut off.
+        ValueError: the bytes are not those of a TIFF. struct.error: the header is cut off.
     """
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
     (magic,) = struct.unpack_from(f"{order or '<'}H", head, 2)
@@ -156,10 +156,11 @@ def _tiff_values(head: bytes, order: str, kind: int, place: int, *, is_big: bool
 
 
 def exr_parts(head: bytes) -> list[dict[str, bytes]]:
-    """The attributes of each part of an OpenEXR file, from its first bytes.
+    """Read the attributes of each part of an OpenEXR file, name -> value, from its first bytes.
 
     Raises:
-        ValueError: it is no OpenEXR file, or cut off. struct.error, IndexError: it is cut off.
+        ValueError: the bytes are not those of an OpenEXR file, or are cut off. struct.error, IndexError: the header is
+            cut off.
     """
     if head[:4] != b"\x76\x2f\x31\x01":
         raise ValueError("it is no OpenEXR image")
@@ -201,7 +202,7 @@ def _exr_attributes(head: bytes, place: int) -> tuple[dict[str, bytes], int]:
 
 
 def _exr_channels(value: bytes) -> list[int]:
-    """Bytes of each channel's numbers."""
+    """Bytes per sample of each channel, from the attribute ``channels``."""
     place, widths = 0, []
     while value[place] != 0:
         place = value.index(0, place) + 1

@@ -1,6 +1,6 @@
-"""What an image says beside its pixels: who, where, when, which device.
+"""Find an image's metadata beside its pixels: persons, places, times, devices.
 
-Only what pixels need to be shown is let pass; everything else has a name here.
+Only the parts that are needed to show the pixels pass; every other part is reported by its name.
 """
 
 from __future__ import annotations
@@ -125,15 +125,17 @@ _EXR_PLAIN = frozenset(
 
 
 def metadata_fault(path: Path, name: str, suffix: str) -> str | None:
-    """What an image says that no capture of a person may keep, one sentence, None if nothing or no image.
+    """One sentence about metadata of an image that no capture of a person may keep.
+
+    The result is None where the image has no such metadata, or the suffix is that of no known image format.
 
     Args:
-        path: where it lies.
-        name: what to call it.
-        suffix: of its name, in lower case.
+        path: the file.
+        name: the image's name in the sentence.
+        suffix: suffix of the image's name, in lower case.
 
     Raises:
-        ValueError: it is no image of that format.
+        ValueError: the file is no image of that format.
     """
     if suffix not in _READERS:
         return None
@@ -152,7 +154,7 @@ def metadata_fault(path: Path, name: str, suffix: str) -> str | None:
 
 
 def plain_png(content: bytes) -> bytes:
-    """A whole PNG with nothing but header, palette and pixels."""
+    """Copy a PNG with nothing but its header, palette and pixels."""
     kept, place = [PNG_SIGNATURE], len(PNG_SIGNATURE)
     while place < len(content):
         length, kind = struct.unpack_from(">I4s", content, place)
@@ -185,8 +187,8 @@ def _png(stream: BinaryIO) -> Iterator[str]:
 
 
 def _tiff(stream: BinaryIO) -> Iterator[str]:
-    # Directories and lists of offsets may lie one over the other, so a small file can hold many long ones: what counts
-    # is their sum.
+    # Directories and lists of offsets may overlap, so a small file can hold many long ones; the limit is therefore on
+    # their sum.
     layout = tiff_layout(stream.read(16))
     waiting, seen, parts = [layout.start], set[int](), 0
     while waiting:
@@ -210,7 +212,7 @@ def _tiff(stream: BinaryIO) -> Iterator[str]:
 
 
 def _sub_images(stream: BinaryIO, offset: str, entry: bytes) -> list[int]:
-    # One offset lies in the entry itself, several where it says.
+    # A single offset lies in the entry itself; for several, the entry holds the position of their list.
     room = struct.calcsize(offset)
     (count,) = struct.unpack_from(offset, entry, 4)
     (value,) = struct.unpack_from(offset, entry, 4 + room)

@@ -15,15 +15,15 @@ from services.core.geometry import Mesh, Tooth, teeth_folder
 FDI_NUMBERS = frozenset(
     10 * quadrant + place for quadrant in range(1, 9) for place in range(1, 9 if quadrant < 5 else 6)
 )
-"""Permanent teeth in quadrants 1 to 4, milk teeth in 5 to 8."""
+"""FDI numbers of all teeth: permanent teeth in quadrants 1 to 4, milk teeth in 5 to 8."""
 TOOTH_EXTENT_MM = (2.0, 45.0)
-"""The longest tooth that was ever measured has 37 mm."""
+"""Smallest and largest extent of a tooth, mm; the longest tooth ever measured has 37 mm."""
 MIN_SPACING_MM = 2.0
-"""Between the centres of two teeth; the narrowest, lower incisors, stand 5 mm apart."""
+"""Smallest distance between the centres of two teeth, mm; the narrowest teeth, lower incisors, stand 5 mm apart."""
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a PLY, OBJ or STL file in mm, vertices welded, orientation untouched.
+    """Read a PLY, OBJ or STL file in mm; vertices at the same place are merged, and no face is flipped.
 
     Raises:
         CaptureInputError: the file is absent or no triangle mesh.
@@ -52,8 +52,12 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 def write_mapped_mesh(path: Path, mesh: Mesh, corners_uv: NDArray[np.float64]) -> None:
-    """Write a binary PLY with texture coordinates (F, 3, 2) as ``u`` and ``v``; vertices on a seam are written once for
-    each side of it.
+    """Write a binary PLY with texture coordinates ``u`` and ``v``.
+
+    Vertices on a seam are written once for each side of it.
+
+    Args:
+        corners_uv: texture coordinates of each face's corners, (F, 3, 2).
     """
     corners = np.concatenate([mesh.vertices_mm[mesh.faces], corners_uv], axis=-1).astype("<f4").reshape(-1, 5)
     vertices, index = np.unique(corners, axis=0, return_inverse=True)
@@ -70,7 +74,7 @@ def write_mapped_mesh(path: Path, mesh: Mesh, corners_uv: NDArray[np.float64]) -
 
 
 def fdi_numbers(root: Path) -> tuple[int, ...]:
-    """Numbers of the folders below ``root/teeth``, in ascending order."""
+    """FDI numbers that name the folders below ``root/teeth``, in ascending order."""
     return tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isascii() and p.name.isdigit()))
 
 

@@ -1,13 +1,13 @@
 """Arrays that lie on an S3 server instead of in a folder.
 
-Where the folder of the arrays would lie there is a file, which says where they are and what was published there::
+In place of the folder of the arrays there is a file that states their URL and the objects that were published there::
 
     {"url": "s3://teeth/lab/5f0c…/prepared.zarr", "objects": {"radiance/c/0/3/0/0/0": {"bytes": 81234, "etag": "9a…"}}}
 
-Endpoint, region and credentials are those of the process's environment, as every program for S3 reads them, and never
-in a job. An object is there whole or not at all, and a missing one reads as zeros, so the file lists all of them; what
-the server lists is held against that. Every store has a name of its own below the URL that a job gives, so no two
-attempts at different stores ever write the same object.
+Endpoint, region and credentials come from the environment of the process, as for every S3 program, and are never part
+of a job. An object exists whole or not at all, and zarr reads a missing one as zeros, so the file lists all of them,
+and the server's listing is compared with this list. Every store has a unique name below the URL that a job gives, so
+two attempts with different stores never write the same object.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ if TYPE_CHECKING:
 
 LIBRARY, EXTRA = "obstore", "s3"
 RETRIES = 5
-"""Of a request that was not answered: they take some 3 s in all, and a stage that fails nevertheless goes on later."""
+"""Number of retries of a request that was not answered. They take some 3 s in all; a stage that fails nevertheless can
+be continued later."""
 CONNECT_S, ANSWER_S = "5s", "300s"
-"""How long a connection and an answer may take; the largest are an image's pieces, 100 MB."""
+"""Longest time to connect, and longest time for an answer; the largest answers are an image's shards, 100 MB."""
 _FAULTS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "bucket": ("has no bucket of that name", "create it, or correct the option 'store'"),
@@ -52,7 +53,7 @@ _FAULTS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "silence": ("does not answer", "check AWS_ENDPOINT_URL and the network, then retry the job"),
     }
 )
-"""What is wrong and what to do."""
+"""Kind of fault -> what is wrong and what to do, as the parts of an error message."""
 _SIGNS: Mapping[str, re.Pattern[str]] = MappingProxyType(
     {
         "credentials": re.compile(
@@ -63,30 +64,31 @@ _SIGNS: Mapping[str, re.Pattern[str]] = MappingProxyType(
         "region": re.compile(r"region"),
     }
 )
-"""By which words of the server or the library a fault is known."""
+"""Kind of fault -> words of the server or the library by which it is recognised."""
 _OF_THE_MACHINE = re.compile(r"//[^/ ]+/latest/(api/token|meta-data)")
-"""Where the library asks for credentials if the environment has none: an Amazon machine is told its own there."""
+"""URL of the metadata service of Amazon machines, which the library asks for credentials if the environment has
+none."""
 
 
 class StoredObject(Record):
-    """An object as it was written."""
+    """Size and ETag of an object as it was written."""
 
     bytes: int
     etag: str
 
 
 class RemoteFolder(Record):
-    """Where arrays lie that are not on this disk."""
+    """The place of arrays that lie on a server."""
 
     url: str
     objects: dict[str, StoredObject] = Field(default={}, description="by path below the URL; empty until all are there")
 
     def array(self, name: str) -> StorePath:
-        """Where one of its arrays lies."""
+        """Zarr's path of one of the arrays."""
         return StorePath(_opened(self.url), name)
 
     def listed(self, prefix: str = "") -> dict[str, StoredObject]:
-        """What is there now, by path below the URL: one request for each thousand objects.
+        """List the objects on the server by path below the URL, with one request for each thousand objects.
 
         Args:
             prefix: whole parts of a path, such as ``radiance/c/0/3``; empty for all.
@@ -101,10 +103,11 @@ class RemoteFolder(Record):
         }
 
     def require_intact(self, remedy: str) -> dict[str, StoredObject]:
-        """Compare what is there with what the record lists; returns all that is there.
+        """Compare the objects on the server with those that this record lists; return all objects on the server.
 
         Raises:
-            CorruptStoreError: names the first object that is not as written. StoreError: as ``listed``.
+            CorruptStoreError: an object is not as it was written; the message names the first one. StoreError: as
+                ``listed``.
         """
         there = self.listed()
         for name, expected in self.objects.items():
@@ -114,7 +117,7 @@ class RemoteFolder(Record):
         return there
 
     def remove(self) -> None:
-        """Remove all that is there; again is the same as once.
+        """Remove all objects below the URL; a second call does no harm.
 
         Raises:
             StoreError: as ``listed``.
@@ -125,16 +128,16 @@ class RemoteFolder(Record):
 
 
 def require_library() -> None:
-    """Import what speaks to S3 servers.
+    """Import the library for S3 servers.
 
     Raises:
-        PlatformError: it is not installed.
+        PlatformError: the library is not installed.
     """
     require_packages((LIBRARY,), EXTRA)
 
 
 def remote_folder(path: Path) -> RemoteFolder | None:
-    """What stands in place of a folder of arrays; None where it is a folder, or nothing.
+    """Read the file that stands in place of a folder of arrays; None where there is a folder, or nothing.
 
     Raises:
         CorruptStoreError: the file cannot be read.
@@ -151,7 +154,13 @@ def remote_folder(path: Path) -> RemoteFolder | None:
 
 
 def new_remote_folder(path: Path, below: str) -> RemoteFolder:
-    """A place for what would lie at a path, under a name that nobody has; to be written down before it is used.
+    """Choose a new place on a server for the arrays that would lie at a path.
+
+    The caller writes the record into the file at that path before it uses the place.
+
+    Args:
+        path: path of the folder that the arrays would have on disk.
+        below: URL below which the place gets a random name.
 
     Raises:
         PlatformError: the library is not installed.
@@ -161,7 +170,7 @@ def new_remote_folder(path: Path, below: str) -> RemoteFolder:
 
 
 def place_of(path: Path) -> Path | StorePath:
-    """Where an array lies: at its path, or where the file says that stands in place of its folder.
+    """Place of an array: its path, or the place on a server if a file stands in place of the array's folder.
 
     Raises:
         CorruptStoreError: as ``remote_folder``. PlatformError: the library is not installed.
@@ -171,9 +180,9 @@ def place_of(path: Path) -> Path | StorePath:
 
 
 def discard(folder: Path) -> None:
-    """Remove a folder and the arrays on servers that it names.
+    """Remove a folder and the arrays on servers that its files name.
 
-    Those go first, so that a removal that was cut short can be gone on with.
+    The arrays on servers are removed first, so that an interrupted removal can be repeated.
 
     Raises:
         StoreError: a server refuses or does not answer; the folder stays.
@@ -195,7 +204,7 @@ def discard_remote(folder: Path, pattern: str = "*.zarr") -> None:
 
 
 class _TellingStore(ObjectStore[Any]):
-    """Zarr's store on an object store, whose faults are this project's errors."""
+    """Zarr's store on an object store that raises this project's errors."""
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
@@ -227,14 +236,15 @@ def _library(part: str = "") -> Any:
 
 @lru_cache(maxsize=8)
 def _opened(url: str) -> _TellingStore:
-    """A client, with its connections; it takes a tenth of a second to make, so each process keeps the last few."""
+    """A client with its connections. Making one takes a tenth of a second, so each process keeps the last few."""
     bucket, _, prefix = url.removeprefix("s3://").partition("/")
     with _telling(url):
         client = _library(".store").S3Store(
             bucket,
             prefix=prefix,
             retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=60)},
-            # The endpoint's URL in the environment says whether it is asked with TLS; Amazon's own always is
+            # The scheme of the endpoint's URL in the environment decides about TLS; Amazon's own endpoints always use
+            # it.
             client_options={"connect_timeout": CONNECT_S, "timeout": ANSWER_S, "allow_http": True},
         )
     return _TellingStore(client)
@@ -246,15 +256,15 @@ def _url_of(client: Any) -> str:
 
 @contextmanager
 def _telling(url: str) -> Iterator[None]:
-    """Turn what a server or its absence raises into a sentence.
+    """Replace an error of the server, or of a server that does not answer, by a ``StoreError`` of one sentence.
 
     Raises:
-        StoreError: in place of any fault of the server; the job goes on from what it had stored once it is retried.
+        StoreError: in place of any fault of the server; a retried job goes on from what it had stored.
     """
     try:
         yield
     except (_library(".exceptions").BaseError, FileNotFoundError) as problem:
-        # The library's words: "<what it did> <URL> in <time> - <what came of it>", then the same at length
+        # The library's message reads "<request> <URL> in <time> - <result>", followed by the same in detail.
         did, _, came = str(problem).partition("Debug source:")[0].partition(" - ")
         said = "credentials" if _OF_THE_MACHINE.search(did) else came or did
         kind = next((kind for kind, sign in _SIGNS.items() if sign.search(said)), "silence")

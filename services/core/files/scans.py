@@ -1,6 +1,4 @@
-"""Read a scan's file as it stands, with what it says of each triangle and of each vertex: VTK PolyData, PLY, STL and
-OBJ.
-"""
+"""Read the file of a scan unchanged, with its data arrays of triangles and vertices: VTK PolyData, PLY, STL and OBJ."""
 
 from __future__ import annotations
 
@@ -20,19 +18,17 @@ from services.core.geometry import Mesh
 FORMATS = (".vtp", ".ply", ".stl", ".obj")
 SIDECARS = (".json", ".npy", ".txt", ".csv")
 MAX_TRIANGLES = 2_000_000
-"""Ten times those of a fine intra-oral scan; repairing more takes minutes and gigabytes, and shows nothing more of a
-tooth."""
+"""Largest number of triangles of a scan: ten times those of a fine intra-oral scan. Repairing more takes minutes and
+gigabytes, and shows nothing more of a tooth."""
 STL_HEADER_BYTES, STL_TRIANGLE_BYTES = 84, 50
-"""Of a binary STL file: 80 bytes of text and a count, then 50 bytes a triangle."""
+"""Sizes in a binary STL file: a header of 80 bytes of text and a count, then 50 bytes per triangle."""
 PLY_HEAD_BYTES = 65536
-"""Enough for the head of a PLY file, which says how many faces follow."""
+"""Number of bytes read from a PLY file: enough for its header, which states the number of faces."""
 
 
 @dataclass(frozen=True)
 class ScanFile:
-    """A surface in its file's unit, and arrays by name, of each triangle (F,) or (F, components) and of each vertex
-    (V,).
-    """
+    """A surface in the unit of its file, with arrays by name: per triangle (F,) or (F, components), per vertex (V,)."""
 
     mesh: Mesh
     triangle_arrays: dict[str, NDArray[Any]]
@@ -40,10 +36,10 @@ class ScanFile:
 
 
 def read_scan_file(path: Path) -> ScanFile:
-    """Read a scan; nothing is welded or turned around.
+    """Read a scan; no vertices are merged and no faces are flipped.
 
     Raises:
-        CaptureInputError: absent, unreadable, of another format, or of more triangles than a scan has.
+        CaptureInputError: the file is absent, unreadable, of another format, or has more triangles than a scan has.
     """
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
@@ -64,7 +60,7 @@ def require_few_triangles(path: Path, count: int) -> None:
     """Refuse a scan of more triangles than any tooth needs.
 
     Raises:
-        CaptureInputError: says how many there are and how many are enough.
+        CaptureInputError: the scan has too many; the message says how many it has and how many are enough.
     """
     if count > MAX_TRIANGLES:
         raise CaptureInputError(
@@ -74,11 +70,11 @@ def require_few_triangles(path: Path, count: int) -> None:
 
 
 def read_sidecar(path: Path) -> NDArray[np.float64]:
-    """Labels from a file beside the scan: numbers one a line (.txt, .csv), an array (.npy), or ``labels`` of a .json
-    file.
+    """Read labels, (N,), from a file beside the scan: one number per line (.txt, .csv), an array (.npy), or the list
+    ``labels`` of a .json file.
 
     Raises:
-        CaptureInputError: absent, of another format, or no list of numbers.
+        CaptureInputError: the file is absent, of another format, or holds no list of numbers.
     """
     if not path.is_file():
         raise CaptureInputError(f"Label file {path} does not exist; put it there or correct its name.")
@@ -96,7 +92,8 @@ def read_sidecar(path: Path) -> NDArray[np.float64]:
 
 
 def _announced_triangles(path: Path) -> int:
-    # What the file's head says, so that a file that is too large is refused before it is read.
+    # Number of triangles that the file's header declares, so that a file that is too large is refused before it is
+    # read; 0 where the header does not tell.
     with path.open("rb") as file:
         head = file.read(PLY_HEAD_BYTES)
     if path.suffix.lower() == ".stl" and len(head) >= STL_HEADER_BYTES:
@@ -118,7 +115,7 @@ def _read_polydata(path: Path) -> ScanFile:
 def _read_by_trimesh(path: Path) -> ScanFile:
     import trimesh
 
-    # Vertices keep the file's order, which a sidecar of one label a vertex counts on.
+    # Vertices keep the file's order, because a label file with one label per vertex relies on it.
     options = {"skip_materials": True, "maintain_order": True} if path.suffix.lower() == ".obj" else {}
     try:
         loaded = trimesh.load_mesh(path, process=False, **options)
@@ -131,7 +128,7 @@ def _read_by_trimesh(path: Path) -> ScanFile:
 
 
 def _properties(data: Any) -> dict[str, NDArray[Any]]:
-    # The only place where trimesh keeps properties of a PLY file's faces and vertices.
+    # Further properties of a PLY file's faces or vertices, which trimesh keeps in its raw data alone.
     names = data.dtype.names if isinstance(data, np.ndarray) else tuple(data)
     geometry = ("vertex_indices", "vertex_index", "x", "y", "z")
     return {name: np.asarray(data[name]).reshape(-1) for name in names if name not in geometry}

@@ -1,5 +1,5 @@
-"""Read triangle surfaces from VTK XML PolyData (.vtp): ascii, base64 and raw, inline and appended, plain and
-zlib-compressed.
+"""Read triangle surfaces from VTK XML PolyData (.vtp): ASCII, base64 and raw data, inline or appended, uncompressed or
+compressed by zlib.
 
 Source: The VTK User's Guide, "VTK File Formats", XML file formats; the binary layout is that of vtkXMLDataParser.
 """
@@ -33,7 +33,7 @@ COMPRESSOR = "vtkZLibDataCompressor"
 
 @dataclass(frozen=True)
 class PolyData:
-    """Points (V, 3) in the file's unit, triangles (F, 3), and what the file says of each triangle, (F,) or (F,
+    """Points (V, 3) in the unit of the file, triangles (F, 3), and arrays of each triangle by name, (F,) or (F,
     components).
     """
 
@@ -44,8 +44,8 @@ class PolyData:
 
 @dataclass
 class _Document:
-    # What stands before the appended bytes: attributes of the file, of its pieces, and every DataArray with its section
-    # and text.
+    # The XML without the appended bytes: attributes of the file and of its pieces, and every DataArray as its section,
+    # attributes and text.
     file: dict[str, str] = field(default_factory=dict)
     pieces: list[dict[str, str]] = field(default_factory=list)
     appended: dict[str, str] = field(default_factory=dict)
@@ -53,10 +53,10 @@ class _Document:
 
 
 def read_polydata(path: Path) -> PolyData:
-    """Read one piece of triangles.
+    """Read a file that holds one piece of triangles.
 
     Raises:
-        CaptureInputError: absent, truncated, another VTK type, or polygons that are no triangles.
+        CaptureInputError: the file is absent, truncated, of another VTK type, or has polygons that are no triangles.
     """
     if not path.is_file():
         raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
@@ -111,8 +111,8 @@ def _polydata(path: Path, content: bytes) -> PolyData:
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:
-    # Appended bytes may be raw, which no XML parser reads; they lie between the first underscore and the last closing
-    # tag.
+    # Appended bytes may be raw, which no XML parser reads. They lie between the first underscore after the opening tag
+    # and the last closing tag.
     opening = content.find(b"<AppendedData")
     if opening < 0:
         return content, b""
@@ -189,7 +189,8 @@ def _decoded(source: bytes, header: str, *, encoded: bool, compressed: bool) -> 
         return [int(value) for value in np.frombuffer(take(width * count), header)]
 
     if compressed:
-        # Number of blocks, their size, the last one's size where it differs, then each one's compressed size.
+        # The header holds the number of blocks, their size, the last block's size where it differs, and then the
+        # compressed size of each block.
         blocks = numbers(1)[0]
         at = 0
         sizes = numbers(3 + blocks)[3:]

@@ -1,1 +1,1 @@
-"""What all rooms know of a raw folder: its description ``raw.toml``, and the counts of its frames."""
+"""Raw folders, as all packages share them: the description ``raw.toml``, and the counts of the frames."""

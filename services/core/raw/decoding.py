@@ -1,8 +1,8 @@
-"""Numbers of an image file as they were written: no colour management, no scaling, no rotation.
+"""Read the numbers of an image file as they were written: no colour management, no scaling, no rotation.
 
-The libraries are imported by the function that needs one. Whole numbers come from PNG, TIFF, NPY and camera raw files,
-single precision from EXR, TIFF and NPY. Decoders of two libraries are used, as OpenCV returns a part of a cut-off PNG
-without a word.
+Each library is imported by the function that needs it. Whole numbers come from PNG, TIFF, NPY and camera raw files,
+single precision from EXR, TIFF and NPY. PNG is read by imagecodecs and TIFF by tifffile, because OpenCV returns a part
+of a truncated PNG without an error.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ Numbers = NDArray[np.generic]
 CAMERA_RAW = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".orf", ".pef", ".raf", ".rw2", ".srw"}
 )
-"""Suffixes of what cameras write and LibRaw reads."""
+"""Suffixes of the camera raw files that LibRaw reads."""
 _SIGNATURES: Mapping[str, bytes] = MappingProxyType(
     {".png": b"\x89PNG\r\n\x1a\n", ".npy": b"\x93NUMPY", ".exr": b"v/1\x01"}
 )
 _JPEG = b"\xff\xd8\xff"
 _LOSSY_TIFF = frozenset({6, 7, 34712, 34892, 50001, 50002})
-"""Codes of compression that change counts: JPEG, JPEG 2000, lossy DNG, WebP, JPEG XL."""
+"""Codes of the TIFF compressions that change counts: JPEG, JPEG 2000, lossy DNG, WebP, JPEG XL."""
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """What a file holds.
+    """The content of an image file.
 
     Attributes:
         values: (H, W) or (H, W, C), uint8, uint16 or float32.
-        names: of the channels, where the format names them: R, G, B, ...
-        pattern: colours of the 2 x 2 pixels at the upper left, where the format tells.
+        names: names of the channels where the format has them: R, G, B, ...
+        pattern: colours of the mosaic's 2 x 2 pixels at the upper left, row by row, where the format states them.
     """
 
     values: Numbers
@@ -51,7 +51,7 @@ def decode(path: Path) -> Decoded:
     """Read an image file.
 
     Raises:
-        ValueError: it cannot be read; the message is the part of a sentence that says why.
+        ValueError: the file cannot be read; the message is the part of a sentence that says why.
         PlatformError: the extra ``raw`` is needed and absent.
     """
     suffix = path.suffix.lower()
@@ -82,7 +82,7 @@ def decode(path: Path) -> Decoded:
 
 
 class _UnfitError(ValueError):
-    """The file is whole, and holds something else than counts."""
+    """The file is intact, but holds something other than counts."""
 
 
 def _png(path: Path) -> Decoded:

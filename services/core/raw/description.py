@@ -1,4 +1,4 @@
-"""What a raw folder and its calibration say together: the cameras and lights of a capture."""
+"""The cameras and lights of a capture, from a raw folder together with its calibration."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from services.core.store import read_record
 
 
 def read_any_description(capture: Path) -> FolderCapture:
-    """What a capture of any form says of its cameras and lights.
+    """Read the description of a capture of any form, with its cameras and lights.
 
     Raises:
-        CaptureInputError: it cannot be read, or is a raw folder without a calibration of its own.
+        CaptureInputError: the description cannot be read, or the capture is a raw folder without a calibration of its
+            own.
     """
     if not is_raw_folder(capture):
         return read_description(capture)
@@ -30,10 +31,11 @@ def read_calibration(root: Path, folder: RawFolder, chosen: Path | None) -> Cali
     """The calibration of a raw folder's cameras.
 
     Args:
-        chosen: that of a job, in place of the folder's own.
+        chosen: path of the calibration that a job names, in place of the folder's own.
 
     Raises:
-        CaptureInputError: there is none, or it lacks a camera, a size or a scale of the folder's.
+        CaptureInputError: there is no calibration, it lacks a camera or a camera's radiance_per_count, or it is for
+            other image sizes or channels.
     """
     if chosen is None and folder.calibration is None:
         raise CaptureInputError(
@@ -69,13 +71,13 @@ def read_calibration(root: Path, folder: RawFolder, chosen: Path | None) -> Cali
 
 
 def described(root: Path, folder: RawFolder, calibration: Calibration, teeth_root: Path | None = None) -> FolderCapture:
-    """The cameras and those lights that frames were taken under, with the calibration's places; no image is listed.
+    """Describe a raw folder's cameras, and the lights of its frames, by the calibration; no image is listed.
 
     Args:
         teeth_root: folder of the teeth and of their registration; the raw folder by default.
 
     Raises:
-        CaptureInputError: no frame is lit, or under a light that is not calibrated.
+        CaptureInputError: no frame is lit, or a frame is lit by a light that is not calibrated.
     """
     lit = {frame.light for frame in folder.frame if frame.kind == "light"}
     if not lit:

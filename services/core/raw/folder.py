@@ -1,4 +1,4 @@
-"""Reads ``raw.toml`` and says in one sentence what is wrong with it."""
+"""Read ``raw.toml``, and name in one sentence what is wrong with it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from services.core.raw.targets import Board, CalibrationFile, Chart, Landmark, S
 
 DESCRIPTION = "raw.toml"
 MAX_DESCRIPTION_BYTES = 16 * 2**20
-"""A hundred thousand frames take less."""
+"""Largest size of ``raw.toml``, bytes; a hundred thousand frames take less."""
 _KINDS: Mapping[str, type[Record]] = MappingProxyType(
     {
         "calibration": CalibrationFile,
@@ -32,7 +32,7 @@ _KINDS: Mapping[str, type[Record]] = MappingProxyType(
         "pixels": SeenPoint,
     }
 )
-"""Records by the key under which they stand."""
+"""Key in ``raw.toml`` -> record of the entries below it."""
 
 
 def is_raw_folder(root: Path) -> bool:
@@ -41,10 +41,10 @@ def is_raw_folder(root: Path) -> bool:
 
 
 def read_raw_folder(root: Path) -> RawFolder:
-    """Read ``root/raw.toml`` and see that the files it names lie in the folder and exist.
+    """Read ``root/raw.toml`` and check that the files it names lie in the folder and exist.
 
     Raises:
-        CaptureInputError: names the entry, and the file, key or name that is wrong.
+        CaptureInputError: an entry is wrong; the message names it, and the file, key or name in it.
     """
     origin = root / DESCRIPTION
     if not origin.is_file():
@@ -55,13 +55,13 @@ def read_raw_folder(root: Path) -> RawFolder:
 
 
 def parse_raw_folder(content: bytes, origin: str) -> RawFolder:
-    """The description that a file holds; whether the files it names exist is not looked at.
+    """Parse the content of ``raw.toml``; whether the files it names exist is not checked.
 
     Args:
-        origin: what messages call the file.
+        origin: name of the file in messages.
 
     Raises:
-        CaptureInputError: not TOML, an unknown key, a wrong value or a name that is not listed.
+        CaptureInputError: the content is no TOML, or has an unknown key, a wrong value or a name that is not listed.
     """
     if len(content) > MAX_DESCRIPTION_BYTES:
         raise CaptureInputError(
@@ -71,7 +71,7 @@ def parse_raw_folder(content: bytes, origin: str) -> RawFolder:
         tree = tomllib.loads(content.decode())
     except RecursionError as problem:
         raise CaptureInputError(f"{origin} nests brackets too deeply; it needs three levels at most.") from problem
-    except ValueError as problem:  # also what is no UTF-8
+    except ValueError as problem:  # also raised by bytes that are no UTF-8
         raise CaptureInputError(f"{origin} is not valid TOML: {problem}; correct that line.") from problem
     try:
         return RawFolder.model_validate(tree)
@@ -80,10 +80,10 @@ def parse_raw_folder(content: bytes, origin: str) -> RawFolder:
 
 
 def require_files(root: Path, folder: RawFolder) -> None:
-    """See that each file that a description names lies in its folder and exists.
+    """Check that each file that a description names lies in its folder and exists; a calibration may lie outside.
 
     Raises:
-        CaptureInputError: names the first one that does not, and what it stands for.
+        CaptureInputError: a file does not; the message names the first such file and its meaning.
     """
     for frame in folder.frame:
         require_inside(root, frame.file, f"Frame {frame.file} ({frame.label})")
@@ -99,10 +99,15 @@ def require_files(root: Path, folder: RawFolder) -> None:
 
 
 def require_inside(root: Path, file: str, what: str) -> Path:
-    """Path of a file of a raw folder.
+    """Return the absolute path of a file of a raw folder.
+
+    Args:
+        root: the raw folder.
+        file: path relative to the folder.
+        what: the file and its meaning, in words with which an error message begins.
 
     Raises:
-        CaptureInputError: it lies elsewhere or is none.
+        CaptureInputError: the path leads out of the folder, or is no file.
     """
     try:
         path = (root / file).resolve()
@@ -130,7 +135,7 @@ def _told(problem: ValidationError, tree: Mapping[str, Any]) -> str:
 
 
 def _place(location: Sequence[int | str], tree: Mapping[str, Any]) -> tuple[str, type[Record]]:
-    """The entry that a problem lies in, in words, and the record whose keys are known there."""
+    """The entry in which a validation error lies, in words, and the record whose keys are known there."""
     parts: list[str] = []
     kind: type[Record] = RawFolder
     node: Any = tree

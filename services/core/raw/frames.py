@@ -1,4 +1,4 @@
-"""Counts of one frame of a raw folder, held against what ``raw.toml`` says of its camera."""
+"""Read the counts of one frame of a raw folder, and check them against the camera's description in ``raw.toml``."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from services.core.raw.records import RawCamera, RawFolder, RawFrame
 Counts = NDArray[np.uint16] | NDArray[np.float32]
 _LETTERS = {"red": "R", "green": "G", "blue": "B"}
 GREENS_APART = 4.0
-"""How many times further apart the two green pixels of a mosaic may be than its red and blue ones before it is taken
-for another."""
+"""Largest ratio of the difference between a mosaic's two green pixels to the difference between its red and blue ones.
+Above it the mosaic is taken to begin with another colour."""
 BRIGHT_PERCENT = 75
-"""Cells brighter than so many others are looked at: the rest may be black."""
+"""Percentile of brightness above which cells of 2 x 2 pixels are compared; the other cells may be black."""
 MIN_CELLS = 32
-"""Cells without which nothing is said."""
+"""Least number of cells to compare; with fewer, the pattern is not judged."""
 CLEARLY_APART = 0.05
-"""Half of the relative difference of a cell's green pixels below which nothing is said: sensors' two greens differ by 1
-or 2 %."""
+"""Half of the relative difference of a cell's green pixels up to which the pattern is not judged. The two greens of
+real sensors differ by 1 or 2 %."""
 
 
 def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
-    """Counts of a frame, whole numbers as uint16 and others as float32.
+    """Read the counts of a frame, whole numbers as uint16 and others as float32.
 
     Returns:
-        (H, W) of a mosaic; (H, W, C) of other cameras, in the order of ``folder.channels``.
+        (H, W) for a camera with a mosaic; (H, W, C) for other cameras, in the order of ``folder.channels``.
 
     Raises:
-        CaptureInputError: names the file, its camera and light, and what is wrong with it.
+        CaptureInputError: the file does not fit; the message names it, its camera and light, and what is wrong.
         PlatformError: the extra ``raw`` is needed and absent.
     """
     what = f"Frame {root / frame.file} ({frame.label})"
@@ -58,7 +58,7 @@ def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
 
 
 def _shaped(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]:
-    """The file's values, (H, W) or (H, W, C) as the camera says, channels in the camera's order."""
+    """The file's values in the shape of the camera, (H, W) or (H, W, C), with channels in the camera's order."""
     values, names = decoded.values, decoded.names
     if names is not None and len(names) == len(camera.channels) and camera.mosaic == "none":
         letters = [_LETTERS.get(channel, channel) for channel in camera.channels]
@@ -88,7 +88,7 @@ def _shaped(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]:
 
 
 def _significant(values: NDArray[np.generic], camera: RawCamera) -> Counts:
-    """Counts without the bits that carry nothing."""
+    """Counts without the unused low bits of the file (``shift``), checked against the camera's depth."""
     if np.issubdtype(values.dtype, np.floating) and values.dtype.itemsize <= 4:
         numbers = np.array(values, dtype=np.float32)
         if broken := int(np.count_nonzero(~np.isfinite(numbers))):
@@ -131,8 +131,8 @@ def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> Non
         return
     if min(counts.shape) < 2:
         raise ValueError("is too small to hold a mosaic; correct mosaic")
-    # Both greens see the same light. Where they differ in most cells and the other two agree, the pattern begins one
-    # pixel further.
+    # Both green pixels of a cell see the same light. Where they differ in most cells and the other two agree, the
+    # pattern begins one pixel further.
     height, width = (length // 2 * 2 for length in counts.shape)
     cells = [counts[k // 2 : height : 2, k % 2 : width : 2].astype(np.float32) for k in range(4)]
     bright = sum(cells) >= np.percentile(sum(cells), BRIGHT_PERCENT)
@@ -140,7 +140,7 @@ def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> Non
         [cell[bright] for cell, letter in zip(cells, camera.mosaic, strict=True) if (letter == "G") == wanted]
         for wanted in (True, False)
     )
-    # Medians, as edges make single cells differ to either side.
+    # Medians are compared, because edges in the image make single cells differ in either direction.
     apart, expected = (abs(float(np.median((a - b) / np.maximum(a + b, 1)))) for a, b in (greens, others))
     if len(greens[0]) >= MIN_CELLS and apart > GREENS_APART * expected and apart > CLEARLY_APART:
         raise ValueError(

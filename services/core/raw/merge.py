@@ -1,5 +1,5 @@
-"""Several exposures of the same light as one image, each pixel weighted by its shot and read noise (Hasinoff et al.
-2010).
+"""Merge several exposures under the same light into one image, each pixel weighted by its shot and read noise (Hasinoff
+et al. 2010).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
 FULL_SIGMAS = 4.0
-"""Longer exposures are left out where they come this near to full: of those, noise lets only the dark ones through."""
+"""Distance to saturation, in standard deviations of the count, within which a pixel of a longer exposure is left out:
+of such pixels, only those that noise has made darker stay below saturation."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +25,11 @@ class Exposure:
     """Counts of one frame, linear in light.
 
     Attributes:
-        signal: above black.
-        extra_variance: of the black that was subtracted, and of what else was.
-        headroom: counts left to full; not positive where the pixel is full.
-        factor: exposure in seconds times gain times level; the signal is in proportion to it.
-        gain: linear.
+        signal: counts above black, any shape.
+        extra_variance: variance of the black frame and of everything else that was subtracted, counts².
+        headroom: counts left to saturation; not positive where the pixel is saturated.
+        factor: exposure in seconds times gain times level; the signal is proportional to it.
+        gain: linear gain.
     """
 
     signal: Image
@@ -39,11 +40,14 @@ class Exposure:
 
 
 def merge(exposures: Sequence[Exposure], noise: NoiseModel) -> tuple[Image, Image, BoolArray]:
-    """Counts per second at gain 1 and level 1, their variance, and where every exposure is full; shapes as the
-    signals'.
+    """Merge exposures into one image.
 
-    Weights are inverse variances at the *expected* signal. Those of the noisy count itself would prefer counts that
-    came out low.
+    Weights are inverse variances at the *expected* signal. Inverse variances at the noisy count itself would favour
+    counts that noise has made lower.
+
+    Returns:
+        Counts per second at gain 1 and level 1, their variance, and whether every exposure is saturated; each in the
+        shape of the signals.
     """
     order = sorted(exposures, key=lambda one: one.factor)
     usable = [order[0].headroom > 0]
@@ -51,14 +55,15 @@ def merge(exposures: Sequence[Exposure], noise: NoiseModel) -> tuple[Image, Imag
         full = np.float32(FULL_SIGMAS) * np.sqrt(noise.variance(one.signal, one.gain))
         usable.append(one.headroom > full)
 
-    # All light that was seen, over all the time it was seen for: the best estimate where shot noise prevails.
+    # Estimate the expected signal: the sum of all usable signals over the sum of their factors, which is the best
+    # estimate where shot noise dominates.
     light, time = (np.zeros_like(order[0].signal) for _ in range(2))
     for one, seen in zip(order, usable, strict=True):
         light += np.where(seen, one.signal, 0)
         time += np.where(seen, np.float32(one.factor), 0)
     expected = (np.maximum(light, 0) / np.maximum(time, np.float32(1e-30))).astype(np.float32)
 
-    # Then each exposure at the inverse variance that this expectation gives it.
+    # Weight each exposure by its inverse variance at this expected signal.
     weighted, weights = (np.zeros_like(light) for _ in range(2))
     for one, seen in zip(order, usable, strict=True):
         variance = noise.variance(expected * np.float32(one.factor), one.gain) + one.extra_variance

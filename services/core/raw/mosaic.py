@@ -1,4 +1,4 @@
-"""Colours of a mosaic's pixels."""
+"""Colour channels of the pixels of a mosaic, as a Bayer filter has them."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ def site_channels(mosaic: Mosaic) -> NDArray[np.intp]:
 
 
 def sites(counts: NDArray[N], mosaic: Mosaic) -> list[tuple[int, NDArray[N]]]:
-    """Each of the four pixels of the pattern: its channel, and a view (H/2, W/2) of all pixels in its place."""
+    """For each of the pattern's four pixels, its channel and a view (H/2, W/2) of all pixels at that place."""
     channels = site_channels(mosaic)
     return [(int(channels[y, x]), counts[y::2, x::2]) for y in range(2) for x in range(2)]
 
 
 def binned(counts: NDArray[Any], mosaic: Mosaic) -> NDArray[np.float32]:
-    """Image of half the size (H // 2, W // 2, 3), each channel the mean of its pixels in each 2 x 2; nothing is
-    interpolated.
+    """Bin a mosaic to an image of half the size, (H // 2, W // 2, 3), without interpolation.
 
-    Red and blue are sampled a quarter of a binned pixel beside its centre, in opposite directions.
+    Each channel is the mean of its pixels in each cell of 2 x 2. Red and blue are sampled a quarter of a binned pixel
+    beside its centre, in opposite directions.
     """
     height, width = (length // 2 * 2 for length in counts.shape)
     image = np.zeros((height // 2, width // 2, 3), dtype=np.float32)

@@ -1,6 +1,7 @@
-"""``raw.toml``: the photographs that a laboratory has, as its cameras wrote them. Lengths mm, times s, angles degrees.
+"""``raw.toml``: the photographs of a laboratory, as its cameras wrote them. Lengths mm, times s, angles degrees.
 
-Pixel centres lie at half-integers. Counts are linear in light above black unless a series of exposures says how not.
+Pixel centres lie at half-integers. Counts above black are linear in light unless a series of exposures measures their
+non-linearity.
 """
 
 from __future__ import annotations
@@ -23,17 +24,18 @@ FrameKind = Literal[
 THING_OF: Mapping[str, str] = MappingProxyType(
     {"board": "board", "mirror-sphere": "sphere", "white-sphere": "sphere", "chart": "chart"}
 )
-"""Kinds of frame that show a named thing, and the key that names it."""
+"""Kind of frame that shows a board, sphere or chart -> key of the frame that names it."""
 LIT_BY_ONE = frozenset({"light", "mirror-sphere", "white-sphere"})
-"""Kinds of frame that are taken light by light."""
+"""Kinds of frame that are taken under one light at a time."""
 DARK = frozenset({"black", "dark-room"})
-"""Kinds of frame for which the dome is off: black ones see nothing at all, dark-room ones the light of the room."""
+"""Kinds of frame for which the dome is off: black frames see no light at all, dark-room frames the light of the
+room."""
 MOSAIC_CHANNELS = ("red", "green", "blue")
 MAX_BITS = 16
 
 
 class RawCamera(Record):
-    """A camera and what its files hold."""
+    """A camera, and the format of its files."""
 
     name: Name
     size: tuple[Annotated[Whole, Field(gt=0, le=65536)], Annotated[Whole, Field(gt=0, le=65536)]] = Field(
@@ -56,7 +58,7 @@ class RawCamera(Record):
 
     @property
     def full_counts(self) -> float | None:
-        """Counts from which on a pixel is full; None where neither bits nor saturation_counts say."""
+        """Counts from which on a pixel is saturated; None where neither bits nor saturation_counts are given."""
         if self.saturation_counts is not None:
             return self.saturation_counts
         return None if self.bits is None else float(2**self.bits - 1)
@@ -112,12 +114,12 @@ class RawFrame(Record):
 
     @property
     def thing(self) -> str | None:
-        """Name of the board, sphere or chart that it shows."""
+        """Name of the board, sphere or chart that the frame shows; None for other kinds."""
         return self.board or self.sphere or self.chart
 
     @property
     def label(self) -> str:
-        """Which photograph it is, in words for a message."""
+        """The frame's camera and light, or its kind, in words for a message."""
         seen = f"light {self.light}" if self.light is not None else self.kind
         return f"camera {self.camera}, {seen}"
 
@@ -142,7 +144,7 @@ class RawFrame(Record):
 
 
 class RawFolder(Record):
-    """What ``raw.toml`` says. Names are unique, and frames and landmarks name only what is listed."""
+    """The content of ``raw.toml``. Names are unique, and frames and landmarks name only things that are listed."""
 
     units: Literal["mm"]
     calibration: CalibrationFile | None = None

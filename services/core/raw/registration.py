@@ -1,4 +1,4 @@
-"""``registration.json``: where the teeth of a scan stand in the rig, and how well that is known."""
+"""``registration.json``: the pose of a scan's teeth in the rig, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from services.core.store import read_record
 
 REGISTRATION = "registration.json"
 REGISTERED = "registered"
-"""Folder in a job's that holds teeth, gums and record of a registration that the job made itself."""
+"""Name of the folder within a job's folder that holds the teeth, gums and record of the job's own registration."""
 
 
 class RegistrationStep(Record):
-    """What one step towards the pose has found."""
+    """The result of one step of the registration."""
 
     name: Literal["landmarks", "outlines"]
     rig_from_scan: Matrix4 = Field(description="rigid transform, mm")
@@ -57,7 +57,7 @@ class Registration(Record):
 def lacks_pose(capture: Path) -> bool:
     """Whether a capture is a raw folder with a scan whose teeth nobody has registered yet.
 
-    A description that cannot be read has no scan here; whoever prepares it says what is wrong.
+    A description that cannot be read counts as one without a scan; the preparation raises its error.
     """
     if not is_raw_folder(capture) or (capture / "teeth").exists():
         return False
@@ -75,10 +75,13 @@ def teeth_root(capture: Path, job: Path) -> Path:
 
 
 def with_registration(root: Path, uncertainty: CalibrationUncertainty | None) -> CalibrationUncertainty | None:
-    """A calibration's uncertainty with that of the teeth's pose, where the teeth of a raw folder come from a
-    registration.
+    """Add the uncertainty of the teeth's pose to that of a calibration, where the teeth come from a registration.
 
-    What the calibration itself says of the teeth is replaced. Both are taken for independent.
+    The registration replaces errors of the teeth that the calibration itself states. The errors of both are taken to be
+    independent.
+
+    Args:
+        root: folder of the teeth, with the registration's record if there is one.
 
     Raises:
         CaptureInputError: the registration's record cannot be read.

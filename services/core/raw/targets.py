@@ -1,5 +1,5 @@
-"""What the photographs of a raw folder show beside teeth: boards, spheres, charts, and the scan that the teeth come
-from.
+"""Things that the photographs of a raw folder show besides teeth (boards, spheres, charts), and the scan from which the
+teeth come.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Board(Record):
 
 
 class Sphere(Record):
-    """A sphere that tells of the lights: a mirror where they are, a white one how bright."""
+    """A sphere by which lights are measured: a mirror sphere for their positions, a white one for their intensities."""
 
     name: Name
     kind: Literal["mirror", "white"]
@@ -116,9 +116,9 @@ class SeenPoint(Record):
 
 
 class Landmark(Record):
-    """A point of a tooth that was clicked, in the scan and in photographs.
+    """A point of a tooth that a person has marked in the scan and in photographs.
 
-    One that no photograph shows serves a scan without labels.
+    A landmark without photographs serves to part the teeth of a scan without labels.
     """
 
     tooth: Fdi

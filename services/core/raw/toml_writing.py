@@ -22,10 +22,10 @@ def description_toml(tree: Mapping[str, Any]) -> bytes:
 
 
 def toml_value(value: Any) -> str:
-    """A value in one line."""
+    """The TOML of a value, in one line."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key} = {toml_value(one)}" for key, one in value.items()) + "}"
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "[" + ", ".join(map(toml_value, value)) + "]"
-    # A string, a number or a truth value of JSON is one of TOML as well, but for DEL, which no name holds.
+    # JSON's strings, numbers and booleans are valid TOML too, except for the character DEL, which no name holds.
     return json.dumps(value, ensure_ascii=False)

@@ -1,1 +1,1 @@
-"""What all rooms know of a material in a cell: its folder and the names of its dictionaries."""
+"""A material in a cell, as all packages share it: its folder, its exposures and the names of its dictionaries."""

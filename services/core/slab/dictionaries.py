@@ -15,9 +15,9 @@ class SlabDictionary:
     """One dictionary."""
 
     summary: str
-    """What its phase functions are."""
+    """Its phase functions, in a few words."""
     door: str
-    """``module:function`` that makes it for one wavelength; imported where the fit runs alone."""
+    """``module:function`` that builds it for one wavelength; only the process of the fit imports it."""
 
 
 DEFAULT_DICTIONARY = "tents"
@@ -35,10 +35,10 @@ DICTIONARIES: Mapping[str, SlabDictionary] = MappingProxyType(
 
 
 def known_dictionary(name: str) -> str:
-    """The name of a dictionary, as it was given.
+    """Return the name of a dictionary unchanged, if there is such a dictionary.
 
     Raises:
-        ValueError: there is no such dictionary; the message lists those that there are.
+        ValueError: there is no such dictionary; the message lists the known ones.
     """
     try:
         chosen("dictionary", name, DICTIONARIES)
@@ -48,10 +48,10 @@ def known_dictionary(name: str) -> str:
 
 
 def require_particles(dictionary: str, particle_index: float | None, particle_absorption: float) -> None:
-    """See that the particles' index is given where it is needed, and only there.
+    """Check that the particles' index is given for the dictionary that needs it, and for no other.
 
     Raises:
-        ValueError: it is missing, or belongs to no dictionary that was chosen.
+        ValueError: it is missing, or the chosen dictionary does not use it.
     """
     if dictionary == "mie" and particle_index is None:
         raise ValueError("dictionary = mie needs particle_index, such as 1.598 for polystyrene at 532 nm")

@@ -48,14 +48,14 @@ class SlabExposure(Record):
         return self
 
     def holds_at(self, wavelength_nm: float, wavelengths_nm: Sequence[float]) -> bool:
-        """Whether it is of a wavelength among all of the folder's."""
+        """Whether the exposure belongs to a wavelength; ``wavelengths_nm`` are all wavelengths of the folder."""
         if self.wavelength_nm is None:
             return self.kind == "black" or wavelength_nm == wavelengths_nm[0]
         return self.wavelength_nm == wavelength_nm
 
 
 def exposures_fault(exposures: Sequence[SlabExposure], wavelengths_nm: Sequence[float]) -> str | None:
-    """What is wrong with exposures beside each other, as the part of a sentence; None if nothing is."""
+    """The first contradiction between the exposures of a folder, as a clause; None if there is none."""
     if twice := [file for file, count in Counter(one.file for one in exposures).items() if count > 1]:
         return f"file {min(twice)} is listed in two exposures; keep one of them"
     for one in exposures:

@@ -66,7 +66,7 @@ class Beam(Record):
 
     @property
     def size_mm(self) -> float:
-        """Standard deviation or radius."""
+        """Standard deviation of a Gaussian beam, or radius of a disc, mm."""
         return self.sigma_mm or self.radius_mm or 0.0
 
 
@@ -115,7 +115,7 @@ class SlabImage(Record):
 
 
 class ThroughBeam(Record):
-    """Where a slanted beam leaves the other face, unscattered: what tells the sample's index."""
+    """The position at which a slanted beam leaves the other face unscattered, which determines the sample's index."""
 
     light: Name
     wavelength_nm: Positive | None = Field(default=None, description="null where it holds for all")
@@ -124,7 +124,7 @@ class ThroughBeam(Record):
 
 
 class SlabFolder(Record):
-    """What ``slab.json`` says."""
+    """The content of ``slab.json``."""
 
     kind: Literal["slab"]
     units: Literal["mm"]
@@ -195,7 +195,7 @@ class SlabFolder(Record):
             )
 
     def _entries(self) -> tuple[SlabImage, ...]:
-        """The images, or one for all exposures of a camera under a light, whose file is the first of theirs."""
+        """The images; or one entry for all exposures of a camera, light and wavelength, with the file of the first."""
         first: dict[tuple[Name, Name | None, float | None], SlabImage] = {}
         for one in self.exposures:
             if one.light is not None:
@@ -204,15 +204,15 @@ class SlabFolder(Record):
         return self.images or tuple(first.values())
 
     def images_at(self, wavelength_nm: float) -> tuple[SlabImage, ...]:
-        """The images of one wavelength in the folder's order; of exposures one for each camera under each light."""
+        """The images of one wavelength in the folder's order; for exposures, one entry for each camera and light."""
         return tuple(image for image in self._entries() if self.wavelength_of(image) == wavelength_nm)
 
     def exposures_at(self, wavelength_nm: float) -> tuple[SlabExposure, ...]:
-        """The exposures of one wavelength, and the black ones that hold for all."""
+        """The exposures of one wavelength, and the black exposures that hold for all wavelengths."""
         return tuple(one for one in self.exposures if one.holds_at(wavelength_nm, self.wavelengths_nm))
 
     def files(self, wavelength_nm: float | None = None) -> tuple[str, ...]:
-        """Every file that is named, of one wavelength or of all."""
+        """Every file that the folder names, for one wavelength or for all."""
         chosen = self.wavelengths_nm if wavelength_nm is None else (wavelength_nm,)
         images = [image for image in self.images if self.wavelength_of(image) in chosen]
         named = [file for image in images for file in (image.file, image.variance_file) if file is not None]
@@ -224,10 +224,10 @@ class SlabFolder(Record):
 
 
 def read_folder(root: Path) -> SlabFolder:
-    """Read ``root/slab.json`` and see that its files exist.
+    """Read ``root/slab.json`` and check that its files exist.
 
     Raises:
-        CaptureInputError: names what is missing or contradictory.
+        CaptureInputError: something is missing or contradictory; the message names it.
     """
     origin = root / "slab.json"
     folder = read_record(origin, SlabFolder)
