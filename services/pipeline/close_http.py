@@ -1,7 +1,8 @@
-"""What every scheduler and worker loads (``--preload services.pipeline.close_http``): closes the HTTP port that Dask
-opens beside its own.
+"""Close the HTTP port that Dask opens beside its own: a preload module of every scheduler and worker (``--preload
+services.pipeline.close_http``).
 
-Dask has no option against it. The port asks nobody who he is, and what it tells this program's API tells better.
+Dask has no option to leave the port closed. The port has no authentication, and this program's API gives the same
+information better.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Dask's own commands with connections that last: ``python -m services.pipeline.dask_command scheduler ...``."""
+"""Dask's own commands with ``LastingSecurity``: ``python -m services.pipeline.dask_command scheduler ...``."""
 
 from __future__ import annotations
 
 
 def main() -> None:
-    """Run the command; every scheduler, nanny and worker that it makes has its certificates by ``LastingSecurity``."""
+    """Run the command; every scheduler, nanny and worker that it makes has its certificates in ``LastingSecurity``."""
     from dask.cli import run_cli
     from distributed import nanny, scheduler, worker
 

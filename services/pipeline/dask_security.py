@@ -1,9 +1,9 @@
-"""Connections of Dask by TLS of which one that breaks takes no other with it.
+"""TLS connections of Dask of which a broken one does not end others.
 
-OpenSSL keeps a list of errors for each thread, and Python from 3.12.9 on leaves a failed system call in it
-(github.com/python/cpython/ issues/148594). The next connection that has nothing to read yet is then told of a broken
-pipe that was another's, and Dask gives up its scheduler. Debian 13 has such a pair, and one peer that goes away ends
-all connections of its thread there.
+OpenSSL keeps a queue of errors for each thread, and Python from 3.12.9 on leaves the error of a failed system call in
+it (github.com/python/cpython/issues/148594). The next connection of that thread that has nothing to read yet then
+raises the broken pipe of another connection, and Dask gives up its scheduler. Debian 13 has such versions of both, and
+there one peer that disconnects ends all connections of its thread.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Answer = TypeVar("Answer")
 
 
 class LastingSocket(ssl.SSLSocket):
-    """Asks again where the answer is an error that may be another connection's; its own error comes a second time."""
+    """A TLS socket that repeats a call whose error may be that of another connection; its own error occurs again."""
 
     def read(self, len: int = 1024, buffer: Any = None) -> Any:  # noqa: A002  # the name is the library's
-        """See ``ssl.SSLSocket``; ``recv`` and ``recv_into`` read by this."""
+        """See ``ssl.SSLSocket``; ``recv`` and ``recv_into`` call this method."""
         return _without_others_errors(super().read, len, buffer)
 
     def send(self, data: Any, flags: int = 0) -> int:
@@ -36,7 +36,10 @@ class LastingSocket(ssl.SSLSocket):
 
 
 class LastingSecurity(Security):  # type: ignore[misc]  # distributed has no types
-    """Certificates of one side, with sockets that last. It travels to workers by its name, so they have them too."""
+    """Dask's TLS settings of one side, with ``LastingSocket``.
+
+    The class is sent to workers by its name, so they use such sockets too.
+    """
 
     def get_connection_args(self, role: str) -> dict[str, Any]:
         """Called by Dask before it connects."""
@@ -59,7 +62,7 @@ def _without_others_errors(
 ) -> Answer:
     try:
         return call(*arguments, **named)
-    except ssl.SSLError:  # of TLS itself, or nothing to read yet; Python empties the list with it
+    except ssl.SSLError:  # an error of TLS itself, or nothing to read yet; Python has emptied the queue
         raise
     except OSError:
         _forget_errors()
@@ -67,8 +70,6 @@ def _without_others_errors(
 
 
 def _forget_errors() -> None:
-    """Empty this thread's list, which Python does after ciphers that it does not know and nowhere by a call of its
-    own.
-    """
+    """Empty this thread's queue of errors. Python does so after unknown ciphers are set, and has no call for it."""
     with suppress(ssl.SSLError):
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).set_ciphers("UNKNOWN")

@@ -1,5 +1,5 @@
-"""How the parts of Dask prove to each other who they are: one folder of certificates, which API, scheduler and every
-worker have.
+"""Mutual TLS between the parts of Dask, by one folder of certificates that the API, the scheduler and every worker
+have.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Certificates:
-    """Whoever shows a certificate of the authority is let in, and nobody else; so the authority signs for this system
-    alone. Host names are not compared.
+    """The certificate of an authority, a certificate that it has signed, and the key of the latter.
+
+    A peer is accepted if its certificate is one of the authority, and no other peer is, so the authority must sign for
+    this system alone. Host names are not compared.
     """
 
     authority: Path
@@ -30,7 +32,7 @@ class Certificates:
         """The files of a folder, named as Kubernetes names them: ``ca.crt``, ``tls.crt``, ``tls.key``.
 
         Raises:
-            SettingsError: one of them is absent, or they do not belong together.
+            SettingsError: one of the files is absent, or they do not belong together.
         """
         found = cls(folder / "ca.crt", folder / "tls.crt", folder / "tls.key")
         for path in (found.authority, found.certificate, found.key):
@@ -49,17 +51,17 @@ class Certificates:
         return found
 
     def context(self) -> ssl.SSLContext:
-        """For a connection to the scheduler."""
+        """The TLS context for a connection to the scheduler."""
         context = ssl.create_default_context(cafile=self.authority)
         context.check_hostname = False
-        # As Dask itself does: from Python 3.13 on the default refuses an authority without key usage, which many are
-        # made without.
+        # Dask itself does the same: from Python 3.13 on the default refuses the certificate of an authority without the
+        # extension for key usage, and many are made without it.
         context.verify_flags &= ~ssl.VERIFY_X509_STRICT
         context.load_cert_chain(self.certificate, self.key)
         return context
 
     def security(self) -> Security:
-        """What Dask's own client takes."""
+        """The TLS settings for Dask's own client."""
         from services.pipeline.dask_security import LastingSecurity
 
         files = {
@@ -70,7 +72,7 @@ class Certificates:
         return LastingSecurity(tls_ca_file=str(self.authority), require_encryption=True, **files)
 
     def arguments(self) -> tuple[str, ...]:
-        """What Dask's commands take."""
+        """The TLS options for Dask's commands."""
         return (
             *("--protocol", "tls", "--tls-ca-file", str(self.authority)),
             *("--tls-cert", str(self.certificate), "--tls-key", str(self.key)),
@@ -78,5 +80,5 @@ class Certificates:
 
 
 def scheduler_address(address: str, certificates: Certificates | None) -> str:
-    """An address as Dask takes it: the setting says whether by TLS, not the address."""
+    """An address as Dask expects it; the certificates decide about TLS, whatever the address says."""
     return address.replace("tcp://", "tls://", 1) if certificates is not None else address

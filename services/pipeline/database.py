@@ -1,9 +1,9 @@
-"""The database behind a URL: SQLite for one machine, Postgres for several; what is read inside ``writing`` stays true
-in both.
+"""The database behind a URL: SQLite for one machine, Postgres for several. In both, data that were read inside
+``writing`` stay valid until its end.
 
-SQLite runs in WAL mode with ``BEGIN IMMEDIATE`` and a busy timeout, because its defaults lose updates in
-read-then-write. On Postgres the same transactions take one advisory lock. So there is one writer at a time, events
-become visible in the order of their ids, and a reader that remembers the last id it saw misses none.
+SQLite runs in WAL mode with ``BEGIN IMMEDIATE`` and a busy timeout, because its defaults lose updates in transactions
+that read and then write. On Postgres the same transactions take one advisory lock. So there is one writer at a time,
+events become visible in the order of their ids, and a reader that remembers the last id it saw misses none.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from sqlalchemy.dialects import sqlite
 from services.core.errors import PlatformError, SettingsError
 
 BUSY_MS = 5000
-"""How long a writer waits for one of another process before it gives up."""
+"""Longest time that a writer waits for a writer of another process."""
 TURN_S = 5.0
-"""How long it waits before that for those of its own."""
+"""Longest time that a writer first waits for other writers of its own process."""
 MAX_CONNECTIONS = 64
-"""Kept open to a file: as many as a server has threads that ask."""
+"""Number of connections that stay open to a file: as many as a server has threads with queries."""
 WRITER_LOCK = 0x64656E74
-"""Number of the advisory lock, "dent"."""
+"""Number of the advisory lock: the letters "dent"."""
 MAX_ID = 2**31 - 1
-"""Largest number of a row: Postgres' INTEGER, to which it takes nothing larger for comparison either."""
+"""Largest id of a row: that of Postgres' INTEGER, which it compares with no larger number either."""
 
 POSTGRES_SILENCE_S = 15
-"""After so long without a sign of life, each side of a connection takes the other for gone, also in the middle of a
+"""Time without a sign of life after which each side of a connection counts the other as lost, also in the middle of a
 transaction."""
 
 PASSWORD_FILE = "password_file"  # noqa: S105 - a name
-"""Part of a database's URL here, not of Postgres': the file that holds the password, so that none travels with the
-URL."""
+"""Parameter of a database's URL that this project adds to Postgres' own: the file that holds the password, so that no
+password is part of the URL."""
 PATIENCE_S = 600.0
-"""How long whoever works on a job waits for a database that went away."""
+"""Longest time that a process at work on a job waits for a database that does not answer."""
 
 T = TypeVar("T")
 metadata = sql.MetaData()
@@ -55,11 +55,11 @@ def open_database(url: str) -> sql.Engine:
     """Open a database; nothing is created in it.
 
     Args:
-        url: may name the file of its password, ``?password_file=PATH``, which is read for every connection, so that a
-            password that was changed needs no restart.
+        url: URL of the database. It may name the file of the password, ``?password_file=PATH``, which is read for every
+            connection, so that a changed password needs no restart.
 
     Raises:
-        SettingsError: not a URL of SQLite or Postgres. PlatformError: Postgres' driver is not installed.
+        SettingsError: the URL is not one of SQLite or Postgres. PlatformError: Postgres' driver is not installed.
     """
     parsed = parse_database_url(url)
     if parsed.get_backend_name() == "sqlite":
@@ -85,10 +85,10 @@ def open_database(url: str) -> sql.Engine:
 
 
 def parse_database_url(url: str) -> sql.URL:
-    """The parts of a database's URL.
+    """Parse a database's URL.
 
     Raises:
-        SettingsError: it is malformed; no part of it is repeated, as one of them is a password.
+        SettingsError: it is malformed; the message repeats no part of it, because one of them is a password.
     """
     try:
         return sql.make_url(url)
@@ -101,16 +101,16 @@ def parse_database_url(url: str) -> sql.URL:
 
 
 def with_password_file(url: str, path: Path) -> str:
-    """The URL of a database whose password stands in a file."""
+    """The URL of a database with the file of its password in place of the password."""
     parsed = parse_database_url(url)
     query = dict(parsed.query) | {PASSWORD_FILE: str(path)}
-    # Made anew, as `URL.set` takes no for "leave it as it is".
+    # The URL is made anew, because `URL.set` leaves a password as it is where it is given none.
     without = sql.URL.create(parsed.drivername, parsed.username, None, parsed.host, parsed.port, parsed.database, query)
     return without.render_as_string(hide_password=False)
 
 
 def read_password(path: Path) -> str:
-    """The password in a file, without the end of its line.
+    """Read the password in a file, without the end of its line.
 
     Raises:
         SettingsError: the file is absent, unreadable, or empty.
@@ -134,7 +134,7 @@ def _read_password_at_each_connection(engine: sql.Engine, path: Path) -> None:
 
 
 def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
-    """Make a call again while the database does not answer, for so long."""
+    """Make a call, and repeat it for up to ``seconds`` while the database does not answer."""
     import stamina
 
     def is_lost(problem: Exception) -> bool:
@@ -146,20 +146,20 @@ def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
 
 
 class Query:
-    """A question that is asked often: built and compiled once.
+    """A frequent query, built and compiled once.
 
-    SQLite's driver is given the text, without a transaction, as one statement sees one state of the database; all that
-    SQLAlchemy does around it takes four times as long as the answer.
+    SQLite's driver runs its text without a transaction, because one statement sees one state of the database;
+    SQLAlchemy's own work around a query takes four times as long as the query.
 
     Args:
-        statement: its parameters have names.
+        statement: the query, with named parameters.
     """
 
     def __init__(self, statement: sql.Select[Any]) -> None:
         self.statement = statement
 
     def rows(self, engine: sql.Engine, **values: str | float | None) -> Sequence[Sequence[Any]]:
-        """The answer, columns in the statement's order.
+        """Run the query and return its rows, with columns in the statement's order.
 
         Raises:
             sqlalchemy.exc.DBAPIError: the database does not answer.
@@ -171,7 +171,7 @@ class Query:
         try:
             with closing(engine.raw_connection()) as borrowed:
                 rows: list[tuple[Any, ...]] = borrowed.cursor().execute(text, constants | values).fetchall()
-        except sqlite3.Error as problem:  # also of connecting, which SQLAlchemy does not translate here
+        except sqlite3.Error as problem:  # also raised by connecting, where SQLAlchemy does not translate it
             raise sql.exc.DBAPIError.instance(
                 text, values, problem, sqlite3.Error, hide_parameters=True, dialect=engine.dialect
             ) from problem
@@ -179,14 +179,14 @@ class Query:
 
     @cached_property
     def _compiled(self) -> tuple[str, dict[str, Any]]:
-        """The text, and the values of parameters that SQLAlchemy has named itself."""
+        """The text of the statement, and the values of the parameters that SQLAlchemy has named itself."""
         compiled = self.statement.compile(dialect=sqlite.dialect(paramstyle="named"))
         return str(compiled), {name: value for name, value in compiled.params.items() if value is not None}
 
 
 @contextmanager
 def writing(engine: sql.Engine) -> Iterator[sql.Connection]:
-    """A transaction that keeps other writers out from its first statement.
+    """A transaction that excludes other writers from its first statement on.
 
     Raises:
         sqlalchemy.exc.OperationalError: others write for too long, or the database does not answer.
@@ -214,40 +214,39 @@ def _turn(engine: sql.Engine) -> Iterator[None]:
 
 
 def _watchful(url: sql.URL) -> dict[str, Any]:
-    # By default a connection over a cut network hangs for a quarter of an hour, and the server keeps what its
-    # transaction has locked for two.
+    # By default a connection over a cut network hangs for a quarter of an hour, and the server keeps the locks of its
+    # transaction for two hours.
     third_s, silence_ms = POSTGRES_SILENCE_S // 3, 1000 * POSTGRES_SILENCE_S
     probes = {"keepalives_idle": third_s, "keepalives_interval": third_s, "keepalives_count": 2}
     theirs = {f"tcp_{name}": value for name, value in probes.items()}
     theirs |= {"tcp_user_timeout": silence_ms, "idle_in_transaction_session_timeout": silence_ms}
     ours: dict[str, Any] = probes | {"tcp_user_timeout": silence_ms, "connect_timeout": BUSY_MS // 1000}
     ours["options"] = " ".join(f"-c {name}={value}" for name, value in theirs.items())
-    return {name: value for name, value in ours.items() if name not in url.query}  # what the URL says holds
+    return {name: value for name, value in ours.items() if name not in url.query}  # the URL has precedence
 
 
 def _sqlite(url: sql.URL) -> sql.Engine:
-    # SQLite lets waiting writers sleep and look again, up to a tenth of a second each time; those of one process take
-    # turns before they ask it. Connections stay open, as opening one costs more than most questions. Errors end in
-    # logs, so they hide what was asked.
+    # SQLite lets waiting writers sleep and try again, up to a tenth of a second each time, so writers of one process
+    # take a lock of their own first. Connections stay open, because opening one costs more than most queries. Errors
+    # end in logs, so they hide the parameters of queries.
     engine = sql.create_engine(
         url, hide_parameters=True, pool_size=MAX_CONNECTIONS, execution_options={"turn": threading.Lock()}
     )
 
     @sql.event.listens_for(engine, "connect")
     def _connect(connection: Any, _: Any) -> None:
-        connection.isolation_level = None  # SQLAlchemy then emits BEGIN itself, see below
+        connection.isolation_level = None  # the driver then emits no BEGIN; _begin does
         connection.execute(f"PRAGMA busy_timeout={BUSY_MS}")
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute("PRAGMA synchronous=NORMAL")
-        connection.execute("PRAGMA secure_delete=ON")  # what is deleted is overwritten
+        connection.execute("PRAGMA secure_delete=ON")  # deleted content is overwritten
 
     @sql.event.listens_for(engine, "begin")
     def _begin(connection: sql.Connection) -> None:
         if connection.get_execution_options().get("writes"):
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         else:
-            connection.connection.cursor().execute(
-                "BEGIN"
-            )  # takes no lock yet and cannot fail, so it needs none of SQLAlchemy's care
+            # This statement takes no lock yet and cannot fail, so SQLAlchemy need not handle its errors.
+            connection.connection.cursor().execute("BEGIN")
 
     return engine

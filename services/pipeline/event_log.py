@@ -1,9 +1,9 @@
-"""The one event table: every process that works on a job appends to it, everybody who watches reads it.
+"""The event table: every process that works on a job appends to it, and everybody who follows the job reads it.
 
-A server keeps it in its own database beside the jobs; ``dentine run`` keeps one in the job's folder.
+A server keeps the table in its own database beside the jobs; ``dentine run`` keeps one in the job's folder.
 
-Whoever runs a job of a server holds a lease with a number. Every start of a stage names it, so that a runner that
-stalled and was given up cannot start a stage behind its successor's back.
+The process that runs a server's job holds a lease with a number. Every start of a stage is checked against the newest
+number, so that a process that stalled and was replaced cannot start another stage.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from services.core.stage import StageEvent, StageName
 from services.pipeline.database import Query, metadata, open_database, sqlite_url, writing
 
 PAGE = 1000
-"""Events read at once."""
+"""Number of events that are read at once."""
 EVENTS_FILE = "events.sqlite"
-"""Name of a job folder's own event table."""
+"""Name of the file with the event table of a job's folder."""
 
 event_table = sql.Table(
     "event",
@@ -61,13 +61,12 @@ _COLUMNS = tuple(JobEvent.model_fields)
 
 
 def latest_of_stages(jobs: sql.Select[Any]) -> sql.Select[Any]:
-    """Query for the last event of each stage of certain jobs, and for the last one with which each was started; see
-    ``begun``.
+    """Query for the last event of each stage of certain jobs, and for the last event that started each; see ``begun``.
 
-    Each is found by one look at an index, however many events there are.
+    Each event is found by one look-up in an index, however many events there are.
 
     Args:
-        jobs: their ids, as column ``id``.
+        jobs: query for the ids of the jobs, as column ``id``.
     """
     those, columns = jobs.subquery(), event_table.c
     last_ids = (
@@ -98,7 +97,7 @@ def latest_of_stages(jobs: sql.Select[Any]) -> sql.Select[Any]:
     )
 
 
-# Queries are built once: building one takes longer than asking it.
+# Queries are built once, because building one takes longer than running it.
 _LATEST = Query(latest_of_stages(sql.select(sql.bindparam("of").label("id"))))
 _NEWEST_ID = Query(sql.select(sql.func.max(event_table.c.id)).where(event_table.c.job == sql.bindparam("of")))
 _TIMED_DATA = Query(
@@ -111,8 +110,8 @@ _TIMED_DATA = Query(
     .order_by(event_table.c.id)
     .limit(PAGE)
 )
-# An overtaken attempt is refused, so the last event of a stage is of its newest attempt: one row to look at, however
-# long the fit.
+# Events of an overtaken attempt are refused, so the last event of a stage is one of its newest attempt, and one row is
+# enough, however long the fit.
 _NEWEST_ATTEMPT = (
     sql.select(event_table.c.attempt)
     .where(event_table.c.job == sql.bindparam("of"), event_table.c.stage == sql.bindparam("of_stage"))
@@ -124,8 +123,9 @@ _INSERT = event_table.insert()
 
 @cache
 def _page_of(columns: tuple[str, ...]) -> Query:
-    """Events of job ``of`` after ``after``, at most ``most``; each of the columns must be what the parameter of its
-    name says.
+    """Query for at most ``most`` events of job ``of`` with an id above ``after``, oldest first.
+
+    Each of the columns must equal its parameter, ``of_`` and the column's name.
     """
     query = sql.select(event_table).where(
         event_table.c.job == sql.bindparam("of"), event_table.c.id > sql.bindparam("after")
@@ -135,17 +135,17 @@ def _page_of(columns: tuple[str, ...]) -> Query:
 
 
 class Begun(NamedTuple):
-    """How far the stages of a job are."""
+    """The progress of a job's stages."""
 
     latest: Sequence[JobEvent] = ()
-    """The last event of each stage, oldest first, its ``done`` filled from the last event of that attempt that has
-    one."""
+    """The last event of each stage, oldest first; its ``done`` is that of the last event of the same attempt that
+    states one."""
     started: JobEvent | None = None
-    """With which the newest stage was started."""
+    """The event that started the newest stage; None before the first start."""
 
 
 class TimedData(NamedTuple):
-    """When an event was told, and its data."""
+    """The Unix time of an event, and its data."""
 
     time_s: float
     data: dict[str, Any]
@@ -153,14 +153,14 @@ class TimedData(NamedTuple):
 
 @dataclass(frozen=True)
 class EventAddress:
-    """Where a job's events go, small enough to travel to a worker."""
+    """The address of the table for a job's events, small enough to be sent to a worker."""
 
     url: str = field(repr=False)
     job: str
     lease: int = 0
-    """Number under which the job is run; 0 where there is only one runner."""
+    """Number of the lease under which the job is run; 0 where only one process can run it."""
     request_id: str | None = None
-    """The request that submitted the job; None where there was none."""
+    """Id of the request that submitted the job; None where there was none."""
 
     @contextmanager
     def open(self) -> Iterator[EventLog]:
@@ -173,7 +173,7 @@ class EventAddress:
 
 
 def folder_events(folder: Path, job: str = "local") -> EventAddress:
-    """The event table in a job's folder, made if it is not there."""
+    """The address of the event table in a job's folder; the table is made if it does not exist."""
     address = EventAddress(sqlite_url(folder / EVENTS_FILE), job)
     engine = open_database(address.url)
     metadata.create_all(engine, tables=[event_table, lease_table])
@@ -204,11 +204,14 @@ class EventLog:
         self._engine, self.job, self._lease, self._request_id = engine, job, lease, request_id
 
     def begin_stage(self, stage: StageName, known: int = 0, machine: str | None = None) -> int:
-        """Record that the stage starts, on which class of machine, and return its attempt: one more than any before, in
-        this table or ``known`` otherwise.
+        """Record the start of a stage and return the number of its attempt, which is one more than any earlier one.
+
+        Args:
+            known: newest attempt by another source than this table.
+            machine: class of the machine on which the stage starts.
 
         Raises:
-            FencedError: somebody else runs the job by now.
+            FencedError: another process has taken over the job.
         """
         with writing(self._engine) as connection:
             newest = connection.scalar(sql.select(lease_table.c.number).where(lease_table.c.job == self.job)) or 0
@@ -238,8 +241,8 @@ class EventLog:
             insert_event(connection, self.job, attempt, event)
 
     def read(self, after: int = 0, limit: int = PAGE, **only: str | int | None) -> list[JobEvent]:
-        """The job's events with an id above ``after``, oldest first; ``only`` names columns and what they must be, None
-        for anything.
+        """The job's events with an id above ``after``, oldest first; ``only`` gives the value that a column must have,
+        or None for any value.
         """
         asked = {name: value for name, value in only.items() if value is not None}
         values = {f"of_{name}": value for name, value in asked.items()}
@@ -249,7 +252,7 @@ class EventLog:
         ]
 
     def data_of(self, kind: str) -> Iterator[TimedData]:
-        """All events of one kind, oldest first, as little of them as a curve of hundreds needs."""
+        """Time and data of all events of one kind, oldest first; a curve of hundreds of events needs no more."""
         after: int | None = 0
         while after is not None:
             rows = _TIMED_DATA.rows(self._engine, of=self.job, of_kind=kind, after=after)
@@ -265,7 +268,7 @@ class EventLog:
             after = events[-1].id
 
     def reached_s(self, stage: StageName, attempt: int, done: float) -> float | None:
-        """When an attempt had done this fraction of its stage, Unix time; None before."""
+        """Unix time at which an attempt had done this fraction of its stage; None as long as it has not."""
         columns = event_table.c
         of_attempt = (columns.job == self.job) & (columns.stage == stage) & (columns.attempt == attempt)
         enough = (columns.done >= done) if done > 0 else sql.true()
@@ -276,7 +279,7 @@ class EventLog:
             return first_s
 
     def begun(self) -> Begun:
-        """How far the job's stages are."""
+        """The progress of the job's stages."""
         return begun(_LATEST.rows(self._engine, of=self.job)).get(self.job, Begun())
 
     def latest(self) -> Sequence[JobEvent]:
@@ -292,7 +295,7 @@ class EventLog:
 
 
 def begun(rows: Iterable[Sequence[Any]]) -> dict[str, Begun]:
-    """By job, what ``latest_of_stages`` has found."""
+    """The progress of each job, by id, from the rows of ``latest_of_stages``."""
     latest: dict[str, dict[str | None, JobEvent]] = {}
     started: dict[str, JobEvent] = {}
     for row in rows:  # oldest first
@@ -306,6 +309,6 @@ def begun(rows: Iterable[Sequence[Any]]) -> dict[str, Begun]:
 
 
 def _event(row: Sequence[Any], **changes: Any) -> JobEvent:
-    # Not validated again: the row is this program's own, and a curve has hundreds.
+    # Rows are not validated again, because this program has written them and a curve has hundreds.
     fields = dict(zip(_COLUMNS, row, strict=True))
     return JobEvent.model_construct(**fields | {"data": from_json(fields["data"])} | changes)

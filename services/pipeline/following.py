@@ -1,4 +1,4 @@
-"""Follows a stage from the side of whoever submitted it: events, cancels, workers that die."""
+"""Follow a stage in the process that submitted it: its events, its cancellation, and the death of workers."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 Listener = Callable[[JobEvent], None]
 
 ENDS = ("finished", "error")
-"""Statuses of a task that do not change by themselves; a lost one, whose worker died with the result, runs again."""
+"""Final statuses of a task; a task with status lost, whose worker died with the result, runs again."""
 POLL_S = 0.25
 KEEP_S = 10.0
-"""How often workers that were given up are started again."""
+"""Interval at which workers that Dask has given up are started again."""
 GRACE_S = 5.0
-"""How long a cancelled stage may take to notice before its worker is stopped. A capture is always awaited: it darkens
-the dome."""
+"""Time within which a cancelled stage must stop before its worker is stopped. The end of a capture is always awaited,
+because the capture darkens the dome."""
 
 
 class Watch:
@@ -38,7 +38,7 @@ class Watch:
         self._log, self._listener, self._after = log, listener, after
 
     def tell(self) -> None:
-        """Pass on what is new."""
+        """Pass all new events to the listener."""
         while new := patiently(lambda: self._log.read(self._after)):
             for event in new:
                 if self._listener is not None:
@@ -47,19 +47,19 @@ class Watch:
 
 
 def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTask, watch: Watch) -> None:
-    """Submit a stage, pass on its events until it has ended, and raise what it raises.
+    """Submit a stage, pass on its events until it has ended, and raise the error that it raises.
 
     Args:
-        keep_workers: called now and then; starts again those that were given up.
+        keep_workers: called from time to time; starts workers again that Dask has given up.
 
     Raises:
-        JobCancelledError: it was asked to stop and did not listen. WorkerLostError: every worker that took it on died.
+        JobCancelledError: the stage was cancelled and did not stop in time. WorkerLostError: every worker that took on
+            the stage died.
     """
     from distributed import KilledWorker
 
-    key = (  # its own, as Dask answers for a key that it still knows with the old result
-        f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"
-    )
+    # The key is unique, because Dask answers a key that it still knows with the old result.
+    key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"
     needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
     stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
     flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
@@ -73,15 +73,16 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
                 keep_at = time.monotonic() + KEEP_S
             if give_up_at is None and flag.exists():
                 give_up_at = time.monotonic() + GRACE_S
-            # By the task and not by its last event: one that no worker takes on tells of nothing, and the capture
-            # before it has ended.
+            # The task decides and not its last event, because a task that no worker takes on has no events, and the
+            # capture before it has ended.
             is_given_up = give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture"
             if ended_as is None and is_given_up:
                 _stop_workers_of(client, key)
                 raise JobCancelledError(
                     "The job was cancelled on request; its workers were stopped, and what it had published is kept."
                 )
-        # By what it ended as, and not by what it is now: a result that is here may die with its worker, and run again.
+        # The status at the task's end decides and not the present one, because a result may be lost with its worker
+        # afterwards, and the task then runs again.
         if ended_as != "finished":
             stage.result()
     except KilledWorker as problem:
@@ -94,11 +95,11 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
 
 
 def _ended_as(stage: Future) -> str | None:
-    """``finished`` once a task's result is here, or ``error``; None while it may still end otherwise.
+    """``finished`` once a task's result has arrived, or ``error``; None while the task may still end otherwise.
 
-    Asks twice for ``POLL_S`` at most, for the end and for the result, and raises what Dask does where the scheduler was
-    lost. A task that has finished has not ended before its result is here: its worker may die with it, and then the
-    task is lost for a while and runs again.
+    Waits twice for ``POLL_S`` at most, for the end and for the result, and raises Dask's error where the scheduler was
+    lost. A finished task counts as ended only once its result has arrived: its worker may die with the result, and then
+    the task is lost for a while and runs again.
     """
     from distributed import wait
 
@@ -113,8 +114,8 @@ def _ended_as(stage: Future) -> str | None:
 
 
 def _stop_workers_of(client: Client, stage: str) -> None:
-    # Those that hold the stage or tasks that it has made, whose keys begin with its own. Each is started again, and
-    # what another job had there runs again.
+    # Restart each worker that holds the stage, or a task that the stage has made, whose key begins with the stage's
+    # own. Tasks of other jobs on these workers run again.
     busy = [worker for worker, keys in client.processing().items() if any(str(key).startswith(stage) for key in keys)]
     with suppress(TimeoutError):
         client.restart_workers(busy, timeout=GRACE_S)

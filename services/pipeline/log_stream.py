@@ -1,7 +1,7 @@
-"""A stream for log lines whose writers never wait: one thread hands them on, in order.
+"""A stream for log lines whose writers never wait: one thread writes the lines in order.
 
-Whoever reads a server's standard error may stall, and a disk may hang. A line that is written by the event loop would
-then keep everybody waiting, ALL OFF among them.
+The program that reads a server's standard error may stall, and a disk may hang. A line that the event loop itself wrote
+would then block every request, ALL OFF among them.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ from contextlib import contextmanager, suppress
 from typing import TextIO
 
 MAX_WAITING_LINES = 10_000
-"""Some 5 MB, or a minute of a busy server. Lines beyond that are lost, and how many is told once there is room."""
+"""Largest number of lines that wait: some 5 MB, or a minute of a busy server. Further lines are lost, and their number
+is logged once there is room."""
 CLOSE_S = 5.0
-"""How long the end of the process waits for a reader that has stalled."""
+"""Longest time that the end of the process waits for a reader that has stalled."""
 
 
 class QueuedStream:
@@ -24,20 +25,20 @@ class QueuedStream:
 
     def __init__(self, stream: TextIO, max_waiting_lines: int = MAX_WAITING_LINES) -> None:
         self._stream, self._max_waiting_lines, self._lost_lines = stream, max_waiting_lines, 0
-        # Both let the same thread in again: the garbage collector may run in the midst of a write, and what it ends may
-        # log.
+        # Queue and lock are re-entrant, because the garbage collector may run in the middle of a write, and an object
+        # that it finalises may log.
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._counting = threading.RLock()
-        # A daemon, as a stalled reader must not keep the process from ending.
+        # The thread is a daemon, because a stalled reader must not keep the process from ending.
         self._thread = threading.Thread(target=self._hand_on, name="log", daemon=True)
         self._thread.start()
 
     def isatty(self) -> bool:
-        """Whether a person reads it in a terminal."""
+        """Whether the stream is a terminal."""
         return self._stream.isatty()
 
     def write(self, text: str) -> int:
-        """Queue a line; once the stream is drained it is written at once, as the process ends."""
+        """Queue a line. After ``drain`` a line is written at once, because the process is ending."""
         if self._lines.qsize() < self._max_waiting_lines:
             self._lines.put(text)
         else:
@@ -48,17 +49,17 @@ class QueuedStream:
         return len(text)
 
     def flush(self) -> None:
-        """Nothing: each line is flushed as it is written."""
+        """Do nothing, because each line is flushed as it is written."""
 
     def drain(self) -> None:
-        """Have every line written that waits, and end the thread."""
+        """Wait until every queued line is written, and end the thread."""
         self._lines.put(None)
         self._thread.join(CLOSE_S)
         if not self._thread.is_alive():
             self._write_rest()
 
     def _write_rest(self) -> None:
-        """Lines that came behind the end."""
+        """Write the lines that were queued after the end of the thread."""
         with suppress(queue.Empty):
             while True:
                 self._write(self._lines.get_nowait() or "")
@@ -66,7 +67,7 @@ class QueuedStream:
     def _hand_on(self) -> None:
         for line in iter(self._lines.get, None):
             self._write(line)
-            if self._lines.empty():  # else the sentence might find no room itself
+            if self._lines.empty():  # otherwise there might be no room for the warning itself
                 self._tell_of_lost_lines()
         self._tell_of_lost_lines()
 
@@ -79,7 +80,7 @@ class QueuedStream:
             )
 
     def _write(self, line: str) -> None:
-        with suppress(OSError, ValueError):  # a full disk, or a reader that has gone; the next line may fare better
+        with suppress(OSError, ValueError):  # the disk is full, or the reader has ended; the next line may succeed
             self._stream.write(line)
             self._stream.flush()
 

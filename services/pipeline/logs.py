@@ -1,8 +1,8 @@
 """Log lines that carry the request and the job they belong to: JSON where a program reads them, plain text in a
 terminal.
 
-Code logs through ``logging`` with ``extra``; what is bound around it is added here. Only whoever owns a process
-configures it: ``serve``, and each worker of a server's job.
+Code logs through ``logging`` with ``extra``; the values of ``log_context`` around it are added here. Only the owner of
+a process configures its logs: ``serve``, and each worker of a server's job.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def configure_logs(stream: TextIO | QueuedStream) -> None:
     """Write every log line of this process to a stream, as JSON unless it is a terminal.
 
-    Other packages are heard from warnings on.
+    Other packages log only warnings and errors.
     """
     import structlog
 
@@ -57,16 +57,14 @@ def configure_logs(stream: TextIO | QueuedStream) -> None:
 
 
 def log_context(**values: str | int | None) -> AbstractContextManager[None]:
-    """Values that every line logged inside the block carries; those that are None are left out."""
+    """Add values to every line logged inside the block; values that are None are left out."""
     from structlog.contextvars import bound_contextvars
 
     return bound_contextvars(**{name: value for name, value in values.items() if value is not None})
 
 
 def bind_request(request_id: str) -> None:
-    """Let every line logged from here on for this request carry its id; the server's task of the request ends with
-    it.
-    """
+    """Add the id of a request to every line logged from here on in the server's task for the request."""
     from structlog.contextvars import bind_contextvars
 
     bind_contextvars(request_id=request_id)
@@ -74,7 +72,9 @@ def bind_request(request_id: str) -> None:
 
 @contextmanager
 def stage_logs(stage: StageName, attempt: int, address: EventAddress) -> Iterator[Callable[[StageEvent], None]]:
-    """Log a stage in its worker's process: its start and end here, what it says through the listener that is given."""
+    """Log a stage in its worker's process: its start, its end, and those events of kind log that the yielded listener
+    is given.
+    """
     configure_logs(sys.stderr)
     log = logging.getLogger(__name__)
 

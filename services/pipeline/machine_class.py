@@ -1,4 +1,4 @@
-"""Which machines take equally long for the same work."""
+"""Class of a machine: machines of one class take equally long for the same work."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """``python -m services.pipeline.scheduler_health tcp://HOST:PORT [FOLDER]``: whether a Dask scheduler answers, for a
 container's health check.
 
-A program of its own, as it is started every few seconds: it loads a tenth of what the ``dentine`` command does.
+It is a separate program, because it is started every few seconds and loads a tenth of what the ``dentine`` command
+does.
 """
 
 from __future__ import annotations
@@ -15,8 +16,11 @@ from services.pipeline.workers import require_scheduler
 
 
 def main(address: str, tls: str | None = None) -> int:
-    """Exit status 0 where the scheduler at ``address`` greets whoever shows it the certificates in the folder
-    ``tls``.
+    """Connect to a scheduler and return the exit status, which is 0 if it answers.
+
+    Args:
+        address: ``tcp://HOST:PORT``.
+        tls: folder of the certificates to show to the scheduler; None without TLS.
     """
     try:
         require_scheduler(address, Certificates.of(Path(tls)) if tls else None)

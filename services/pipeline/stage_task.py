@@ -24,7 +24,7 @@ PUBLISHED_AS = {
     "fit": "fit",
     "export": "asset",
 }
-"""Folder of what each stage publishes, in the job's."""
+"""Stage -> name of the folder that it publishes within the job's folder."""
 _EXTRAS = {
     "phantom": "fit",
     "capture": "capture",
@@ -33,12 +33,12 @@ _EXTRAS = {
     "fit": "fit",
     "export": "fit",
 }
-"""What to install where a stage runs."""
+"""Stage -> extra of the distribution that a worker needs to run it."""
 
 
 @dataclass(frozen=True)
 class StageTask:
-    """What a worker needs to run one stage."""
+    """A task that runs one stage on a worker, with everything that the worker needs for it."""
 
     stage: StageName
     door: str
@@ -49,7 +49,7 @@ class StageTask:
     is_logged: bool = False
 
     def __call__(self) -> str:
-        """Run the stage unless a worker that died afterwards has published it; returns the stage's name."""
+        """Run the stage, unless a worker has published it and then died; return the stage's name."""
         folder = PUBLISHED_AS[self.stage]
         if is_published(self.root, folder) and not self.again:
             return self.stage
@@ -76,7 +76,7 @@ class StageTask:
         return self.stage
 
     def _logs(self, attempt: int) -> AbstractContextManager[Callable[[StageEvent], None]]:
-        """The worker's log lines, or silence."""
+        """A context that logs the stage's events in the worker, or does nothing."""
         if not self.is_logged:
             return nullcontext(lambda _event: None)
         from services.pipeline.logs import stage_logs

@@ -1,19 +1,19 @@
-"""Strings the stages together on Dask: records travel between tasks, pixels go through the store.
+"""Run the stages of a job in order on Dask: records travel between tasks, pixels go through the store.
 
 ::
 
     phantom {STAGES: 1} -> capture {DOME: 1} -> register {STAGES: 1} -> prepare {STAGES: 1} -> fit {STAGES: 1} -> export
     {STAGES: 1}
 
-A capture only where the job names a rig, a phantom only where that is the demonstration's, a registration only where a
-raw folder has a scan and no teeth; that is looked for when the job runs, so such a stage is in the plan once it has
-begun.
+A job has a capture only where it names a rig, a phantom only where that rig is the demonstration's, and a registration
+only where a raw folder has a scan and no teeth. The latter is checked when the job runs, so a registration is part of
+the plan only once it has begun.
 
-Each stage is one task, submitted once the one before has ended, so that nothing is needed of a worker that has done its
-part: a rig may go away after its capture. A stage that is published already is skipped, so the same call starts,
-resumes and repeats a job. A task whose worker dies is run again by Dask on another worker; it then counts one attempt
-more than any before, which fences whatever the old one may still write. The fit spreads its passes over the same
-workers and secedes from its own slot meanwhile.
+Each stage is one task, submitted once the stage before has ended, so a worker is not needed after its stage: a rig may
+be disconnected after its capture. A stage that is published already is skipped, so the same call starts, resumes and
+repeats a job. Dask runs a task whose worker dies again on another worker; its attempt then has a higher number than any
+before, which fences off later writes of the old attempt. The fit spreads its passes over the same workers and secedes
+from its own slot meanwhile.
 """
 
 from __future__ import annotations
@@ -54,18 +54,18 @@ from services.pipeline.workers import Workers
 
 JOB_FILE = "job.json"
 DAMAGE_FLAG = ".damaged"
-"""In a job's folder: a stage found another one's published files damaged, so the next run looks for what it must make
-anew."""
+"""Name of a file in a job's folder. It says that a stage has found published files of another stage damaged, so that
+the next run looks for stages that it must run again."""
 
 DOORS: Mapping[StageName, str] = MappingProxyType({})
-"""``module:function`` of stages that are entered elsewhere than a job's kind says."""
+"""Stage -> ``module:function`` in place of that of the job's kind; empty by default."""
 
 
 def stages_of(spec: JobSpec, begun: Collection[StageName | None] = ()) -> tuple[StageName, ...]:
     """The stages a job goes through, in order.
 
     Args:
-        begun: those that were started; a registration is one of the stages if it is among them.
+        begun: the stages that were started; the result has a registration only if it is among them.
     """
     made = (*(("phantom",) if spec.is_demo else ()), *(("capture",) if spec.rig is not None else ()))
     registered: tuple[StageName, ...] = ("register",) if "register" in begun else ()
@@ -97,12 +97,12 @@ def run_job(
         listener: called in this thread with every new event.
         workers: worker processes, default ``spec.workers``.
         events: event table to append to, default one in ``root``.
-        doors: where stages are entered other than the job's kind says.
-        cluster: where it runs, default workers of its own.
+        doors: stage -> ``module:function`` in place of that of the job's kind.
+        cluster: workers to run on, default workers of the run's own.
         is_logged: workers write log lines on standard error.
-        before: called before each stage but a capture; what it raises ends the run.
-        phantoms: folder in which the demonstration's mouth is kept from job to job, seen by the workers; None to make
-            it anew for each.
+        before: called before each stage but a capture; an error that it raises ends the run.
+        phantoms: folder, accessible to the workers, in which the demonstration's mouth is kept from job to job; None to
+            render it anew for each job.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
@@ -138,7 +138,7 @@ def run_stages(
     before: Callable[[], None] | None = None,
     phantoms: Path | None = None,
 ) -> None:
-    """Run some stages of a job in order; see ``run_job``. ``again`` runs those that are published too."""
+    """Run some stages of a job in order; see ``run_job``. With ``again``, published stages run too."""
     root = root.resolve()
     with telling_disk_faults(root), _sole_owner(root):
         _claim_folder(root, spec)
@@ -174,8 +174,8 @@ def _with_registration(spec: JobSpec, stages: tuple[StageName, ...]) -> tuple[St
 
 
 def _seen_by(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None) -> JobSpec:
-    """The options as a stage sees them: the demonstration's mouth is where such mouths are kept, and then the one made
-    for this job.
+    """The options as a stage receives them. The demonstration's mouth is the folder of kept mouths for the phantom
+    stage, and the mouth that was made for this job for all others.
     """
     if spec.rig is None or not spec.is_demo:
         return spec
@@ -184,23 +184,23 @@ def _seen_by(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None)
 
 
 def request_cancel(root: Path) -> None:
-    """Ask whoever runs the job in this folder to stop between two frames or steps."""
+    """Ask the process that runs the job in this folder to stop between two frames or steps."""
     (root / CANCEL_FLAG).touch()
 
 
 def withdraw_cancel(root: Path) -> None:
-    """Forget an earlier cancel request; call before a job is started again."""
+    """Remove an earlier request to cancel; call before a job is started again."""
     (root / CANCEL_FLAG).unlink(missing_ok=True)
 
 
 def _go_on() -> None:
-    """Nothing keeps the next stage."""
+    """Let the next stage start."""
 
 
 def _run_tasks(
     processes: Workers, count: int, tasks: list[StageTask], watch: Watch, before: Callable[[], None]
 ) -> None:
-    """Submit each stage once the one before has ended, follow its events, and raise what it raises."""
+    """Submit each stage once the stage before has ended, follow its events, and raise the error that it raises."""
     from distributed.comm import CommClosedError
 
     try:
@@ -217,7 +217,7 @@ def _run_tasks(
 
 @contextmanager
 def _sole_owner(root: Path) -> Iterator[None]:
-    """Hold the folder's lock; the system drops it however this process ends."""
+    """Hold the folder's lock; the system releases it however this process ends."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / ".lock").open("w") as stream:
         try:
@@ -230,8 +230,8 @@ def _sole_owner(root: Path) -> Iterator[None]:
 
 
 def _withdraw_prepared(root: Path) -> None:
-    """Remove what was made with masks by hand that have changed since; last what says so, so that a kill in between is
-    gone on with.
+    """Remove the results of masks by hand that have changed since. The preparation, whose record shows that, goes last,
+    so that a later run completes an interrupted removal.
     """
     for result in ("report.html", "parameters.json", "errors.json"):
         (root / result).unlink(missing_ok=True)
@@ -241,7 +241,7 @@ def _withdraw_prepared(root: Path) -> None:
 
 @contextmanager
 def _remembering_damage(root: Path) -> Iterator[None]:
-    # Not withdrawn at once: whoever has a copy may restore it before a retry.
+    # Damaged stages are not removed at once, because a person who has a copy may restore it before a retry.
     try:
         yield
     except CorruptStoreError:
@@ -250,8 +250,8 @@ def _remembering_damage(root: Path) -> Iterator[None]:
 
 
 def _withdraw_damaged(root: Path) -> None:
-    """Remove published stages that are not as published, so that they are run again; those after them were made of the
-    whole ones. Never a capture.
+    """Remove damaged stages, so that they run again. Stages after them stay, because they were made from intact files,
+    and a capture is never removed.
     """
     for stage in ("registered", "prepared", "fit", "asset"):
         try:
@@ -264,7 +264,7 @@ def _withdraw_damaged(root: Path) -> None:
 
 
 def _claim_folder(root: Path, spec: JobSpec) -> None:
-    """Write the job's options, or refuse a folder that holds the results of other ones."""
+    """Write the job's options, or refuse a folder that holds the results of other options."""
     path, indifferent = root / JOB_FILE, {"workers", "priority"}
     if path.exists():
         earlier = read_record(path, JobSpec)
@@ -279,5 +279,5 @@ def _claim_folder(root: Path, spec: JobSpec) -> None:
 
 
 def _options(spec: JobSpec) -> dict[str, Any]:
-    # A server that lowers how far a rig may go does not make another job of it.
+    # A server that lowers the limits of a rig does not turn a job into another one.
     return spec.model_dump(mode="json", exclude={"rig": set(LIMITS_OF_A_RIG)})

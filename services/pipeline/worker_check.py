@@ -1,8 +1,8 @@
-"""Whether a machine can do what a worker claims: imports what the stages need and renders a pixel, in a process of its
-own.
+"""Check whether a machine can do what a worker claims: import what the stages need and render a pixel, in a separate
+process.
 
-``python -m services.pipeline.worker_check STAGES DOME`` says nothing and ends with status 0, or ends with 4 after one
-sentence. What breaks an interpreter, such as a library that aborts it, so breaks no worker.
+``python -m services.pipeline.worker_check STAGES DOME`` prints nothing and ends with status 0, or prints one sentence
+and ends with status 4. So a fault that ends the interpreter, such as a library that aborts it, ends no worker.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from services.core.installed import require_packages
 from services.core.placement import DOME, STAGES
 
 CHECK_S = 120.0
-"""How long it may take; 1.5 s were measured, and a machine on which much else starts takes many times as long."""
+"""Longest time of the check; 1.5 s were measured, and a machine on which many other programs start takes many times as
+long."""
 
 CHECKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {DOME: ("services.capture.stage:check",), STAGES: ("services.preprocess.stage:check", "services.fit.stage:check")}
 )
-"""By what a worker claims: ``module:function`` that raises what is missing."""
+"""Resource that a worker claims -> ``module:function`` of the checks, which raise an error for what is missing."""
 
 
 def fault_of(claims: Iterable[str], timeout_s: float = CHECK_S) -> str:
-    """The sentence that says why this machine cannot do what is claimed; empty if it can. Waits for a process."""
+    """Check the claims in a separate process; return the sentence on why this machine fails them, empty if it does not."""
     command = [sys.executable, "-m", "services.pipeline.worker_check", *claims]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603
@@ -51,19 +52,17 @@ def fault_of(claims: Iterable[str], timeout_s: float = CHECK_S) -> str:
 
 
 class OwnCheck:
-    """The check of the machine that this process runs on, begun when this is made; it holds for all workers of its
-    own.
-    """
+    """The check of this process's machine, which starts with the object; it holds for all workers of this process."""
 
     def __init__(self) -> None:
         self._fault: str | None = None
         threading.Thread(target=self._look, name="worker-check", daemon=True).start()
 
     def condition(self) -> str:
-        """That workers can run stages.
+        """A sentence which says that workers can run stages.
 
         Raises:
-            PlatformError: they cannot, or it is not known yet.
+            PlatformError: they cannot, or the check has not ended yet.
         """
         if self._fault is None:
             raise PlatformError("It is being found out whether this machine can run stages; ask again in some seconds.")
@@ -76,7 +75,7 @@ class OwnCheck:
 
 
 def require(claims: Iterable[str]) -> None:
-    """Import what is needed and render a pixel, in this very process.
+    """Import what the claims need and render a pixel, in this process.
 
     Raises:
         PlatformError: something is missing or does not work.
@@ -88,7 +87,7 @@ def require(claims: Iterable[str]) -> None:
 
 
 def main() -> int:
-    """Check what the arguments claim; one sentence on standard error where it fails."""
+    """Check what the arguments claim; print one sentence on standard error where that fails."""
     try:
         require(sys.argv[1:])
     except PlatformError as problem:

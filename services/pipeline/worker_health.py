@@ -1,8 +1,8 @@
 """Signs of life of this machine's workers: each writes a small file every few seconds, ``dentine worker-health`` reads
 them.
 
-Asking the scheduler instead would cost each check a connection and a line in its log, and would not say whether it is
-this machine's worker that works. ``python -m services.pipeline.worker_health`` says the same and imports nothing large.
+Asking the scheduler instead would cost each check a connection and a line in its log, and would not show whether this
+machine's own worker works. ``python -m services.pipeline.worker_health`` prints the same and imports nothing large.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from pathlib import Path
 from services.core.errors import PlatformError
 
 SIGN_S = 5.0
-"""How often a worker gives a sign."""
+"""Interval between a worker's signs of life."""
 SILENT_S = 60.0
-"""Without a sign for so long a worker does not count: a busy machine may hold one up for some seconds."""
+"""Time without a sign of life after which a worker does not count; a busy machine may delay a sign by some seconds."""
 
 
 def default_folder() -> Path:
-    """Where the workers of this user write."""
+    """Folder to which the workers of this user write."""
     return Path(tempfile.gettempdir()) / f"dentine-workers-{os.getuid()}"
 
 
 @dataclass(frozen=True)
 class Sign:
-    """The file of one worker."""
+    """The file by which one worker gives signs of life."""
 
     path: Path
 
     @classmethod
     def of_this_process(cls) -> Sign:
-        """That of the worker in this process."""
+        """The file of the worker in this process."""
         return cls(default_folder() / f"{os.getpid()}.json")
 
     def give(self, fault: str) -> None:
-        """Say that the worker is connected and answers.
+        """Record that the worker is connected and answers.
 
         Args:
-            fault: what it cannot do of what it was started for; empty where nothing is missing.
+            fault: sentence on what the worker was started for and cannot do; empty where there is nothing.
         """
         from services.core.store import write_atomic
 
@@ -51,15 +51,15 @@ class Sign:
         write_atomic(self.path, json.dumps({"fault": fault}).encode())
 
     def withdraw(self) -> None:
-        """Say that the worker has ended."""
+        """Remove the file, because the worker has ended."""
         self.path.unlink(missing_ok=True)
 
 
 def require_healthy_workers(folder: Path | None = None) -> int:
-    """How many workers of this machine are connected to their scheduler and can do what they were started for.
+    """Number of this machine's workers that are connected to their scheduler and can do what they were started for.
 
     Raises:
-        PlatformError: there is none, or one cannot.
+        PlatformError: there is none, or one of them cannot do what it was started for.
     """
     folder, since_s = folder or default_folder(), time.time() - SILENT_S
     signs = sorted(path for path in folder.glob("*.json") if path.stat().st_mtime > since_s)
@@ -74,7 +74,7 @@ def require_healthy_workers(folder: Path | None = None) -> int:
 
 
 def main() -> int:
-    """One sentence, and the exit status."""
+    """Print one sentence and return the exit status."""
     try:
         count = require_healthy_workers()
     except PlatformError as problem:

@@ -1,8 +1,8 @@
-"""What ``dentine worker`` loads into each of its Dask workers (``--preload services.pipeline.worker_setup``).
+"""Check each Dask worker that ``dentine worker`` starts (by ``--preload services.pipeline.worker_setup``).
 
-A worker claims what it can do by Dask resources (``services.core.placement``). Before it takes tasks each claim is
-checked by a process of its own; what the machine does not bear out is withdrawn and told, in the log and to the
-scheduler, and no task that needs it is given to this worker.
+A worker claims by Dask resources (``services.core.placement``) what it can do. Before it takes tasks, a separate
+process checks each claim. A claim that fails is withdrawn and reported, in the log and to the scheduler, and no task
+that needs it is given to this worker.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ async def dask_setup(worker: Any) -> None:
 
 
 class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no types
-    """Prepares one worker."""
+    """Plugin of Dask that checks one worker and gives its signs of life."""
 
     name = "dentine-setup"
 
@@ -44,7 +44,7 @@ class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no typ
                     del resources[claim]
                 logging.getLogger(__name__).error("This worker takes no task that needs %s: %s", claim, fault)
         worker.startup_information[TOLD] = lambda _: self.told
-        # The loop that answers the scheduler writes it, so that a worker that hangs gives no sign of life either.
+        # The event loop that answers the scheduler also writes the sign, so that a worker that hangs gives none.
         sign = PeriodicCallback(lambda: self._give_sign(worker), 1000 * SIGN_S)
         worker.periodic_callbacks[self.name] = sign
 
@@ -54,7 +54,7 @@ class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no typ
 
     @property
     def told(self) -> str:
-        """What is wrong with the worker; empty where nothing is."""
+        """The faults of the worker, in sentences; empty where there are none."""
         return " ".join(dict.fromkeys(self._faults.values()))
 
     def _give_sign(self, worker: Any) -> None:

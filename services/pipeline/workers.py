@@ -28,36 +28,36 @@ CLOSE_HTTP = "services.pipeline.close_http"
 CONNECT_S = 10.0
 PROBE_S = 1.0
 LOOK_S = 3.0
-"""How long the scheduler may take to tell of its workers."""
+"""Longest time that the scheduler may take to answer about its workers."""
 
 
 NOT_STARTED = "Workers start with the next job."
 TOLD = "dentine"
-"""Under which name a worker tells its scheduler what is wrong with it."""
+"""Name under which a worker reports its faults to the scheduler."""
 RIG = "rig"
-"""Name of the worker of this process's own that captures."""
+"""Name of this process's own worker for captures."""
 
 
 class Demand(NamedTuple):
-    """What a job that runs wants of the workers."""
+    """The workers that a running job needs."""
 
     workers: int
     captures: bool
 
 
 class Census(NamedTuple):
-    """What a scheduler tells of its workers, each by its address."""
+    """A scheduler's information on its workers, by their addresses."""
 
     workers: Mapping[str, Mapping[str, Any]]
     processing: Mapping[str, Sequence[Any]]
-    """Keys of the tasks that each has been given."""
+    """Keys of the tasks that each worker has been given."""
 
     def able(self, resource: str) -> int:
-        """How many workers have a resource."""
+        """Number of workers that have a resource."""
         return sum(bool(worker["resources"].get(resource)) for worker in self.workers.values())
 
     def sentence(self, *, captures: bool = False) -> str:
-        """How many workers can do what, or why none can run stages or capture."""
+        """A sentence on how many workers can run stages and can capture, or on why none can."""
         connected, stages = len(self.workers), self.able(STAGES)
         if captures and not self.able(DOME):
             return (
@@ -75,13 +75,13 @@ class Census(NamedTuple):
 
 
 class Workers:
-    """Opened at the first job and again after they broke; a context manager.
+    """The workers of this process's jobs, started with the first job and again after they broke; a context manager.
 
     Args:
-        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, one thread each.
-            One more than jobs ask for is started where one of them captures, so that no capture waits for a fit or is
-            stopped with it.
-        certificates: what to show that scheduler; None for connections without TLS.
+        scheduler: address of a Dask scheduler; None for workers of this process's own, on loopback, with one thread
+            each. Where a job captures, one worker more than the jobs ask for is started, so that no capture waits for a
+            fit or is stopped with it.
+        certificates: certificates to show to that scheduler; None for connections without TLS.
     """
 
     def __init__(self, scheduler: str | None = None, certificates: Certificates | None = None) -> None:
@@ -102,9 +102,9 @@ class Workers:
 
     @contextmanager
     def serving(self, count: int, *, captures: bool = False) -> Iterator[Client]:
-        """A connection to at least ``count`` workers for one job, or to all where they run elsewhere.
+        """A connection to at least ``count`` workers for one job, or to all workers where they run elsewhere.
 
-        Jobs at once share the workers of the one that asks for most.
+        Jobs that run at once share as many workers as the largest of their demands.
 
         Raises:
             SchedulerLostError: the scheduler does not answer.
@@ -119,7 +119,7 @@ class Workers:
                 self._demands.remove(demand)
 
     def connect(self) -> Client:
-        """A connection; it stays this object's.
+        """The connection to the scheduler, which this object owns and closes.
 
         Raises:
             SchedulerLostError: the scheduler does not answer.
@@ -133,18 +133,18 @@ class Workers:
             return self._client
 
     def keep(self) -> None:
-        """Start again what was lost of the workers: Dask gives up one that does not come back within 15 s."""
+        """Start lost workers again; Dask gives up a worker that does not come back within 15 s."""
         with self._lock:
             self._scale()
 
     def look(self) -> Census | None:
-        """Who works on what by now; None where workers of this process's own have not been started yet, as the first
-        job does that.
+        """The present workers and their tasks; None where this process has workers of its own that no job has started
+        yet.
 
         Raises:
             SchedulerLostError: the scheduler does not answer.
         """
-        client = self._client  # without the lock, which whoever starts workers holds for seconds
+        client = self._client  # read without the lock, which a thread that starts workers holds for seconds
         if client is None or client.status != "running":
             if self._scheduler is None:
                 return None
@@ -159,7 +159,7 @@ class Workers:
         return census
 
     def lacking(self, captures: bool) -> str | None:
-        """Why no worker can capture, or run other stages; None if one can, also where this process starts its own."""
+        """Why no worker can capture, or run other stages; None if one can, or if this process starts its own."""
         if self._scheduler is None:
             return None
         try:
@@ -171,10 +171,10 @@ class Workers:
         )
 
     def condition(self) -> str:
-        """How many workers can run stages.
+        """A sentence on how many workers can run stages.
 
         Raises:
-            PlatformError: none can; SchedulerLostError: their scheduler does not answer.
+            PlatformError: none can. SchedulerLostError: their scheduler does not answer.
         """
         if self._own_check is not None:
             return self._own_check.condition()
@@ -186,12 +186,12 @@ class Workers:
         return census.sentence()
 
     def begin_check(self) -> None:
-        """Find out, in the background, whether workers of this process's own can run stages; ``condition`` tells it."""
+        """Check in the background whether this process's own workers can run stages; ``condition`` gives the result."""
         if self._scheduler is None:
             self._own_check = OwnCheck()
 
     def close(self) -> None:
-        """End the processes, or leave those that run elsewhere."""
+        """End this process's own workers, or close the connection to workers that run elsewhere."""
         with self._lock:
             self._close()
 
@@ -204,9 +204,9 @@ class Workers:
             rig = fresh | {"options": fresh["options"] | {"resources": {DOME: 1}}}
             others = dict(specs)
             specs.clear()
-            specs.update({RIG: rig} | others)  # first, as scaling down removes the last
+            specs.update({RIG: rig} | others)  # first, because scaling down removes the last workers
         extra = int(RIG in specs)
-        if len(self._demands) > 1:  # a worker that is one too many for this job may hold tasks of another
+        if len(self._demands) > 1:  # a worker that this job does not need may hold tasks of another
             wanted = max(wanted, len(specs) - extra)
         self._cluster.scale(wanted + extra)
 
@@ -217,7 +217,7 @@ class Workers:
         from services.pipeline.dask_security import LastingSecurity
 
         _leave_dask_alone()
-        # For good, and in this process too, as connections that are made later read it.
+        # The configuration is set for good, and in this process too, because later connections read it.
         preloads = {
             "distributed.worker.preload": [SIGINT_IS_THE_PARENTS, CLOSE_HTTP],
             "distributed.scheduler.preload": [CLOSE_HTTP],
@@ -231,8 +231,8 @@ class Workers:
                 raise SchedulerLostError(
                     f"The scheduler {self._scheduler} does not answer; start it, the job waits."
                 ) from problem
-        # Loopback is open to every user of the machine, so workers there show certificates too: made now, kept in
-        # memory.
+        # Loopback is open to every user of the machine, so workers there show certificates too, which are made here and
+        # kept in memory.
         self._cluster = LocalCluster(
             n_workers=0,
             threads_per_worker=1,
@@ -254,7 +254,8 @@ class Workers:
 
 @cache
 def _leave_dask_alone() -> None:
-    # Once in a process: whatever else is frozen, such as what a connection that failed has left, is never collected.
+    # This is done once in a process, because anything else that is frozen, such as the remains of a failed connection,
+    # is never collected.
     leave_alone_what_is_loaded()
 
 
@@ -264,14 +265,14 @@ async def _census(client: Client) -> Census:
 
 
 def require_scheduler(address: str, certificates: Certificates | None = None) -> None:
-    """Look whether a scheduler answers: it greets whoever connects, and by TLS only whom it trusts.
+    """Check that a scheduler answers: it greets every peer that connects, and with TLS only those that it trusts.
 
     Args:
         address: ``tcp://HOST:PORT``
-        certificates: what to show it; None without TLS.
+        certificates: certificates to show to it; None without TLS.
 
     Raises:
-        SchedulerLostError: nobody answers there.
+        SchedulerLostError: no scheduler answers there.
     """
     parts = urlsplit(address)
     try:
