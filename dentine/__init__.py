@@ -1,16 +1,16 @@
-"""The public face of dentine: what a script needs, loaded when it is first used.
+"""The public interface of dentine: the names that a script needs, each loaded when it is first used.
 
 >>> import dentine
 >>> with dentine.Client("http://127.0.0.1:8000") as client:
 ...     job = client.submit(spec)
 
 =====================  =============================================================================
-``Client``             speaks to a server: submit, watch, upload, download
+``Client``             client of a server: submit, watch, upload, download
 ``AsyncClient``        the same for asyncio
 ``JobSpec``            the options of a job
-``run``                a job to its asset on this machine, without a server
-``simulate_slab``      reflectance, transmittance and their derivatives of a slab
-``load_asset``         what a job has measured, from its folder
+``run``                runs a job on this machine, without a server
+``simulate_slab``      reflectance and transmittance of a slab, with their derivatives
+``load_asset``         loads the asset that a job has exported, from the job's folder
 ``register_mitsuba``   makes ``dentine`` an integrator of this process's Mitsuba
 =====================  =============================================================================
 

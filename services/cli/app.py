@@ -1,4 +1,4 @@
-"""Puts the commands together, and tells every error as one sentence."""
+"""Assemble the commands, and report every error as one sentence."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def main() -> NoReturn:
 
 
 def build_app() -> typer.Typer:
-    """Put the commands together."""
+    """Assemble the commands into one application."""
     from services.cli.bench import bench
     from services.cli.capture import capture
     from services.cli.client.cancel import cancel
@@ -109,14 +109,14 @@ _EXTRAS = MappingProxyType(
         "register": "calibrate,preprocess",
     }
 )
-"""What a command needs beside the base installation; of those that are not named here all that a worker has."""
+"""Command -> extras that it needs beside the base installation; commands that are not listed need the extra worker."""
 
 
 def _remedy(missing: ModuleNotFoundError) -> str:
-    """What to install for the command that was called; a module of our own that is missing is a fault.
+    """The sentence that names the extra to install for the called command.
 
     Raises:
-        ModuleNotFoundError: it is one of our own.
+        ModuleNotFoundError: the missing module is one of this project's own, which is a fault.
     """
     if (missing.name or "services").partition(".")[0] == "services":
         raise missing

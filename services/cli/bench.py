@@ -1,4 +1,4 @@
-"""``dentine bench``: speed with its error beside it."""
+"""``dentine bench``: benchmarks that measure speed together with its error."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def bench(
 
 
 def _draw(module: Any, rows: list[dict[str, Any]], png: Path) -> None:
-    """Draw a benchmark in its module's own way if it has one."""
+    """Draw a benchmark by the function ``picture`` of its module, or as error against time where it has none."""
     try:
         from services.bench.plots import error_against_time, write_png
     except ModuleNotFoundError as missing:

@@ -1,5 +1,5 @@
-"""``dentine scheduler`` and ``dentine worker``: Dask's own commands, with TLS as the settings say and workers that are
-checked.
+"""``dentine scheduler`` and ``dentine worker``: Dask's own commands, with TLS according to the settings, and with
+checks of the workers.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ALL_TO_DASK = {"allow_extra_args": True, "ignore_unknown_options": True, "help_
 
 
 def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -> None:
-    """Add the commands."""
+    """Add the commands ``scheduler``, ``worker`` and ``worker-health`` to an application."""
 
     @app.command(context_settings=_ALL_TO_DASK)
     def scheduler(context: typer.Context) -> None:
@@ -57,7 +57,7 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
 
 
 def _claiming(arguments: Sequence[str], claims: Mapping[str, int]) -> list[str]:
-    """The arguments with resources added to those that they name themselves."""
+    """The arguments with the claims added to their own ``--resources``, whose amounts have precedence."""
     others, named = list[str](), dict[str, str]()
     rest = iter(arguments)
     for argument in rest:
@@ -100,5 +100,5 @@ def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], fold
         "services.pipeline.close_http",
         *(certificates.arguments() if certificates else ()),
     ]
-    os.umask(PRIVATE)  # which what is started here inherits: a worker writes captures of people, too
+    os.umask(PRIVATE)  # inherited by the command that is started: a worker writes captures of people, too
     os.execve(sys.executable, command, as_environment() | os.environ)  # noqa: S606

@@ -1,4 +1,4 @@
-"""``dentine export``: the asset and the report of a finished fit once more."""
+"""``dentine export``: write the asset and the report of a finished fit again."""
 
 from __future__ import annotations
 

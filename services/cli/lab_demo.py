@@ -14,7 +14,7 @@ from services.cli.arguments import Json, Workers
 
 
 class KnownName(StrEnum):
-    """Which truth a comparison is given."""
+    """The part of the truth that a comparison is given."""
 
     PERFECT = "perfect"
     POSE = "true pose"

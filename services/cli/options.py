@@ -1,4 +1,4 @@
-"""``dentine options``: what a job's TOML file may say."""
+"""``dentine options``: the options of a job's TOML file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def options(
 
 
 def _lines(properties: dict[str, dict[str, Any]]) -> Iterator[str]:
-    """One option a line; those without a default are commented out."""
+    """One line for each option; options without a default are commented out."""
     from services.core.raw.toml_writing import toml_value
 
     for name, told in properties.items():
@@ -45,7 +45,7 @@ def _lines(properties: dict[str, dict[str, Any]]) -> Iterator[str]:
 
 
 def _limits(told: dict[str, Any]) -> Iterator[str]:
-    """What values may be, in words."""
+    """The limits of an option's values, in words."""
     for kind in (told, *told.get("anyOf", ())):
         if choices := kind.get("enum"):
             yield f"one of {', '.join(map(str, choices))}"

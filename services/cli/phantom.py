@@ -12,7 +12,7 @@ from services.core.errors import InputError
 
 
 class RendererName(StrEnum):
-    """Who renders a phantom."""
+    """The renderer of a phantom."""
 
     ENGINE = "engine"
     MITSUBA = "mitsuba"

@@ -1,4 +1,4 @@
-"""``dentine run``: a job to its asset, without a server."""
+"""``dentine run``: run a job to its asset, without a server."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def require_apart(spec: JobSpec, out: Path) -> None:
     """Refuse results in the folder that they are made from.
 
     Raises:
-        InputError: names both folders.
+        InputError: the results would lie in that folder; the message names both.
     """
     from services.core.files.folders import require_outside
 

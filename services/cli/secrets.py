@@ -1,4 +1,4 @@
-"""``dentine secrets``: makes and renews what the parts of a composed system know of each other."""
+"""``dentine secrets``: make and renew the certificates and the database password of a composed system."""
 
 from __future__ import annotations
 

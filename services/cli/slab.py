@@ -1,4 +1,4 @@
-"""``dentine simulate slab``: reads one slab or a stack of layers from options and prints its totals."""
+"""``dentine simulate slab``: simulate one slab or a stack of layers, given by options, and print the totals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dentine sphere``: readings of an integrating sphere to absorption and reduced scattering."""
+"""``dentine sphere``: from readings of an integrating sphere to absorption and reduced scattering."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``dentine token``: works on the database itself, so that the first token can be made."""
+"""``dentine token``: make, list and revoke tokens in the database itself, so that the first token can be made."""
 
 from __future__ import annotations
 

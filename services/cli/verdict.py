@@ -1,4 +1,4 @@
-"""How well a fit went, as a sentence and an exit status."""
+"""The verdict on a fit, as a sentence and an exit status."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from services.core.verdict import NOT_CONVERGED_STATUS
 
 
 def require_converged(verdict: Verdict) -> None:
-    """Say on standard error how well a fit went.
+    """Print on standard error how well a fit went.
 
     Raises:
-        typer.Exit: it did not converge.
+        typer.Exit: the fit did not converge.
     """
     print(verdict.headline, file=sys.stderr)
     if not verdict.converged:

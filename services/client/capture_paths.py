@@ -1,5 +1,5 @@
-"""Which files a capture may hold, by their paths alone: the client asks before it reads a file, the server before it
-believes a manifest.
+"""Rules for the paths of a capture's files: the client applies them before it reads a file, the server before it
+accepts a manifest.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ TEXTS = frozenset({".csv", ".json", ".jsonl", ".toml"})
 IMAGES = frozenset({".npy", ".png", ".tif", ".tiff", ".exr"})
 MESHES = frozenset({".ply", ".obj", ".stl"})
 DESCRIPTIONS = frozenset({"capture.json", "manifest.json", "raw.toml", "slab.json"})
-"""One of these makes a folder a capture: linear images, what the capture stage published, raw photographs, or a
-material's cell."""
+"""Names of the files of which one makes a folder a capture: of linear images, of the capture stage's result, of raw
+photographs, or of a material in a cell."""
 
 _CHUNK = re.compile(r"(.*/)?[^/]+\.zarr/(.*/)?c(/\d+)+")
 
@@ -54,7 +54,7 @@ def require_paths(paths: Iterable[str]) -> None:
 
 
 def path_fault(path: str) -> str | None:
-    """What is wrong with a path and what to do, None if nothing is."""
+    """The fault of a path and its remedy, as a clause; None if the path is accepted."""
     parts = path.split("/")
     if path.startswith("/"):
         return "is absolute; give it relative to the capture's folder"

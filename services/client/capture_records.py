@@ -41,9 +41,9 @@ class UploadManifest(Record):
     )
 
     def digest(self, owner: str = DEFAULT_GROUP) -> str:
-        """The same for the same files in any order, the same subject and the same owner."""
+        """A digest of the files in any order, the subject and the owner."""
         rows = sorted((file.path, file.bytes, file.sha256) for file in self.files)
-        whose = [] if owner == DEFAULT_GROUP else [owner]  # as version 0.1 knew no owners
+        whose = [] if owner == DEFAULT_GROUP else [owner]  # the same digest as in version 0.1, which knew no owners
         return hashlib.sha256(json.dumps([self.subject, rows, *whose]).encode()).hexdigest()
 
 

@@ -1,6 +1,6 @@
 """Typed clients of the REST API: one that blocks, as the command line uses it, and one for asyncio.
 
-What they say is in ``requests``.
+Their requests are in ``requests``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ R = TypeVar("R")
 
 
 class Client:
-    """Speaks to one server; a context manager."""
+    """A client of one server that blocks; a context manager."""
 
     def __init__(self, server: str, token: SecretStr | None = None) -> None:
         self._requests = Requests(server, token)
@@ -46,15 +46,15 @@ class Client:
         self._http.close()
 
     def submit(self, spec: JobSpec, key: str | None = None, name: str | None = None) -> dict[str, Any]:
-        """Submit a job, under a label where it is given one; the same key and options give the same job."""
+        """Submit a job, with the label ``name`` if that is given; the same key and options give the same job."""
         return self.run(self._requests.submit(spec, key, name))
 
     def jobs(self, limit: int = 50, before: int | None = None, **only: Any) -> dict[str, Any]:
-        """Some jobs, newest first; ``only`` are the filters of GET /v1/jobs."""
+        """List at most ``limit`` jobs, newest first; ``only`` are the filters of GET /v1/jobs."""
         return self.run(self._requests.jobs(limit, before, **only))
 
     def delete(self, job_id: str) -> dict[str, Any]:
-        """Remove what is stored of a job that has ended; the answer is the receipt."""
+        """Delete the stored data of a job that has ended; return the receipt."""
         return self.run(self._requests.delete(job_id))
 
     def download(self, job_id: str, out: Path) -> int:
@@ -74,7 +74,7 @@ class Client:
         return self.run(self._requests.calibration(name))
 
     def keep_calibration(self, job_id: str, name: str) -> dict[str, Any]:
-        """Put what a calibration job made under a name, which jobs then give; the same again changes nothing."""
+        """Store the calibration of a job under a name, which other jobs then use; a repeated call changes nothing."""
         return self.run(self._requests.keep_calibration(job_id, name))
 
     def upload(
@@ -103,7 +103,7 @@ class Client:
         return self.run(self._requests.retry(job_id))
 
     def workers(self) -> dict[str, Any]:
-        """The workers, what each is doing, and how many jobs they got done."""
+        """The workers, the present work of each, and the number of jobs that they have finished."""
         return self.run(self._requests.workers())
 
     def events(self, job_id: str, after: int = 0) -> Iterator[JobEvent]:
@@ -128,7 +128,7 @@ class Client:
             time.sleep(RECONNECT_S)
 
     def run(self, flow: Flow[R]) -> R:
-        """Perform a flow."""
+        """Perform the steps of a flow and return its result."""
         with closing(flow):
             try:
                 step = next(flow)
@@ -154,7 +154,7 @@ class Client:
 
 
 class AsyncClient:
-    """The same for asyncio; an asynchronous context manager. Files are hashed and read in threads."""
+    """A client of one server for asyncio; an asynchronous context manager. Files are hashed and read in threads."""
 
     def __init__(self, server: str, token: SecretStr | None = None) -> None:
         self._requests = Requests(server, token)

@@ -1,4 +1,4 @@
-"""What both clients do around a file that is sent to them: it is there whole or not at all."""
+"""Downloads of both clients: a file appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from services.core.errors import InputError, PlatformError
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that appears under its name once the block has ended well.
+    """A file that appears under its name once the block has ended without an error.
 
     Raises:
-        InputError: it is there already, or cannot be written.
+        InputError: the file exists already, or cannot be written.
     """
     if path.exists():
         raise InputError(f"{path} exists already; remove it or give another name with --out.")
@@ -33,10 +33,10 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def telling_lost(server: str) -> Iterator[None]:
-    """Say in one sentence that the connection broke.
+    """Replace the error of a broken connection by one sentence.
 
     Raises:
-        PlatformError: it did.
+        PlatformError: the connection broke.
     """
     import httpx
 

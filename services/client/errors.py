@@ -1,4 +1,4 @@
-"""The errors that the service alone raises: leaves of the tree in ``services.core.errors``.
+"""The errors that only the server and its clients raise: further leaves of the tree in ``services.core.errors``.
 
 ::
 
@@ -12,7 +12,7 @@
     ├── MaskError                a mask by hand does not fit its image
     ├── UnknownMaskError         no such mask, camera or light
     ├── UnknownCalibrationError  no such calibration
-    ├── CalibrationTakenError    a calibration's name means another content
+    ├── CalibrationTakenError    a calibration's name stands for other content
     ├── UnknownDomeError         this server has no dome
     ├── UnknownTokenError        no such token
     ├── BodyTooLargeError        a request's body is over the limit
@@ -94,7 +94,7 @@ class UnknownCalibrationError(InputError):
 
 
 class CalibrationTakenError(InputError):
-    """The name of a calibration means another content already."""
+    """The name of a calibration already stands for other content."""
 
     code = "calibration-taken"
 
@@ -215,7 +215,7 @@ class ExpiredError(UploadError):
 
 
 def error_of(code: str, message: str) -> DentineError | None:
-    """The error of the tree that a code means, None if it means none."""
+    """Make the error of the tree that has a code; None if no error has it."""
     kinds: list[type[DentineError]] = [DentineError]
     for kind in kinds:
         if kind.code == code:

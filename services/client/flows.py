@@ -1,9 +1,9 @@
-"""What a client and a server say to each other, without a connection: whoever has one performs the steps and hands back
-what came of them.
+"""The exchanges between client and server as flows, which have no connection: a client performs each step and sends its
+result back into the flow.
 
 A flow is a generator. It yields an ``Ask``, a ``Pause`` or some ``Work``, is sent the answer or has the error thrown
 into it, and returns the result. So the blocking and the asynchronous client share every request, retry and error, and
-differ only in how a step is taken.
+differ only in how they perform a step.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Pause:
 
 @dataclass(frozen=True)
 class Work:
-    """A call that takes a while, as it reads a file."""
+    """A call that takes a while, because it reads files."""
 
     call: Callable[[], Any]
 
@@ -49,12 +49,12 @@ Flow = Generator[Ask | Pause | Work, Any, R]
 
 
 def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
-    """The JSON that a request is answered with.
+    """Make a request and return the JSON of the answer.
 
-    One that changes nothing is made once more if its connection breaks, as servers close idle ones.
+    A GET request is repeated once if its connection breaks, because servers close idle connections.
 
     Raises:
-        PlatformError: no server answers. DentineError: the one that the answer tells of.
+        PlatformError: no server answers. DentineError: the error that the answer states.
     """
     import httpx
 
@@ -84,12 +84,12 @@ class EventCursor:
         self.has_ended = False
 
     def ask(self) -> Ask:
-        """The request of another connection, for what was not read yet."""
+        """The request for another connection, for the events that were not read yet."""
         self._ends = False
         return Ask("GET", self._path, {"headers": {"Last-Event-ID": str(self._after)}})
 
     def take(self, line: str) -> JobEvent | None:
-        """Read a line; an event if it completes one."""
+        """Read a line; return an event if the line completes one."""
         name, _, value = line.partition(": ")
         if name == "event":
             self._ends = value == "end"
@@ -102,10 +102,10 @@ class EventCursor:
         return None
 
     def lose(self, problem: Exception) -> None:
-        """The connection broke.
+        """Count a broken connection.
 
         Raises:
-            PlatformError: it has done so too often in a row.
+            PlatformError: connections have broken too often in a row.
         """
         self._tries += 1
         if self._tries > RECONNECT_TRIES:
@@ -115,7 +115,7 @@ class EventCursor:
 
 
 def error_in(response: Any) -> DentineError:
-    """The error that a problem document tells of."""
+    """The error that the problem document in a response states."""
     try:
         problem = response.json()
         detail, code = str(problem["detail"]), str(problem["code"])

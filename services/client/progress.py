@@ -1,4 +1,4 @@
-"""Shows a job's events in a terminal: bars where there is one, plain lines elsewhere. Always on standard error."""
+"""Show a job's events on standard error: as bars in a terminal, as plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 ASK_AGAIN_S = 5.0
-"""How often the range of the time that remains is asked for; where lines are printed, a twelfth as often."""
+"""Interval at which the range of the remaining time is requested; where plain lines are printed, 12 times as long."""
 
 
 class ProgressView:
     """A context manager that is called with every event; ``events`` counts them.
 
     Args:
-        remaining: tells how long until the job ends, as a job's ``remaining`` in the API.
+        remaining: returns the remaining time of the job, as ``remaining`` of a job in the API.
     """
 
     def __init__(self, remaining: Callable[[], dict[str, Any] | None] | None = None) -> None:
@@ -94,7 +94,7 @@ class ProgressView:
             bars.update(task, left="")
 
     def _worth_a_line(self, event: JobEvent) -> bool:
-        """Every event but previews, and progress only when it enters another tenth."""
+        """Whether to print the event: all but previews, and progress only where it enters another tenth."""
         if event.kind != "progress" or event.done is None or event.stage is None:
             return event.kind != "preview"
         tenth = int(10 * event.done)
@@ -114,7 +114,7 @@ def _note(event: JobEvent) -> str:
 
 
 def describe(remaining: dict[str, Any] | None) -> str:
-    """What is known of the time that remains, in a few words; empty once the job has ended."""
+    """The range of the remaining time in a few words, or why there is none; empty once the job has ended."""
     if remaining is None:
         return ""
     if remaining["low_s"] is None or remaining["high_s"] is None:
@@ -126,7 +126,7 @@ def describe(remaining: dict[str, Any] | None) -> str:
 
 
 def range_text(low_s: float, high_s: float) -> str:
-    """Two durations with as many digits as mean something."""
+    """A range between two durations, with as many digits as are significant."""
     (low, low_unit), (high, high_unit) = _duration(low_s), _duration(high_s)
     return f"{low} to {high} {high_unit}" if low_unit == high_unit else f"{low} {low_unit} to {high} {high_unit}"
 

@@ -1,4 +1,4 @@
-"""Every request that the clients make of a server, as flows."""
+"""Every request that the clients send to a server, as flows."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class Requests:
         )
 
     def jobs(self, limit: int, before: int | None = None, **only: Any) -> Flow[dict[str, Any]]:
-        """Some jobs, newest first; ``only`` are the list's filters."""
+        """List at most ``limit`` jobs, newest first; ``only`` are the filters of the list."""
         asked = {"limit": limit, "before": before} | only
         return self._answer("GET", "/jobs", params={name: value for name, value in asked.items() if value is not None})
 
     def delete(self, job_id: str) -> Flow[dict[str, Any]]:
-        """Remove what is stored of a job."""
+        """Delete the stored data of a job."""
         return self._answer("DELETE", f"/jobs/{quote(job_id, safe='')}")
 
     @staticmethod
     def archive(job_id: str) -> Ask:
-        """The request for a job's files as one zip; its answer is to be streamed."""
+        """The request for a job's files as one zip; the client streams its answer."""
         return Ask("GET", f"/jobs/{quote(job_id, safe='')}/artifacts.zip")
 
     def calibration(self, name: str) -> Flow[dict[str, Any]]:
@@ -59,7 +59,7 @@ class Requests:
         return self._answer("GET", f"/calibrations/{quote(name, safe='')}")
 
     def keep_calibration(self, job_id: str, name: str) -> Flow[dict[str, Any]]:
-        """Put what a calibration job made under a name."""
+        """Store the calibration of a job under a name."""
         return self._answer("PUT", f"/jobs/{quote(job_id, safe='')}/calibration/{quote(name, safe='')}")
 
     def upload(
@@ -81,7 +81,7 @@ class Requests:
         return self._answer("POST", f"/jobs/{job_id}/retry")
 
     def workers(self) -> Flow[dict[str, Any]]:
-        """The workers and what each is doing."""
+        """The workers and the present work of each."""
         return self._answer("GET", "/workers")
 
     def _answer(self, method: str, path: str, **options: Any) -> Flow[dict[str, Any]]:

@@ -21,7 +21,7 @@ _KEY = re.compile(r"[!-+\--~]+")
 
 @dataclass(frozen=True)
 class Checksum:
-    """What a request says of its own bytes."""
+    """The checksum that a request states for its own bytes."""
 
     algorithm: str
     digest: bytes
@@ -83,5 +83,5 @@ def format_checksum(checksum: Checksum) -> str:
 
 
 def format_expiry(time_s: float) -> str:
-    """Upload-Expires of a Unix time."""
+    """The value of Upload-Expires for a Unix time."""
     return formatdate(time_s, usegmt=True)

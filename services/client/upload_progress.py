@@ -1,4 +1,4 @@
-"""Shows an upload in a terminal: a bar where there is one, a line per tenth elsewhere. Always on standard error."""
+"""Show the progress of an upload on standard error: as a bar in a terminal, as one line per tenth elsewhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class UploadView:
-    """A context manager that is called with every progress of an upload."""
+    """A context manager that is called with every ``UploadProgress``."""
 
     def __init__(self) -> None:
         self._bars: Progress | None = None
@@ -50,7 +50,7 @@ class UploadView:
             self._bars.stop()
 
     def __call__(self, progress: UploadProgress) -> None:
-        """Show how far it is."""
+        """Show the progress."""
         if self._bars is not None:
             if progress.phase not in self._tasks:
                 self._tasks[progress.phase] = self._bars.add_task(progress.phase, total=progress.total_bytes, path="")

@@ -1,6 +1,6 @@
-"""Sends a folder to a server, file by file and chunk by chunk.
+"""Upload a folder to a server, file by file and chunk by chunk.
 
-All state is the server's, so any later process goes on where this one ends.
+The server holds all state, so any later process can continue where this one ends.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 CHUNK_BYTES = 4 * 2**20
 MIN_CHUNK_BYTES = 2**18
-"""A chunk is recorded whole or not at all; one that failed is halved down to this, so that a bad connection still gets
-on."""
+"""Smallest size of a chunk. A chunk is recorded whole or not at all, so the size is halved after each failure, down to
+this one, and an upload advances even over a bad connection."""
 PATIENCE_S = 300.0
-"""How long a chunk is tried again while the server does not answer."""
+"""Time for which a step of the upload is repeated while the server does not answer."""
 VERIFYING_S = 900.0
-"""How long the server may take to answer, as after the last chunk it reads the whole file."""
+"""Longest time for an answer of the server, which reads the whole file after its last chunk."""
 MIN_WAIT_S, MAX_WAIT_S = 0.2, 5.0
-"""Between two tries; twice as long each time."""
+"""Shortest and longest wait between two tries; each wait is twice as long as the one before."""
 _PASSING = frozenset({408, 423, 429, 460, 502, 503, 504})
 
 
 class UploadProgress(Record):
-    """How far an upload is."""
+    """The progress of an upload."""
 
     phase: Literal["hashing", "sending"]
     path: str = Field(description="file that is being worked on")
@@ -51,7 +51,7 @@ class UploadProgress(Record):
 
 
 class UploadResult(Record):
-    """What an upload led to."""
+    """The result of an upload."""
 
     id: str
     path: str = Field(description="what a job's option 'capture' takes")
@@ -61,7 +61,7 @@ class UploadResult(Record):
 
 
 class PassingError(Exception):
-    """Something that may be over after a while."""
+    """A fault that may pass after a while."""
 
     def __init__(self, message: str, wait_s: float | None = None) -> None:
         super().__init__(message)
@@ -82,8 +82,8 @@ class Uploader:
         """Upload a folder and commit it.
 
         Raises:
-            CaptureInputError: the folder is no capture, or a file changes meanwhile. UploadError: what the server
-                refuses. PlatformError: no server answers.
+            CaptureInputError: the folder is no capture, or a file changes meanwhile. UploadError: the folder, or the
+                server, refuses something of it. PlatformError: no server answers.
         """
         if subject is not None and re.fullmatch(SUBJECT, subject) is None:
             raise UploadError(
@@ -133,7 +133,7 @@ class Uploader:
         with source.open("rb") as stream:
 
             def step() -> Flow[int]:
-                """The next offset after one more chunk; a failed one asks the server for its own first."""
+                """Send one chunk and return the next offset; after a failure, ask the server for its offset first."""
                 nonlocal offset
                 start, offset = offset, -1
                 if start < 0:
@@ -174,10 +174,10 @@ class Uploader:
         return int(appended.headers["Upload-Offset"])
 
     def _answer(self, method: str, path: str, **options: Any) -> Flow[httpx.Response]:
-        """Ask once.
+        """Make one request and return its response.
 
         Raises:
-            PassingError: worth another try. DentineError: not.
+            PassingError: another try may succeed. DentineError: another try would fail too.
         """
         import httpx
 
@@ -198,7 +198,11 @@ class Uploader:
         raise error_in(response)
 
     def _patiently(self, step: Callable[[], Flow[R]]) -> Flow[R]:
-        """Take a step again while what keeps it may pass, at growing intervals."""
+        """Perform a step, and repeat it at growing intervals while its fault may pass.
+
+        Raises:
+            PlatformError: the fault has not passed in time.
+        """
         give_up_s, wait_s = time.monotonic() + self._patience_s, MIN_WAIT_S
         while True:
             try:
@@ -220,7 +224,7 @@ class Uploader:
 
 
 def _read_chunk(stream: BinaryIO, start: int, size: int) -> tuple[bytes, str]:
-    """Some bytes of a file, and their checksum as a header tells it."""
+    """Read some bytes of a file; return them and their checksum as the value of a header."""
     from services.client.tus import Checksum, format_checksum
 
     stream.seek(start)
@@ -229,7 +233,7 @@ def _read_chunk(stream: BinaryIO, start: int, size: int) -> tuple[bytes, str]:
 
 
 def _scan(folder: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Files that a capture may hold, and the others; a link is an other."""
+    """The files of a folder that a capture may hold, and all others; symbolic links are among the others."""
     if not folder.is_dir():
         raise CaptureInputError(f"Capture {folder} is not a folder; give the folder that holds capture.json.")
     inside = sorted(_walk(folder, folder))
@@ -239,9 +243,9 @@ def _scan(folder: Path) -> tuple[list[str], tuple[str, ...]]:
 
 
 def _require_no_metadata(folder: Path, files: list[str]) -> None:
-    # The server refuses it too, but then it has left this machine.
+    # The server refuses metadata too, but by then they have left this machine.
     for path in files:
-        with suppress(ValueError):  # what is no image the server says with all its faults
+        with suppress(ValueError):  # the server reports a file that is no valid image, with all other faults
             if (fault := metadata_fault(folder / path, path, PurePosixPath(path).suffix.lower())) is not None:
                 raise UploadError(fault)
 

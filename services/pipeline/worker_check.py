@@ -30,7 +30,7 @@ CHECKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 def fault_of(claims: Iterable[str], timeout_s: float = CHECK_S) -> str:
-    """Check the claims in a separate process; return the sentence on why this machine fails them, empty if it does not."""
+    """Check the claims in a separate process; return the sentence that says why one fails, empty where none fails."""
     command = [sys.executable, "-m", "services.pipeline.worker_check", *claims]
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)  # noqa: S603

@@ -1,4 +1,4 @@
-"""The server that a command speaks to."""
+"""The connection of a command to its server."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from services.core.settings import read_settings
 
 
 def connect(server: str | None) -> Client:
-    """A client of the server that was named, else of the settings' one."""
+    """A client of the given server, or of the server in the settings where none is given."""
     settings = read_settings(os.environ)
     return Client(server or f"http://{settings.server.host}:{settings.server.port}", settings.client.token)

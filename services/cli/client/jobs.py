@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from services.client.client import Client
 
 MAX_AT_ONCE = 500
-"""Jobs that a server lists in one answer."""
+"""Largest number of jobs that a server lists in one answer."""
 
 
 def jobs(

@@ -44,7 +44,7 @@ def upload_folder(client: Client, folder: Path, subject: str | None = None) -> U
 
 
 def with_uploaded_source(client: Client, spec: JobSpec) -> JobSpec:
-    """The job with its capture, or its rig's mouth, uploaded and named as the server names it."""
+    """Upload a job's capture, or its rig's mouth; return the job with the path of the upload on the server."""
     if spec.rig is not None:
         mouth = Path(upload_folder(client, spec.rig.mouth).path)
         return spec.model_copy(update={"rig": spec.rig.model_copy(update={"mouth": mouth})})

@@ -23,10 +23,11 @@ def watch(job_id: JobId, server: Server = None, as_json: Json = False) -> None:
 
 
 def watch_job(client: Client, job_id: str, *, as_json: bool = False) -> None:
-    """Show a job until it ends.
+    """Show the progress of a job until it ends.
 
     Raises:
-        JobCancelledError: it was. typer.Exit: it failed, with the status of its own, or its fit did not converge.
+        JobCancelledError: the job was cancelled. typer.Exit: the job failed, with its exit status, or its fit did not
+            converge.
     """
     from services.client.progress import ProgressView
 
@@ -48,6 +49,6 @@ def watch_job(client: Client, job_id: str, *, as_json: bool = False) -> None:
 
 
 def shown_state(job: dict[str, Any]) -> str:
-    """A job's state, and of one that succeeded whether its fit did: the same word that the page shows."""
+    """The state of a job as the page shows it: NOT CONVERGED for a job that succeeded with a fit that did not."""
     verdict = job["verdict"]
     return "NOT CONVERGED" if verdict is not None and not verdict["converged"] else str(job["state"])

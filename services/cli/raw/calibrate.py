@@ -1,4 +1,4 @@
-"""``dentine calibrate``: photographs of boards, spheres and charts to a calibration that knows its errors."""
+"""``dentine calibrate``: from photographs of boards, spheres and charts to a calibration with its errors."""
 
 from __future__ import annotations
 

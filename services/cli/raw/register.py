@@ -1,4 +1,4 @@
-"""``dentine register``: the scan of a raw folder becomes teeth where they stand in the rig."""
+"""``dentine register``: find the pose of a raw folder's scan, and place its teeth in the rig."""
 
 from __future__ import annotations
 
