@@ -2,14 +2,14 @@
 # Runs make targets on bare machines: a fresh Debian or Ubuntu with apt, make and python3 alone, in a folder, entered by
 # chroot.
 #   deploy/bare_machine.sh SUITE [TARGET...]     SUITE: bookworm, trixie, noble ...; TARGET: of the Makefile, default demo and test
-# Needs root and mmdebstrap. The tree is what is committed. Of what it mounts nothing is seen outside, and all ends with
-# it.
-#   BARE_FOLDER     where the machine lies, 10 GB; default /var/tmp/dentine-bare. Logs and times stay there, the machine does not
+# Needs root and mmdebstrap. It runs the committed tree. Its mounts are not visible outside, and all its processes end
+# with it.
+#   BARE_FOLDER     folder of the machine, 10 GB; default /var/tmp/dentine-bare. Logs and times stay there, the machine does not
 #   BARE_USER       yes: targets are run by an ordinary user who may call sudo; default: by root
-#   BARE_KEEP       yes: the machine is left in its folder
-#   BARE_MIRROR     of the packages; default: Debian's own, or Ubuntu's for its suites
+#   BARE_KEEP       yes: the machine stays in its folder
+#   BARE_MIRROR     mirror of the packages; default: Debian's own, or Ubuntu's for its suites
 #   BARE_KEYRING    file with the keys of the mirror; default: the one that apt has
-#   BARE_MOUNTS     "FILE[:INSIDE] ..." of this machine's apt and pip configuration, seen there and copied nowhere; /etc/resolv.conf always is
+#   BARE_MOUNTS     "FILE[:INSIDE] ..." of this machine's apt and pip configuration, mounted there and never copied; /etc/resolv.conf always is
 #   BARE_VARIABLES  names of environment variables that targets are given, such as PIP_CERT
 set -eu
 
@@ -57,7 +57,7 @@ make_machine() {
     say "making $suite"
     mmdebstrap --quiet --variant=apt --include="$packages" --components="$parts" ${BARE_KEYRING:+--keyring="$BARE_KEYRING"} \
         "$suite" "$machine" "${BARE_MIRROR:-$mirror}" </dev/null >"$logs/$suite-machine.log" 2>&1 || die "mmdebstrap failed; see $logs/$suite-machine.log." 1
-    # The file that an installation writes and the packages alone do not.
+    # An installation writes this file, and the packages alone do not.
     echo "127.0.0.1 localhost" >"$machine/etc/hosts"
     home=$machine/root
     if [ "$who" != root ]; then

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Writes what each image is made of as CycloneDX bills of material: deploy/bom.sh FOLDER. They are made of the locks and
+# Writes a CycloneDX bill of materials for each image: deploy/bom.sh FOLDER. The bills are made from the lock files and
 # checked against the format's schema.
 set -eu
 folder=${1:?give the folder to write to}

@@ -1,8 +1,8 @@
 #!/bin/sh
-# Writes what each image installs, with versions and hashes: deploy/images/{build,api,worker}.lock. Needs network;
-# commit what it writes.
+# Writes the lock files of the packages that each image installs, with versions and hashes:
+# deploy/images/{build,api,worker}.lock. Needs network; commit the files.
 #   deploy/lock.sh             keeps the versions that the files name already, where pyproject.toml still allows them
-#   deploy/lock.sh --upgrade   takes the newest
+#   deploy/lock.sh --upgrade   takes the newest versions
 set -eu
 cd "$(dirname "$0")/.."
 [ -x .venv/bin/uv ] || .venv/bin/python -m pip install --quiet uv

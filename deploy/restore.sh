@@ -1,5 +1,5 @@
 #!/bin/sh
-# Puts a backup in place of what a composed system holds: deploy/restore.sh FOLDER
+# Replaces database and data of a composed system by those of a backup: deploy/restore.sh FOLDER
 # Stops the system, replaces database and data, and starts it again. DENTINE_COMPOSE as for backup.sh.
 set -eu
 folder=$(cd "${1:?give the folder of the backup}" && pwd)

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Prepares a fresh Debian 12+ or Ubuntu 24.04+ machine; what is there already is left alone.
+# Prepares a fresh Debian 12+ or Ubuntu 24.04+ machine; parts that are present already stay as they are.
 #   deploy/setup.sh              .venv with the package and its tools, libLLVM and libatomic for the renderer, and the dashboard's bundle;
 #                                goes on without the bundle where npm does not reach its packages
 #   deploy/setup.sh dashboard    the same, but ends where the bundle cannot be built
@@ -44,7 +44,7 @@ prepare_packages() {
     touch "$stamp"
 }
 
-# What the renderer lacks on this machine, as one sentence, into $lack; false if it lacks something.
+# Set $lack to one sentence on what the renderer lacks on this machine; false if it lacks something.
 check_renderer() {
     lack=$(.venv/bin/python -m services.fit.transport.platform 2>&1) && return
     lack=$(printf '%s\n' "$lack" | tail -n 1)
@@ -75,7 +75,7 @@ prepare_dashboard() {
         npm --prefix $folder ci --silent </dev/null || return
     fi
     npm --prefix $folder run --silent build </dev/null || return
-    rm -f "$folder"/node_modules/.built-*  # one stamp alone: that of an earlier source would pass for this bundle's when that source comes back
+    rm -f "$folder"/node_modules/.built-*  # keep one stamp only: the stamp of an earlier source would count for this bundle when that source comes back
     touch "$stamp"
 }
 

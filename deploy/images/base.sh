@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes the base of the images from Debian's packages, for a machine that can pull no public one:
+# Makes the base of the images from Debian's packages, for a machine that cannot pull a public image:
 #   deploy/images/base.sh NAME [SUITE]     NAME such as localhost/dentine-base, SUITE bookworm by default; give NAME as PYTHON_IMAGE
 # Needs mmdebstrap, and podman or docker (DENTINE_ENGINE).
 set -eu
@@ -7,8 +7,8 @@ name=${1:?give the name of the image}
 suite=${2:-bookworm}
 engine=${DENTINE_ENGINE:-$(command -v podman || command -v docker)}
 exclude() { printf -- '--dpkgopt=path-exclude=%s ' "$@"; }
-# Manuals, texts and translations are half of what a root holds and nothing reads them there. usr-is-merged is what
-# mmdebstrap has done already, and keeps apt from taking usrmerge, which brings 50 MB of Perl.
+# Manuals, texts and translations are half of the files of such a root, and nothing reads them there. The hook merges
+# /usr as usr-is-merged demands, which keeps apt from installing usrmerge and 50 MB of Perl for it.
 # shellcheck disable=SC2046
 mmdebstrap --quiet --variant=apt --include=python3,python3-venv,ca-certificates,usr-is-merged \
     --hook-dir=/usr/share/mmdebstrap/hooks/maybe-merged-usr \

@@ -1,13 +1,13 @@
-"""Writes ``dentine.yaml``, the Kubernetes manifests of the system that ``compose.yaml`` describes; the compose file is
-the one source of its values.
+"""Write ``dentine.yaml``, the Kubernetes manifests of the system that ``compose.yaml`` describes; the compose file is
+the only source of its values.
 
     python deploy/kubernetes/render.py            writes the file
     python deploy/kubernetes/render.py --check    exit status 1 where the file is not what would be written
 
-What differs between the two is said here: each service is a Deployment of one pod (the worker of two, a fixed number,
-as Dask's scaling under load loses work), each volume a claim, each network a policy that lets in only pods of the same
-network (``front``: whoever asks the api), and ``secrets`` the first container of the api's pod. The other pods start
-again until it has made what they need.
+This module states the differences between the two. Each service is a Deployment of one pod (the worker of two, a fixed
+number, because Dask's scaling under load loses work), each volume a claim, each network a policy that admits only pods
+of the same network (``front``: everybody, to the api's port), and ``secrets`` the first container of the api's pod. The
+other pods restart until this container has made the secrets that they need.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ NAMESPACE = "dentine"
 REPLICAS = {"worker": 2}
 PORTS = {"api": 8000, "scheduler": 8786, "postgres": 5432, "dome": 5020}
 SIZES = {"data": "200Gi", "database": "10Gi", "kernels": "2Gi"}
-"""Of claims; the others hold some kilobytes."""
+"""Volume -> size of its claim; the other volumes hold some kilobytes."""
 SHARED = "ReadWriteMany"
-"""Pods of several nodes write captures and results."""
+"""Access mode of claims, because pods of several nodes write captures and results."""
 USER = 10001
-"""Of the images' user."""
+"""Id of the user in the images."""
 HEADER = "# Written by deploy/kubernetes/render.py from deploy/compose.yaml; change that file, not this one.\n"
 
 
@@ -170,7 +170,7 @@ def _seconds(text: str) -> int:
 
 
 def _default(text: Any) -> str:
-    """A value with the defaults of its variables, innermost first."""
+    """A value whose variables are replaced by their defaults, innermost first."""
     before, after = None, str(text)
     while after != before:
         before, after = after, re.sub(r"\$\{\w+(?::-([^${}]*)|:\+[^{}]*)?\}", lambda found: found[1] or "", after)
