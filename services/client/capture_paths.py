@@ -27,7 +27,7 @@ def require_paths(paths: Iterable[str]) -> None:
     """Refuse paths that cannot be the files of one capture.
 
     Raises:
-        UploadError: names the first such path and what is wrong with it.
+        UploadError: there is such a path; the message names the first one and what is wrong with it.
     """
     files: set[str] = set()
     spelled: dict[str, str] = {}

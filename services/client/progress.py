@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 ASK_AGAIN_S = 5.0
-"""Interval at which the range of the remaining time is requested; where plain lines are printed, 12 times as long."""
+"""Interval, s, at which the range of the remaining time is requested; 12 times as long where lines are printed."""
 
 
 class ProgressView:

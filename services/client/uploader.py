@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 CHUNK_BYTES = 4 * 2**20
 MIN_CHUNK_BYTES = 2**18
-"""Smallest size of a chunk. A chunk is recorded whole or not at all, so the size is halved after each failure, down to
-this one, and an upload advances even over a bad connection."""
+"""Smallest size of a chunk, bytes. A chunk is recorded whole or not at all, so the size is halved after each failure,
+down to this one, and an upload advances even over a bad connection."""
 PATIENCE_S = 300.0
-"""Time for which a step of the upload is repeated while the server does not answer."""
+"""Time, s, for which a step of the upload is repeated while the server does not answer."""
 VERIFYING_S = 900.0
-"""Longest time for an answer of the server, which reads the whole file after its last chunk."""
+"""Longest time, s, for an answer of the server, which reads the whole file after its last chunk."""
 MIN_WAIT_S, MAX_WAIT_S = 0.2, 5.0
-"""Shortest and longest wait between two tries; each wait is twice as long as the one before."""
+"""Shortest and longest wait between two tries, s; each wait is twice as long as the one before."""
 _PASSING = frozenset({408, 423, 429, 460, 502, 503, 504})
 
 
@@ -82,8 +82,8 @@ class Uploader:
         """Upload a folder and commit it.
 
         Raises:
-            CaptureInputError: the folder is no capture, or a file changes meanwhile. UploadError: the folder, or the
-                server, refuses something of it. PlatformError: no server answers.
+            CaptureInputError: the folder is no capture, or a file changes meanwhile. UploadError: the folder cannot be
+                accepted, or the server refuses a part of it. PlatformError: no server answers.
         """
         if subject is not None and re.fullmatch(SUBJECT, subject) is None:
             raise UploadError(

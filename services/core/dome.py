@@ -1,4 +1,4 @@
-"""What crosses the pipe between a server and the process that works its dome by hand."""
+"""The messages on the pipe between a server and the process that works its dome by hand."""
 
 from __future__ import annotations
 

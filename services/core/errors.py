@@ -139,7 +139,7 @@ class SchedulerLostError(PlatformError):
 
 
 class RigError(DentineError):
-    """The dome or a camera misbehaves. Whoever raises it has already switched the lights off."""
+    """The dome or a camera misbehaves. The code that raises this error has already switched the lights off."""
 
     code = "rig-fault"
     exit_status = 5

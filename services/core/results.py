@@ -48,7 +48,7 @@ class ToothReport(Record):
 
 
 class Correlation(Record):
-    """How errors go together, between -1 and 1."""
+    """Correlations between the errors of a fit's coordinates, each between -1 and 1."""
 
     names: tuple[str, ...] = Field(
         description="coordinates of the fit, such as enamel.sigma; alpha stands for -log10(1 - alpha)"
@@ -57,7 +57,7 @@ class Correlation(Record):
 
 
 class FitReport(Record):
-    """Published by the fit stage, and as parameters.json and errors.json by export."""
+    """Report of a fit, published by the fit stage, and by export as parameters.json and errors.json."""
 
     converged: bool
     advice: str = Field(description="what to do when it did not converge, or for a better answer; may be empty")

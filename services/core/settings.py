@@ -104,7 +104,7 @@ class DomeSettings(Record):
 
     @property
     def allowed_addresses(self) -> frozenset[str]:
-        """Where jobs may capture."""
+        """Addresses of the domes with which jobs may capture."""
         further = (one.strip() for one in self.job_addresses.split(","))
         return frozenset(one for one in (SIMULATED_DOME, self.address, *further) if one)
 
@@ -209,7 +209,7 @@ def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> 
     """Build settings from variables such as ``DENTINE__SERVER__PORT``.
 
     Raises:
-        SettingsError: unknown key or wrong type; the message names the variable.
+        SettingsError: a key is unknown or a value has a wrong type; the message names the variable.
     """
     tree: dict[str, Any] = {}
     for variable, value in environment.items():
@@ -240,7 +240,7 @@ def read_job(path: Path) -> JobSpec:
     """Read JOB.toml. Relative paths in it are relative to the file.
 
     Raises:
-        SettingsError: not TOML, unknown option, wrong value; the message names the option.
+        SettingsError: the file is no TOML, or an option is unknown or has a wrong value; the message names the option.
     """
     if not path.is_file():
         raise SettingsError(f"Job file {path} does not exist; check the path.")
@@ -259,7 +259,7 @@ def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
     """Validate a job's options; relative paths are resolved against ``base``.
 
     Raises:
-        SettingsError: names the option and what is wrong with it.
+        SettingsError: an option is unknown or has a wrong value; the message names it and what is wrong.
     """
     try:
         spec = JobSpec.model_validate(dict(tree))

@@ -16,7 +16,7 @@ StageName = Literal["phantom", "capture", "register", "prepare", "fit", "export"
 
 
 class StageEvent(Record):
-    """One thing that happened: the event table, the progress bars and the dashboard all read these."""
+    """One event of a stage, as the event table, the progress bars and the dashboard read it."""
 
     stage: StageName
     kind: Literal["started", "progress", "log", "step", "preview", "finished"]

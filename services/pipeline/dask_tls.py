@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Certificates:
-    """The certificate of an authority, a certificate that it has signed, and the key of the latter.
+    """Paths of an authority's certificate, of a certificate that this authority has signed, and of the latter's key.
 
     A peer is accepted if its certificate is one of the authority, and no other peer is, so the authority must sign for
     this system alone. Host names are not compared.

@@ -22,25 +22,25 @@ from sqlalchemy.dialects import sqlite
 from services.core.errors import PlatformError, SettingsError
 
 BUSY_MS = 5000
-"""Longest time that a writer waits for a writer of another process."""
+"""Longest time, ms, that a writer waits for a writer of another process."""
 TURN_S = 5.0
-"""Longest time that a writer first waits for other writers of its own process."""
+"""Longest time, s, that a writer first waits for other writers of its own process."""
 MAX_CONNECTIONS = 64
 """Number of connections that stay open to a file: as many as a server has threads with queries."""
 WRITER_LOCK = 0x64656E74
 """Number of the advisory lock: the letters "dent"."""
 MAX_ID = 2**31 - 1
-"""Largest id of a row: that of Postgres' INTEGER, which it compares with no larger number either."""
+"""Largest id of a row: the largest INTEGER of Postgres, which refuses a larger number even in a comparison."""
 
 POSTGRES_SILENCE_S = 15
-"""Time without a sign of life after which each side of a connection counts the other as lost, also in the middle of a
-transaction."""
+"""Time, s, without a sign of life after which each side of a connection counts the other as lost, also in the middle of
+a transaction."""
 
 PASSWORD_FILE = "password_file"  # noqa: S105 - a name
 """Parameter of a database's URL that this project adds to Postgres' own: the file that holds the password, so that no
 password is part of the URL."""
 PATIENCE_S = 600.0
-"""Longest time that a process at work on a job waits for a database that does not answer."""
+"""Longest time, s, that a process at work on a job waits for a database that does not answer."""
 
 T = TypeVar("T")
 metadata = sql.MetaData()
@@ -104,7 +104,7 @@ def with_password_file(url: str, path: Path) -> str:
     """The URL of a database with the file of its password in place of the password."""
     parsed = parse_database_url(url)
     query = dict(parsed.query) | {PASSWORD_FILE: str(path)}
-    # The URL is made anew, because `URL.set` leaves a password as it is where it is given none.
+    # The URL is made anew, because `URL.set` cannot remove a password: None means "leave it unchanged" there.
     without = sql.URL.create(parsed.drivername, parsed.username, None, parsed.host, parsed.port, parsed.database, query)
     return without.render_as_string(hide_password=False)
 
@@ -148,7 +148,7 @@ def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
 class Query:
     """A frequent query, built and compiled once.
 
-    SQLite's driver runs its text without a transaction, because one statement sees one state of the database;
+    SQLite's driver runs the text without a transaction, because one statement sees one state of the database;
     SQLAlchemy's own work around a query takes four times as long as the query.
 
     Args:

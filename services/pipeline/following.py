@@ -25,10 +25,10 @@ ENDS = ("finished", "error")
 """Final statuses of a task; a task with status lost, whose worker died with the result, runs again."""
 POLL_S = 0.25
 KEEP_S = 10.0
-"""Interval at which workers that Dask has given up are started again."""
+"""Interval, s, at which workers that Dask has given up are started again."""
 GRACE_S = 5.0
-"""Time within which a cancelled stage must stop before its worker is stopped. The end of a capture is always awaited,
-because the capture darkens the dome."""
+"""Time, s, within which a cancelled stage must stop before its worker is stopped. The end of a capture is always
+awaited, because the capture darkens the dome."""
 
 
 class Watch:

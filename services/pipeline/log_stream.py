@@ -17,7 +17,7 @@ MAX_WAITING_LINES = 10_000
 """Largest number of lines that wait: some 5 MB, or a minute of a busy server. Further lines are lost, and their number
 is logged once there is room."""
 CLOSE_S = 5.0
-"""Longest time that the end of the process waits for a reader that has stalled."""
+"""Longest time, s, that the end of the process waits for a reader that has stalled."""
 
 
 class QueuedStream:

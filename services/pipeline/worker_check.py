@@ -20,8 +20,8 @@ from services.core.installed import require_packages
 from services.core.placement import DOME, STAGES
 
 CHECK_S = 120.0
-"""Longest time of the check; 1.5 s were measured, and a machine on which many other programs start takes many times as
-long."""
+"""Longest time of the check, s; 1.5 s were measured, and a machine on which many other programs start takes many times
+as long."""
 
 CHECKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {DOME: ("services.capture.stage:check",), STAGES: ("services.preprocess.stage:check", "services.fit.stage:check")}

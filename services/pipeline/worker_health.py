@@ -18,9 +18,9 @@ from pathlib import Path
 from services.core.errors import PlatformError
 
 SIGN_S = 5.0
-"""Interval between a worker's signs of life."""
+"""Interval between a worker's signs of life, s."""
 SILENT_S = 60.0
-"""Time without a sign of life after which a worker does not count; a busy machine may delay a sign by some seconds."""
+"""Time, s, without a sign of life after which a worker does not count; a busy machine may delay one by some seconds."""
 
 
 def default_folder() -> Path:

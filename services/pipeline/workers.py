@@ -28,7 +28,7 @@ CLOSE_HTTP = "services.pipeline.close_http"
 CONNECT_S = 10.0
 PROBE_S = 1.0
 LOOK_S = 3.0
-"""Longest time that the scheduler may take to answer about its workers."""
+"""Longest time, s, that the scheduler may take to answer about its workers."""
 
 
 NOT_STARTED = "Workers start with the next job."

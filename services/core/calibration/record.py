@@ -117,7 +117,7 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
     """Refuse a description whose names or channels contradict each other.
 
     Raises:
-        CaptureInputError: names the first contradiction.
+        CaptureInputError: there is a contradiction; the message names the first one.
     """
     named = {
         "camera": [camera.name for camera in description.cameras],

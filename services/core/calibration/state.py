@@ -72,7 +72,7 @@ def require_within_limits(calibration: Calibration, name: str, *, accepted: bool
     """Refuse a calibration that does not keep its own limits, unless it is accepted all the same.
 
     Raises:
-        CaptureInputError: names the first limit that is not kept.
+        CaptureInputError: a limit is not kept; the message names the first one.
     """
     if (broken := broken_limits(calibration)) and not accepted:
         raise CaptureInputError(refusal(name, broken))

@@ -99,10 +99,10 @@ def require_known_names(
     lights: Sequence[Light],
     origin: str,
 ) -> None:
-    """Refuse the error of an unknown channel, camera or light.
+    """Refuse an uncertainty that names the error of an unknown channel, camera or light.
 
     Raises:
-        CaptureInputError: names the first one.
+        CaptureInputError: there is such a name; the message states the first one.
     """
     if uncertainty is None:
         return

@@ -76,7 +76,7 @@ def decode(path: Path) -> Decoded:
         raise
     except MemoryError as problem:
         raise ValueError("is larger than the memory; crop or bin it") from problem
-    except Exception as problem:  # each library has errors of its own, and damaged files raise whatever they like
+    except Exception as problem:  # each library has errors of its own, and a damaged file may raise any error
         reason = (str(problem) or type(problem).__name__).splitlines()[0].rstrip(".")
         raise ValueError(f"cannot be read ({reason}); it may be truncated, so copy or export it again") from problem
 

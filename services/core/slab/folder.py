@@ -71,7 +71,7 @@ class Beam(Record):
 
 
 class PixelGrid(Record):
-    """Pixels on a face, in the world's x and y; element [0, 0] of a file lies at x from, y from."""
+    """Pixels on a face, in the world's x and y; element [0, 0] of a file lies at the lower ends of x_mm and y_mm."""
 
     x_mm: tuple[float, float]
     y_mm: tuple[float, float]
