@@ -1,4 +1,4 @@
-"""The engine's door: one built scene, images and Jacobians under all lights on demand."""
+"""Public interface of the engine: one built scene, from which it computes images and Jacobians under all lights."""
 
 from __future__ import annotations
 
@@ -40,12 +40,13 @@ if TYPE_CHECKING:
     from services.fit.transport.scene.media import Media
 
 WIDEST_BORDER_MM = 5.0
+"""Largest accepted width of a smoothed border between enamel and dentin, mm."""
 LANE_BUDGET = 24_000_000
-"""Numbers a tally may hold at once, about 100 MB; larger requests are cut into slices of pixels."""
+"""Largest number of float64 sums that a tally may hold, about 190 MB; larger requests are cut into slices of pixels."""
 
 
 class Engine:
-    """A scene built once per process; parameters and dentin shape change per call without rebuilding it."""
+    """A scene built once per process; tissue parameters and dentin shape change per call without rebuilding it."""
 
     def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
         """Build the scene. Selects the variant and thread count if none is set yet.
@@ -97,17 +98,17 @@ class Engine:
         """Radiance of ``view``'s pixels under each light.
 
         Args:
-            seed: with pixel and sample number it fixes every random number.
+            seed: together with camera, pixel and sample number it fixes every random number.
             samples: paths per pixel, rounded up to a multiple of ``batches``; fewer than ``batches`` make as many
                 batches.
-            rel_error: instead of ``samples``, sqrt(sum of variances) / norm to reach over all pixels and lights of the
-                view.
-            max_seconds: with ``rel_error``, give the result as it stands after this time, with ``complete`` false and
-                its true error.
-            max_samples: the same after so many paths per pixel. A result that was not cut short by time repeats bit for
-                bit.
+            rel_error: alternative to ``samples``: sqrt(sum of variances) / norm to reach over all pixels and lights of
+                the view.
+            max_seconds: with ``rel_error``, the time after which the estimate is returned as it is, with ``complete``
+                false and its true error.
+            max_samples: with ``rel_error``, the same limit in paths per pixel. A result that was not cut short by time
+                repeats bit for bit.
             batches: independent batches whose spread gives the variance; one value's error follows Student's t with
-                ``batches - 1``.
+                ``batches - 1`` degrees of freedom.
 
         Raises:
             InputError: a parameter is outside its physical range, the view lists no pixel, or not exactly one of
@@ -138,14 +139,15 @@ class Engine:
         max_samples: int = MAX_SAMPLES,
         batches: int = 4,
     ) -> JacobianEstimate:
-        """Images and their derivatives to the natural parameters ``names`` (see ``Tissue``).
+        """Images and their derivatives with respect to the natural parameters ``names`` (see ``Tissue``).
 
-        Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` has both border terms.
-        Arguments are those of ``images``; ``rel_error`` is to be reached by the images and by each derivative, relative
-        to its own norm. A derivative of which only noise is seen never gets there: give a limit.
+        Derivatives are scores of the same paths that make the images (optics.md); ``shape.k`` includes both border
+        terms. Arguments are those of ``images``; ``rel_error`` is to be reached by the images and by each derivative,
+        relative to its own norm. A derivative that is nothing but noise never reaches it, so set a limit.
 
         Raises:
-            As ``images``; InputError also for a name the scene does not have.
+            InputError: as ``images``; also for a name that the scene does not have, or shapes of several teeth at once.
+            NonFiniteError: a result is NaN or infinite.
         """
         from services.fit.transport.paths.scores import Plan
         from services.fit.transport.scene.media import Score
@@ -188,23 +190,23 @@ class Engine:
         order: int = 5,
         tooth: int = 0,
     ) -> ShapeGradient:
-        """Derivatives of sum(cotangent x images) to all weights of a tooth's dentin shape, with far less noise than the
-        Jacobian's.
+        """Derivatives of sum(cotangent x images) with respect to all weights of a tooth's dentin shape, with far less
+        noise than the Jacobian's.
 
-        Light and importance on the border (``border_series``) instead of single paths. It has a bias: the series ends
-        at ``order``, and light is averaged over patches of the border.
+        It multiplies light and importance on the border (``border_series``) instead of following single paths. It has a
+        bias: the series ends at ``order``, and light is averaged over patches of the border.
 
         Args:
-            cotangent: (L, N) weight of every light's pixel, such as an L2 loss's residual; rows of lights that the view
-                does not list do not count.
+            cotangent: (L, N) weight of every pixel under every light, such as an L2 loss's residual; rows of lights
+                that the view does not list are ignored.
             samples: walks per pixel, rounded up to whole batches.
-            photons: per light, likewise; by default as many in all as there are walks.
-            order: of the spherical harmonics, 1 to 9.
-            tooth: whose dentin moves.
+            photons: photons per light, rounded up likewise; by default as many over all lights as there are walks.
+            order: highest degree of the spherical harmonics, 1 to 9.
+            tooth: index of the tooth whose dentin moves.
 
         Raises:
-            InputError: as ``images``; also for a scene without shape modes, and a cotangent of another shape or not
-                finite.
+            InputError: as ``images``; also for a scene without shape modes, a smoothed border, phase tables, and a
+                cotangent of another shape or not finite.
             NonFiniteError: the result is NaN or infinite.
         """
         from services.fit.transport.gradients.shape_gradient import ShapeGradients
@@ -253,10 +255,10 @@ class Engine:
         seed: int,
         batches: int = 1,
     ) -> NDArray[np.float64]:
-        """Images at albedo 1, split by scattering order: (K, L, N), bin k holds paths of bin_edges[k] <= scatters <
-        bin_edges[k + 1].
+        """Images at albedo 1, split by scattering order: (K, L, N), where bin k holds paths with bin_edges[k] <=
+        scatterings < bin_edges[k + 1].
 
-        An image is a polynomial in a common albedo with these as coefficients; paths end at the last edge.
+        An image is a polynomial in a common albedo, and these are its coefficients; paths end at the last edge.
         """
         from services.fit.transport.paths.scores import Plan
 
@@ -277,15 +279,16 @@ class Engine:
         samples: int,
         batches: int = 16,
     ) -> StainGradient:
-        """Derivatives of sum(cotangent x images) to every texel of the stains, in one pass, both of a path's crossings
-        included (teeth 2018 Eq. 10).
+        """Derivatives of sum(cotangent x images) with respect to every texel of the stains, in one pass that scores
+        every stained face on a path, in and out (teeth 2018 Eq. 10).
 
         Args:
             cotangent: (L, N), such as the residual of an L2 loss; independent of this pass where the result is to be
                 unbiased.
 
         Raises:
-            As ``images``; InputError also for a cotangent of another shape, or a scene without stains.
+            InputError: as ``images``; also for a cotangent of another shape, or a scene without stains.
+            NonFiniteError: the result is NaN or infinite.
         """
         from services.fit.transport.gradients.stains import StainTally
         from services.fit.transport.paths.scores import Plan
@@ -311,7 +314,7 @@ class Engine:
         return StainGradient(textures.cut(gradient), textures.cut(variance), batches * count)
 
     def _prepare(self, tissue: Tissue | Mouth, view: View) -> tuple[Media, PointLights]:
-        """Check a request, put surfaces and stains in their places, and give the media and lights of its kernel."""
+        """Check a request, update shapes and stains of the scene, and return the media and lights of its kernel."""
         from services.fit.transport.scene.media import Media
 
         require_view(view, self.recipe)
@@ -324,7 +327,9 @@ class Engine:
         return Media(media), self._lights_of(view)
 
     def _trace(self, tissue: Tissue | Mouth, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
-        """Contributions, and each derivative, (batches, N, slots), summed over the sample numbers of every batch."""
+        """Sums of contributions, then of each derivative, over the sample numbers of every batch, each (batches, N,
+        slots).
+        """
         from services.fit.transport.paths.starts import CameraStart
 
         media, lights = self._prepare(tissue, view)
@@ -343,7 +348,7 @@ class Engine:
         return whole
 
     def _among_all(self, view: View, *arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Arrays (..., lights of the view, N) with zeros in place of the lights that were not sampled."""
+        """Arrays (..., lights of the view, N) extended to all lights, with zeros for lights that were not sampled."""
         if view.lights is None:
             return arrays
         whole = tuple(
@@ -359,7 +364,7 @@ class Engine:
         return Walk(self._geometry, media, lights, start, plan, self._ior)
 
     def _lights_of(self, view: View) -> PointLights:
-        """The lights that a view needs; none of the others is in its kernel."""
+        """Lights that a view lists, or all; its kernel contains no others."""
         from services.fit.transport.lighting.lights import PointLights
 
         if view.lights is None:
@@ -375,7 +380,7 @@ class Engine:
 
 
 def _mean_and_variance(batches: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean (L, N) over batches and the variance of that mean."""
+    """Mean over batches (batches, N, L) and the variance of that mean, both (L, N); one batch has variance NaN."""
     count = len(batches)
     variance = batches.var(axis=0, ddof=1) / count if count > 1 else np.full(batches.shape[1:], np.nan)
     return batches.mean(axis=0).T, variance.T

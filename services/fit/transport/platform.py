@@ -1,7 +1,7 @@
 """Choose the Dr.Jit back end once per process, after checking that it cannot abort the process.
 
-Whoever renders calls ``prepare_device`` before it imports a kernel, so that whatever the machine lacks is told here, as
-one sentence. ``python -m services.fit.transport.platform`` tells it too, and exits with status 4.
+Code that renders calls ``prepare_device`` before it imports a kernel, so that anything the machine lacks is reported
+here, in one sentence. ``python -m services.fit.transport.platform`` reports it too, and exits with status 4.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from services.core.errors import PlatformError
 from services.core.records import Device
 
 OLDEST_LLVM = 17
-"""libLLVM 13 and 14 are refused by Dr.Jit with a misleading sentence; 15 and 16 abort the process in the first
-kernel."""
+"""Oldest usable major version of libLLVM. Dr.Jit refuses versions 13 and 14 with a misleading sentence; versions 15 and
+16 abort the process in the first kernel."""
 LLVM_REMEDY = "install libllvm19 (or 18, 17), or set DRJIT_LIBLLVM_PATH to such a libLLVM.so"
 PACKAGES = {"libatomic.so.1": "libatomic1", "libstdc++.so.6": "libstdc++6"}
-"""Debian's and Ubuntu's package of each library that Dr.Jit's wheel takes from the system; a bare system lacks the
-first."""
+"""Debian and Ubuntu package of each system library that Dr.Jit's wheel needs; a bare system lacks the first."""
 _MISSING_LIBRARY = re.compile(r"(lib\S+?\.so[.\d]*): cannot open shared object file")
 
 
@@ -30,13 +29,13 @@ def import_renderer() -> tuple[ModuleType, ModuleType]:
     """The modules ``drjit`` and ``mitsuba``.
 
     Raises:
-        PlatformError: names the system library that their wheels need and the machine lacks.
+        PlatformError: a system library that their wheels need is missing; the message names it.
     """
     try:
         return importlib.import_module("drjit"), importlib.import_module("mitsuba")
     except ModuleNotFoundError:
-        raise  # the package itself: whoever installed this process's extras knows which one brings it
-    except (ImportError, NameError) as problem:  # drjit's own handler of a failed import ends in a NameError
+        raise  # drjit or mitsuba itself is absent: the caller knows which extra installs it
+    except (ImportError, NameError) as problem:  # drjit's own handler of a failed import raises a NameError
         for cause in _causes(problem):
             if missing := _MISSING_LIBRARY.search(str(cause)):
                 package = PACKAGES.get(missing[1], f"the package of {missing[1]}")
@@ -47,10 +46,13 @@ def import_renderer() -> tuple[ModuleType, ModuleType]:
 
 
 def require_llvm(version: tuple[int, int, int]) -> None:
-    """Refuse a missing or unusable libLLVM by its version, (-1, -1, -1) when none was found.
+    """Refuse a missing or unusable libLLVM.
+
+    Args:
+        version: major, minor and patch number; (-1, -1, -1) when no libLLVM was found.
 
     Raises:
-        PlatformError: names what was found and what to install.
+        PlatformError: names the version that was found and the package to install.
     """
     if version[0] < 0:
         raise PlatformError(f"No libLLVM was found, which the CPU renderer needs; {LLVM_REMEDY}.")
@@ -62,10 +64,10 @@ def require_llvm(version: tuple[int, int, int]) -> None:
 
 
 def require_renderer() -> None:
-    """Render one pixel of an empty scene.
+    """Render one pixel of an empty scene, to check that the renderer works.
 
     Raises:
-        PlatformError: that does not work; an unusable libLLVM may end the process instead.
+        PlatformError: the pixel cannot be rendered or is wrong; an unusable libLLVM may end the process instead.
     """
     prepare_device(threads=1)
     drjit, mitsuba = import_renderer()
@@ -87,15 +89,15 @@ def require_renderer() -> None:
 def prepare_device(
     threads: int | None = None, backend: Device | None = None, colours: Literal["mono", "rgb"] = "mono"
 ) -> None:
-    """Set Mitsuba's variant and Dr.Jit's thread count. Later calls with the same back end do nothing.
+    """Set Mitsuba's variant and Dr.Jit's thread count. Later calls with the same variant do nothing.
 
     Args:
         threads: CPU threads of this process; None keeps Dr.Jit's default.
-        backend: ``llvm`` or ``cuda``; None takes what this process already uses, else ``llvm``.
-        colours: ``mono`` for everything that fits; ``rgb`` for pictures of other people's scenes.
+        backend: ``llvm`` or ``cuda``; None keeps the back end that this process already uses, else ``llvm``.
+        colours: ``mono`` for all fits; ``rgb`` for pictures of other people's scenes.
 
     Raises:
-        PlatformError: a library is missing, the back end is not usable here, or another one is already in use.
+        PlatformError: a library is missing, the back end is not usable here, or another variant is already in use.
     """
     drjit, mitsuba = import_renderer()
     if backend is None:

@@ -1,4 +1,4 @@
-"""What a camera sees first: nearest surface points along pixel rays, by Mitsuba's ray tracer."""
+"""First surface points along a camera's pixel rays, found by Mitsuba's ray tracer."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ class Hits:
     """Nearest intersections of N rays."""
 
     hit: NDArray[np.bool_]
+    """(N,) whether the ray hit a mesh."""
     points_mm: NDArray[np.float64]
-    """(N, 3); meaningless where nothing was hit."""
+    """(N, 3); meaningless where no mesh was hit."""
     normals: NDArray[np.float64]
     """(N, 3) unit face normals, outward."""
     mesh: NDArray[np.int64]
     """(N,) index of the mesh that was hit, -1 for none."""
     face: NDArray[np.int64]
-    """(N,) face within that mesh."""
+    """(N,) index of the face within that mesh."""
 
 
 class RayScene:
-    """Closed meshes to shoot rays at."""
+    """Closed meshes for ray intersection."""
 
     def __init__(self, *meshes: Mesh) -> None:
         prepare_device()
@@ -47,10 +48,8 @@ class RayScene:
         self._scene = mi.load_dict({"type": "scene", "surface": surface})
 
     def first_hits(self, origins_mm: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
-        """Nearest hits of rays from ``origins_mm`` (N, 3) or (3,) along unit ``directions`` (N, 3); there may be
-        none.
-        """
-        if len(directions) == 0:  # Dr.Jit ends the process that evaluates nothing
+        """Nearest hits of rays from ``origins_mm`` (N, 3) or (3,) along unit ``directions`` (N, 3); N may be 0."""
+        if len(directions) == 0:  # because Dr.Jit ends the process when an empty array is evaluated
             none = np.zeros(0, dtype=np.int64)
             return Hits(none.astype(bool), np.zeros((0, 3)), np.zeros((0, 3)), none, none)
         import drjit as dr
@@ -82,7 +81,7 @@ class RayScene:
 def pixel_rays(
     camera: Camera, offset: tuple[float, float] = (0.5, 0.5)
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Origin (3,) and directions (H * W, 3) through every pixel, row by row, at an offset inside the pixel."""
+    """Origin (3,) and directions (H * W, 3) of rays through every pixel, row by row, at an offset inside the pixel."""
     width, height = camera.size
     x, y = np.meshgrid(np.arange(width) + offset[0], np.arange(height) + offset[1])
     return camera.rays(x.reshape(-1), y.reshape(-1))

@@ -2,8 +2,8 @@
 
 Looking up every light costs as much as dozens of steps of the walk. So a lane keeps one of its last few vertices,
 chosen in proportion to the most that it could contribute, and connects that one, to one light of every group
-(``light_groups``). All lanes connect in the same turn, which keeps the vector units full where each vertex deciding for
-itself would not.
+(``light_groups``). All lanes connect at the same step, which keeps the vector units full; a separate decision at each
+vertex would not.
 """
 
 from __future__ import annotations
@@ -21,52 +21,58 @@ from services.fit.transport.scene.geometry import Geometry
 from services.fit.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 
 MAP_DOUBT = 0.1
-"""Relative error that a light map is trusted not to exceed where it is certain: the share of a connection that shadow
-rays check."""
+"""Bound assumed for the relative error of a light map where it is certain. It sets the share of a connection that
+shadow rays check."""
 MAP_FAILURE = 0.003
-"""The same, relative to the brightest that the vertex could be: no connection goes unchecked."""
+"""Bound added to that one, relative to the largest possible contribution of the vertex, so that no connection goes
+unchecked."""
 
 
 @dataclass
 class Vertex:
-    """One scattering vertex of each lane, kept by reservoir sampling, with all that its path had scored there."""
+    """One scattering vertex of each lane, kept by reservoir sampling, with all the scores that its path had there."""
 
     point: mi.Point3f
     omega: mi.Vector3f
+    """Propagation direction of the path before the vertex scatters it."""
     place: mi.UInt32
     carried: mi.Float
+    """Throughput of the path, albedos included."""
     clear: mi.Float
-    """Transmittance over the distance in which no surface lies: no light can be brighter."""
+    """Transmittance over the distance in which no surface lies: an upper bound of the transmittance to any light."""
     so_far: Scatterings
     sums: list[mi.Float]
     border_sums: list[mi.Float]
     secondary: mi.Bool
     shape_factor: list[mi.Float]
     wall: list[mi.Bool]
-    """Whether it lies on an opaque surface, whose normal ``omega`` then is; empty in scenes that have none."""
+    """Whether the vertex lies on an opaque surface, whose normal ``omega`` then is; empty in scenes without such
+    surfaces."""
     stains: list[FaceCrossing]
-    """One of the stained faces on the way; empty unless they are asked for."""
+    """One of the stained faces that the path crossed; empty unless stain derivatives are computed."""
     total: mi.Float
     """Sum of ``carried * clear`` over the vertices offered; 0 when there was none."""
 
 
 @dataclass
 class Doubt:
-    """The one light of a vertex whose look-up is checked."""
+    """The one light of a vertex whose look-up a shadow ray may check."""
 
     light: mi.UInt32
     direction: mi.Vector3f
     weight: mi.Float
     """Contribution at full transmittance."""
     expected: mi.Float
-    """Transmittance by the map."""
+    """Transmittance according to the map."""
     lengths: list[mi.Float]
-    """Path lengths by the map, in the media that extinction scores ask for."""
+    """Path lengths in mm according to the map, in the media that extinction scores need."""
     importance: mi.Float
+    """Weight of this light in the reservoir: the assumed error of its look-up."""
     total: mi.Float
-    """Importance of all lights together."""
+    """Sum of the importance of all lights."""
     expected_sum: list[mi.Float]
-    """By the maps, what all lights bring, weighted by the cotangent; empty unless stains are asked for."""
+    """Contribution of all lights according to the maps, weighted by the cotangent; empty unless stain derivatives are
+    computed."""
 
 
 class Connections:
@@ -100,7 +106,7 @@ class Connections:
         )  # fmt: skip
 
     def offer(self, kept: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:
-        """Offer a vertex; ``found.total`` is ignored."""
+        """Offer ``found`` to the reservoir ``kept``, with a uniform random number ``u``; ``found.total`` is ignored."""
         importance = dr.select(active, found.carried * found.clear, 0)
         total = kept.total + importance
         chosen: Vertex = dr.select(active & (u * total < importance), found, kept)
@@ -108,13 +114,13 @@ class Connections:
         return chosen
 
     def connect(self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally) -> mi.PCG32:
-        """Add the kept vertex's light from everywhere; returns the advanced generator."""
+        """Add the contributions of all lights at the kept vertex to the tally; returns the advanced generator."""
 
         def to_lights(vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool) -> mi.PCG32:
             kept, rng = self._look_around(vertex, lane, rng, active, tally)
 
-            # Correct what the maps said about one light by a shadow ray, cast with a probability in proportion to the
-            # doubt.
+            # Correct the maps' transmittance to one light by a shadow ray, cast with a probability proportional to the
+            # assumed error.
             chance = dr.clip(ROULETTE_GAIN * kept.total * self.lights.inverse_irradiance, DARKEST_CHANCE, 1)
             casts = active & (kept.total > 0) & (rng.next_float32() < chance)
             weight = kept.weight * kept.total / (kept.importance * chance)
@@ -181,8 +187,8 @@ class Connections:
     def _look_around(
         self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally
     ) -> tuple[Doubt, mi.PCG32]:
-        """Count what the light maps expect from one light of every group, and keep one of these in proportion to the
-        doubt about it.
+        """Add the contributions that the light maps predict for one light of every group, and keep one of these lights
+        with a probability proportional to the assumed error of its look-up.
         """
         maps, groups = self.lights.maps, self.lights.groups
         doubt = MAP_DOUBT if self.plan.shape is None and not self.plan.stains else 1.0
@@ -195,7 +201,7 @@ class Connections:
                 group, vertex.point, lambda direction: self._density(vertex, direction), u
             )
             seen = maps.look(light, vertex.point, vertex.place, active)
-            # A vertex stands for all that were offered with it, and a light for its group.
+            # The kept vertex represents all that were offered with it, and the chosen light its whole group.
             weight = vertex.total / dr.maximum(vertex.clear, 1e-30) * brightness
             expected, lengths = seen.transmittance(self.media), seen.lengths(self.book.sigma_media)
             importance = weight * dr.select(seen.certain, doubt * expected + MAP_FAILURE * vertex.clear, vertex.clear)
@@ -260,7 +266,7 @@ class Connections:
             tally.add_derivative(len(self.plan.scores) + mode, lane, slot, value * factor, active)
 
     def _medium(self, vertex: Vertex) -> mi.UInt32 | Mixed:
-        """What a vertex scatters in, a wall where it lies on one."""
+        """Medium in which a vertex scatters, or the wall (number ``media.count``) where it lies on the wall."""
         wall = mi.UInt32(self.media.count)
         if not self.geometry.mixing:
             medium = self.geometry.medium(vertex.place)
@@ -275,7 +281,7 @@ class Connections:
         return mixed
 
     def _density(self, vertex: Vertex, direction: mi.Vector3f) -> mi.Float:
-        """Phase function, or diffuse reflection of white, towards a direction, 1/sr."""
+        """Phase function, or on a wall the diffuse reflection of a white surface, towards a direction, 1/sr."""
         density = PhaseFunction(self.media, self._medium(vertex)).density(vertex.omega, direction)
         if vertex.wall:
             density = dr.select(vertex.wall[0], dr.maximum(dr.dot(vertex.omega, direction), 0) * dr.inv_pi, density)

@@ -1,10 +1,10 @@
-"""Where and in which directions scattered light leaves a slab: rings about the point of entry, radiance at chosen
+"""Places and directions where scattered light leaves a slab: rings about the point of entry, radiance at chosen
 cosines.
 
 Every flight is connected to every exit cosine by the mean over its possible collisions, along one random azimuth, the
 same for all cosines: on a straight flight in one layer the phase function towards an exit is constant and the
-transmittance an integral of exponentials, so neither where the collision happens nor how grazing the exit is adds
-noise. Between partly reflecting faces the way out goes on as a geometric series.
+transmittance an integral of exponentials, so neither the place of the collision nor a grazing exit adds noise. Between
+partly reflecting faces the light's further way out is summed as a geometric series.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from services.fit.transport.scene.geometry import Hit, SlabGeometry
 from services.fit.transport.scene.media import Media, PhaseFunction
 
 MIN_RATE = 1e-6
-"""Attenuation along flight and way out per optical depth flown; nearer to 0 than this the two cancel, and the integrand
-is constant."""
+"""Smallest rate of attenuation along flight and way out together, per optical depth flown. Closer to 0 than this the
+two cancel, and the integrand is constant."""
 
 
 class Exits:
-    """Slots of a tally, from ``first_slot`` on: lit and far face of every cosine, then of every ring."""
+    """Exit slots of a tally, from ``first_slot`` on: lit and far face for every cosine, then for every ring."""
 
     def __init__(self, geometry: SlabGeometry, media: Media, plan: Plan, ior: mi.Float | None, first_slot: int) -> None:
         self.geometry, self.media, self.plan, self.ior = geometry, media, plan, ior
@@ -41,7 +41,9 @@ class Exits:
     def count_ring(
         self, walker: Walker, order: mi.UInt32, hit: Hit, face: mi.UInt32, value: mi.Float, tally: Tally
     ) -> None:
-        """Count light that leaves ahead, having scattered ``order`` times, in the ring of its exit point."""
+        """Count ``value``, light that leaves through the face ahead after ``order`` scatterings, in the ring of its
+        exit point; unscattered light is left out.
+        """
         if not self.plan.rings:
             return
         radius = dr.hypot(
@@ -54,8 +56,8 @@ class Exits:
         tally.add(walker.lane, self._first_ring + 2 * ring + face, value, scattered)
 
     def connect(self, walker: Walker, hit: Hit, sigma: mi.Float, scattered: mi.Float, tally: Tally) -> None:
-        """Add to the radiance at every cosine what the flight ahead sends there; a collision leaves ``scattered`` of
-        it.
+        """Add to the radiance at every cosine the light that collisions on the flight ahead scatter there;
+        ``scattered`` is the throughput after one collision.
         """
         if not self.plan.exit_cosines:
             return
@@ -75,15 +77,15 @@ class Exits:
             sine = dr.sqrt(dr.maximum(1 - dr.square(inside), 0))
             sent = []
             for side, sign in enumerate((-1, 1)):
-                # Collisions come at rate exp(-depth flown), and their light gets out by exp(-depth to the face /
-                # cosine).
+                # Collisions have density exp(-depth flown), and their light leaves with transmittance exp(-depth to the
+                # face / cosine).
                 rate = 1 + (-sign / inside) * omega.z
                 size = dr.maximum(dr.abs(rate), MIN_RATE)
                 brightest = dr.select(rate > 0, begin[side] / inside, end[side] / inside + flown)
                 chance = dr.exp(-brightest) * one_minus_exp(size * flown) / size
                 sent.append(chance * phase.density(omega, mi.Vector3f(across.x * sine, across.y * sine, sign * inside)))
 
-            # What the face turns back crosses the slab to the other one, and so on.
+            # Light that a face reflects back crosses the slab to the other face, and so on.
             back = mirrored * dr.exp(-(begin.x + begin.y) / inside)
             strength = scattered * (1 - mirrored) / (narrowing * inside * (1 - dr.square(back)))
             slot = self._first_cosine + 2 * which
@@ -110,7 +112,7 @@ class Exits:
         )
 
     def _face(self, cosine: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Cosine inside, solid angle times cosine outside over that inside, reflectance."""
+        """Cosine inside, ratio of solid angle times cosine outside to the same inside, and reflectance of the face."""
         if self.ior is None:
             return cosine, mi.Float(1), mi.Float(0)
         mirrored = fresnel.reflectance(cosine, self.ior)

@@ -1,4 +1,4 @@
-"""What a kernel has to compute, and the scores that turn its paths into derivatives."""
+"""The plan of what a kernel computes, and the scores that turn its paths into derivatives."""
 
 from __future__ import annotations
 
@@ -12,33 +12,35 @@ from services.fit.optics.free_flight import minus_log1m
 from services.fit.transport.scene.media import Media, Mixed, Score
 
 NEARLY_ONE = 1 - 2.0**-24
+"""Largest float32 number below 1."""
 MAX_COUNTED = 3
-"""Media of which each keeps a count of its own scatterings."""
+"""Largest number of media for each of which a kernel counts the scatterings separately."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What this kernel has to do; everything here is decided before compilation."""
+    """Quantities that one kernel computes; all of them are chosen before compilation."""
 
     scores: tuple[Score, ...] = ()
     shape: int | None = None
-    """Tooth to whose border's shape modes derivatives are wanted; they follow those of ``scores`` in the tally."""
+    """Index of the tooth to whose dentin shape modes derivatives are computed; they follow those of ``scores`` in the
+    tally."""
     faces: bool = False
-    """Count what leaves the slab's faces instead of connecting to lights."""
+    """Count the light that leaves the slab's faces instead of connecting to lights."""
     bend: bool = False
     """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
     exit_cosines: tuple[float, ...] = ()
     """With ``faces``: also the radiance that leaves at these cosines."""
     ring_edges_mm: tuple[float, ...] = ()
-    """With ``faces``: also what leaves within rings about the point of entry, between these radii and beyond the
-    last."""
+    """With ``faces``: also the light that leaves within rings about the point of entry, between these radii and beyond
+    the last."""
     order_edges: tuple[int, ...] = ()
     """Split images by scattering order at these edges."""
     stains: bool = False
-    """Instead of images, the derivative of their sum, weighted by a cotangent, to the texels of stains."""
+    """Instead of images, compute the derivative of their sum, weighted by a cotangent, to the texels of stains."""
     most_steps: int | None = None
-    """End paths after so many flights, for media in which some never end; with ``faces`` what they still carried is
-    counted as a third slot."""
+    """Number of flights after which a path ends, for media in which some never end; with ``faces`` the throughput of
+    paths ended in this way is counted in a third slot."""
 
     @property
     def rings(self) -> int:
@@ -48,17 +50,17 @@ class Plan:
 
 @dataclass
 class Scatterings:
-    """What a path has scattered so far.
+    """Scatterings of a path so far.
 
-    The albedos sit in an exponent, exact also where 1 - alpha is below float32 resolution.
+    Albedos are accumulated as logarithms, which stays exact where 1 - alpha is below float32 resolution.
     """
 
     counts: list[mi.UInt32]
-    """In each medium that is counted on its own."""
+    """Number of scatterings in each medium that is counted separately."""
     others: list[mi.Float]
-    """Sum of ln alpha over all other scatterings; empty where every medium is counted."""
+    """Sum of ln alpha over all other scatterings; empty where every medium is counted separately."""
     total: list[mi.UInt32]
-    """Likewise, the number of all scatterings."""
+    """Number of all scatterings; empty likewise."""
 
 
 class Scores:
@@ -74,23 +76,24 @@ class Scores:
                     " derivatives."
                 )
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
-        # Of few media all are counted; of many, those whose albedo is free; where media mix, none.
+        # Where there are few media all are counted, where there are many only those whose albedo is free, and where
+        # media mix none.
         self.mixing = mixing
         self.counts_all = media.count <= MAX_COUNTED and not mixing
         asked = set() if mixing else {s.medium for s in plan.scores if s.field == "alpha"}
         self.counted = tuple(range(1, media.count + 1)) if self.counts_all else tuple(sorted(asked))
 
     def zero(self) -> list[mi.Float]:
-        """No score yet."""
+        """Scores of a path that has just begun."""
         return [mi.Float(0) for _ in self.plan.scores]
 
     def unscattered(self) -> Scatterings:
-        """No scattering yet."""
+        """Scatterings of a path that has just begun."""
         rest = 0 if self.counts_all else 1
         return Scatterings([mi.UInt32(0) for _ in self.counted], [mi.Float(0)] * rest, [mi.UInt32(0)] * rest)
 
     def scatter(self, so_far: Scatterings, medium: mi.UInt32 | Mixed, active: mi.Bool) -> Scatterings:
-        """One more in each active lane."""
+        """Scatterings with one more in each active lane."""
         if isinstance(medium, Mixed):
             log_alpha = -minus_log1m(dr.minimum(self.media.pick(self.media.absorbed, medium), NEARLY_ONE))
             return Scatterings(
@@ -127,7 +130,9 @@ class Scores:
         return total
 
     def flight(self, sums: list[mi.Float], medium: mi.UInt32, length: mi.Float, scatter: mi.Bool) -> list[mi.Float]:
-        """Sigma at fixed albedo: -t per segment, 1/sigma per scatter (teeth 2018 Eq. 23, corrected)."""
+        """Scores after a flight of extinction at fixed albedo: -length per segment, 1/sigma per scattering (teeth 2018
+        Eq. 23, corrected).
+        """
         return [
             (
                 dr.select(
@@ -142,7 +147,7 @@ class Scores:
         ]
 
     def mixed_albedo(self, sums: list[mi.Float], medium: Mixed, active: mi.Bool) -> list[mi.Float]:
-        """Albedos where media mix: their share over the mixture's albedo per scatter (Eq. 20)."""
+        """Scores of the albedos where media mix: the medium's share over the mixture's albedo per scatter (Eq. 20)."""
         inverse = dr.rcp(dr.maximum(1 - self.media.pick(self.media.absorbed, medium), 1 - NEARLY_ONE))
         return [
             total + dr.select(active, medium.share_of(s.medium) * inverse, 0) if s.field == "alpha" else total
@@ -150,8 +155,8 @@ class Scores:
         ]
 
     def mixed_motion(self, medium: Mixed, terms: dict[str, mi.Float]) -> mi.Float:
-        """Change of ln(phase function) with q, per mm: differences of the two media times ``terms``, all fields of the
-        lobes (Eq. 19, corrected).
+        """Derivative of ln(phase function) with respect to the distance q, per mm: differences of the two media's lobe
+        parameters times ``terms``, which holds all fields of the lobes (Eq. 19, corrected).
         """
         total = mi.Float(0)
         for field, term in terms.items():
@@ -160,7 +165,7 @@ class Scores:
         return total * medium.slope
 
     def mixed_albedo_motion(self, medium: Mixed) -> mi.Float:
-        """Change of ln(albedo) with q, per mm (Eq. 21)."""
+        """Derivative of ln(albedo) with respect to the distance q, per mm (Eq. 21)."""
         absorbed = self.media.absorbed
         less = self.media.pick(absorbed, medium.second) - self.media.pick(absorbed, medium.first)
         return less * medium.slope / dr.maximum(1 - self.media.pick(absorbed, medium), 1 - NEARLY_ONE)
@@ -168,7 +173,7 @@ class Scores:
     def turn(
         self, sums: list[mi.Float], medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], active: mi.Bool
     ) -> list[mi.Float]:
-        """Phase function parameters: d ln f per scatter (Eq. 12, 13)."""
+        """Scores of the phase function's parameters after a change of direction: d ln f per scattering (Eq. 12, 13)."""
         if isinstance(medium, Mixed):
             return [
                 total + dr.select(active, medium.share_of(s.medium) * terms[s.field], 0) if s.field in terms else total
@@ -187,8 +192,8 @@ class Scores:
         terms: dict[str, mi.Float],
         lengths: dict[int, mi.Float],
     ) -> list[mi.Float]:
-        """Scores of a whole path: what was accumulated, 1/alpha per scatter (Eq. 20), the connection's phase value and
-        segments.
+        """Scores of a whole path: the accumulated sums, 1/alpha per scattering (Eq. 20), and the connection's phase
+        function and segments.
         """
         whole = []
         for s, total in zip(self.plan.scores, sums, strict=True):

@@ -1,7 +1,7 @@
-"""Where walks begin, and with which random numbers.
+"""Starting points of walks, and their streams of random numbers.
 
-Streams depend on (seed, pixel, sample) alone, never on block, batch or worker, so a result does not depend on how the
-work was cut.
+A camera's streams depend on seed, camera, pixel and sample alone, never on block, batch or worker, so a result does not
+depend on how the work was cut.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ from services.fit.transport.lighting.light_maps import aligned
 from services.fit.transport.scene.recipe import View
 
 NEAR_MARGIN_MM = 1.0
+"""Distance in mm from the sphere about the origin that holds the scene to the start of rays outside it."""
 
 
 def stream(seed: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.PCG32:
-    """Counter-based generator: two rounds of the tiny encryption algorithm place a PCG32 stream."""
+    """Counter-based generator: two calls of the tiny encryption algorithm choose the state and stream of a PCG32
+    generator.
+    """
     a, b = mi.sample_tea_32(seed, pixel)
     c, d = mi.sample_tea_32(a ^ sample, b)
     rng = mi.PCG32()
@@ -43,9 +46,10 @@ class PathStart:
 
 
 class CameraStart:
-    """Walks from a view's pixels, box filter; every batch leaves out its first ``skipped`` samples.
+    """Walks that start at random points of a view's pixels (box filter); every batch leaves out its first ``skipped``
+    samples.
 
-    Every camera has streams of its own, by its name.
+    Every camera has streams of its own, because its name enters the seed.
     """
 
     def __init__(self, view: View, batches: int, seed: int, radius_mm: float, skipped: int = 0) -> None:
@@ -81,10 +85,11 @@ class CameraStart:
 
 
 class LightStart:
-    """Photons from every light, uniformly over a rectangle that holds the tooth as that light sees it, in batches of
+    """Photons from every light, uniform over a rectangle that encloses the tooth as seen from that light, in batches of
     their own.
 
-    Weights are near 1; ``power`` says what 1 stands for. Lanes are ordered by light, then by batch: groups.
+    Weights are near 1; ``power`` is the quantity that a weight of 1 represents. A group is one batch of one light;
+    lanes are ordered by light, then by batch.
     """
 
     def __init__(
@@ -96,7 +101,7 @@ class LightStart:
         lanes_per_group: int,
         seed: int,
     ) -> None:
-        """Take lights (L, 3) and (L,), and all vertices of the tooth."""
+        """Take the lights' positions (L, 3) and intensities (L,), and all vertices of the tooth (V, 3)."""
         self.count, self.batches, self.lanes_per_group = len(positions_mm), batches, lanes_per_group
         self.groups = self.count * batches
         self.lanes = self.groups * lanes_per_group
@@ -123,7 +128,7 @@ class LightStart:
         dr.eval(self._frames)
 
     def group(self, lane: mi.UInt32) -> mi.UInt32:
-        """Light and batch of a lane, as light x batches + batch."""
+        """Group of a lane: light x batches + batch."""
         return lane // self._lanes_per_group
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
@@ -138,7 +143,7 @@ class LightStart:
         squared = dr.squared_norm(across)
         inverse = dr.rsqrt(squared + dr.square(distance))
         omega = (across + forward * distance) * inverse
-        # Where the ray is as far from the light as the near plane, without the difference of two long distances.
+        # Start where the ray is as far from the light as the near plane, without the difference of two long distances.
         back = before + squared / (dr.rcp(inverse) + distance)
         cosine = distance * inverse
         return PathStart(rng, mi.Point3f(across - omega * back), omega, mi.UInt32(0), cosine * cosine * cosine)
@@ -155,7 +160,7 @@ class SlabStart:
         self.refractive = ior != 1
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
-        """A path just inside the lit face, weighted by the share that enters."""
+        """A path just inside the lit face, weighted by the share of light that enters."""
         rng = stream(self.seed, lane, sample)
         cosine = dr.sqrt(1 - rng.next_float32()) if self.diffuse else self.cosine
         weight = 1 - fresnel.reflectance(cosine, self.ior) if self.refractive else mi.Float(1)

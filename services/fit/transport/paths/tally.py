@@ -1,7 +1,7 @@
-"""Where a walk's contributions land: private slots per lane, so that sums never depend on the order of threads.
+"""Sums of a walk's contributions, in private slots per lane, so that sums never depend on the order of threads.
 
-Sums are double: a lane that adds ten thousand nearly equal float32 numbers is off by 1e-5, and the rounding is the same
-way each time.
+Sums are in double precision: in single precision, a lane that adds ten thousand nearly equal numbers is off by 1e-5,
+with the same sign each time.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 
 class Tally:
-    """Sums of contributions and of contributions times scores, per (lane, slot); a slot is a light, or a light's order
-    bin.
+    """Sums of contributions and of contributions times scores, per (lane, slot). A slot is a light, or a bin of
+    scattering order under a light.
     """
 
     def __init__(self, lanes: int, slots: int, derivatives: int) -> None:
@@ -24,17 +24,17 @@ class Tally:
         dr.make_opaque(self.sums, self.derivatives)
 
     def add(self, lane: mi.UInt32, slot: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
-        """Add to a light's sum."""
+        """Add a contribution to a slot's sum."""
         dr.scatter_add(self.sums, mi.Float64(value), lane * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts)
 
     def add_derivative(self, which: int, lane: mi.UInt32, slot: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
-        """Add to a derivative's sum."""
+        """Add a contribution times score to a slot's sum of derivative ``which``."""
         dr.scatter_add(
             self.derivatives[which], mi.Float64(value), lane * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts
         )
 
     def evaluate(self) -> None:
-        """Run the kernel without holding the interpreter: a worker's heartbeat goes on."""
+        """Run the kernel without holding the interpreter lock, so that a worker's heartbeat goes on."""
         dr.eval(self.sums, self.derivatives)
         dr.sync_thread()
 

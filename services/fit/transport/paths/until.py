@@ -1,4 +1,6 @@
-"""How long to trace: a number of paths, or rounds of growing size until the result's own error is as small as asked."""
+"""Number of paths to trace: a fixed number, or rounds of growing size until the estimated error is as small as
+requested.
+"""
 
 from __future__ import annotations
 
@@ -17,23 +19,24 @@ from services.fit.transport.scene.recipe import JacobianEstimate, StackEstimate
 FIRST_ROUND = 4
 """Paths per batch in the first round."""
 GROWTH = 4.0
-"""A round makes all paths so far at most this many times more: an early estimate of the error is not trusted
+"""Largest growth of the number of all paths in one round, because an early estimate of the error is not trusted
 further."""
 MIN_GROWTH = 1.25
-"""And at least this: every look at the error is a chance to stop on one that is too small by luck."""
+"""Smallest growth of that number, because every look at the error is a chance to stop on one that is too small by
+luck."""
 SAFETY = 1.05
-"""More paths than the error so far asks for."""
+"""Factor by which a round exceeds the number of paths that the error so far calls for."""
 MAX_SAMPLES = 2**31
-"""Paths per pixel that sample numbers of 32 bits tell apart, with room to spare."""
+"""Largest number of paths per pixel; sample numbers of 32 bits tell them apart, with room to spare."""
 
 Sums = list[NDArray[np.float64]]
-"""Per table, (batches, N, slots) summed over paths."""
+"""Sums over paths for each table, (batches, N, slots)."""
 Estimate = TypeVar("Estimate", StackEstimate, JacobianEstimate)
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What a caller asks for: either ``samples`` paths per pixel, or ``rel_error`` within the limits.
+    """The effort that a caller requests: either ``samples`` paths per pixel, or ``rel_error`` within the limits.
 
     Raises:
         InputError: both or neither is given, or a number is out of its range.
@@ -72,20 +75,20 @@ class Effort:
             )
 
     def shares(self, samples: int) -> tuple[int, int]:
-        """Batches, and sample numbers in each, that make up ``samples`` paths per pixel."""
+        """Number of batches, and of samples in each, that make up ``samples`` paths per pixel."""
         batches = min(self.batches, samples)
         return batches, -(-samples // batches)
 
 
 def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums], Estimate], effort: Effort) -> Estimate:
-    """Trace rounds with sample numbers that follow on, and summarise all of them together.
+    """Trace rounds with consecutive sample numbers, and summarise all of them together.
 
-    Every batch has an equal share of every round, so that however many rounds were needed, errors have one degree of
-    freedom less than there are batches.
+    Every batch has an equal share of every round, so errors have one degree of freedom less than there are batches,
+    however many rounds were needed.
 
     Args:
-        trace: sums over the sample numbers in a range, in every one of so many batches.
-        summarise: from means per path.
+        trace: gives the sums over the sample numbers in a range, in each of a number of batches.
+        summarise: makes the estimate from means per path.
     """
     if effort.samples is not None:
         batches, count = effort.shares(effort.samples)
@@ -103,7 +106,7 @@ def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums],
         missing = (estimate.rel_error / effort.rel_error) ** 2
         if missing <= 1:
             return replace(estimate, complete=True)
-        # As many paths as the error asks for, but no round far beyond the time that is left.
+        # Trace as many paths as the error asks for, but no round far beyond the time that is left.
         elapsed_s = time.monotonic() - begun_s
         if done >= most or elapsed_s >= effort.max_seconds:
             return estimate

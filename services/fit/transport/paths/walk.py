@@ -1,7 +1,7 @@
 """The nested-media walk: free flights, crossings, scattering, connections to all lights, and scores for derivatives.
 
-One loop serves everything the project computes: camera walks in a tooth that connect to point lights, and walks in a
-flat slab that count what leaves either face. What a scene lacks is absent from its kernel.
+One loop serves camera walks in a tooth, which connect to point lights, and walks in a flat slab, which count the light
+that leaves either face. Code for features that a scene lacks is absent from its kernel.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from services.fit.transport.scene.geometry import Geometry, SlabGeometry
 from services.fit.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 
 ROULETTE_WEIGHT = 0.1
-"""Paths below this fraction of their first weight survive in proportion to it."""
+"""Fraction of the reference weight below which a path survives in proportion to its weight."""
 
 
 class Walk:
-    """The walk through one geometry under one plan. ``run`` is the only door."""
+    """The walk through one geometry under one plan; call ``run``."""
 
     def __init__(
         self,
@@ -54,14 +54,14 @@ class Walk:
             self.slots += self.exits.slots
 
     def run(self, samples: int, tally: Tally | None = None) -> Tally:
-        """Sums of ``samples`` paths in every lane, evaluated; a plan for stains brings its own tally."""
+        """Tally of ``samples`` paths in every lane, evaluated; a plan for stains needs a tally of its own kind."""
         tally = tally or Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
         self.trace(samples, tally)
         tally.evaluate()
         return tally
 
     def trace(self, samples: int, tally: Tally) -> None:
-        """The loop itself; adds to ``tally`` without evaluating it."""
+        """Record the loop; it adds to ``tally`` without evaluating it."""
         limit = dr.opaque(mi.UInt32, samples)
         lane = dr.arange(mi.UInt32, self.start.lanes)
         path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
@@ -123,13 +123,13 @@ class Walk:
         inside = walker.active & (medium != 0)
         traced = walker.active & (distance >= self.geometry.clearance(walker.origin, inside))
         hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, traced)
-        # A lane with no surface ahead has left the tooth, whatever its place says: it meets nothing and ends.
+        # A lane with no surface ahead has left the tooth, whatever its place is: it meets nothing and ends.
         scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
         meets = walker.active & ~scatters & hit.valid
         reflects = mi.Bool(False)
         if self.ior is not None:
-            # A thin face lets the camera's own ray in where its mirror image would be of empty space, and reflects
-            # others by chance.
+            # A thin face lets a camera ray in, weighted, where its mirror image would be of empty space, and reflects
+            # other rays by chance.
             contrast = self.geometry.contrast(
                 self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit)
             )
@@ -141,7 +141,7 @@ class Walk:
         return Flight(medium, sigma, hit, distance, scatters, meets, reflects, meets & hit.opaque)
 
     def _unmirrored(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
-        """Lanes whose reflection at an outer face is left out."""
+        """Lanes whose reflection at an outer face is left out: camera rays that would mirror empty space."""
         if not self.geometry.single:
             return mi.Bool(False)
         return (self.book.order(walker.so_far) == 0) & (medium == 0) & ~walker.secondary
@@ -185,7 +185,7 @@ class Walk:
         distance = dr.select(leaving, dr.minimum(distance, hit.distance), distance)
         first = scatters & (self.book.order(walker.so_far) == 0) & ~walker.secondary
         walker.weight *= remains
-        # Judged by what one scattering leaves of it, single scattering survives at any albedo.
+        # Compare roulette with the weight after one scattering, so that single scattering survives at any albedo.
         walker.reference = dr.select(
             first, walker.weight * dr.exp(self.media.pick(self.media.log_alpha, medium)), walker.reference
         )
@@ -242,7 +242,7 @@ class Walk:
         walker.so_far = self.book.scatter(walker.so_far, scattered_in, flight.scatters | flight.bounces)
 
     def _mixed(self, walker: Walker, flight: Flight) -> Mixed:
-        """What the vertex that a flight ends at scatters in."""
+        """Mixture of media in which the vertex at the end of a flight scatters."""
         mixed = self.geometry.mixed(walker.origin, walker.place, flight.scatters)
         if self.geometry.opaque:
             wall = mi.UInt32(self.media.count)
@@ -257,7 +257,7 @@ class Walk:
         return mixed
 
     def _score_mixture(self, walker: Walker, change: mi.Float, active: mi.Bool) -> None:
-        """Score what the border's motion changes in the mixture where a lane scatters, per mm of its distance."""
+        """Score the border's motion at a scattering vertex by ``change``, the mixture's change per mm of distance."""
         if self.plan.shape is not None:
             motion = self.geometry.mixture_motion(walker.origin, self.plan.shape, active)
             walker.border_sums = [
@@ -310,7 +310,7 @@ class Walk:
         return -dr.mulsign(mi.Vector3f(flight.hit.normal), dr.dot(walker.omega, flight.hit.normal))
 
     def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
-        # Paths that faded survive in proportion to what they carry; those that met nothing are gone.
+        # Let faded paths survive in proportion to their throughput; end those that met nothing.
         share = self._carried(walker) / (ROULETTE_WEIGHT * walker.reference)
         faded = (share < 1) & (walker.rng.next_float32() >= share)
         walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
@@ -320,7 +320,7 @@ class Walk:
         return ended
 
     def _cut(self, walker: Walker, ended: mi.Bool, most_steps: int, tally: Tally) -> mi.Bool:
-        """End paths that took their last step, and count what they still carried."""
+        """End paths that took their last step, and count the throughput that they still carried."""
         walker.steps = [count + 1 for count in walker.steps]
         cut = walker.active & ~ended & (walker.steps[0] >= most_steps)
         if self.plan.faces:
@@ -328,7 +328,7 @@ class Walk:
         return ended | cut
 
     def _start_secondary(self, walker: Walker, ended: mi.Bool, tally: Tally) -> mi.Bool:
-        """Send the kept crossing's secondary walk from paths that ended; returns those that are finished altogether."""
+        """Start the kept crossing's secondary walk where paths ended; returns the lanes that are wholly finished."""
         begins = ended & ~walker.secondary & (walker.kept.total > 0)
 
         def begin(walker: Walker, begins: mi.Bool) -> Walker:
@@ -338,7 +338,7 @@ class Walk:
             strength = kept.throughput * kept.total / kept.importance * size
             ratios = [shift / size for shift in kept.shifts]
 
-            # Light that the border point scatters directly.
+            # Add the light that the border point scatters directly.
             if self.lights is not None:
                 chosen = self.lights.choose(kept.point, scattering, rng, begins)
                 point, place = scattering.point(chosen.direction), scattering.place(chosen.direction)
@@ -347,7 +347,7 @@ class Walk:
                 for mode, ratio in enumerate(ratios):
                     tally.add_derivative(len(self.plan.scores) + mode, walker.lane, chosen.index, value * ratio, begins)
 
-            # One walk for both sides' lobes, carrying their signed difference.
+            # Start one walk for the lobes of both sides, which carries their signed difference.
             u_lobe = rng.next_float32() if self.media.two_lobes else None
             omega = scattering.sample(rng.next_float32(), u_lobe, rng.next_float32(), rng.next_float32())
             balance = scattering.balance(omega)

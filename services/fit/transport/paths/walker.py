@@ -1,4 +1,4 @@
-"""The state of walks under way, a lane each, and what one step of them met."""
+"""The state of walks under way, one per lane, and the result of one of their steps."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from services.fit.transport.scene.geometry import Hit
 
 @dataclass
 class Walker:
-    """State of every lane: a path under way, what it has scored, and which sample of the lane it is."""
+    """State of every lane: a path under way, its scores so far, and its sample number."""
 
     rng: mi.PCG32
     origin: mi.Point3f
     omega: mi.Vector3f
     place: mi.UInt32
     weight: mi.Float
-    """Throughput without the albedos, which are counted."""
+    """Throughput without the albedos, which follow from ``so_far``."""
     reference: mi.Float
     """Throughput against which roulette compares."""
     so_far: Scatterings
@@ -30,17 +30,20 @@ class Walker:
     """Flights so far; empty unless they are limited."""
     sums: list[mi.Float]
     border_sums: list[mi.Float]
+    """Scores of the shape modes so far."""
     kept: Crossing
+    """Border crossing from which the secondary walk will start."""
     stains: list[FaceCrossing]
-    """One of the stained faces crossed; empty unless they are asked for."""
+    """One of the stained faces crossed; empty unless stain derivatives are computed."""
     vertex: Vertex | None
-    """Waits for its connection to the lights."""
+    """Scattering vertex that waits for its connection to the lights."""
     turn: mi.UInt32
     """Steps since the last connection."""
     secondary: mi.Bool
     """Whether this is a border crossing's secondary walk; it feeds the shape derivatives alone."""
     shape_factor: list[mi.Float]
-    """Of a secondary walk: dt_b of each mode relative to their sum, with the sign of the scattering difference."""
+    """For a secondary walk: dt_b of each mode over the sum of their magnitudes, with the sign of the scattering
+    difference."""
     lane: mi.UInt32
     sample: mi.UInt32
     active: mi.Bool
@@ -48,7 +51,7 @@ class Walker:
 
 @dataclass
 class Flight:
-    """What one step of the walk met."""
+    """Result of one free flight."""
 
     medium: mi.UInt32
     sigma: mi.Float
@@ -56,8 +59,8 @@ class Flight:
     distance: mi.Float
     scatters: mi.Bool
     meets: mi.Bool
-    """A surface is reached ..."""
+    """Whether a surface is reached."""
     reflects: mi.Bool
-    """... and reflects like a mirror, or ..."""
+    """Whether that surface reflects like a mirror."""
     bounces: mi.Bool
-    """... is opaque and reflects diffusely, else it is crossed."""
+    """Whether that surface is opaque and reflects diffusely. A surface that does neither is crossed."""
