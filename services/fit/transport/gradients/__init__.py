@@ -1,1 +1,1 @@
-"""Derivatives of images by moving borders, shapes and stains."""
+"""Derivatives of images with respect to borders, shapes and stains."""

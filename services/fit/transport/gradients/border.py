@@ -20,12 +20,13 @@ from services.fit.transport.scene.geometry import Geometry, Hit
 from services.fit.transport.scene.media import Media, PhaseFunction
 
 COSINE_CLAMP = 1e-3
-"""1/|omega . n| has a logarithmically divergent second moment. Crossings at cosine mu come with density ~ mu, so
-clamping below this value removes about half of it, 5e-4, of a one-sided term that its partner nearly cancels."""
+"""Smallest |omega . n| in 1/|omega . n|, whose second moment diverges logarithmically. Crossings at cosine mu come with
+density ~ mu, so the clamp removes about half of this value, 5e-4, of a one-sided term that its partner nearly
+cancels."""
 
 
 def inverse_cosine(cosine: mi.Float) -> mi.Float:
-    """1 / cosine, clamped."""
+    """1 / cosine, with |cosine| clamped to at least ``COSINE_CLAMP``."""
     return dr.mulsign(dr.rcp(dr.maximum(dr.abs(cosine), COSINE_CLAMP)), cosine)
 
 
@@ -37,15 +38,15 @@ class Crossing:
     omega: mi.Vector3f
     normal: mi.Vector3f
     before: mi.UInt32
-    """Place on the side the path came from."""
+    """Place on the side from which the path came."""
     after: mi.UInt32
     throughput: mi.Float
     shifts: list[mi.Float]
     """dt_b per shape mode."""
     importance: mi.Float
-    """Of the kept crossing."""
+    """Importance of the kept crossing."""
     total: mi.Float
-    """Sum over all crossings of the path; 0 when there was none."""
+    """Sum of the importance of all crossings of the path; 0 when there was none."""
 
 
 def no_crossing(modes: int) -> Crossing:
@@ -135,7 +136,7 @@ class BorderScattering:
         return dr.select(onward, self.crossing.after, self.crossing.before)
 
     def point(self, direction: mi.Vector3f) -> mi.Point3f:
-        """Start of that walk, offset off the border to its side."""
+        """Start of a walk in ``direction``, offset off the border to its side."""
         offset = self.crossing.normal * dr.mulsign(
             mi.Float(self.geometry.epsilon), dr.dot(direction, self.crossing.normal)
         )

@@ -1,8 +1,8 @@
 """Light on the dentin's border, gathered by photons, and the camera's walks that meet it.
 
-Both count where they cross the border, by 1 / |n . w|, and expand directions in spherical harmonics
-(``border_series``). Light that has not collided keeps its one direction instead. No path connects to a light or to
-another path, so both walks are cheap, and a product of their sums stands for all pairs.
+Both score their crossings of the border with weight 1 / |n . w|, and expand directions in spherical harmonics
+(``border_series``). Light that has not collided keeps its single direction instead. No path connects to a light or to
+another path, so both walks are cheap, and a product of their sums accounts for all pairs of paths.
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ from services.fit.transport.scene.media import Media
 from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
 GRAZING_COSINE = 0.2
-"""A crossing with less |n . w| counts with the mean of 1 / |n . w| below it, 2 / this, exact where radiance is constant
-there: 1 / |n . w| itself has a logarithmically divergent second moment."""
+"""Smallest |n . w| of a crossing that is weighted by 1 / |n . w|, whose second moment diverges logarithmically. Below
+it the weight is 2 / this value, the mean of 1 / |n . w| there, which is exact where radiance is constant over those
+directions."""
 FIXED_POINT = 2.0**36
-"""Units of the table of light per unit of weight: fine against single precision, and 1e8 before it overflows."""
+"""Integer units of the light table per unit of weight: finer than single precision, and sums up to 1e8 do not
+overflow."""
 
 Array = NDArray[np.float64]
 
@@ -39,7 +41,7 @@ def harmonics(directions: Array, order: int) -> NDArray[np.float32]:
 
 
 def per_cosine(cosine: mi.Float) -> mi.Float:
-    """1 / |cosine|, or its mean where that is grazing."""
+    """1 / |cosine|, or the mean of that over grazing cosines where the cosine is grazing."""
     size = dr.abs(cosine)
     return dr.select(size < GRAZING_COSINE, 2 / GRAZING_COSINE, dr.rcp(dr.maximum(size, GRAZING_COSINE)))
 
@@ -48,7 +50,7 @@ class Texels:
     """Patches of the border over which light is averaged."""
 
     def __init__(self, of_face: NDArray[np.int64], areas_mm2: Array, tooth: int) -> None:
-        """Take the patch of each triangle of a tooth's dentin, and its area."""
+        """Take the patch number (F,) and the area (F,) of each triangle of a tooth's dentin."""
         self.tooth = tooth
         self.count = int(of_face.max()) + 1
         self.areas_mm2 = np.bincount(of_face, areas_mm2)
@@ -57,7 +59,7 @@ class Texels:
 
 
 class BorderWalk(Walk, ABC):
-    """The walk without connections, which instead counts its crossings of the border."""
+    """The walk without connections, which instead scores its crossings of the border."""
 
     def __init__(
         self,
@@ -71,7 +73,7 @@ class BorderWalk(Walk, ABC):
         super().__init__(geometry, media, None, start, Plan(), ior)
         self.mesh, self.texels, self.order = geometry, texels, order
         self.columns = (order + 1) ** 2 + 1
-        """Of a table: harmonics of what has collided, and one for what has not."""
+        """Columns of a light table: one per harmonic of the light that has collided, and one for light that has not."""
 
     def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
         crosses = flight.meets & ~flight.reflects & ~flight.hit.outer
@@ -99,7 +101,7 @@ class BorderWalk(Walk, ABC):
     def _count(
         self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
     ) -> None:
-        """Count crossings of a lane's path at ``strength``, its weight over the cosine; ``fresh`` ones have not
+        """Score crossings of a lane's path with ``strength``, its weight over the cosine; ``fresh`` paths have not
         collided.
         """
 
@@ -110,20 +112,20 @@ class BorderWalk(Walk, ABC):
 
 
 class LightWalk(BorderWalk):
-    """Photons from the lights; gathers how much light, from where, there is on each texel."""
+    """Photons from the lights; gathers the light on each texel by direction."""
 
     def __init__(
         self, geometry: MeshGeometry, media: Media, start: LightStart, texels: Texels, order: int, ior: float | None
     ) -> None:
         super().__init__(geometry, media, start, texels, order, ior)
         self.photons = start
-        # Whole numbers, so that sums do not depend on the order of threads.
+        # Sum whole numbers, so that sums do not depend on the order of threads.
         self.table = dr.zeros(mi.Int64, start.groups * texels.count * self.columns)
         dr.make_opaque(self.table)
 
     def gather(self, samples: int) -> NDArray[np.float32]:
-        """Mean radiance on texels, in spherical harmonics what has collided, integrated over directions what has not:
-        (L, batches, texels, columns).
+        """Mean radiance on texels, (L, batches, texels, columns): light that has collided as coefficients of spherical
+        harmonics, light that has not as its integral over directions.
         """
         self.trace(samples, Tally(1, 1, 0))
         dr.eval(self.table)
@@ -134,7 +136,7 @@ class LightWalk(BorderWalk):
         return np.asarray(sums * scale[:, None, :, None], dtype=np.float32)
 
     def _unmirrored(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - cameras need the medium
-        # As the straight connections of images have it, light that has not scattered is transmitted only.
+        # Transmit light that has not scattered, and reflect none of it, as the straight connections of images do.
         return self.book.order(walker.so_far) == 0
 
     def _count(
@@ -148,8 +150,8 @@ class LightWalk(BorderWalk):
 
 
 class CameraWalk(BorderWalk):
-    """Walks from the camera's pixels; at each crossing they meet the light that counts for their pixel, and sum up what
-    each shape mode changes.
+    """Walks from the camera's pixels. At each crossing they multiply by the light there, weighted for their pixel, and
+    sum the change with each shape mode.
     """
 
     def __init__(
@@ -162,20 +164,20 @@ class CameraWalk(BorderWalk):
         coefficients: Array,
         light: NDArray[np.float32],
     ) -> None:
-        """Take c_j (order + 1,), and light as (N, batches, texels, columns): harmonics to meet crossings, and what
-        uncollided ones, of one direction, meet.
+        """Take c_j (order + 1,), and light as (N, batches, texels, columns): coefficients of harmonics for crossings
+        after a collision, and in the last column the light for crossings before any, which have a single direction.
         """
         super().__init__(geometry, media, start, texels, len(coefficients) - 1, ior)
         self.pixels, self.light_batches = light.shape[:2]
         self.shape_modes = geometry.modes_of[texels.tooth]
-        # Light that the camera counts travels against the walk, which turns the sign of odd harmonics.
+        # Light that reaches the camera travels against the walk, which turns the sign of odd harmonics.
         self.coefficients = [dr.opaque(mi.Float, -c if j % 2 else c) for j, c in enumerate(coefficients.tolist())]
         self.light = mi.Float(light.reshape(-1))
         self.sums = dr.zeros(mi.Float64, start.lanes * self.light_batches * self.shape_modes)
         dr.make_opaque(self.light, self.sums)
 
     def meet(self, samples: int) -> Array:
-        """Sums over every lane's samples, (lanes, batches of light, M)."""
+        """Sums over every lane's samples for each of M shape modes, (lanes, batches of light, M)."""
         self.trace(samples, Tally(1, 1, 0))
         dr.eval(self.sums)
         dr.sync_thread()

@@ -1,16 +1,16 @@
-"""What moving the dentin's border does to images, order by order in spherical harmonics; and the patches on which light
-is averaged.
+"""Change of images with the position of the dentin's border, as a series in spherical harmonics; and the patches on
+which light is averaged.
 
-With L(x, w) the radiance of a light in propagation direction w, and L+(x, w) what the cameras count of light that
-travels so, a change of the media changes an image by dI = -int dV int dw L+ [dsigma L - dsigma_s (f * L)]. A border
-that moves by v along the dentin's outward normal n exchanges enamel for dentin in the volume it sweeps. In real
-spherical harmonics, in which f is diagonal with its Legendre moments f_j,
+With L(x, w) the radiance of a light in propagation direction w, and L+(x, w) the importance, the response of the
+cameras to light that travels so, a change of the media changes an image by dI = -int dV int dw L+ [dsigma L - dsigma_s
+(f * L)]. A border that moves by v along the dentin's outward normal n exchanges enamel for dentin in the volume it
+sweeps. In real spherical harmonics, in which f is diagonal with its Legendre moments f_j,
 
     dI/dc = -int dA (n . v) sum_j c_j sum_k L_jk L+_jk,
     c_j = [sigma - sigma_s f_j] dentin - [sigma - sigma_s f_j] enamel.
 
-What extinction takes and scattering returns cancels in c_0 before anything is sampled: c_0 is the difference of
-absorption.
+In c_0 the light that extinction removes and scattering returns cancels before anything is sampled: c_0 is the
+difference of absorption.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from services.fit.optics.parameters import Medium
 
 Array = NDArray[np.float64]
 LLOYD_ROUNDS = 10
+"""Number of iterations of Lloyd's algorithm."""
 
 
 @dataclass(frozen=True)
 class BorderSeries:
-    """The series of two media, and what stands in its place where it would not converge."""
+    """The series of two media, and the closed form that replaces it where it would not converge."""
 
     enamel: Medium
     dentin: Medium
 
     def coefficients(self, order: int) -> Array:
-        """c_j for j = 0 ... order, per mm, the last one halved: the mean of the last two partial sums, as terms
-        alternate where light is sent back.
+        """c_j for j = 0 ... order, per mm. The last one is halved, which averages the last two partial sums, because
+        terms alternate in sign where light is scattered back.
         """
         j = np.arange(order + 1)
         terms = _attenuation(self.dentin, j) - _attenuation(self.enamel, j)
@@ -45,10 +46,11 @@ class BorderSeries:
         return terms
 
     def uncollided(self, cosine: Array) -> Array:
-        """sum_jk c_j Y_jk Y_jk between light that arrives and light that is seen in one direction each, per mm and sr,
-        at the cosine between the two.
+        """sum_jk c_j Y_jk Y_jk in closed form, per mm and sr, for arriving light and camera importance of one direction
+        each, at the cosine between the two.
 
-        Unless both are one line, extinction takes nothing, and what scatters is the phase function's own value.
+        Unless both directions lie on one line, the term of extinction is zero, and that of scattering is the value of
+        the phase function.
         """
         return _scattered(self.enamel, cosine) - _scattered(self.dentin, cosine)
 
@@ -68,10 +70,11 @@ def _scattered(medium: Medium, cosine: Array) -> Array:
 
 
 def patches(surface: Mesh, count: int) -> NDArray[np.int64]:
-    """Divide a surface into at most so many patches of like size that bend little: each triangle's patch, (T,).
+    """Divide a surface into at most ``count`` patches of like size that bend little; returns each triangle's patch,
+    (T,).
 
-    Lloyd's algorithm on middles and unit normals of triangles (a turn by one radian counts as one millimetre), from
-    farthest points.
+    Lloyd's algorithm on the triangles' centroids and unit normals (a turn by one radian counts as one millimetre),
+    started from farthest points.
     """
     corners = surface.vertices_mm[surface.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,5 +1,5 @@
-"""The gradient of a weighted sum of images to the dentin's shape: light on the border times importance, summed over the
-border.
+"""The gradient of a weighted sum of images with respect to the dentin's shape: light on the border times importance,
+summed over the border.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from services.fit.transport.scene.recipe import ShapeGradient, View
 
 Array = NDArray[np.float64]
 TEXELS = 130
-"""Of the border: more of them hold more noise, fewer mix light that differs."""
+"""Number of patches of the border: with more of them each holds more noise, with fewer each mixes light that
+differs."""
 LIGHT_BATCHES = 4
 CAMERA_BATCHES = 16
 TABLE_BUDGET = 48_000_000
-"""Numbers in a table of light by pixel, about 200 MB; more pixels are done in turn."""
+"""Largest number of entries in a table of light by pixel, about 200 MB; more pixels are processed in slices."""
 MAX_LANES_PER_GROUP = 64
 
 
 class ShapeGradients:
-    """Shape gradients in one scene; texels are made once."""
+    """Shape gradients of one tooth in one scene; texels are made once."""
 
     def __init__(self, geometry: MeshGeometry, tooth: int, ior: float | None, radius_mm: float) -> None:
         dentin = geometry.recipe.teeth[tooth].dentin
@@ -52,7 +53,9 @@ class ShapeGradients:
         photons: int,
         order: int,
     ) -> ShapeGradient:
-        """See ``Engine.shape_gradient``; all arguments are checked, and the geometry has the tissue's shape."""
+        """See ``Engine.shape_gradient``; all arguments must be checked before, and the geometry must have the tissue's
+        shape.
+        """
         light_seed, camera_seed = (int(number) for number in np.random.SeedSequence(seed).generate_state(2))
         series, texels = (
             BorderSeries(tissue.enamel, tissue.dentin),
@@ -90,22 +93,22 @@ class ShapeGradients:
     def _light_of_pixels(
         self, table: NDArray[np.float32], series: BorderSeries, order: int, view: View, arriving: Array, weights: Array
     ) -> NDArray[np.float32]:
-        """Light weighted by the cotangent (L, N), as a ``CameraWalk`` meets it: (N, batches, texels, columns).
+        """Light weighted by the cotangent ``weights`` (L, N), in the form that ``CameraWalk`` takes: (N, batches,
+        texels, columns).
 
-        ``arriving`` are directions of uncollided light, (L, 3). These and the pixels' own are taken as from the tooth's
-        middle.
+        ``arriving`` are directions of uncollided light, (L, 3), all taken as at the tooth's middle; a pixel's own
+        direction is that through its middle.
         """
         seen, weighting, uncollided = -_along(view), weights.T.astype(np.float32), table[..., -1]
         light = np.tensordot(weighting, table, axes=1)
 
-        # What meets a pixel's own uncollided line: collided light by the series, uncollided light by the phase
-        # function.
+        # Light for a pixel's uncollided walk: collided light by the series, uncollided light by the phase function.
         factors = np.repeat(series.coefficients(order), 2 * np.arange(order + 1) + 1)
         exact = weights * series.uncollided(arriving @ seen.T)
         light[..., -1] = np.einsum("nbtk,nk->nbt", light[..., :-1], harmonics(seen, order) * factors)
         light[..., -1] += np.tensordot(exact.T.astype(np.float32), uncollided, axes=1)
 
-        # What meets all others: uncollided light by the series too.
+        # Light for collided walks: here uncollided light is expanded in the series too.
         for k, column in enumerate(harmonics(arriving, order).T):
             light[..., k] += np.tensordot(weighting * column, uncollided, axes=1)
         return light
@@ -120,9 +123,9 @@ def _along(view: View) -> Array:
 
 
 def crossed_mean(crossed: Array) -> tuple[Array, Array]:
-    """Mean of A x B crossed batches (A, B, M), and the variance of that mean.
+    """Mean (M,) of A x B crossed batches (A, B, M), and the variance of that mean (M,).
 
-    Each number has the noise of its row, of its column and of the two together. Of the mean squares of rows, columns
+    Each entry has the noise of its row, of its column and of the two together. With the mean squares of rows, columns
     and the rest, (rows + columns - rest) / (A B) is the mean's variance without bias; here rows and columns count at
     least as much as the rest.
     """

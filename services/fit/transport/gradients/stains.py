@@ -1,8 +1,8 @@
-"""Stains: a texture a_t on a tooth's outer surface that dims what passes through it, in and out (teeth 2018 Eq. 1, 10),
+"""Stains: a texture a_t on a tooth's outer surface that attenuates light on its way in and out (teeth 2018 Eq. 1, 10),
 and the derivative to its texels.
 
 A path that crosses stained faces k carries the factor prod a_t(k), so its derivative to a texel is its contribution
-times the texel's bilinear weight over a_t at each of these faces, that of the connection to the light included.
+times the texel's bilinear weight over a_t at each of these faces, including those on the connection to the light.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from services.fit.transport.scene.geometry import Hit
 
 @dataclass
 class FaceCrossing:
-    """One of the stained faces that a path crossed, each as likely as any other."""
+    """One of the stained faces that a path crossed, each kept with equal probability."""
 
     primitive: mi.UInt32
     uv: mi.Point2f
     tooth: mi.UInt32
     number: mi.Float
-    """Of all faces crossed; 0 when there was none."""
+    """Number of stained faces crossed; 0 when there was none."""
     u: mi.Float
-    """What is left of a random number."""
+    """Remainder of a uniform random number, which decides the next choice."""
 
     @staticmethod
     def none(u: mi.Float) -> FaceCrossing:
-        """No face yet."""
+        """An empty reservoir."""
         return FaceCrossing(mi.UInt32(0), mi.Point2f(0), mi.UInt32(0), mi.Float(0), u)
 
     def offer(self, hit: Hit, active: mi.Bool) -> FaceCrossing:
-        """One more face, by reservoir sampling."""
+        """The reservoir after one more face was offered where ``active``."""
         number = self.number + dr.select(active, 1.0, 0.0)
         chosen = self.u * number < 1
         take = active & chosen
@@ -52,7 +52,7 @@ class FaceCrossing:
 
 
 class StainTextures:
-    """The textures of all teeth that have one, and where each face lies in them."""
+    """The textures of all stained teeth, and the texture coordinates of their faces."""
 
     def __init__(self, corners_uv: list[NDArray[np.float64]], stains: tuple[Stain | None, ...]) -> None:
         """Take texture coordinates (F, 3, 2) of every tooth's outer faces, in the order of the scene's faces, and every
@@ -74,21 +74,23 @@ class StainTextures:
         dr.eval(self._values, self._corners, self._layout)
 
     def cut(self, texels: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, ...]:
-        """Numbers of all texels as every tooth's (H, W)."""
+        """Split values of all texels into every tooth's (H, W); None for a tooth without stains."""
         return tuple(
             None if place is None else texels[place[0] : place[0] + place[1][0] * place[1][1]].reshape(place[1])
             for place in self.ranges
         )
 
     def transmittance(self, hit: Hit, active: mi.Bool) -> mi.Float:
-        """a_t at a hit of a tooth's outer surface, 1 elsewhere."""
+        """a_t at a hit of a tooth's outer surface; 1 in lanes that are not active."""
         value = mi.Float(0)
         for texel, weight in self._texels(hit.primitive, hit.uv, hit.surface, active):
             value = dr.fma(weight, dr.gather(mi.Float, self._values, texel, active), value)
         return dr.select(active, value, 1)
 
     def scores(self, crossing: FaceCrossing, active: mi.Bool) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Texels of a kept face, and d ln(path) / d(texel), which stands for all faces of the path."""
+        """Texels of a kept face, and d ln(path) / d(texel), scaled so that this face stands for all faces of the
+        path.
+        """
         texels = self._texels(crossing.primitive, crossing.uv, crossing.tooth, active)
         a_t = mi.Float(0)
         for texel, weight in texels:
@@ -98,7 +100,7 @@ class StainTextures:
     def _texels(
         self, primitive: mi.UInt32, uv: mi.Point2f, tooth: mi.UInt32, active: mi.Bool
     ) -> list[tuple[mi.UInt32, mi.Float]]:
-        # Texel centres lie at half-integers; beyond the outermost ones the texture goes on as there.
+        # Texel centres lie at half-integers; outside the outermost ones the texture is constant.
         weights = (1 - uv.x - uv.y, uv.x, uv.y)
         place = mi.Point2f(0)
         for corner, weight in enumerate(weights):
@@ -120,7 +122,7 @@ class StainTextures:
 class StainTally(Tally):
     """Derivatives of sum(cotangent x images) to all texels, (batches, texels).
 
-    Lanes add to common slots, so bits depend on the order of threads.
+    Lanes add to shared slots, so the last bits of a sum depend on the order of threads.
     """
 
     def __init__(self, textures: StainTextures, cotangent: NDArray[np.float64], batches: int) -> None:

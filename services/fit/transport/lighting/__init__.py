@@ -1,1 +1,1 @@
-"""Lights: connections to them and maps of what they reach."""
+"""Lights of a scene: their choice, shadow rays to them, and depth maps as seen from them."""

@@ -1,8 +1,9 @@
-"""Groups of lights, of each of which a connection looks up one: under many lights, few of them matter to one vertex.
+"""Groups of lights. A connection looks up one light of every group, because of many lights only few matter to one
+vertex.
 
-A vertex scatters most of its light into a lobe, so that most lights hardly show through it. Each group holds lights
-from all around the tooth, and its one light is chosen in proportion to what it would bring through clear space, which
-costs a fraction of a look-up for each.
+A vertex scatters most of its light into a lobe, so that most lights contribute little through it. Each group holds
+lights from all around the tooth, and one of them is chosen in proportion to its contribution at full transmittance,
+which costs a fraction of a look-up for each light.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ class LightGroups:
         self.count = -(-lights // math.ceil(math.sqrt(lights)))
         self.size = -(-lights // self.count)
 
-        # Rows of neighbours, so that a column has one light of every part of the dome; dark ones fill the last row.
+        # Write neighbouring lights into rows, so that a column, which is a group, has one light of every part of the
+        # dome; dark copies fill the last row.
         places = np.arange(self.size * self.count).reshape(self.size, self.count).T.reshape(-1)
         members = neighbours_in_a_row(positions_mm)[places % lights]
         columns = np.concatenate([positions_mm, intensities[:, None]], axis=1)[members]
@@ -42,8 +44,8 @@ class LightGroups:
         """Choose one light of a group in proportion to importance(direction) x intensity / distance^2.
 
         Returns:
-            Its index, and the sum of those products over the group: the value over the probability of whichever is
-            chosen.
+            Index of the light, and the sum of those products over the group, which equals the chosen light's product
+            over its probability.
         """
         first, total, sums = group * self.size, mi.Float(0), []
         for member in range(self.size):
@@ -59,8 +61,8 @@ class LightGroups:
 
 
 def neighbours_in_a_row(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of points, ordered so that points near each other come near each other, by halving along the widest
-    axis.
+    """Indices (N,) of points (N, 3), ordered by repeated halving along the widest axis, so that points close in space
+    are close in the list.
     """
 
     def halve(chosen: NDArray[np.int64]) -> list[int]:

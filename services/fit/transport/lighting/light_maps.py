@@ -1,10 +1,10 @@
-"""Depth maps seen from every light: what lies between a scattering vertex and the light, looked up instead of ray
+"""Depth maps as seen from every light: the media between a scattering vertex and the light, looked up instead of ray
 traced.
 
 One map per light holds, on a grid of directions, where the light's ray enters the outer surface and where it enters and
 leaves the dentin. Between grid points depths are interpolated, so that the optical depth from any vertex to any light
 costs one look-up. It is an estimate; the walk corrects it by exact shadow rays, few where the map is smooth and more
-where it cannot know: at silhouettes, and where a ray meets a surface more often than once in and once out (translucent
+where it is uncertain: at silhouettes, and where a ray meets a surface more often than once in and once out (translucent
 shadow maps, Dachsbacher and Stamminger 2003, here as a control variate).
 """
 
@@ -28,29 +28,30 @@ if TYPE_CHECKING:
     from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
 TEXEL_MM = 0.15
-"""Spacing of the grid at the tooth."""
+"""Spacing of a map's grid at the tooth, mm."""
 MARGIN_MM = 1.0
+"""Distance in mm from the sphere around the scene to the start of a map's rays."""
 DARK_DEPTH = 40.0
 """Optical depth past which a connection is dark: exp(-40) is below float32 resolution of any sum it could join."""
 WIDEST = 3.0
-"""Half-width of the map over the tooth's radius, at most."""
+"""Largest half-width of a map, over the radius of the sphere around the scene."""
 
 
 @dataclass
 class LightView:
-    """What a vertex sees in the direction of one light."""
+    """Media and light in the direction from a vertex to one light, according to a map."""
 
     direction: mi.Vector3f
     falloff: mi.Float
     """Intensity over squared distance."""
     media: tuple[int | mi.UInt32, ...]
-    """Numbers of the media on the way ..."""
+    """Numbers of the media on the way to the light."""
     lengths_mm: tuple[mi.Float, ...]
-    """... and how far it leads through each."""
+    """Path length in mm through each of ``media``."""
     surface: mi.Float
     """Transmittance of the outer face."""
     certain: mi.Bool
-    """Whether the map knows; elsewhere lengths are meaningless."""
+    """Whether the map is certain; elsewhere the lengths are meaningless."""
 
     def lengths(self, media: tuple[int, ...]) -> list[mi.Float]:
         """Path length in mm inside each of some media."""
@@ -64,7 +65,7 @@ class LightView:
         return found
 
     def transmittance(self, media: Media) -> mi.Float:
-        """Expected transmittance, 0 where the map does not know."""
+        """Expected transmittance, 0 where the map is not certain."""
         depth = mi.Float(0)
         for number, length in zip(self.media, self.lengths_mm, strict=True):
             if not isinstance(number, int):
@@ -76,41 +77,41 @@ class LightView:
 
 @dataclass
 class MapRay:
-    """A light's ray on its way through the scene, and what it met."""
+    """A light's ray on its way through the scene, and the surfaces that it has met."""
 
     point: mi.Point3f
     direction: mi.Vector3f
     travelled: mi.Float
-    """From the plane across the scene's centre, negative before it."""
+    """Distance in mm from the plane across the scene's centre, negative before it."""
     place: mi.UInt32
     entry: mi.Float
     dentin_entry: mi.Float
     dentin_exit: mi.Float
     surface: mi.Float
     meetings: mi.UInt32
-    """What it met, in bits."""
+    """Surfaces met so far, coded in bits."""
     limit: mi.Float
-    """Where following it ended."""
+    """Distance travelled up to the surface behind which the map is not certain."""
     alive: mi.Bool
 
 
 @dataclass
 class MapCell:
-    """Where a vertex lies in a light's map: the four grid points around it, and the light itself."""
+    """Position of a vertex in a light's map: the four grid points around it, and the light itself."""
 
     direction: mi.Vector3f
     falloff: mi.Float
     depth: mi.Float
-    """Of the vertex along the light's ray, mm."""
+    """Depth of the vertex along the light's ray, mm."""
     corners: list[list[mi.UInt32]]
-    """Words of each grid point."""
+    """Table words of each grid point."""
     u: mi.Float
     v: mi.Float
     inside: mi.Bool
-    """Whether it is on the map."""
+    """Whether the vertex lies on the map."""
 
     def between(self, word: int, shift: int) -> mi.Float:
-        """Bilinear interpolation of the half of a word from a bit on."""
+        """Bilinear interpolation of the 16-bit number that starts at bit ``shift`` (0 or 16) of a table word."""
         values = [
             mi.Float((corner[word] >> shift) & 0xFFFF if shift == 0 else corner[word] >> shift)
             for corner in self.corners
@@ -122,9 +123,9 @@ class LightMaps:
     """One depth map per light of a single tooth, over a square of directions that holds all of it."""
 
     WORDS = 2
-    """Of 32 bits per grid point."""
+    """Number of 32-bit table words per grid point."""
     MAX_BYTES = 2**29
-    """Of all maps; larger scenes under more lights have a coarser grid."""
+    """Largest size of all maps together; larger scenes under more lights have a coarser grid."""
 
     def __init__(
         self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], outer_mm: NDArray[np.float64]
@@ -134,8 +135,8 @@ class LightMaps:
         relative = positions_mm - centre
         distance = np.linalg.norm(relative, axis=1)
 
-        # A sphere of this radius seen from so far away fills this half-angle; what a very near light sees beyond the
-        # map is not certain.
+        # Half-width at which a map holds the whole sphere as seen from its light; outside the map of a very near light
+        # nothing is certain.
         half_mm = float((radius / np.sqrt(np.maximum(1 - (radius / distance) ** 2, WIDEST**-2))).max())
         self.count = len(positions_mm)
         self.texel_mm = max(TEXEL_MM, 2 * half_mm / math.sqrt(self.MAX_BYTES / (4 * self.WORDS * self.count)))
@@ -159,20 +160,21 @@ class LightMaps:
         return maps
 
     def keep(self, chosen: list[int]) -> None:
-        """Forget all other lights."""
+        """Discard the maps of all other lights."""
         self._frames = aligned(mi.Float(np.array(self._frames).reshape(self.count, -1)[chosen].reshape(-1)))
         self._table = mi.UInt32(np.array(self._table).reshape(self.count, -1)[chosen].reshape(-1))
         self.count = len(chosen)
         dr.eval(self._table)
 
     def trace(self, geometry: MeshGeometry, ior: mi.Float | None) -> None:
-        """Fill the maps for surfaces as they now are."""
+        """Compute the maps for the present surfaces."""
         lanes = self.count * self.size**2
         index = dr.arange(mi.UInt32, lanes)
         frame = self._frame(index // self.size**2)
         x = mi.Float(index % self.size) - self.size // 2
         y = mi.Float(index // self.size % self.size) - self.size // 2
-        # Through a point of the plane across the scene's centre; written without the difference of two long distances.
+        # Aim every ray at a grid point of the plane across the scene's centre, without the difference of two long
+        # distances.
         across = (frame.right * x + frame.up * y) * dr.square(self.texel_mm / frame.distance)
         ray_length = dr.norm(frame.forward + across) * frame.distance
         direction = (frame.forward + across) * (frame.distance / ray_length)
@@ -208,15 +210,16 @@ class LightMaps:
         self._store(ray)
 
     def _meet(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:  # noqa: ARG002 - scenes of several surfaces need it
-        """Note a surface.
+        """Record a surface that a ray meets.
 
-        Bits: outer entered, dentin entered, dentin left, outer left; the last bit: anything out of that order.
+        Bits of ``meetings``: outer surface entered, dentin entered, dentin left, outer surface left; the last bit marks
+        any other order.
         """
         entering, met = dr.dot(ray.direction, hit.normal) < 0, hit.valid
         event = dr.select(
             hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4))
         )
-        # Each event once, and inside the dentin only inside the tooth.
+        # Every event must happen once, and those of the dentin inside the tooth.
         repeated = (ray.meetings & event) != 0
         unordered = ((event > 1) & ((ray.meetings & 1) == 0)) | ((ray.meetings & 8) != 0)
         ray.meetings |= dr.select(met, event | dr.select(repeated | unordered, mi.UInt32(16), mi.UInt32(0)), 0)
@@ -237,10 +240,11 @@ class LightMaps:
         certain_kinds: tuple[int, ...],
         more: tuple[mi.UInt32, ...] = (),
     ) -> None:
-        """Four numbers of 16 bits, so that all maps stay in the cache: three depths, and the surface with the cell's
-        certainty in the lowest bit.
+        """Store four numbers of 16 bits per grid point, so that all maps stay in the cache: three depths, and the outer
+        face's transmittance with the cell's certainty in the lowest bit.
 
-        A cell is certain where all its corners met the same, of a kind that the map can tell.
+        A cell is certain where the rays of all its corners met the same surfaces, in one of the orders
+        ``certain_kinds``, which the map can represent.
         """
         shape = (self.count, self.size, self.size)
         kinds = np.array(kind).reshape(shape)
@@ -270,7 +274,7 @@ class LightMaps:
 
     @dataclass
     class _Frame:
-        """A light looking at the scene; ``right`` and ``up`` are as long as there are texels in the distance."""
+        """Frame of a light that looks at the scene; ``right`` and ``up`` have the length of ``distance`` in texels."""
 
         intensity: mi.Float
         right: mi.Vector3f
@@ -284,18 +288,18 @@ class LightMaps:
         return LightMaps._Frame(first.w, right, dr.cross(forward, right), forward, second.w)
 
     def look(self, light: mi.UInt32, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> LightView:
-        """What lies between ``point`` and a light."""
+        """Media between ``point`` and a light, with the direction to that light."""
         frame, from_centre = self._frame(light), mi.Vector3f(point - self._centre)
         from_light = frame.forward * frame.distance + from_centre
         ahead = dr.dot(from_centre, frame.forward)
         squared = dr.squared_norm(from_light)
         inverse = dr.rsqrt(squared)
-        # How much farther than the scene's centre, without the difference of two long distances.
+        # Depth of the vertex beyond the scene's centre, without the difference of two long distances.
         depth = dr.fma(2 * frame.distance, ahead, dr.squared_norm(from_centre)) / dr.fma(
             squared, inverse, frame.distance
         )
 
-        # Bilinear interpolation between the four rays around the vertex.
+        # Interpolate between the four rays around the vertex.
         per_forward = dr.rcp(frame.distance + ahead)
         x = dr.fma(dr.dot(from_centre, frame.right), per_forward, self.size // 2)
         y = dr.fma(dr.dot(from_centre, frame.up), per_forward, self.size // 2)
@@ -319,7 +323,7 @@ class LightMaps:
         return self._view(found, place)
 
     def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:  # noqa: ARG002 - scenes of several surfaces need the place
-        """Read a cell."""
+        """Media and light according to a cell of the map."""
         entry, dentin_entry, dentin_exit = (
             dr.fma(cell.between(*half), self._depth_step, -self._near) for half in ((0, 0), (0, 16), (1, 0))
         )
@@ -337,10 +341,11 @@ class LightMaps:
 
 
 def aligned(values: Any) -> Any:
-    """A copy in Dr.Jit's own memory: what NumPy lends may lack the alignment that a gather of four at once needs.
+    """A copy in Dr.Jit's own memory, because a NumPy buffer may lack the alignment that a gather of four numbers at
+    once needs.
 
-    A kernel that reads one number per lane is compiled for the alignment it meets, and so again at random for memory
-    that NumPy lends.
+    A kernel that reads one number per lane is compiled for the alignment of its input, so with NumPy buffers it would
+    be compiled again at random.
     """
     copy = values + dr.opaque(type(values), 0)
     dr.eval(copy)

@@ -1,4 +1,6 @@
-"""Connections from scattering vertices to the lights: which light, through what, with which derivative."""
+"""Connections from scattering vertices to the lights: the choice of a light, and the shadow ray to it with its
+derivatives.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,14 @@ from services.fit.transport.scene.geometry import Geometry
 from services.fit.transport.scene.media import Media
 
 CANDIDATES = 8
-"""Stratified candidate lights per connection; 18 or 54 cost more than they gave."""
+"""Number of stratified candidate lights per connection; 18 or 54 cost more than they gained."""
 STEPS_PER_ROOT = 0.4
-"""Steps of the walk per connection, over the root of the number of lights. A connection looks up about as many lights
-as that root, so the look-ups per step do not grow with the lights. Measured best at 54 and at 155 lights, and within 3
-% of it at 6."""
+"""Steps of the walk per connection, over the square root of the number of lights. A connection looks up about as many
+lights as that root, so the look-ups per step do not grow with the lights. This value measured best at 54 and at 155
+lights, and within 3 % of the best at 6."""
 ROULETTE_GAIN = 3.0
 DARKEST_CHANCE = 0.02
-"""A shadow ray is cast with probability clip(gain x expected contribution, floor, 1)."""
+"""A shadow ray is cast with probability clip(``ROULETTE_GAIN`` x expected contribution, ``DARKEST_CHANCE``, 1)."""
 
 
 class PointLights:
@@ -95,11 +97,11 @@ class ShadowRay:
     border: list[mi.Float]
     """d ln T / dc per shape mode: (sigma_B - sigma_A) dt/dc per crossing (teeth 2018 Eq. 30-32)."""
     stains: list[FaceCrossing]
-    """One of the stained faces crossed, where that is asked for."""
+    """One of the stained faces crossed; empty unless stain derivatives are computed."""
     alive: mi.Bool
 
     def transmittance(self) -> mi.Float:
-        """T, zero where the line is too deep to matter."""
+        """Transmittance; 0 where the optical depth is too large to matter."""
         return dr.select(self.depth < DARK_DEPTH, self.surface * dr.exp(-self.depth), 0)
 
 
@@ -119,10 +121,10 @@ def shadow(
     """Follow straight lines to distant lights through all media.
 
     Args:
-        measured: media whose path lengths are wanted.
-        shape: tooth to whose border's shape derivatives are wanted.
+        measured: media whose path lengths are summed.
+        shape: index of the tooth to whose dentin shape derivatives are computed.
         thin_ior: index of refraction of ``thin`` outer faces; None where they are index-matched.
-        stains: an empty reservoir for one of the stained faces crossed.
+        stains: an empty reservoir for one of the stained faces crossed; None where stain derivatives are not computed.
     """
 
     def step(ray: ShadowRay, direction: mi.Vector3f) -> tuple[ShadowRay, mi.Vector3f]:

@@ -1,9 +1,8 @@
-"""Light maps of scenes of several surfaces: each knows the first thing that a light's ray enters, and how far into it
-the ray may be followed.
+"""Light maps of scenes with several surfaces. Each map holds the first object that a light's ray enters, and how far
+the ray may be followed inside it.
 
-A thing is a tooth with its dentin, the gums, or the wall. Behind anything else a map says nothing, and the shadow ray
-is all. Where a ray has met nothing yet the map knows that too: what lies on a wall in front of all surfaces sees the
-light.
+An object is a tooth with its dentin, the gums, or the wall. Behind any other surface a map is not certain, and the
+shadow ray alone decides. In front of all surfaces a map is certain too: a vertex there, on a wall, sees the light.
 """
 
 from __future__ import annotations
@@ -16,22 +15,22 @@ from services.fit.transport.scene.geometry import Hit
 from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
 FIRST = 31
-"""Bits of what a ray met: one more than the first thing's number, 0 for nothing ..."""
+"""Bits of ``meetings`` that hold one more than the first object's number, or 0 while there is none."""
 DENTIN_ENTERED, DENTIN_LEFT = 32, 64
-"""... and what became of its dentin."""
+"""Bits of ``meetings`` that say whether the ray has entered and left that object's dentin."""
 
 WALL_TEXELS = 2.0
-"""How much deeper than a cell's nearest corner a vertex on the wall may lie, in texels."""
+"""Largest depth in texels of a vertex on the wall beyond the nearest corner of its cell."""
 
 
 class MouthMaps(LightMaps):
-    """One depth map per light of several teeth, gums or a wall."""
+    """One depth map per light for a scene of several teeth, gums or a wall."""
 
     WORDS = 3
     MAX_BYTES = 2**26
 
     def trace(self, geometry: MeshGeometry, ior: mi.Float | None) -> None:
-        """Fill the maps for surfaces as they now are."""
+        """Compute the maps for the present surfaces."""
         self._geometry = geometry
         super().trace(geometry, ior)
 
@@ -52,7 +51,7 @@ class MouthMaps(LightMaps):
         ray.entry = dr.select(begins, ray.travelled, ray.entry)
         ray.surface = dr.select(begins, through, ray.surface)
         ray.dentin_entry = dr.select(enters, ray.travelled, ray.dentin_entry)
-        # Until it leaves, all the rest is dentin.
+        # Until the ray leaves it, all the rest of the way counts as dentin.
         ray.dentin_exit = dr.select(enters, self._near, dr.select(leaves, ray.travelled, ray.dentin_exit))
         ray.limit = dr.select(ends, ray.travelled, ray.limit)
         ray.alive &= met & ~ends
@@ -80,7 +79,7 @@ class MouthMaps(LightMaps):
         nearest = cell.corners[0][0] & 0xFFFF
         for corner in cell.corners[1:]:
             nearest = dr.minimum(nearest, corner[0] & 0xFFFF)
-        # On a wall the first thing is the wall itself, as far as the grid can tell.
+        # For a vertex on the wall the first object is the wall itself, as far as the grid can resolve.
         free = outside & (
             cell.depth < dr.fma(mi.Float(nearest), self._depth_step, -self._near) + WALL_TEXELS * self.texel_mm
         )

@@ -1,6 +1,6 @@
-"""What the engine refuses, each with the name and the value of what is wrong.
+"""Checks of the engine's input and results; each error names the quantity that is wrong, and its value.
 
-Media check themselves (``media.require_medium``), meshes too.
+Media are checked by ``media.require_medium``, meshes by their own methods.
 """
 
 from __future__ import annotations
@@ -12,18 +12,19 @@ from services.core.errors import InputError, NonFiniteError
 from services.fit.transport.scene.recipe import SceneRecipe, View
 
 FARTHEST_MM = 1e12
-"""A million kilometres; farther away, squares of distances leave what single precision holds."""
+"""Largest distance of a light from the origin in mm, a million kilometres; farther away, squares of distances leave the
+range of single precision."""
 INTENSITIES = (1e-30, 1e30)
-"""Likewise."""
+"""Smallest and largest intensity of a light, for the same reason."""
 MAX_TEETH = 15
-"""A place in the scene is 32 bits: two for each tooth, one for gums."""
+"""Largest number of teeth: a place in the scene is 32 bits, two for each tooth and one for gums."""
 
 
 def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], reach_mm: float) -> None:
     """Refuse lights that cannot light a tooth about the origin that reaches ``reach_mm`` far.
 
     Raises:
-        InputError: no light, or one that is not finite, dark, or where the tooth is.
+        InputError: there is no light, or one is not finite, dark, too bright, too far away, or where the tooth is.
     """
     if len(positions_mm) == 0:
         raise InputError("The scene has no light; list at least one with a position and an intensity.")
@@ -106,7 +107,7 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
 
 
 def require_cotangent(cotangent: NDArray[np.float64], view: View, recipe: SceneRecipe) -> None:
-    """Refuse weights that are not one finite number for each image's pixel.
+    """Refuse a cotangent that is not one finite number for each image's pixel.
 
     Raises:
         InputError: names the shape, or the first weight that is not finite.

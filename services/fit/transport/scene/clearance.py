@@ -1,4 +1,4 @@
-"""A grid that tells how far the nearest surface is at least, so that short free flights need no ray tracing.
+"""A grid of lower bounds of the distance to the nearest surface, so that short free flights need no ray tracing.
 
 The distance to a surface changes by at most the distance moved, so ``d(cell centre) - |x - centre|`` is a lower bound
 everywhere in the cell: a flight shorter than that meets nothing, exactly and not approximately.
@@ -18,21 +18,24 @@ from scipy import ndimage
 from services.core.geometry import Mesh
 
 CELL_MM = 0.1
+"""Smallest size of a grid cell, mm."""
 MAX_CELLS = 6_000_000
-"""Larger scenes have larger cells."""
+"""Largest number of grid cells; larger scenes have larger cells."""
 SPACING_PER_CELL = 0.3
-"""Surfaces are sampled so densely that no surface point is farther than this from a sample, over the size of a cell."""
+"""Largest distance from any surface point to the nearest sample of its surface, over the size of a cell."""
 REBUILD_MM = 0.1
-"""A border that moved less than this only lowers the bound; one that moved more is measured again."""
+"""Largest motion of a border in mm that only lowers the bound; after a larger one the distance is measured again."""
 MARGIN_MM = 1.5
-"""Of several inner surfaces each is measured so far around its box, and taken to be just as far from all other
-places."""
+"""Margin in mm around an inner surface's box within which its distance is measured, where there are several such
+surfaces; all other places are taken to be just as far away."""
 
 
 def surface_samples(
     vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], spacing_mm: float
 ) -> NDArray[np.float64]:
-    """Points on every triangle, none of whose points is farther than the spacing from one of them."""
+    """Sample points (S, 3) on every triangle, such that no surface point is farther than the spacing from the nearest
+    sample.
+    """
     corners = vertices_mm[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     # A sub-triangle of edge e has no point farther than e / sqrt(3) from its nearest corner.
@@ -47,7 +50,7 @@ def surface_samples(
 
 @dataclass(frozen=True)
 class _Measured:
-    """The distance to one inner surface, about where it was at some time."""
+    """The distance to one inner surface, and the vertices with which it was measured."""
 
     vertices_mm: NDArray[np.float64]
     window: tuple[slice, ...]
@@ -63,7 +66,9 @@ class Clearance:
         outer_faces: NDArray[np.int32],
         solids_mm: NDArray[np.float64] | None = None,
     ) -> None:
-        """Take the surfaces that never move, and the solids' vertices (V, 3) where not all of those bound one."""
+        """Take the surfaces that never move, and the vertices (V, 3) of those that bound a solid, where not all of them
+        do.
+        """
         solids_mm = outer_vertices_mm if solids_mm is None else solids_mm
         low, extent = solids_mm.min(axis=0), np.ptp(solids_mm, axis=0)
         self._cell_mm = max(CELL_MM, float(np.cbrt(extent.prod() / MAX_CELLS)))
@@ -75,7 +80,7 @@ class Clearance:
         self._upload(self._outer)
 
     def move_inner(self, surfaces: Sequence[Mesh]) -> None:
-        """Account for the inner surfaces at their present places."""
+        """Update the bound for the inner surfaces at their present places."""
         bound = self._outer.copy() if len(surfaces) == 1 else np.minimum(self._outer, MARGIN_MM - REBUILD_MM)
         for k, surface in enumerate(surfaces):
             known = self._inner.get(k)
@@ -117,7 +122,7 @@ class Clearance:
         empty[tuple(cells[kept].T)] = False
         if empty.all():
             return np.zeros(empty.shape)
-        # From cell centre to cell centre; a sample may sit in its cell's corner.
+        # The transform measures from cell centre to cell centre; a sample may sit in its cell's corner.
         between_centres = ndimage.distance_transform_edt(empty, sampling=self._cell_mm)
         return np.asarray(between_centres - np.sqrt(3) / 2 * self._cell_mm - spacing)
 
@@ -126,7 +131,7 @@ class Clearance:
         dr.eval(self._table)
 
     def __call__(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
-        """Bound at ``point``, mm; not positive where nothing is known."""
+        """Lower bound in mm at ``point``; not positive where the distance is not known."""
         cell = mi.Point3f(point - self._low) * (1 / self._cell_mm)
         index = dr.floor(cell)
         inside = active

@@ -1,7 +1,8 @@
-"""Where media lie. The walk asks two questions of a geometry: what do I hit next, and which medium is behind it.
+"""Geometries: the regions that media fill. The walk asks a geometry for the next surface along a ray and for the medium
+behind it.
 
-A geometry's *place* is a small integer per lane that says where the lane is: for meshes (``mesh_geometry.py``) the set
-of surfaces it is inside of, for slabs the number of the layer.
+A geometry's *place* is a small integer per lane that encodes its position: for meshes (``mesh_geometry.py``) the set of
+surfaces it is inside of, for slabs the number of the layer.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from services.fit.transport.scene.media import Mixed
 ENAMEL, DENTIN = 1, 2
 """Numbers of the media of a single tooth."""
 RAY_EPSILON = 1e-5
-"""Offset of a ray that starts on a surface, over 1 + the largest coordinate: 170 roundings. What it skips is neither
-absorbed nor scattered, so it is nine times less than Mitsuba's own; of two million rays none met its surface again at
-thirty times less."""
+"""Offset of a ray that starts on a surface, over 1 + the largest coordinate: 170 roundings. The skipped distance
+neither absorbs nor scatters, so the offset is nine times less than Mitsuba's own; of two million rays none met its
+surface again at an offset thirty times less."""
 
 
 @dataclass
@@ -33,35 +34,35 @@ class Hit:
     valid: mi.Bool
     normal: mi.Normal3f
     outer: mi.Bool
-    """Whether it is no border between enamel and dentin, or between layers."""
+    """Whether the surface is an outer one: not a border between enamel and dentin, or between layers."""
     opaque: mi.Bool
-    """Whether it lets nothing through."""
+    """Whether the surface lets nothing through."""
     surface: mi.UInt32
-    """Its number, in scenes of several."""
+    """Number of the surface, in scenes of several."""
     primitive: mi.UInt32
     uv: mi.Point2f
 
 
 class Geometry(Protocol):
-    """Nested media."""
+    """Interface of a geometry of nested media."""
 
     modes_of: tuple[int, ...]
-    """Shape modes of each tooth's border to dentin."""
+    """Number of shape modes of each tooth's border to dentin."""
     epsilon: float
     """Ray offset, mm."""
     opaque: bool
-    """Whether any surface is."""
+    """Whether any surface is opaque."""
     mixing: bool
     """Whether albedo and phase function change gradually across borders."""
     single: bool
-    """One tooth and nothing else: what its face mirrors to a camera is empty space."""
+    """Whether the scene is one tooth and nothing else, whose face mirrors only empty space to a camera."""
 
     @property
     def stained(self) -> bool:
-        """Whether what crosses outer faces is dimmed."""
+        """Whether stains attenuate light that crosses outer faces."""
 
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:
-        """Next surface."""
+        """Next surface along a ray."""
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Distance in mm within which no surface lies; 0 where that is not known."""
@@ -70,10 +71,10 @@ class Geometry(Protocol):
         """Index of the medium, 0 for empty space."""
 
     def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
-        """The media that mix at a point; asked only where borders are gradual."""
+        """The media that mix at a point; called only where borders are gradual."""
 
     def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
-        """Change of the distance to a tooth's dentin with each of its shape modes."""
+        """Change of the distance to a tooth's dentin with each of its shape modes, mm."""
 
     def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
         """Place after crossing the surface."""
@@ -85,7 +86,7 @@ class Geometry(Protocol):
         """Ratio of the indices of refraction on the two sides of an outer face; ``ior`` is the teeth's."""
 
     def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:
-        """Transmittance of the stains where an outer face is crossed; asked only of what is stained."""
+        """Transmittance of the stains where an outer face is crossed; called only where ``stained`` is true."""
 
     def on_stain(self, hit: Hit, before: mi.UInt32, after: mi.UInt32) -> mi.Bool:
         """Whether a stained face is crossed between two places."""
@@ -104,7 +105,7 @@ class SlabGeometry:
     single = True
 
     def __init__(self, thicknesses_mm: Sequence[float | NDArray[np.float64]], *, moving_border: bool) -> None:
-        """Take each layer's thickness once for all lanes, or as an array of one per lane."""
+        """Take each layer's thickness in mm, once for all lanes, or as an array of one per lane."""
         depths: list[float | NDArray[np.float64]] = [0.0]
         for thickness in thicknesses_mm:
             depths.append(depths[-1] + thickness)
@@ -136,7 +137,7 @@ class SlabGeometry:
         )
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:  # noqa: ARG002 - planes are as cheap to hit
-        """Not used: hitting a plane costs as little."""
+        """Always 0: intersecting a plane costs as little as this look-up."""
         return mi.Float(0)
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
@@ -148,11 +149,11 @@ class SlabGeometry:
         return dr.select(direction.z > 0, place + 1, place - 1)
 
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:  # noqa: ARG002 - meshes need it
-        """The plane itself: the layer number says which side."""
+        """The point on the plane itself, because the layer number tells the side."""
         return dr.fma(direction, dr.select(hit.valid, hit.distance, 0), origin)
 
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:  # noqa: ARG002 - meshes need the places
-        """Layers are all of one index."""
+        """``ior`` itself, because all layers have one index of refraction."""
         return ior
 
     def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:  # noqa: ARG002 - faces have none
@@ -180,5 +181,5 @@ class SlabGeometry:
         return above, below
 
     def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:  # noqa: ARG002 - there is one border
-        """The first inner border moves along +z."""
+        """Speed 1 along +z of an inner border, 0 of an outer face."""
         return [dr.select(active & hit.valid & ~hit.outer, mi.Float(1), 0)]

@@ -17,12 +17,12 @@ from services.fit.transport.scene.tables import PhaseTables
 
 LOBE_FIELDS = frozenset({"beta", "g1", "g2"})
 MAX_SELECTED = 3
-"""Values of more media than this are gathered from a table."""
+"""Largest number of media among which kernels select by comparison; values of more media are gathered from a table."""
 
 
 def require_medium(name: str, medium: Medium) -> None:
-    """Refuse parameters outside their physical range, before any kernel; kernels compute in single precision, where
-    they must lie inside it too.
+    """Refuse parameters outside their physical range, before any kernel; kernels compute in single precision, so the
+    rounded values must lie inside it too.
 
     Raises:
         InputError: names parameter and value.
@@ -52,19 +52,19 @@ class Score:
 
 @dataclass
 class Mixed:
-    """Two media mixed near a gradual border; away from it one of them alone."""
+    """Two media mixed near a gradual border, or a single medium away from it."""
 
     first: mi.UInt32
-    """Number of the enamel, or of what there is no mixing of."""
+    """Number of the enamel, or of the single medium where nothing is mixed."""
     second: mi.UInt32
-    """Number of the dentin."""
+    """Number of the dentin, or of the same single medium."""
     share: mi.Float
-    """Of the first."""
+    """Share of the first medium."""
     slope: mi.Float
     """d share / d distance, per mm; 0 where nothing is mixed."""
 
     def share_of(self, medium: int) -> mi.Float:
-        """How much of a lane's scattering is in a medium."""
+        """Share of a lane's scattering that a medium has."""
         return dr.select(self.first == medium, self.share, dr.select(self.second == medium, 1 - self.share, 0))
 
 
@@ -76,7 +76,8 @@ class Media:
         self.count = len(media)
         each = [[entry] if isinstance(entry, Medium) else entry for entry in media]
         self.two_lobes = any(m.beta < 1 for entry in each for m in entry)
-        """Whether the second lobe counts; also asked for by a derivative to beta, which tells what it would bring."""
+        """Whether kernels evaluate the second lobe; a derivative to beta also needs it, as it gives what the lobe would
+        contribute."""
         if any(m.table is not None for entry in each for m in entry if len(entry) > 1):
             raise InputError("Media that differ from lane to lane cannot have phase tables; give them lobes.")
         tables = [entry[0].table for entry in each]
@@ -106,7 +107,7 @@ class Media:
             dr.eval(self._tables)
 
     def pick(self, values: list[mi.Float], index: mi.UInt32 | Mixed) -> mi.Float:
-        """Value of the medium an index names, or of the mixture; any where it names empty space."""
+        """Value of the medium with number ``index``, or of the mixture; arbitrary in empty space."""
         if isinstance(index, Mixed):
             return dr.lerp(self.pick(values, index.second), self.pick(values, index.first), index.share)
         if self._tables:
@@ -132,7 +133,7 @@ class PhaseFunction:
             self.beta = media.pick(media.beta, index)
 
     def density(self, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Float:
-        """Value, 1/sr."""
+        """Value of the phase function, 1/sr."""
         value = self._density_of_lobes(omega, omega_out)
         if self.tables is None or isinstance(self.index, Mixed):
             return value

@@ -2,7 +2,7 @@
 
 All surfaces are one mesh. A surface's number is k for the outer surface of tooth k of T, T + k for its dentin, 2T for
 gums and 2T + 1 for the wall. A lane's *place* holds bit n while it is inside the solid that surface n bounds, so solids
-may overlap. What a scene lacks is absent from its kernels.
+may overlap. Code for features that a scene lacks is absent from its kernels.
 """
 
 from __future__ import annotations
@@ -141,13 +141,13 @@ class MeshGeometry:
         )
 
     def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
-        """Change of the distance to dentin with each shape mode of a tooth."""
+        """Change of the distance to dentin with each shape mode of a tooth, mm."""
         assert self._border is not None
         return self._border.motion(point, active)[: self.modes_of[tooth]]
 
     @property
     def stained(self) -> bool:
-        """Whether any tooth has stains now."""
+        """Whether any tooth has stains."""
         return self.textures is not None
 
     def restain(self, stains: tuple[Stain | None, ...]) -> bool:
@@ -165,7 +165,7 @@ class MeshGeometry:
         return True
 
     def stain(self, hit: Hit, active: mi.Bool) -> mi.Float:
-        """Transmittance of the stains where an outer face is crossed."""
+        """Transmittance of the stains where an outer face is crossed; 1 in lanes that are not active."""
         assert self.textures is not None
         return self.textures.transmittance(hit, active)
 
@@ -199,7 +199,7 @@ class MeshGeometry:
         return tables
 
     def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:  # noqa: ARG002 - slabs need the place
-        """Next surface, by ray tracing."""
+        """Next surface along a ray, by ray tracing."""
         ray = mi.Ray3f(origin, direction)
         found = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         valid = active & found.is_valid()
@@ -212,12 +212,12 @@ class MeshGeometry:
         )
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
-        """Distance within which no surface lies."""
+        """Distance in mm within which no surface lies; not positive where that is not known."""
         return self._clearance(point, active)
 
     def inside(self, place: mi.UInt32) -> mi.UInt32:
-        """Number of the tooth that counts at a place, the number of teeth where that is gums, and above that outside of
-        all.
+        """Number of the tooth whose tissue fills a place; the number of teeth for gums, and one more outside of all
+        solids.
         """
         within = place & (2**self.teeth - 1)
         if self._dentins:
@@ -230,7 +230,7 @@ class MeshGeometry:
         )
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
-        """Dentin over enamel over gums over air, whatever surfaces overlap."""
+        """Medium at a place: dentin over enamel over gums over air, whatever surfaces overlap."""
         if self.single:
             inside_outer = place & 1
             return dr.select((place & 2) != 0, mi.UInt32(2), inside_outer) if self._dentins else inside_outer
@@ -243,7 +243,9 @@ class MeshGeometry:
         )
 
     def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
-        """Entering sets the surface's bit and leaving clears it, so a missed hit heals at the next."""
+        """Place after a hit. Entering sets the surface's bit and leaving clears it, so the next hit corrects a missed
+        one.
+        """
         bit = dr.select(hit.outer, mi.UInt32(1), mi.UInt32(2)) if self.single else mi.UInt32(1) << hit.surface
         return dr.select(dr.dot(direction, hit.normal) < 0, place | bit, place & ~bit)
 
@@ -260,14 +262,13 @@ class MeshGeometry:
         return dr.maximum(first, second) / dr.minimum(first, second)
 
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:
-        """Offset along the normal as Mitsuba does."""
+        """The hit point, offset along the normal to either side as Mitsuba does."""
         offset = dr.mulsign(dr.select(through, self.epsilon, -self.epsilon), dr.dot(direction, hit.normal))
         return dr.fma(direction, hit.distance, origin) + hit.normal * offset
 
     def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:
-        """Normal speed n .
-
-        (B_m - B0) at the hit, interpolated over its triangle; zero but on the dentin of one tooth.
+        """Normal speed n . (B_m - B0) at the hit for each shape mode m, interpolated over its triangle; zero except on
+        the dentin of the one tooth.
         """
         active = active & ~hit.outer & hit.valid
         if not self.single:
@@ -284,7 +285,7 @@ class MeshGeometry:
 
 
 def _alike(one: Stain | None, other: Stain | None) -> bool:
-    # By value, because a stain that travelled between processes is another object.
+    # Compare by value, because a stain that travelled between processes is another object.
     return one is other or (
         one is not None and other is not None and np.array_equal(one.transmittance, other.transmittance)
     )

@@ -16,12 +16,15 @@ from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 from services.core.geometry import Mesh
 
 WIDTHS_PER_SCALE = 8.0
-"""The border's width over s: l goes from 2 % to 98 % across it."""
+"""Width of the border over the scale s: l goes from 2 % to 98 % across it."""
 PITCH_MM = 0.15
+"""Smallest pitch of the grid, mm."""
 MAX_CELLS = 8_000_000
+"""Largest number of grid cells; larger scenes have a larger pitch."""
 MARGIN_WIDTHS = 1.5
-"""How far the grid reaches beyond the dentin, in widths; there l is 1 within 1e-5."""
+"""Margin of the grid around the dentin, in widths of the border; at its end l is 1 within 1e-5."""
 ON_SURFACE_MM = 1e-6
+"""Distance in mm up to which a point counts as on the surface."""
 
 Array = NDArray[np.float64]
 
@@ -34,7 +37,9 @@ class MixedBorder:
         self._inverse_scale = dr.opaque(mi.Float, WIDTHS_PER_SCALE / width_mm)
 
     def move(self, dentin: Mesh, modes_mm: NDArray[np.float64]) -> None:
-        """Measure distances to the surface at its present place, whose vertices its modes (M, V, 3) displace."""
+        """Measure distances to the present dentin surface, and how they change with the modes (M, V, 3) of its
+        vertices.
+        """
         margin = MARGIN_WIDTHS * self.width_mm
         extent = np.ptp(dentin.vertices_mm, axis=0) + 2 * margin
         pitch = max(PITCH_MM, float(np.cbrt(extent.prod() / MAX_CELLS)))
@@ -43,7 +48,8 @@ class MixedBorder:
         self._low, self._inverse_pitch = dr.opaque(mi.Point3f, low.tolist()), dr.opaque(mi.Float, 1 / pitch)
         self._shape = grid.depth.shape
 
-        # Exact where the mixture changes; what the grid itself holds away from the surface is a little too far from it.
+        # Measure exactly where the mixture changes, because the grid's own distances away from the surface are a little
+        # too large.
         distance = -grid.depth
         near = np.abs(distance) < margin
         axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, self._shape, strict=True)]
@@ -60,7 +66,7 @@ class MixedBorder:
     def share(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Share of enamel at a point, and its slope dl/dq, per mm."""
         x = self._look(self._distance, point, active) * self._inverse_scale
-        # Branching on the sign keeps the exponential small.
+        # Branch on the sign, so that the exponential stays small.
         small = dr.exp(-dr.abs(x))
         share = dr.select(x >= 0, 1, small) / (1 + small)
         return share, small / dr.square(1 + small) * self._inverse_scale
@@ -83,7 +89,9 @@ def _texture(values: NDArray[np.float64]) -> mi.Texture3f:
 def _speeds(
     dentin: Mesh, modes_mm: Array, points: Array, nearest: Array, distance: Array, face: NDArray[np.int64]
 ) -> list[Array]:
-    """How fast q changes, -(gradient of q) . displacement of the closest surface point, a row of points per mode."""
+    """Change of q with each mode's weight, -(gradient of q) . displacement of the closest surface point, (N,) for each
+    mode.
+    """
     if len(modes_mm) == 0:
         return []
     from trimesh.triangles import points_to_barycentric

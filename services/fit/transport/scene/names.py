@@ -1,4 +1,4 @@
-"""What the parameters of a scene are called, and which medium and field each name means."""
+"""Names of a scene's parameters, and the medium and field that each name refers to."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ class MediaNumbers:
     cavity: bool
 
     def of(self, tooth: int, part: str) -> int:
-        """``enamel`` or ``dentin`` of a tooth."""
+        """Number of ``enamel`` or ``dentin`` of a tooth."""
         return 1 + tooth * (1 + self.dentin) + (part == "dentin")
 
     @property
     def of_gums(self) -> int:
-        """The gums'."""
+        """Number of the gums."""
         return 1 + self.teeth * (1 + self.dentin)
 
     @property
     def of_cavity(self) -> int:
-        """The wall's."""
+        """Number of the wall."""
         return self.of_gums + self.gums
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a scene."""
+    """One parameter of a scene: a field of a medium, or a weight of a tooth's dentin shape."""
 
     medium: int
     field: str
     shape: int | None = None
-    """The tooth whose dentin it blends."""
+    """Index of the tooth whose dentin shape it changes; None for a field of a medium."""
 
 
 def media_numbers(recipe: SceneRecipe) -> MediaNumbers:
-    """How the scene's media are numbered."""
+    """Numbers of the scene's media."""
     return MediaNumbers(
         len(recipe.teeth),
         any(tooth.dentin is not None for tooth in recipe.teeth),
@@ -93,7 +93,7 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         require_medium(f"{prefix}enamel", tissue.enamel)
         media.append(tissue.enamel)
         if numbers.dentin:
-            # A tooth without dentin has no place where its second number counts.
+            # No place of a tooth without dentin refers to its second number, so enamel fills it.
             media.append(tissue.enamel if tooth.dentin is None else tissue.dentin)
             require_medium(f"{prefix}dentin", media[-1])
         modes = 0 if tooth.dentin is None else len(tooth.dentin.modes_mm)
@@ -130,10 +130,10 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
 
 
 def require_stain(name: str, stain: Stain | None, tooth: ToothSurfaces) -> None:
-    """Refuse a texture that dims nothing or everything, or that a tooth has no coordinates for.
+    """Refuse a texture with texels outside 0 (excluded) to 1, or one for which a tooth has no coordinates.
 
     Raises:
-        InputError: names it.
+        InputError: names the texture.
     """
     if stain is None:
         return
@@ -160,7 +160,7 @@ def require_stain(name: str, stain: Stain | None, tooth: ToothSurfaces) -> None:
 
 
 def whitened(tissue: Tissue | Mouth) -> Tissue | Mouth:
-    """The same without absorption."""
+    """The same tissue without absorption."""
     if isinstance(tissue, Tissue):
         return _white(tissue)
     gums = None if tissue.gums is None else replace(tissue.gums, alpha=1.0)

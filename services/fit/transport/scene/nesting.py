@@ -1,4 +1,4 @@
-"""Whether dentin lies inside enamel with room for a ray's offset between the two surfaces.
+"""Check that dentin lies inside enamel, with room for a ray's offset between the two surfaces.
 
 Surfaces nearer to each other than the offset hide one another: a ray that crosses the first starts anew beyond the
 second.
@@ -14,6 +14,7 @@ from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
 MAX_CHECKED = 64
+"""Largest number of vertices whose winding number is computed, the farthest from the outer surface first."""
 
 
 def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
@@ -26,7 +27,7 @@ def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
     nearest, distance, face = SurfaceDistance(outer).closest(points)
     a, b, c = (outer.vertices_mm[outer.faces[face, k]] for k in range(3))
     above = np.einsum("ij,ij->i", points - nearest, np.cross(b - a, c - a)) > 0
-    # Where the nearest point is a corner a face's normal can mislead; the winding number cannot.
+    # Where the nearest point is a corner, a face's normal can mislead; the winding number cannot.
     suspects = np.flatnonzero(above)
     suspects = suspects[np.argsort(distance[suspects])[::-1][:MAX_CHECKED]]
     outside = suspects[winding_number(outer, points[suspects]) < 0.5]
@@ -44,7 +45,9 @@ def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
 
 
 def winding_number(mesh: Mesh, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How often a closed mesh winds around each point: 1 inside, 0 outside (van Oosterom & Strackee 1983, Eq. 8)."""
+    """Number of times a closed mesh winds around each point (N, 3): 1 inside, 0 outside (van Oosterom & Strackee 1983,
+    Eq. 8).
+    """
     winding = np.empty(len(points_mm))
     for k, point in enumerate(points_mm):
         a, b, c = (mesh.vertices_mm[mesh.faces[:, corner]] - point for corner in range(3))

@@ -1,4 +1,6 @@
-"""What the engine needs to build a scene: plain arrays, so that it pickles; the scene itself never travels."""
+"""Description from which the engine builds a scene: plain arrays, so that it pickles; the built scene never leaves its
+process.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +16,17 @@ from services.core.records import Boundary, Device
 
 @dataclass(frozen=True)
 class ToothSurfaces:
-    """One tooth: the surface around its enamel, and the dentin's inside, if there is any."""
+    """One tooth: the surface around its enamel, and the shape of the dentin inside, if there is any."""
 
     outer: Mesh
     dentin: DentinShape | None = None
     stain_uv: NDArray[np.float64] | None = None
-    """Texture coordinates of the outer faces' corners (F, 3, 2), where it may have stains."""
+    """Texture coordinates of the outer faces' corners (F, 3, 2); None for a tooth that cannot have stains."""
 
 
 @dataclass(frozen=True)
 class SceneRecipe:
-    """Teeth with what surrounds them, their lights and their boundary model, for one colour channel.
+    """Teeth with their surroundings, their lights and their boundary model, for one colour channel.
 
     Where solids overlap, dentin counts over enamel over gums, and of two teeth the one listed first.
     """
@@ -37,15 +39,15 @@ class SceneRecipe:
     boundary: Boundary = "matched"
     ior: float = 1.631
     device: Device | None = None
-    """Where its paths are traced; None for where this process already renders, else the processor."""
+    """Device that traces the paths; None for the one that this process already uses, else the CPU."""
     gums: Mesh | None = None
     """The solid that holds the roots."""
     gums_ior: float = 1.33
     cavity: Mesh | None = None
     """The wall of the mouth behind the teeth, an opaque diffuse surface; it need not be closed."""
     border_width_mm: float = 0.0
-    """Over which albedo and phase function change from enamel's to dentin's, half of it on either side; 0 for a sharp
-    border."""
+    """Width in mm of the border over which albedo and phase function change from enamel's to dentin's, half of it on
+    either side; 0 for a sharp border."""
 
     def vertices_mm(self) -> NDArray[np.float64]:
         """Vertices of all outer surfaces, (V, 3)."""
@@ -71,21 +73,21 @@ def single_tooth(
 
 @dataclass(frozen=True)
 class View:
-    """The pixels of one camera that count, and the lights."""
+    """The valid pixels of one camera, and the lights under which they are rendered."""
 
     camera: Camera
     pixels: NDArray[np.int32]
     """(N, 2) integer x, y of the valid pixels."""
     lights: tuple[int, ...] | None = None
-    """Indices of the lights that count in some of these pixels; None for all. The others are not sampled: their images
-    are 0 with variance 0."""
+    """Indices of the lights that contribute to some of these pixels; None for all. The others are not sampled: their
+    images are 0 with variance 0."""
 
     def __len__(self) -> int:
         return len(self.pixels)
 
 
 def relative_error(mean: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
-    """sqrt(sum of variances) / norm: 0 for what is dark and certain, NaN without batches to compare."""
+    """sqrt(sum of variances) / norm: 0 where both are 0, NaN where there are no batches to compare."""
     spread, norm = float(np.sqrt(variance.sum())), float(np.linalg.norm(mean))
     if norm == 0:
         return 0.0 if spread == 0 else np.inf
@@ -99,9 +101,9 @@ class StackEstimate:
     mean: NDArray[np.float64]
     variance: NDArray[np.float64]
     samples: int = 0
-    """Paths per pixel behind them; 0 if not known."""
+    """Paths per pixel of this estimate; 0 if not known."""
     complete: bool = True
-    """Whether the error asked for was reached before a limit was."""
+    """Whether the requested error was reached before a limit was."""
 
     @property
     def rel_error(self) -> float:
@@ -111,8 +113,8 @@ class StackEstimate:
 
 @dataclass(frozen=True)
 class StainGradient:
-    """Derivatives of sum(cotangent x images) to the texels of each tooth's stain, (H, W) each, None where it has none;
-    variances are of the means.
+    """Derivatives of sum(cotangent x images) with respect to the texels of each tooth's stain, (H, W) each, None for a
+    tooth without stains; variances are of the means.
     """
 
     gradient: tuple[NDArray[np.float64] | None, ...]
@@ -132,13 +134,14 @@ class JacobianEstimate:
     jacobian: NDArray[np.float64]
     jacobian_variance: NDArray[np.float64]
     samples: int = 0
-    """As ``StackEstimate``, as are the next two."""
+    """Paths per pixel of this estimate; 0 if not known."""
     complete: bool = True
+    """Whether the requested error was reached before a limit was."""
 
     @property
     def rel_error(self) -> float:
-        """The worst of the images and of each derivative, each relative to its own norm: units of parameters do not
-        matter.
+        """The largest relative error of the images and of each derivative, each over its own norm, so that units of
+        parameters do not matter.
         """
         pairs = [(self.mean, self.variance), *zip(self.jacobian, self.jacobian_variance, strict=True)]
         return float(np.max([relative_error(*pair) for pair in pairs]))
@@ -146,9 +149,11 @@ class JacobianEstimate:
 
 @dataclass(frozen=True)
 class ShapeGradient:
-    """Derivatives of a weighted sum of images to the shape modes, (M,), and the variances of these means."""
+    """Derivatives of a weighted sum of images with respect to the shape modes, (M,), and the variances of these
+    means.
+    """
 
     gradient: NDArray[np.float64]
     variance: NDArray[np.float64]
     samples: int
-    """Paths per pixel behind them."""
+    """Paths per pixel of this estimate."""

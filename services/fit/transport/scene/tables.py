@@ -1,4 +1,4 @@
-"""Tabulated phase functions in a kernel: evaluated and sampled as ``optics.phase_table`` defines them."""
+"""Tabulated phase functions in a kernel, evaluated and sampled as ``optics.phase_table`` defines them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from services.fit.optics import phase
 from services.fit.optics.phase_table import PhaseTable
 
 ISOTROPIC = PhaseTable((0.0, np.pi), (1.0, 1.0))
-"""Stands where a medium has no table."""
+"""Placeholder for a medium that has no table."""
 BELOW_ONE = 1 - 2.0**-24
+"""Largest float32 number below 1."""
 MIN_WIDTH = 1e-30
-"""Nodes may fall together in single precision."""
+"""Smallest width of an interval as a divisor, because nodes may coincide in single precision."""
 
 
 class PhaseTables:
@@ -40,11 +41,11 @@ class PhaseTables:
         dr.eval(self._known, self._first, self._bins, self._forward, self._deviations, self._values, self._cumulative)
 
     def known(self, medium: mi.UInt32) -> mi.Bool:
-        """Whether the medium has a table; as the last one in empty space."""
+        """Whether the medium has a table; empty space gives the answer of the last medium."""
         return dr.gather(mi.Bool, self._known, self._index(medium))
 
     def density(self, medium: mi.UInt32, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Float:
-        """Value, 1/sr."""
+        """Value of the phase function, 1/sr."""
         sign = dr.mulsign(mi.Float(1), dr.dot(omega, omega_out))
         m = phase.deviation(sign, omega, omega_out)
         node = self._last_not_above(self._deviations, self._half(medium, sign < 0), m)
@@ -52,8 +53,9 @@ class PhaseTables:
         return dr.lerp(p0, p1, dr.clip((m - m0) / dr.maximum(m1 - m0, MIN_WIDTH), 0, 1))
 
     def sample(self, medium: mi.UInt32, omega: mi.Vector3f, u: mi.Float, v: mi.Float) -> mi.Vector3f:
-        """Direction distributed as the table, by its inverse distribution function."""
-        # The half, the interval between nodes, and the place in it, all from what is left of one number.
+        """Direction distributed as the table, by inversion of its distribution function."""
+        # Choose the half, the interval between nodes and the position in it, each from the remainder of one random
+        # number.
         forward = dr.gather(mi.Float, self._forward, self._index(medium))
         back = u >= forward
         u = dr.clip(dr.select(back, (u - forward) / (1 - forward), u / forward), 0, BELOW_ONE)
@@ -75,7 +77,7 @@ class PhaseTables:
         return 2 * self._index(medium) + dr.select(back, mi.UInt32(1), mi.UInt32(0))
 
     def _last_not_above(self, column: mi.Float, half: mi.UInt32, value: mi.Float) -> mi.UInt32:
-        """The node of a half that begins the interval with ``value``."""
+        """Index of the node that begins the interval of a half in which ``value`` lies."""
         first, bins = dr.gather(mi.UInt32, self._first, half), dr.gather(mi.UInt32, self._bins, half)
         last = first + bins - 1
 
