@@ -42,9 +42,10 @@ BOUNDS = {
     "reflectance": (-7.4, 7.4),
     "shape": (0.0, 1.0),
 }
+"""Lower and upper bound of the coordinate x of each kind of parameter."""
 HELD_G = 0.8
-"""Mean cosine at which sigma and alpha are coordinates where the cosine is one too, and that a single lobe has where it
-is not."""
+"""Mean cosine of the similar medium whose sigma and alpha are coordinates where the mean cosine is a coordinate too;
+also the mean cosine of a single lobe where it is none."""
 STEP_SCALE = {
     "sigma": math.log(2.0),
     "alpha": 0.4,
@@ -55,7 +56,7 @@ STEP_SCALE = {
     "reflectance": 1.0,
     "shape": 0.25,
 }
-"""Length over which the image is roughly linear in each coordinate; a trust radius of 1 means one of these."""
+"""Length over which the image is roughly linear in each coordinate; a trust radius of 1 is one such length."""
 UNITS = {
     "sigma": "1/mm",
     "alpha": "1",
@@ -72,6 +73,9 @@ LOGISTIC = frozenset({"beta", "reflectance"})
 def kind_of(name: str) -> str:
     """The kind of a parameter: the key into BOUNDS for ``enamel.sigma`` or ``3.enamel.sigma`` is ``sigma``, for
     ``shape.0`` it is ``shape``.
+
+    Raises:
+        SettingsError: a fit cannot change a parameter of this name.
     """
     part, _, leaf = name.rpartition(".")
     kind = "shape" if part.rpartition(".")[2] == "shape" else leaf
@@ -98,7 +102,9 @@ def to_dual(kind: str, value: float) -> float:
 
 
 def to_natural(kind: str, x: float) -> float:
-    """Natural value of a coordinate. ``alpha`` by expm1 and ``beta`` by sign, so that nothing cancels or overflows."""
+    """Natural value of a coordinate; ``alpha`` uses expm1 and ``beta`` branches on the sign, so that nothing cancels or
+    overflows.
+    """
     if kind == "sigma":
         return math.exp(x)
     if kind == "alpha":
@@ -132,6 +138,7 @@ class Coordinate:
     prior_mean: float | None = None
     """Centre of a Gaussian prior in this domain; None for a flat prior."""
     prior_sd: float = math.inf
+    """Standard deviation of that prior."""
 
     @property
     def name(self) -> str:
@@ -145,7 +152,7 @@ class Coordinate:
 
     @property
     def tooth(self) -> int | None:
-        """The one tooth of a jaw that it belongs to, by its position; None for any other."""
+        """Position in the jaw of the one tooth to which the coordinate belongs; None for any other coordinate."""
         owners = {target.partition(".")[0] for target in self.targets}
         return int(owner) if len(owners) == 1 and (owner := owners.pop()).isdigit() else None
 
@@ -158,7 +165,7 @@ class Domain:
     """
 
     coordinates: tuple[Coordinate, ...]
-    """Of the tissue."""
+    """Coordinates of the tissue."""
     errors: InstrumentErrors = NO_ERRORS
 
     @property
@@ -168,7 +175,7 @@ class Domain:
 
     @property
     def tissue_count(self) -> int:
-        """How many coordinates are the tissue's."""
+        """Number of the tissue's coordinates."""
         return len(self.coordinates)
 
     @property
@@ -189,8 +196,8 @@ class Domain:
 
     @property
     def prior(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Prior mean and precision 1/sd^2 of the tissue's coordinates, both (F,); precision 0 where the prior is flat,
-        and of errors.
+        """Prior mean and precision 1/sd^2 of the coordinates, both (F,); precision 0 where the prior is flat, and for
+        the instrument's errors, whose precision is a matrix.
         """
         none = [0.0] * len(self.errors.names)
         mean = np.array([0.0 if c.prior_mean is None else c.prior_mean for c in self.coordinates] + none)
@@ -212,7 +219,7 @@ class Domain:
         return slope
 
     def prior_change(self, x_old: NDArray[np.float64], x_new: NDArray[np.float64]) -> float:
-        """By how much that half square changes from one x to another."""
+        """Change of 1/2 (x - mean)' precision (x - mean) from one x to another."""
         mean, precision = self.prior
         change = 0.5 * float(precision @ ((x_new - mean) ** 2 - (x_old - mean) ** 2))
         if self.errors.names:
@@ -226,10 +233,11 @@ class Domain:
 
     @property
     def relation(self) -> NDArray[np.int_]:
-        """How two coordinates are related, (F, F): 0 of one tooth, 1 where one is of gums, wall or all teeth, 2 of two
-        teeth. All 0 for a tooth alone.
+        """Relation of every two coordinates, (F, F): 0 for two of one tooth, 1 where one belongs to gums, wall or all
+        teeth, 2 for two of different teeth. All are 0 for a tooth alone.
 
-        With the instrument's errors 3 (row the tissue's), 4 (row an error's) and 5 (both errors').
+        The instrument's errors add 3 (row of the tissue, column of an error), 4 (row of an error, column of the tissue)
+        and 5 (both of errors).
         """
         tooth = np.array([-1 if c.tooth is None else c.tooth for c in self.coordinates])
         shared = (tooth < 0)[:, None] | (tooth < 0)
@@ -245,7 +253,8 @@ class Domain:
     def cosines(self) -> tuple[str, ...]:
         """Parts whose mean cosine is a coordinate.
 
-        Their sigma and alpha are coordinates at ``HELD_G``, so that the cosine changes neither reduced quantity.
+        Their sigma and alpha are coordinates of the similar medium at ``HELD_G``, so that the cosine changes neither
+        reduced scattering nor absorption.
         """
         return tuple(target.rpartition(".")[0] for c in self.coordinates if c.kind == "cosine" for target in c.targets)
 
@@ -273,10 +282,10 @@ class Domain:
         return _at_cosines(_at_cosines(base, dict.fromkeys(cosines, HELD_G)).with_values(values), cosines)
 
     def chain(self, x: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivative of each parameter to each of the tissue's coordinates, (P, F): maps derivatives to natural
-        parameters onto coordinates.
+        """Derivative of each parameter with respect to each of the tissue's coordinates, (P, F): it maps derivatives to
+        natural parameters onto coordinates.
 
-        Not with ``cosines``.
+        Not valid for a domain with ``cosines``.
         """
         matrix = np.zeros((len(self.parameters), self.tissue_count))
         row = 0
@@ -297,7 +306,7 @@ def similar_medium(medium: Medium, g: float) -> Medium:
 
 
 def _at_cosines(tissue: Optics, cosines: Mapping[str, float]) -> Optics:
-    # Some parts' media replaced by similar ones.
+    # Replace the media of some parts by similar ones of the given mean cosines.
     for part, cosine in cosines.items():
         medium = similar_medium(tissue.medium(part), cosine)
         tissue = tissue.with_values({f"{part}.{leaf}": getattr(medium, leaf) for leaf in MEDIUM_FIELDS})
@@ -305,7 +314,9 @@ def _at_cosines(tissue: Optics, cosines: Mapping[str, float]) -> Optics:
 
 
 def similar_tissue(tissue: Optics, g: float) -> Optics:
-    """All media replaced by similar ones; shapes, stains and what is opaque stay."""
+    """The tissue with all media replaced by similar ones of mean cosine g; shapes, stains and the wall's reflectance
+    stay.
+    """
     if isinstance(tissue, Tissue):
         return replace(tissue, enamel=similar_medium(tissue.enamel, g), dentin=similar_medium(tissue.dentin, g))
     gums = None if tissue.gums is None else similar_medium(tissue.gums, g)

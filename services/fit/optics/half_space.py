@@ -1,4 +1,4 @@
-"""How much light a deep medium throws back."""
+"""Diffuse reflectance of a deep medium."""
 
 from __future__ import annotations
 

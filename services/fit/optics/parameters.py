@@ -1,5 +1,5 @@
-"""Medium parameters in physical units, their names, and the unbounded domain they are fitted in (optics.md; teeth 2018
-Eq. 22, 24).
+"""Medium parameters in physical units, and their names; ``domain`` holds the unbounded domain in which they are
+fitted.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Medium:
 
 @dataclass(frozen=True, eq=False)
 class Stain:
-    """A texture on a tooth's outer surface, by which light is dimmed that passes through it (teeth 2018 Eq. 1)."""
+    """A texture on a tooth's outer surface that attenuates the light passing through it (teeth 2018 Eq. 1)."""
 
     transmittance: NDArray[np.float64]
     """a_t, (H, W), above 0 and at most 1; the first row's centre lies at v = 1 / 2H."""
@@ -72,7 +72,7 @@ class Stain:
 
 @dataclass(frozen=True)
 class Tissue:
-    """Everything a fit may change, for one colour channel.
+    """All parameters that a fit may change, for one colour channel.
 
     Names: ``enamel.sigma`` ... ``dentin.g2``, ``shape.0`` ... ``shape.2``.
     """
@@ -85,7 +85,7 @@ class Tissue:
     """None for a surface without stains."""
 
     def medium(self, part: str) -> Medium:
-        """``enamel`` or ``dentin``."""
+        """The medium of ``enamel`` or ``dentin``."""
         return self.enamel if part == "enamel" else self.dentin
 
     def value(self, name: str) -> float:
@@ -110,7 +110,7 @@ class Tissue:
 
 @dataclass(frozen=True)
 class Mouth:
-    """Everything a fit may change in a scene of several parts, for one colour channel.
+    """All parameters that a fit may change in a scene of several parts, for one colour channel.
 
     Names: ``0.enamel.sigma`` ... ``13.shape.2`` by tooth, ``gums.sigma`` ..., ``cavity.reflectance``.
     """
@@ -118,10 +118,10 @@ class Mouth:
     teeth: tuple[Tissue, ...]
     gums: Medium | None = None
     reflectance: float | None = None
-    """Of the cavity's wall, diffuse, 0 to 1."""
+    """Diffuse reflectance of the cavity's wall, 0 to 1."""
 
     def medium(self, part: str) -> Medium:
-        """``0.enamel`` ... ``13.dentin`` or ``gums``."""
+        """The medium of ``0.enamel`` ... ``13.dentin`` or ``gums``."""
         if part == "gums":
             assert self.gums is not None
             return self.gums
@@ -155,4 +155,4 @@ class Mouth:
 
 
 Optics = TypeVar("Optics", Tissue, Mouth)
-"""What a fit changes: one tooth alone, or a whole mouth."""
+"""The parameters that a fit changes: of one tooth alone, or of a whole mouth."""

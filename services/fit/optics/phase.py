@@ -1,7 +1,7 @@
 """Henyey-Greenstein phase functions for propagation directions, in forms that hold in float32 (optics.md).
 
-Every function speaks of the *deviation* m = 1 - sign(g) cos(theta), which keeps its relative precision where the lobe
-is narrow: D = 1 + g^2 - 2 g cos(theta) becomes (1 - |g|)^2 + 2 |g| m, a sum of positive terms.
+Every function uses the *deviation* m = 1 - sign(g) cos(theta), which keeps its relative precision where the lobe is
+narrow: D = 1 + g^2 - 2 g cos(theta) becomes (1 - |g|)^2 + 2 |g| m, a sum of positive terms.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Phase functions given as tables: p(cos theta), linear in cos theta between nodes, normalised on the sphere.
 
-Piecewise linear in cos theta, all integrals are closed: a node's tent weighs pi times the cosines that it spans, and a
-distribution inverts by one square root. Nodes near a pole are kept as deviations 1 - |cos theta| from it, in which the
-narrowest peak has room.
+Because values are piecewise linear in cos theta, all integrals have closed forms: the integral of a node's tent is pi
+times the range of cosines that it spans, and a distribution is inverted by one square root. Nodes near a pole are
+stored as deviations 1 - |cos theta| from it, which resolve even the narrowest peak.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FEWEST_NODES = 2
 
 @dataclass(frozen=True)
 class PhaseTable:
-    """Phase function values at angles between propagation directions. Given in any unit, they are normalised.
+    """Phase function values at angles between propagation directions. They may be given in any unit and are normalised.
 
     Raises:
         InputError: fewer than two nodes, angles that do not increase from 0 to pi, or values that are negative, not
@@ -45,7 +45,7 @@ class PhaseTable:
                     f"The phase table's value at {math.degrees(angle):.4g} degrees is {value:g}; it must be finite and"
                     " not negative."
                 )
-        # Pi need not have all its digits.
+        # The last angle may give pi with fewer digits.
         angles[-1] = math.pi if math.isclose(angles[-1], math.pi, rel_tol=1e-6) else math.nan
         if angles[0] != 0 or not (np.diff(_cosine_deviations(angles)) > 0).all():
             raise InputError("The angles of a phase table must increase from 0 to pi; add or sort them.")
@@ -59,7 +59,7 @@ class PhaseTable:
 
     @property
     def mean_cosine(self) -> float:
-        """First moment."""
+        """First moment of the phase function."""
         # Simpson's rule is exact for the product of two linear functions.
         m, p = _cosine_deviations(np.array(self.angles_rad)), np.array(self.values)
         middle = (1 - 0.5 * (m[1:] + m[:-1])) * (p[1:] + p[:-1]) * 2
@@ -89,13 +89,13 @@ class Hemisphere:
     values: NDArray[np.float64]
     """1/sr"""
     cumulative: NDArray[np.float64]
-    """Share of the half's light from the pole to each node."""
+    """Share of the half's light between the pole and each node."""
     share: float
-    """Of the sphere's light."""
+    """Share of the sphere's light in this half."""
 
 
 def tent_weights(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Integral over the sphere of each node's tent, sr; a tent of unit light peaks at the inverse."""
+    """Integral over the sphere of each node's tent, sr; a tent whose integral is 1 has the inverse as its peak."""
     widths = np.diff(_cosine_deviations(angles_rad))
     return math.pi * (np.append(widths, 0.0) + np.insert(widths, 0, 0.0))
 

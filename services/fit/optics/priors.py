@@ -1,8 +1,8 @@
 """Gaussian priors of the fit's coordinates, in the unbounded domain: weak ones, those of the literature, and those
 towards other teeth.
 
-sigma and g are nearly one parameter, and a fit holds g1 at ``HELD_G``. So a measured medium counts through its reduced
-scattering and its absorption: the medium with these at that mean cosine is what a fit of it would report.
+sigma and g are nearly one parameter, and a fit holds g1 at ``HELD_G``. So a measured medium enters by its reduced
+scattering and its absorption: a fit would report the medium that has these at that mean cosine.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from services.fit.optics.domain import HELD_G, similar_medium, to_dual
 from services.fit.optics.parameters import Medium
 
 MIN_SD = {"sigma": 0.2, "alpha": 0.1}
-"""However well few teeth agree, a prior towards them is no narrower."""
+"""Smallest standard deviation of a prior towards other teeth, however well few of them agree."""
 
 Priors = Mapping[str, tuple[float, float]]
-"""By parameter: mean and standard deviation in the unbounded domain; one not named has a flat prior."""
+"""Mean and standard deviation in the unbounded domain, by name of the parameter; a parameter not named has a flat
+prior."""
 
 _LEAVES = {
     "g1": (to_dual("g1", 0.8), 0.35),
@@ -32,12 +33,13 @@ _LEAVES = {
 WEAK: Priors = MappingProxyType(
     {f"{part}.{leaf}": prior for part in ("enamel", "dentin") for leaf, prior in _LEAVES.items()}
 )
-"""g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25 (one sigma)."""
+"""One-sigma ranges of g1: 0.64 to 0.89; 1 - alpha: 5e-4 to 5e-2; beta: 0.77 to 0.96; g2: -0.42 to 0.25."""
 COSINE = (to_dual("cosine", 0.7), 0.35)
-"""Of the mean cosine of one lobe that stands for two: 0.48 to 0.84 (one sigma). Similarity of second order asks teeth's
-lobes for 0.5 to 0.7."""
+"""Prior of the mean cosine of a single lobe that replaces two: 0.48 to 0.84 (one sigma). Similarity of second order
+gives 0.5 to 0.7 for the lobes of teeth."""
 SHAPE = (0.6, 0.3)
-"""Of a blend weight: those nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3 to 1."""
+"""Prior of a blend weight: the weights nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3
+to 1."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,13 @@ LITERATURE_TABLE = (
     Measured("dentin", 400, 0.504, 0.2, "Zoller et al. 2018"),
     Measured("dentin", 700, 0.245, 0.1, "Zoller et al. 2018"),
 )
-"""Where both reduced scattering and its source are known. Fried's absorption of enamel is an upper limit."""
+"""Measurements of which both reduced scattering and source are known. Fried's absorption of enamel is an upper
+limit."""
 
 
 def towards(part: str, media: Iterable[Medium]) -> Priors:
-    """Prior around the mean of other media, as wide as they differ: teeth of the same mouth (teeth 2018, section 7), or
-    other authors' teeth.
+    """Prior around the mean of other media, with their spread as its width: teeth of the same mouth (teeth 2018,
+    section 7), or other authors' teeth.
 
     Args:
         part: ``enamel`` or ``dentin``, or with a tooth's number before it.
@@ -83,7 +86,8 @@ def towards(part: str, media: Iterable[Medium]) -> Priors:
 
 
 def literature() -> Priors:
-    """Prior towards the table; a source without absorption takes the mean of the others', in the logarithm.
+    """Prior towards ``LITERATURE_TABLE``; a source without absorption gets the geometric mean of the others'
+    absorption.
 
     Lobes keep the weak priors.
     """
@@ -101,5 +105,5 @@ def literature() -> Priors:
 
 
 def priors_of(kind: Literal["weak", "literature"]) -> Priors:
-    """The priors of a job's option."""
+    """The priors that a job's option names."""
     return WEAK if kind == "weak" else literature()

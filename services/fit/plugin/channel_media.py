@@ -1,8 +1,9 @@
 """Media that differ per colour channel, for paths that carry all channels at once.
 
-A path takes its flights and turns as one channel, the *leader*, picked by chance, and is worth f_k / mean_c(pdf_c) to
-channel k: the balance heuristic over all channels that could have led the whole path (Wilkie et al. 2014). Only ratios
-of the pdf_c enter, so they are carried relative to the largest. With one channel all of this is absent from the kernel.
+A path samples its flights and directions by the medium of one channel, the *leader*, picked at random, and has the
+weight f_k / mean_c(pdf_c) for channel k: the balance heuristic over all channels that could have led the whole path
+(Wilkie et al. 2014). Only ratios of the pdf_c enter, so they are carried relative to the largest. With one channel all
+of this is absent from the kernel.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from services.fit.transport.scene.media import Media, PhaseFunction
 
 @dataclass(frozen=True)
 class ToothOptics:
-    """What teeth are made of: one medium per colour channel, lengths in scene units (mm where the fit's values are
+    """Optical parameters of teeth: one medium per colour channel, lengths in scene units (mm where the fit's values are
     used).
     """
 
@@ -27,7 +28,7 @@ class ToothOptics:
     dentin: tuple[Medium, ...]
     """Empty where no dentin surface is named."""
     ior: float | None = None
-    """Of ``thin`` outer faces; None where they are index-matched."""
+    """Index of refraction of ``thin`` outer faces; None where they are index-matched."""
     roughness: float | None = None
     """GGX roughness of the outer face's mirror image; None leaves that image out, as a fit does."""
 
@@ -38,7 +39,7 @@ class ChannelMedia:
     def __init__(self, optics: ToothOptics) -> None:
         self.channels = len(optics.enamel)
         self._parts = DENTIN if optics.dentin else 1
-        # Numbered one channel after the other.
+        # Media are numbered channel by channel.
         pairs = (
             zip(optics.enamel, optics.dentin, strict=True) if optics.dentin else ((medium,) for medium in optics.enamel)
         )
@@ -70,19 +71,19 @@ class ChannelMedia:
         return PhaseFunction(self._media, index).sample(omega, u_lobe, u.x, u.y)
 
     def pick_leader(self, u: mi.Float) -> mi.UInt32:
-        """Any channel, equally likely."""
+        """A random channel, each with equal probability."""
         return dr.minimum(mi.UInt32(u * self.channels), self.channels - 1) if self.channels > 1 else mi.UInt32(0)
 
     def of_leader(self, leader: mi.UInt32, values: mi.Spectrum) -> mi.Float:
-        """The leader's of all channels' values."""
+        """The leader's value among those of all channels."""
         result = values[0]
         for k in range(1, self.channels):
             result = dr.select(leader == k, values[k], result)
         return result
 
     def rival(self, likely: mi.Spectrum, density: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
-        """Bring the channels' relative likelihoods up to date with one more choice, which each makes with this
-        density.
+        """Multiply the channels' relative densities ``likely`` by those of one more choice, and scale the largest to
+        1.
         """
         if self.channels == 1:
             return likely
@@ -90,9 +91,9 @@ class ChannelMedia:
         return dr.select(active, product / dr.max(product), likely)
 
     def share(self, likely: mi.Spectrum) -> mi.Spectrum:
-        """What a path of unit throughput is worth to each channel."""
+        """Weight of a path of unit throughput for each channel."""
         return likely / dr.mean(likely) if self.channels > 1 else mi.Spectrum(1)
 
     def mean(self, likely: mi.Spectrum, values: mi.Spectrum) -> mi.Float:
-        """Density over all leaders of a choice that each makes with density ``values``."""
+        """Mean density over all possible leaders of a choice that each makes with density ``values``."""
         return dr.mean(self.share(likely) * values)

@@ -1,5 +1,5 @@
-"""The mirror image of the surroundings in a thin outer face, spread by a GGX roughness: what a fit masks and a picture
-wants back.
+"""The mirror image of the surroundings in a thin outer face, spread by a GGX roughness. A fit masks it; a picture needs
+it.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from services.fit.optics import fresnel
 
 
 class Gloss:
-    """Rough reflection off the outside of a face (Walter et al. 2007, Eq. 20, 23, 33, 34); what is not reflected goes
-    on unbent.
+    """Rough reflection off the outside of a face (Walter et al. 2007, Eq. 20, 23, 33, 34); light that is not reflected
+    continues unbent.
     """
 
     def __init__(self, roughness: float, ior: mi.Float) -> None:
@@ -30,6 +30,6 @@ class Gloss:
         return dr.select(above, value, 0), dr.select(above, density, 0)
 
     def sample(self, si: mi.SurfaceInteraction3f, u: mi.Point2f) -> mi.Vector3f:
-        """A world direction by the normals that the viewer sees."""
+        """A reflected world direction, by a facet normal sampled among those that are visible from ``si.wi``."""
         half = mi.Vector3f(self.facets.sample(si.wi, u)[0])
         return si.to_world(mi.reflect(si.wi, half))

@@ -17,7 +17,8 @@ roughness                      GGX roughness of the mirror image in thin faces; 
 max_depth                      scatterings and reflections after which a path ends; 5000 where left out
 =============================  ====================================================================
 
-BSDFs of tooth surfaces and stock media are not looked at. Cameras stand outside the teeth. Images only, no derivatives.
+BSDFs of tooth surfaces and stock media are ignored. Cameras must stand outside the teeth. It renders images only, no
+derivatives.
 """
 
 from __future__ import annotations
@@ -41,8 +42,9 @@ PLUGIN = "dentine"
 PARTS = ("enamel", "dentin")
 MEDIUM_DEFAULTS = {"beta": 1.0, "g1": 0.0, "g2": 0.0}
 STOCK_PROPERTIES = {"samples_per_pass", "block_size", "timeout"}
-"""What Mitsuba's own base class reads."""
+"""Properties that Mitsuba's own base class reads."""
 ROUGHNESS = (1e-3, 1.0)
+"""Smallest and largest GGX roughness that is accepted."""
 NO_DERIVATIVES = f"Integrator {PLUGIN} gives images only; take derivatives from services.fit.transport.engine.Engine."
 
 
@@ -71,11 +73,11 @@ def read_properties(given: Mapping[str, Any], channels: int) -> ToothProperties:
     """Check an integrator's properties.
 
     Args:
-        given: by name.
-        channels: of the variant, 1 or 3.
+        given: properties by name.
+        channels: number of colour channels of the variant, 1 or 3.
 
     Raises:
-        InputError: unknown, missing or impossible; names property and value.
+        InputError: a property is unknown, missing or impossible; names property and value.
     """
     known = {
         *PARTS,
@@ -151,7 +153,7 @@ def _media(part: str, given: Mapping[str, Any], channels: int) -> tuple[Medium, 
 
 
 def register_integrator() -> None:
-    """Make ``{"type": "dentine"}`` known to the current variant; see this module for its properties.
+    """Make ``{"type": "dentine"}`` known to the current variant; this module's docstring lists its properties.
 
     Raises:
         PlatformError: no variant is set, or one that is neither mono nor RGB.

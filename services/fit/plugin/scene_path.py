@@ -1,9 +1,9 @@
 """Paths through somebody else's scene: stock surfaces and lights around teeth, and the walk's own physics inside them.
 
-Flights, phase functions, nested media and thin faces are those of the walk (``walk.py``); what differs is that any
+Flights, phase functions, nested media and thin faces are those of the walk (``walk.py``); the difference is that any
 Mitsuba surface and emitter may surround a tooth. Every vertex is joined to one sampled emitter along a straight line
-with analytic transmittance, and weighed against the chance that the path finds that emitter by itself (Veach 1997,
-power heuristic).
+with analytic transmittance, and weighted against the chance that the path finds that emitter by itself (multiple
+importance sampling, Veach 1997, power heuristic).
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ from services.fit.transport.scene.geometry import ENAMEL
 
 CONNECTION_GAIN = 3.0
 CONNECTION_FLOOR = 0.02
-"""A scattering vertex is joined to its emitter with probability clip(gain x expected contribution, floor, 1), as in the
-walk."""
+"""A scattering vertex is joined to its emitter with probability clip(``CONNECTION_GAIN`` x expected contribution,
+``CONNECTION_FLOOR``, 1), as in the walk."""
 SCALE_SAMPLES = 4096
+"""Number of samples for the mean light that the emitters bring to the teeth."""
 DARK_DEPTH = 40.0
-"""Optical depth past which a straight line is dark in single precision."""
+"""Optical depth beyond which a straight line is dark in single precision."""
 
 
 @dataclass
@@ -41,15 +42,16 @@ class Path:
     throughput: mi.Spectrum
     radiance: mi.Spectrum
     last: mi.Interaction3f
-    """The vertex that chose the ray's direction ..."""
+    """The last vertex at which the ray's direction was chosen."""
     density: mi.Float
-    """... with this density, 1/sr ..."""
+    """Density of that choice, 1/sr."""
     certain: mi.Bool
-    """... or without a choice that an emitter connection could have made (camera, mirror)."""
+    """Whether no emitter connection could have made that choice (camera, mirror)."""
     leader: mi.UInt32
-    """Colour channel whose flights and turns this path takes."""
+    """Colour channel by which the path samples its flights and directions."""
     likely: mi.Spectrum
-    """How likely each channel would have led the same path, relative to the likeliest; throughput is short of this."""
+    """Density of the same path with each channel as leader, relative to the largest; ``throughput`` does not contain
+    this factor."""
     from_tooth: mi.Bool
     """Whether the last scattering was inside a tooth."""
     depth: mi.UInt32
@@ -59,32 +61,32 @@ class Path:
 
 @dataclass
 class Flight:
-    """What one flight met."""
+    """Result of one flight."""
 
     si: mi.SurfaceInteraction3f
     part: mi.UInt32
-    """Of the surface: ENAMEL, DENTIN or 0."""
+    """Part of the tooth that the surface bounds: ENAMEL, DENTIN, or 0 for any other surface."""
     cosine: mi.Float
-    """Between flight and outward normal."""
+    """Cosine between flight and outward normal."""
     distance: mi.Float
     meets: mi.Bool
-    """A surface, or ..."""
+    """Whether the flight meets a surface."""
     scatters: mi.Bool
-    """... scatters before one, in a tooth."""
+    """Whether the flight scatters in a tooth before it meets a surface."""
     ordinary: mi.Bool
-    """Meets a surface that is no tooth's."""
+    """Whether the flight meets a surface that is no tooth's."""
     mirrors: mi.Bool
-    """Turned back by a smooth face."""
+    """Whether a face reflects the path like a smooth mirror."""
     glossy: mi.Bool
-    """Turned back by a rough one, from among ..."""
+    """Whether a rough face reflects the path; never where ``shines`` is false."""
     shines: mi.Bool
-    """... those that could have been."""
+    """Whether the flight meets a rough face from outside, which could reflect it."""
     reflected: mi.Float
     """Reflectance of the outer face that is met."""
 
     @property
     def turns(self) -> mi.Bool:
-        """Whether it ends at a vertex with a choice of directions."""
+        """Whether the flight ends at a vertex with a choice of directions."""
         return self.scatters | self.ordinary | self.glossy
 
 
@@ -96,7 +98,7 @@ class OnwardChoice:
     density: mi.Float
     weight: mi.Spectrum
     certain: mi.Bool
-    """Whether no emitter connection could have made it."""
+    """Whether no emitter connection could have made this choice."""
 
 
 @dataclass
@@ -113,7 +115,7 @@ class Shadow:
 
 
 def power(p: mi.Float, q: mi.Float) -> mi.Float:
-    """Weight of a sample drawn with density p that could also have been drawn with q."""
+    """Weight (power heuristic) of a sample drawn with density p that could also have been drawn with density q."""
     return dr.select(p > 0, dr.square(p) / (dr.square(p) + dr.square(q)), 0)
 
 
@@ -128,7 +130,7 @@ class ScenePaths:
         self.inverse_irradiance = self._inverse_irradiance()
 
     def _inverse_irradiance(self) -> mi.Float:
-        # What the emitters would bring to the teeth's middle without obstacles.
+        # Estimate the light that the emitters would bring to the teeth's middle without obstacles.
         rng = mi.PCG32(SCALE_SAMPLES)
         middle = dr.zeros(mi.Interaction3f, SCALE_SAMPLES)
         middle.p = mi.Point3f(self.teeth.centre.tolist())
@@ -174,14 +176,14 @@ class ScenePaths:
         choice = self._join_and_turn(path, flight, vertex, (flight.turns | flight.shines) & ~ends)
         self._go_on(path, flight, vertex, choice)
 
-        # Paths that faded survive in proportion to what they carry.
+        # Let faded paths survive in proportion to their throughput.
         left = dr.max(path.throughput * self.media.share(path.likely)) / ROULETTE_WEIGHT
         path.active &= ~ends & (path.sampler.next_1d(path.active) < left)
         path.throughput *= dr.select(left < 1, dr.rcp(dr.maximum(left, 1e-20)), 1)
         return path
 
     def _fly(self, path: Path) -> Flight:
-        # One that ends within the known clearance meets no surface and traces no ray.
+        # A flight that ends within the known clearance meets no surface and traces no ray.
         part = self.teeth.medium(path.place)
         sigmas = self.media.extinction(part)
         sigma = self.media.of_leader(path.leader, sigmas)
@@ -194,7 +196,7 @@ class ScenePaths:
         scatters = inside & ~meets
         si = found.compute_surface_interaction(path.ray, +mi.RayFlags.All, meets)
 
-        # The density that each channel would have flown so far with, relative to the leader's.
+        # Multiply by the density of this flight under each channel, relative to the leader's.
         length = dr.select(meets, found.t, distance)
         path.likely = self.media.rival(
             path.likely, dr.exp((sigma - sigmas) * length) * dr.select(scatters, sigmas / sigma, 1), inside
@@ -216,7 +218,7 @@ class ScenePaths:
         )
 
     def _collect(self, path: Path, flight: Flight) -> None:
-        """Light that the path has found by itself, on a surface or in the environment."""
+        """Add light that the path has found by itself, on a surface or in the environment."""
         active = flight.ordinary | (path.active & ~flight.meets & ~flight.scatters)
         emitter = flight.si.emitter(self.scene, active)
         there = mi.DirectionSample3f(self.scene, flight.si, path.last)
@@ -226,9 +228,10 @@ class ScenePaths:
         path.radiance += dr.select(active, carried * emitter.eval(flight.si, active) * share, 0)
 
     def _reflect(self, path: Path, flight: Flight, ior: mi.Float) -> None:
-        """What a thin outer face turns back.
+        """Decide which paths a thin outer face reflects.
 
-        Without gloss, light from elsewhere shows no mirror image: its loss is a weight.
+        Without gloss, a path that arrives from outside the teeth shows no mirror image: it is transmitted, and the loss
+        is a weight.
         """
         face, enters = flight.meets & (flight.part == ENAMEL), flight.cosine < 0
         flight.reflected = fresnel.reflectance(dr.abs(flight.cosine), ior)
@@ -243,7 +246,7 @@ class ScenePaths:
             flight.mirrors = turned & ~enters
 
     def _vertex(self, path: Path, flight: Flight) -> mi.Interaction3f:
-        # Of an albedo, 1 - alpha below single precision is lost here, unlike in the walk: a picture does not show 1e-7.
+        # Here 1 - alpha below single precision is lost, unlike in the walk, because a picture does not show 1e-7.
         path.throughput *= dr.select(flight.scatters, self.media.albedo(self.teeth.medium(path.place)), 1)
         vertex = dr.zeros(mi.Interaction3f)
         vertex.p = dr.select(flight.scatters, path.ray(flight.distance), flight.si.p)
@@ -256,13 +259,13 @@ class ScenePaths:
         sampler, si, scatters, ordinary = path.sampler, flight.si, flight.scatters, flight.ordinary
         light, brought = self.scene.sample_emitter_direction(vertex, sampler.next_2d(joins), False, joins)
 
-        # A scattering in a tooth.
+        # Evaluate and sample a scattering in a tooth.
         part = self.teeth.medium(path.place)
         u_lobe = sampler.next_1d(scatters) if self.media.two_lobes else None
         onward = self.media.turn(part, path.leader, path.ray.d, u_lobe, sampler.next_2d(scatters))
         to_light, to_onward = self.media.phase(part, path.ray.d, light.d), self.media.phase(part, path.ray.d, onward)
 
-        # An ordinary surface.
+        # Evaluate and sample an ordinary surface.
         value, density, bounce, weight = si.bsdf().eval_pdf_sample(
             mi.BSDFContext(), si, si.to_local(light.d), sampler.next_1d(ordinary), sampler.next_2d(ordinary), ordinary
         )
@@ -275,7 +278,7 @@ class ScenePaths:
             ordinary & mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta),
         )
 
-        # The outside of a glossy face.
+        # Evaluate and sample the outside of a glossy face.
         if self.gloss is not None:
             shine, chance = self.gloss.evaluate(si, light.d)
             value, density = (
@@ -304,7 +307,7 @@ class ScenePaths:
         density: mi.Float,
         joins: mi.Bool,
     ) -> None:
-        # In a tooth only with a probability in proportion to what the emitter could bring.
+        # In a tooth, join only with a probability in proportion to the light that the emitter could bring.
         value = path.throughput * self.media.share(path.likely) * value
         chance = dr.clip(CONNECTION_GAIN * dr.max(value) * self.inverse_irradiance, CONNECTION_FLOOR, 1)
         chance = dr.select(flight.scatters, chance, 1)
@@ -332,7 +335,7 @@ class ScenePaths:
         path.depth += dr.select(turns, mi.UInt32(1), 0)
 
     def _transmittance(self, ray: mi.Ray3f, place: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """Of the straight line along ``ray``, through teeth as far as its maxt."""
+        """Transmittance of the straight line along ``ray``, through teeth as far as its maxt."""
 
         def step(shadow: Shadow) -> Shadow:
             found = self.scene.ray_intersect_preliminary(shadow.ray, coherent=False, active=shadow.alive)

@@ -16,7 +16,7 @@ from services.fit.transport.scene.clearance import CELL_MM, Clearance
 from services.fit.transport.scene.geometry import DENTIN, ENAMEL
 
 CLEARANCE_CELLS = 4_000_000
-"""A distance grid of more cells takes longer to build than it saves."""
+"""Largest number of cells of a distance grid; a grid of more cells takes longer to build than it saves."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class SceneTeeth:
         """Find and check the surfaces.
 
         Raises:
-            InputError: no shape of such an id, or one that cannot be a tooth's surface. MeshError: a surface cannot
-                bound a medium.
+            InputError: no shape has such an id, or one cannot be a tooth's surface.
+            MeshError: a surface cannot bound a medium.
         """
         self._shapes = shapes
         self._state = _state(scene, shapes)
@@ -57,27 +57,27 @@ class SceneTeeth:
         self._clearance = _clearance(outer, inner, [shape.bbox() for shape in scene.shapes() if shape.id() not in part])
 
     def describe(self, scene: Any) -> bool:
-        """Whether this is still true of a scene: its shapes are the same and none has moved."""
+        """Whether a scene is unchanged: its shapes are the same and none has moved."""
         now = _state(scene, self._shapes)
         return len(now) == len(self._state) and all(np.array_equal(a, b) for a, b in zip(now, self._state, strict=True))
 
     def part(self, found: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.UInt32:
-        """Of the surface that was hit: ENAMEL, DENTIN, or 0 where it belongs to no tooth."""
-        # In an instance no shape is given; that is number 0, no tooth's.
+        """Part that the hit surface bounds: ENAMEL, DENTIN, or 0 where it belongs to no tooth."""
+        # A hit in an instance has no shape; its number is then 0, which is no tooth's.
         return dr.gather(mi.UInt32, self._parts, dr.reinterpret_array(mi.UInt32, found.shape), active)
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
-        """Dentin over enamel over whatever is outside (0)."""
+        """Medium at a place: dentin over enamel over the outside (0)."""
         return dr.select((place & DENTIN) != 0, DENTIN, place & ENAMEL)
 
     def beyond(self, place: mi.UInt32, part: mi.UInt32, cosine: mi.Float) -> mi.UInt32:
-        """Place after crossing a surface at ``cosine`` between direction and outward normal; a missed hit heals at the
-        next.
+        """Place after crossing a surface at ``cosine`` between direction and outward normal; the next hit corrects a
+        missed one.
         """
         return dr.select(cosine < 0, place | part, place & ~part)
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
-        """Distance within which no surface lies; 0 where that is not known."""
+        """Distance within which no surface lies; not positive where that is not known."""
         return mi.Float(0) if self._clearance is None else self._clearance(point, active)
 
 
@@ -107,7 +107,7 @@ def _solid(shape: Any) -> Mesh:
     arrays = mi.traverse(shape)
     vertices = np.array(arrays["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     faces = np.array(arrays["faces"]).reshape(-1, 3)
-    # Vertices that were split for texture seams or normals become one again.
+    # Merge vertices that were split for texture seams or normals.
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces].astype(np.int32)
     mesh = Mesh(welded, faces[:, ::-1] if shape.has_flipped_normals() else faces)
@@ -116,7 +116,7 @@ def _solid(shape: Any) -> Mesh:
 
 
 def _clearance(outer: list[Mesh], inner: list[Mesh], other_boxes: list[Any]) -> Clearance | None:
-    # Only for one tooth that nothing else can reach into; elsewhere every flight is traced.
+    # Build a grid only for a single tooth into whose box no other shape reaches; elsewhere every flight is traced.
     low, high = outer[0].vertices_mm.min(axis=0), outer[0].vertices_mm.max(axis=0)
     near = any((np.array(box.min) < high).all() and (np.array(box.max) > low).all() for box in other_boxes)
     if len(outer) > 1 or near or np.prod((high - low) / CELL_MM + 2) > CLEARANCE_CELLS:
