@@ -1,1 +1,3 @@
-"""Flat slabs: totals and their derivatives, by the same walk as the fit."""
+"""Flat slabs: the fit of a material to images of a cell, and totals of layers with derivatives by the walk of the
+teeth.
+"""

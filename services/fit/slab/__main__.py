@@ -1,4 +1,4 @@
-"""``python -m services.fit.slab FOLDER --out DIR``: fit a slab folder and print what came out."""
+"""``python -m services.fit.slab FOLDER --out DIR``: fit a slab folder and print the results."""
 
 from __future__ import annotations
 

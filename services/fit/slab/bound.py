@@ -1,7 +1,9 @@
-"""What images of a cell can tell at best: the Cramér-Rao bound of a material under a rig, before anything is measured.
+"""Cramér-Rao bound of a material under a rig: the smallest errors that images of a cell allow, before anything is
+measured.
 
 The curvature of the misfit comes from the forward model at a known material, and the smoothness prior adds its own. The
-bound of a number is the root of its posterior variance and the square of what the prior moves it by at that material.
+bound of a quantity is the root of the sum of its posterior variance and the square of its bias by the prior at that
+material.
 """
 
 from __future__ import annotations
@@ -26,26 +28,27 @@ from services.fit.slab.solve.weights import independent_weights
 Array = NDArray[np.float64]
 
 BATCHES, PATHS = 8, 60_000
-"""Of the render that gives the curvature. Fewer pass noise for signal: of 200 nm spheres at sigma_t w = 9.1, sigma_s
-was bounded by 0.36 % with 8,000 paths, 1.4 % with 40,000, 0.85 % with 250,000."""
+"""Batches, and paths per batch and light, of the render that gives the curvature. With fewer, noise passes for signal:
+of 200 nm spheres at sigma_t w = 9.1, sigma_s was bounded by 0.36 % with 8,000 paths, 1.4 % with 40,000, 0.85 % with
+250,000."""
 FIRST_STEP = 2**33
-"""Numbers its random streams apart from a fit's."""
+"""Number of the render, apart from those of a fit, so that the two share no random stream."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Of one material under one rig."""
+    """Bound of one material under one rig."""
 
     uncertainty: Uncertainty
     bias: Array
-    """What the prior moves the unknowns by (UNKNOWNS,)."""
+    """Bias of the unknowns by the prior (UNKNOWNS,)."""
 
     def of(self, slope: Array) -> float:
-        """Of a quantity, from its derivatives by ln f and sigma_a (UNKNOWNS,)."""
+        """Bound of a quantity, from its derivatives with respect to ln f and sigma_a (UNKNOWNS,)."""
         return float(np.hypot(self.uncertainty.standard_error(slope), slope @ self.bias))
 
     def of_phase(self, material: Material) -> Array:
-        """Of the phase function at the knots, 1/sr (KNOTS,)."""
+        """Bound of the phase function at the knots, 1/sr (KNOTS,)."""
         chain = phase_chain(material)
         variance = np.einsum("ij,jk,ik->i", chain, self.uncertainty.covariance, chain, optimize=True)
         return np.asarray(np.sqrt(variance + (chain @ self.bias) ** 2) * material.phase_per_sr)
@@ -66,9 +69,9 @@ def bound_of(
 
     Args:
         noise: standard deviation of a pixel that has its image's mean, as a share of it.
-        variances: of the measurement beside its shot noise (images, values), such as a reference's own.
-        paths: of a batch and light, instead of ``PATHS``.
-        scale: of the smoothness prior, per rad2; the loosest that a fit may choose where it is not given.
+        variances: variances of the measurement beside its shot noise (images, values), such as a reference's own.
+        paths: paths per batch and light, instead of ``PATHS``.
+        scale: scale of the smoothness prior, per rad2; by default the loosest that a fit may choose.
     """
     quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths, blocks=blocks)
     x = Knots().unknowns(material)
@@ -89,7 +92,7 @@ def curvature_of(
     paths: int | None = None,
     blocks: Blocks = map,
 ) -> Quadratic:
-    """What images tell of ln f and sigma_a; arguments as of ``bound_of``."""
+    """Quadratic model of half the misfit in ln f and sigma_a that such images give; arguments as of ``bound_of``."""
     thick = is_thick(material, rig.width_mm)
     batches = render(
         rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths or PATHS, scores=True, blocks=blocks

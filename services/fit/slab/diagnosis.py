@@ -1,7 +1,7 @@
-"""Whether a cell's images can tell its phase function, and what to measure instead.
+"""Checks whether a cell's images determine its phase function, and advice on what to measure instead.
 
-Images are looked at one by one before the fit. How thick and how absorbing the sample is comes from the fit itself: the
-HG medium that it starts from takes a thin sample and an absorbing one for each other.
+Images are checked one by one before the fit. Thickness and absorption of the sample come from the fit itself, because
+the HG medium that it starts from confuses a thin sample with an absorbing one.
 """
 
 from __future__ import annotations
@@ -18,25 +18,27 @@ from services.fit.slab.model.dictionary import Material
 Array = NDArray[np.float64]
 
 THINNEST, THICKEST = 0.1, 10.0
-"""Range of sigma_t w in which images tell a phase function (Gkioulekas et al. 2013, figure 6): below, they hold little
-but noise, above, light has forgotten each single deflection."""
+"""Range of sigma_t w in which images determine a phase function (Gkioulekas et al. 2013, figure 6): below, they hold
+little but noise, above, light has forgotten each single deflection."""
 BEST = 2.0
-"""sigma_t w to aim at: many photons scatter, and most of those that do only a few times."""
+"""Value of sigma_t w to aim at: many photons scatter, and most of those that do only a few times."""
 MIN_ALBEDO = 0.2
-"""Below, most of what scatters is absorbed before it leaves, and higher orders add nothing."""
+"""Smallest albedo. Below it most of the light that scatters is absorbed before it leaves, and higher orders add
+nothing."""
 MAX_AT_MAXIMUM = 4
-"""Pixels that may share an image's largest value: as many as are alike by symmetry in an image without noise."""
+"""Largest number of pixels that may share an image's largest value: so many are alike by symmetry in an image without
+noise."""
 MAX_MISFIT_SIGMAS = 5.0
 """Standard errors by which squared residuals may exceed the noise before a dictionary is doubted: the chance is 3e-7 a
 fit."""
 MIN_LIT = 0.5
-"""Share of an image's maximum from which pixels count for where the beam is."""
+"""Smallest share of an image's maximum at which a pixel counts for the position of the beam."""
 MAX_OFF = 1.0
-"""How far the beam may lie beside y = 0, in pixels and in beams' sizes, whichever is more."""
+"""Largest distance of the beam from y = 0, in pixels and in sizes of the beam, whichever is more."""
 
 
 def image_faults(name: str, image: Array, pixels: PixelGrid, beam: Beam) -> tuple[str, ...]:
-    """What is wrong with one image (rows, columns) as taken, a sentence each.
+    """Faults of one image (rows, columns) as taken, a sentence each.
 
     Args:
         name: camera and light, such as "b0 under l1".
@@ -69,7 +71,7 @@ def _off_axis(name: str, image: Array, largest: float, pixels: PixelGrid, beam: 
 
 
 def grid_faults(pixels: PixelGrid) -> tuple[str, ...]:
-    """Whether the beam's axis, which meets its face at x = y = 0, lies where pixels are."""
+    """A sentence for each axis along which the beam's entry point x = y = 0 lies beside the pixels."""
     beside = [axis for axis, (low, high) in (("x", pixels.x_mm), ("y", pixels.y_mm)) if not low < 0 < high]
     return tuple(
         f"The beam meets the cell at {axis} = 0, beside the pixels; correct pixels.{axis}_mm." for axis in beside
@@ -77,8 +79,8 @@ def grid_faults(pixels: PixelGrid) -> tuple[str, ...]:
 
 
 def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
-    """Whether the sample is too thin, too thick or too absorbing to tell its phase function, and what to measure
-    instead.
+    """Sentences on a sample that is too thin, too thick or too absorbing to determine its phase function, and on what
+    to measure instead.
     """
     thickness = material.extinction_per_mm * width_mm
     albedo = material.scattering_per_mm / material.extinction_per_mm
@@ -100,10 +102,11 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
 
 
 def similarity_faults(material: Material, width_mm: float, *, scattering: bool, reduced: bool) -> tuple[str, ...]:
-    """Whether only sigma_s' is fixed, as in thick samples, and what would tell sigma_s and g apart.
+    """A sentence where the images fix sigma_s' alone, as in thick samples, with what would tell sigma_s and g apart.
 
     Args:
-        scattering: whether the images determine sigma_s; ``reduced`` says so of sigma_s'.
+        scattering: whether the images determine sigma_s.
+        reduced: whether the images determine sigma_s'.
     """
     thickness = material.extinction_per_mm * width_mm
     if scattering or not reduced or thickness <= BEST:
@@ -117,11 +120,12 @@ def similarity_faults(material: Material, width_mm: float, *, scattering: bool, 
 
 
 def mixture_faults(dictionary: str, misfit: float, misfit_se: float, values: int) -> tuple[str, ...]:
-    """Whether the images are beyond what a dictionary of few atoms can make; the tents can make any.
+    """A sentence where no mix of a dictionary of few atoms can make the images; the tents can make any.
 
     Args:
-        misfit: half the weighted squares at the solution, and its Monte Carlo error.
-        values: number of them.
+        misfit: half the weighted squares at the solution.
+        misfit_se: Monte Carlo error of the misfit.
+        values: number of the weighted squares.
     """
     squares, error = 2 * misfit / values, math.hypot(math.sqrt(2 / values), 2 * misfit_se / values)
     if dictionary == DEFAULT_DICTIONARY or squares <= 1 + MAX_MISFIT_SIGMAS * error:

@@ -1,8 +1,8 @@
-"""Exposures of one wavelength to linear images with their variances, merged as those of all raw cameras are.
+"""Merge the exposures of one wavelength into linear images with variances, as those of all raw cameras are.
 
 A camera's noise is measured from its own frames: read noise from black frames of one exposure, counts per electron from
-pairs of frames of one light. Light and camera stand still, so two different exposures are a pair as well as two alike
-are.
+pairs of frames of one light. Light and camera stand still, so two frames of different exposure make a pair as well as
+two of the same.
 """
 
 from __future__ import annotations
@@ -27,28 +27,30 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.float32]
 
 ASSUMED = NoiseModel(read_counts=2.0, counts_per_electron=1.0)
-"""By which exposures are weighed where no frames tell the noise; variances are then assumed as for images that come
+"""Noise by which exposures are weighted where no frames measure it; variances are then assumed as for images that come
 without."""
 ABOVE_BLACK = 5.0
-"""Standard errors of its mean by which a frame must be brighter than black, or it was taken with the beam off."""
+"""Number of standard errors of its mean by which a frame must be brighter than black; otherwise the beam was off."""
 SIGMA_OF_MEDIAN = 1.4826
-"""Standard deviation of a normal distribution in units of its median distance from the median."""
+"""Standard deviation of a normal distribution in units of its median absolute deviation."""
 
 
 @dataclass(frozen=True)
 class Merged:
-    """Images by camera and light (rows, columns), per unit of the beam's power; NaN where every exposure is full."""
+    """Images by camera and light (rows, columns), per unit of the beam's power; NaN where every exposure is
+    saturated.
+    """
 
     values: dict[tuple[str, str], Array]
     variances: dict[tuple[str, str], Array] | None
-    """None where the frames do not tell the noise."""
+    """Variances of these images; None where the frames do not determine the noise."""
 
 
 def merged_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Merged:
     """Merge all exposures of one wavelength.
 
     Raises:
-        CaptureInputError: a frame cannot be read, does not fit what is said of it, or holds no light; names it.
+        CaptureInputError: a frame cannot be read, contradicts its description, or holds no light; names the frame.
     """
     frames = folder.exposures_at(wavelength_nm)
     values: dict[tuple[str, str], Array] = {}
@@ -111,7 +113,11 @@ class _Stack:
         )  # fmt: skip
 
     def exposures_of(self, image: SlabImage, noise: NoiseModel) -> list[Exposure]:
-        """All of a light, each brighter than black."""
+        """All exposures of an image's light.
+
+        Raises:
+            CaptureInputError: a frame is no brighter than black.
+        """
         found = []
         for frame in (one for one in self.frames if one.light == image.light):
             exposure = self.exposure(frame, noise)
@@ -124,7 +130,7 @@ class _Stack:
         return found
 
     def noise(self) -> NoiseModel | None:
-        """Of the camera, from its frames; None where they do not tell."""
+        """Noise of the camera, from its frames; None where they do not determine it."""
         read = self._read_counts()
         measured = shot_noise(self._pairs(), read)
         return None if measured is None else NoiseModel(measured[1], measured[0])
@@ -147,13 +153,13 @@ class _Stack:
                 yield LitPair(a, b, first.gain)
 
     def _above_black(self, frame: SlabExposure) -> Counts:
-        """NaN where full."""
+        """Counts above black (rows, columns); NaN where saturated."""
         exposure = self.exposure(frame, NoiseModel(0.0, 0.0))
         return np.where(exposure.headroom > 0, exposure.signal, np.float32(np.nan)).astype(np.float32)
 
 
 def _error_of_mean(signal: Counts) -> float:
-    """Standard error of a frame's mean by its noise; by medians, as a narrow beam on a few pixels is no noise."""
+    """Standard error of a frame's mean by its noise; by medians, because a narrow beam on a few pixels is no noise."""
     spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(signal - np.median(signal))))
     return float(np.sqrt((spread**2 + ROUNDING) / signal.size))
 

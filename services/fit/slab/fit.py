@@ -1,4 +1,4 @@
-"""A slab folder to its material, wavelength by wavelength."""
+"""Fit of the material in a slab folder, wavelength by wavelength."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
 
 STEPS_OF_ATOMS = 20
-"""Most steps of a search by the weights of atoms: narrow lobes are noisy and their steps damped, and a start that was
-30 % off took 11."""
+"""Largest number of steps of a search by the weights of atoms: narrow lobes are noisy and their steps damped, and a
+start that was 30 % off took 11."""
 LAST_LOOK = 2**30
-"""Number of the render, counted apart from the solver's, that errors are taken from."""
+"""Number of the render from which image errors are taken, apart from those of the solver."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def fit_images(
     """Fit the images of one wavelength by the dictionary that the options name; see ``fit_slab``.
 
     Args:
-        kept: where the fit goes on from, and keeps how far it has come.
+        kept: file from which an interrupted fit continues, and which stores its state before each of the last steps.
     """
     begun_s = time.process_time()
     index = index_of(folder, wavelength_nm)
@@ -129,13 +129,13 @@ def _budget(options: SlabOptions, dictionary: ChosenDictionary) -> Budget:
 
 
 def last_look(rig: Rig, material: Material, budget: Budget, seed: int, blocks: Blocks) -> NDArray[np.float64]:
-    """Two independent renders of what the fit ended with (2, images, pixels)."""
+    """Two independent renders of the fit's final material (2, images, pixels)."""
     paths = 4 * budget.last[-1][0]
     return render(rig, material, seed=seed, step=LAST_LOOK, batches=2, paths=paths, scores=False, blocks=blocks).images
 
 
 def _errors(measured: Measurements, first: NDArray[np.float64], second: NDArray[np.float64]) -> Errors:
-    """Errors of the images that were fitted, and of those that were not."""
+    """Errors of the images that were fitted, and of those that were held out."""
     told = []
     for chosen in (~measured.held_out, measured.held_out):
         arrays = (image[chosen] for image in (first, second, measured.values, measured.variances))

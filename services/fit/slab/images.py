@@ -20,12 +20,12 @@ Array = NDArray[np.float64]
 DEFAULT_NOISE = 0.01
 """Standard deviation of shot noise where no variance is given, as a share of a pixel that has the image's mean."""
 DARKEST = 0.01
-"""Shot noise is not believed to fall further below this share of the image's mean."""
+"""Share of the image's mean below which shot noise falls no further."""
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Values (images, pixels); variance is infinite where a pixel is not finite."""
+    """Values and variances (images, pixels); a variance is infinite where a pixel is not used."""
 
     values: Array
     variances: Array
@@ -42,7 +42,8 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
     """The images of one wavelength, per unit of the beam's power.
 
     Raises:
-        CaptureInputError: a file cannot be read, has another shape, or is not finite.
+        CaptureInputError: a file cannot be read, has another shape, or has no usable pixel; or no image is left to be
+            fitted.
     """
     grid = grid_of(folder.pixels)
     entries = folder.images_at(wavelength_nm)
@@ -72,7 +73,7 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
 
 
 def _linear(root: Path, folder: SlabFolder, wavelength_nm: float) -> Iterator[tuple[SlabImage, Array, Array | None]]:
-    """Each image with its variance, None where that has to be assumed; exposures are merged."""
+    """Each image with its variance, None where the variance has to be assumed; exposures are merged."""
     entries = folder.images_at(wavelength_nm)
     if folder.exposures:
         merged = merged_images(root, folder, wavelength_nm)
@@ -86,7 +87,7 @@ def _linear(root: Path, folder: SlabFolder, wavelength_nm: float) -> Iterator[tu
 
 
 def shot_noise(image: Array, share: float = DEFAULT_NOISE) -> Array:
-    """Variance of Poisson noise that is ``share`` of a pixel at the image's mean."""
+    """Variance of Poisson noise whose standard deviation is ``share`` of a pixel at the image's mean."""
     finite = image[np.isfinite(image)]
     mean = max(float(finite.mean()), 0.0) if finite.size else 0.0
     return share**2 * mean * np.maximum(image, DARKEST * mean)
@@ -114,13 +115,15 @@ def _read(root: Path, folder: SlabFolder, entry: SlabImage, file: str) -> Array:
 
 
 def folded(value: Array, variance: Array, grid: Grid) -> tuple[Array, Array]:
-    """Means of the two halves by inverse variance where the grid is folded, and their variances; flat (pixels,)."""
+    """Means of the two halves where the grid is folded, over those that are usable, and their variances; flat
+    (pixels,).
+    """
     if not grid.folded:
         return value.ravel(), variance.ravel()
     halves = np.stack([value[: grid.rows][::-1], value[grid.rows :]])
     weights = 1 / np.stack([variance[: grid.rows][::-1], variance[grid.rows :]])
     total = weights.sum(axis=0)
-    # Both halves have the same expectation, so they are weighed alike where both are usable: weights by noisy values
+    # Both halves have the same expectation, so they are weighted alike where both are usable: weights by noisy values
     # are biased.
     usable = weights > 0
     count = usable.sum(axis=0)

@@ -1,8 +1,9 @@
-"""Which further measurement would help most: the bound of the fit's images and those of another cell, dilution or
-camera together.
+"""Search for the further measurement that would help most, by the bound of the fit's images together with those of
+another cell, dilution or camera.
 
 The material is taken to be what the fit found. Diluting it by a known factor divides f and sigma_a by that factor and
-leaves the shape of ln f, so what two dilutions tell of ln f adds up, as what two cells of different width tell does.
+leaves the shape of ln f, so the information on ln f from two dilutions adds up, as that from two cells of different
+width does.
 """
 
 from __future__ import annotations
@@ -27,26 +28,28 @@ from services.fit.slab.solve.uncertainty import phase_chain, slopes
 Array = NDArray[np.float64]
 
 FACTORS = (0.125, 0.25, 0.5, 2.0, 4.0)
-"""Of the concentration, and of the cell's width."""
+"""Factors on the concentration, and on the cell's width."""
 BESIDE_DEG = 4.0
-"""Angle in air between a beam and a camera that is to look beside it: a beam of a degree or two is out of its sight."""
+"""Angle in air between a beam and a camera that is to look beside it: a beam of a degree or two is then out of its
+sight."""
 NEAR_DEG = 8.0
-"""A camera this near to a beam already looks beside it."""
+"""Largest angle between a beam and a camera at which the camera already looks beside it."""
 PATHS = 1000
-"""Of a batch, light and candidate: a hundredth of what a fit spends in all."""
+"""Paths per batch, light and candidate: a hundredth of what a fit spends in all."""
 UNKNOWN_LN_F = 10.0
+"""Standard deviation of ln f at a knot where images determine nothing."""
 WORTH = 0.2
-"""A measurement is named when it cuts the error by more than this part."""
+"""Smallest part by which a measurement must cut the error to be named."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A measurement that was not made."""
+    """A possible further measurement."""
 
     words: str
     folder: SlabFolder
     dilution: float = 1.0
-    """By which f and sigma_a are multiplied."""
+    """Factor on f and sigma_a."""
 
 
 def next_measurement(
@@ -59,16 +62,17 @@ def next_measurement(
     seed: int,
     blocks: Blocks = map,
 ) -> str:
-    """One sentence on what to measure next and what it would buy; empty where nothing tried would cut the largest error
-    much.
+    """One sentence on what to measure next and how much it would help; empty where no candidate would cut the largest
+    error much.
 
     Args:
-        index: of the sample.
-        material: as the fit found it, with the smoothness prior's scale.
+        index: index of refraction of the sample.
+        material: as the fit found it.
+        scale: the smoothness prior's scale that the fit used.
     """
     variances = np.where(measured.held_out[:, None], np.inf, measured.variances)
     prior = precision(scale)
-    # Where images tell nothing at all, ln f may be off by ten at each knot, and the absorption by all of the
+    # Where images determine nothing at all, ln f may be off by ten at each knot, and the absorption by all of the
     # extinction.
     prior[np.diag_indices(KNOTS)] += UNKNOWN_LN_F**-2
     prior[-1, -1] += material.extinction_per_mm**-2
@@ -84,7 +88,7 @@ def next_measurement(
         other = Material(candidate.dilution * material.scattering, candidate.dilution * material.absorption_per_mm)
         of_other = rig_of(candidate.folder, wavelength_nm, index)
         told = curvature_of(of_other, other, noise=noise, seed=seed, paths=PATHS, blocks=blocks)
-        # By ln f of the sample as it is, and by its own absorption.
+        # Convert to ln f of the sample as it is, and to its own absorption.
         unit = np.append(np.ones(KNOTS), candidate.dilution)
         added = seen_of(told, prior).curvature * np.outer(unit, unit)
         after[candidate.words] = errors_of(material, _inverse(now + added + prior))[worst]
@@ -111,7 +115,7 @@ def candidates(folder: SlabFolder, wavelength_nm: float, material: Material) -> 
     """Dilutions and cells within the range in which a fit comes near its bound, and a camera beside a beam where none
     is.
 
-    Beyond ``THICK`` fits stay ten times above the bound, so that what it promises there would not come true.
+    Beyond ``THICK`` fits stay ten times above the bound, so that its promise would not come true there.
     """
     thickness, width_mm = material.extinction_per_mm * folder.cell.width_mm, folder.cell.width_mm
     for factor in FACTORS:
@@ -126,7 +130,7 @@ def candidates(folder: SlabFolder, wavelength_nm: float, material: Material) -> 
 
 
 def errors_of(material: Material, covariance: Array) -> dict[str, float]:
-    """Relative errors of what a report leads with, from a covariance of ln f and sigma_a."""
+    """Relative errors of sigma_s, sigma_s' and the phase function, from a covariance of ln f and sigma_a."""
     slope = slopes(material)
     values = {
         "sigma_s": material.scattering_per_mm,
@@ -143,7 +147,9 @@ def errors_of(material: Material, covariance: Array) -> dict[str, float]:
 
 
 def _beside_a_beam(folder: SlabFolder, wavelength_nm: float) -> Candidate | None:
-    """All images of one more camera beside the through-beam of the first light; None where one looks there already."""
+    """All images of one more camera beside the through-beam of the first light; None where a camera looks there
+    already.
+    """
     entries = folder.images_at(wavelength_nm)
     lights = {light.name: light for light in folder.lights}
     cameras = {camera.name: camera for camera in folder.cameras}
@@ -171,8 +177,8 @@ def _beside_a_beam(folder: SlabFolder, wavelength_nm: float) -> Candidate | None
 
 
 def _noise_share(measured: Measurements, averaged: int) -> float:
-    """Standard deviation of a pixel that has its image's mean, as a share of it, over all images; a value averages so
-    many pixels.
+    """Standard deviation of a pixel that has its image's mean, as a share of it, the median over all images; a value
+    averages ``averaged`` pixels.
     """
     usable = np.isfinite(measured.variances) & ~measured.held_out[:, None]
     shares = [

@@ -1,4 +1,4 @@
-"""What a slab's fit may be told."""
+"""Options of a slab's fit."""
 
 from __future__ import annotations
 

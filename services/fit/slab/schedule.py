@@ -1,4 +1,4 @@
-"""Where a slab's work runs: whole wavelengths on a worker each, or the blocks of paths of one wavelength on all
+"""Distribution of a slab's work: whole wavelengths on a worker each, or the blocks of paths of one wavelength on all
 workers.
 """
 
@@ -24,8 +24,8 @@ from services.fit.slab.results.kept import fingerprint, keep, read_kept
 from services.fit.slab.solve.standing import Standing, StandingFile
 
 MAX_TRAVELLING_BYTES = 32 * 2**20
-"""Of a block's sums: its paths take seconds, in which any network between workers carries ten times that. Larger ones
-stay where they are."""
+"""Largest size of a block's sums that may be sent to another worker: its paths take seconds, in which any network
+between workers carries ten times that. Larger sums stay on their worker."""
 
 
 @dataclass(frozen=True)
@@ -38,24 +38,24 @@ class WavelengthTask:
     place: Path
     """Folder in which its result is kept."""
     flag: Path
-    """The job is cancelled once it exists."""
+    """File whose existence means that the job is cancelled."""
 
 
 Told = Callable[[float, Standing], None]
-"""Takes a wavelength and where its fit stands."""
+"""Callback that takes a wavelength in nm and the state of its fit."""
 
 
 def run_wavelengths(
     run_on: Executor, tasks: Sequence[WavelengthTask], workers: int, told: Told = lambda *_: None
 ) -> Iterator[Path]:
-    """Fit wavelengths, unless an earlier attempt has; gives the folder of each as soon as it is done.
+    """Fit the wavelengths that no earlier attempt has fitted; gives the folder of each as soon as it is done.
 
     With as many wavelengths as workers or more, each runs whole on one of them. With fewer, one runs after the other
-    here, and its blocks on all workers. A block's sums depend on what names it alone and are added in the order of the
-    blocks, so the answer is the same to the last digit.
+    here, and its blocks on all workers. A block's sums depend on its description alone and are added in the order of
+    the blocks, so the answer is the same to the last digit.
 
     Args:
-        workers: that the job asked for; some may still be starting.
+        workers: number of workers that the job asked for; some may still be starting.
         told: called before each of the last steps of a wavelength whose blocks run on all workers.
 
     Raises:
@@ -69,7 +69,7 @@ def run_wavelengths(
 
 
 def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
-    """A whole wavelength, one block after the other."""
+    """Fit a whole wavelength, one block after the other."""
 
     def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> Iterator[BlockSums]:
         for block in some:
@@ -80,14 +80,14 @@ def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
 
 
 def block_task(_host: Any, trace: Callable[[Block], BlockSums], block: Block, flag: Path) -> BlockSums:
-    """One block of paths."""
+    """Trace one block of paths."""
     _raise_if_cancelled(flag)
     return trace(block)
 
 
 def fit_wavelength(task: WavelengthTask, blocks: Blocks, told: Callable[[Standing], None] = lambda _: None) -> Path:
-    """Fit one wavelength into its folder, unless an earlier attempt has; one that was cut short goes on before its last
-    step.
+    """Fit one wavelength into its folder, unless an earlier attempt has; a fit that was cut short continues before the
+    last step that it saved.
     """
     mark = fingerprint(task.root, task.wavelength_nm, task.options)
     kept = read_kept(task.place)
@@ -103,7 +103,7 @@ def fit_wavelength(task: WavelengthTask, blocks: Blocks, told: Callable[[Standin
 
 
 def _spread(run_on: Executor, task: WavelengthTask) -> Blocks:
-    """Blocks on all workers, their sums in the order of the blocks."""
+    """A function that runs blocks on all workers and gives their sums in the order of the blocks."""
     numbers = itertools.count()
 
     def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> list[BlockSums]:

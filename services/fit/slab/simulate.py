@@ -1,7 +1,7 @@
 """Total reflectance and transmittance of flat layers, with derivatives, to a requested error.
 
 Runs the fit's own walk (``services.fit.transport.paths.walk``) between planes instead of meshes; light that leaves
-either face is counted instead of connected to lamps.
+either face is counted instead of connected to lights.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Sums:
         self.passes += 1
 
     def mean(self) -> NDArray[np.float64]:
-        """Totals and what follows them (rows, 2)."""
+        """Means of all rows per incident flux (rows, 2), the specular reflection included."""
         mean = self.first / self.samples
         mean[0, 0] += self.specular
         return mean
@@ -144,31 +144,32 @@ def simulate_slab(
     numbered: bool = False,
 ) -> SlabResult:
     """Simulate until max(R_se / R, T_se / max(T, 1e-3)) <= ``rel_error`` and, with ``gradient``, every derivative is as
-    sure as asked.
+    accurate as described below.
 
-    Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer;
-    ``sigma1, alpha1, beta1, g1a, g1b, sigma2, ..., c`` for layers or where ``numbered``, c the depth of the first inner
-    border at fixed total depth. A derivative's standard error is held to 0.3 % of its value or of 1e-3 of the largest
-    derivative of the same source, whichever is larger; that of a radiance or ring to ``rel_error`` of its value or of a
-    tenth of the largest. After ``max_seconds`` the result is given as it stands, with ``complete`` false and its true
-    standard errors.
+    Derivative names: ``sigma`` (per mm, at fixed albedo), ``alpha``, ``g`` for one single-lobe layer; ``sigma1, alpha1,
+    beta1, g1a, g1b, sigma2, ..., c`` for layers or where ``numbered``, c the depth of the first inner border at fixed
+    total depth. A derivative's standard error is held to 0.3 % of its value or of 1e-3 of the largest derivative of the
+    same source, whichever is larger; that of a radiance or ring to ``rel_error`` of its value or of a tenth of the
+    largest. After ``max_seconds`` the result is returned as it is, with ``complete`` false and its true standard
+    errors.
 
     Args:
         layers: the first one is lit.
         mu_incident: cosine to the normal of the collimated beam of source ``normal``.
-        exit_cosines: cosines to the normal, in air, at which the radiance that leaves each face is wanted; scattered
+        exit_cosines: cosines to the normal, in air, at which the radiance that leaves each face is computed; scattered
             light only.
-        ring_edges_mm: radii about the point of entry between which, and beyond the last of which, the light that leaves
-            is wanted; scattered light only.
+        ring_edges_mm: radii about the point of entry; the light that leaves between each two of them, and beyond the
+            last, is computed; scattered light only.
 
     Raises:
-        InputError: a parameter is outside its range. PlatformError: no usable libLLVM. NonFiniteError: a total is not
-            finite.
+        InputError: a parameter is outside its range.
+        PlatformError: no usable libLLVM.
+        NonFiniteError: a total is not finite.
     """
     ring_count = len(ring_edges_mm) + 1 if ring_edges_mm else 0
 
     def parts(table: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Totals, derivatives, radiances and rings."""
+        """Split rows into totals, derivatives, radiances and rings."""
         rows = len(table)
         return np.split(table, [1, rows - ring_count - len(exit_cosines), rows - ring_count])
 
@@ -203,7 +204,7 @@ def simulate_slab(
 
 
 def _face_values(rows: NDArray[np.float64]) -> FaceValues | None:
-    """From rows of R, T and their standard errors."""
+    """Values from rows of R, T and their standard errors; None where there is no row."""
     R, T, R_se, T_se = (tuple(column.tolist()) for column in rows.T)
     return FaceValues(R=R, T=T, R_se=R_se, T_se=T_se) if R else None
 
@@ -223,11 +224,12 @@ def accumulate(
     max_seconds: float = math.inf,
     border_terms_only: bool = False,
 ) -> tuple[tuple[str, ...], Sums]:
-    """Trace until ``shortfall``, the largest ratio of a standard error to what is asked of it, is at most 1.
+    """Trace until ``shortfall``, the largest ratio of a standard error to its allowed value, is at most 1.
 
     The derivative to the border's depth c comes from the border terms, or from the extinction scores of both layers, to
     which it is equal in a slab because R and T depend on sigma_i d_i alone: dR/dc = (sigma1/d1) dR/dsigma1 -
-    (sigma2/d2) dR/dsigma2. The first pass tells which is less noisy; ``border_terms_only`` keeps the first.
+    (sigma2/d2) dR/dsigma2. The first pass takes the less noisy of the two; ``border_terms_only`` always takes the
+    border terms.
 
     Returns:
         Names of the derivatives, and the sums.
@@ -275,7 +277,7 @@ def accumulate(
                 table[:, -1] = equivalent
         sums.add(np.concatenate([table, slots[:, 2:].reshape(LANES, -1, 2)], axis=1), samples)
         missing = shortfall(sums)
-        # As many paths as the error asks for, but no pass far beyond the time that is left.
+        # Trace as many paths as the error asks for, but no pass far beyond the time that is left.
         elapsed_s = time.monotonic() - begun_s
         affordable = sums.samples / LANES * (max_seconds - elapsed_s) / elapsed_s
         wanted = min(sums.samples * (missing**2 * 1.05 - 1) / LANES, affordable, 4 * samples, MAX_SAMPLES)
@@ -333,7 +335,7 @@ def _medium(layer: Layer) -> Medium:
 
 
 def _derivatives(layers: tuple[Layer, ...]) -> tuple[tuple[str, ...], tuple[tuple[int, str], ...]]:
-    """Names as printed, and (medium, field) of each score."""
+    """Names as printed, and medium number and field of each score."""
     fields = [("sigma", "alpha", *_phase_fields(layer)) for layer in layers]
     if len(layers) == 1 and layers[0].beta == 1:
         return tuple({"g1": "g"}.get(field, field) for field in fields[0]), tuple((1, field) for field in fields[0])
@@ -358,8 +360,8 @@ def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> floa
 
 
 def specular_share(ior: ArrayLike, source: str, mu_incident: float = 1.0) -> NDArray[np.float64]:
-    """Share of the incident flux that the lit face reflects, for each ``ior``; Lambertian light by Gauss-Legendre in
-    float64.
+    """Share of the incident flux that the lit face reflects, for each ``ior``; Lambertian light by Gauss-Legendre
+    quadrature in float64.
     """
     eta = np.asarray(ior, dtype=np.float64)
     if source == "normal":

@@ -1,5 +1,5 @@
-"""Doors of the job kind ``slab``: ``run`` fits a folder's wavelengths on the workers, ``export`` writes what came
-out.
+"""Entry points of the job kind ``slab``: ``run`` fits a folder's wavelengths on the workers, ``export`` writes the
+results.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ if TYPE_CHECKING:
     from services.fit.slab.solve.standing import Standing
 
 CHECKPOINT = "fit-checkpoint"
-"""Below the job's folder, one folder a wavelength: its result once it is done, until then where its fit stands, so that
-a new attempt goes on there."""
+"""Folder within the job's folder, with one folder per wavelength: its result once it is done, until then the state of
+its fit, from which a new attempt continues."""
 
 
 def run(spec: JobSpec, context: StageContext) -> SlabReport:
-    """Fit every wavelength on the workers, tell of each as it is done, and publish ``fit/`` with their images.
+    """Fit every wavelength on the workers, report each as it is done, and publish ``fit/`` with their images.
 
     Raises:
-        CaptureInputError: the folder cannot be read. JobCancelledError: between two blocks of paths.
+        CaptureInputError: the folder cannot be read.
+        JobCancelledError: between two blocks of paths.
     """
     from services.fit.execution.executors import executor
     from services.fit.slab.dictionaries.chosen import dictionary_of
@@ -45,7 +46,7 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     context.raise_if_cancelled()
     root, folder = _folder(spec)
     options = SlabOptions.model_validate(spec.model_dump(include={"seed", *SLAB_OPTIONS}))
-    for wavelength_nm in folder.wavelengths_nm:  # a fault in the last one is told before the first has cost its time
+    for wavelength_nm in folder.wavelengths_nm:  # report a fault in the last one before the first has cost its time
         dictionary_of(root, folder, wavelength_nm, options)
         for fault in read_images(root, folder, wavelength_nm).faults:
             context.report(StageEvent(stage="fit", kind="log", message=f"{wavelength_nm:g} nm: {fault}"))
@@ -86,7 +87,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     Mitsuba as the asset.
 
     Raises:
-        StoreError: the fit is missing or damaged. CaptureInputError: the folder is gone.
+        StoreError: the fit is missing or damaged.
+        CaptureInputError: the folder is gone.
     """
     from services.fit.slab.fit import write_results
     from services.fit.slab.results.chart import phase_picture

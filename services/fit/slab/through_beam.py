@@ -1,8 +1,9 @@
-"""The sample's index of refraction from where a slanted beam leaves the cell (Gkioulekas et al. 2013, section 5).
+"""The sample's index of refraction from the point where a slanted beam leaves the cell (Gkioulekas et al. 2013, section
+5).
 
-A beam at angle a outside is bent to a', n sin a' = n0 sin a, and leaves the other face beside where it entered:
+A beam at angle a outside is bent to a', n sin a' = n0 sin a, and leaves the other face at a distance x from its entry:
 
-    x = w tan a' + 2 g        with g the way along x through one glass, none without walls
+    x = w tan a' + 2 g        with g the displacement along x in one glass, none without walls
 
 so one measured x gives tan a' and with it n. Several beams are averaged by the inverse squares of their errors.
 """
@@ -17,15 +18,15 @@ from services.core.slab.folder import Cell, SlabFolder, ThroughBeam
 
 SMALLEST_INDEX, LARGEST_INDEX = 1.0, 4.0
 MAX_APART = 4.0
-"""Standard errors by which one beam's index may differ from the mean of all: more is no noise of the peaks."""
+"""Largest difference of one beam's index from the mean of all, in standard errors: more is no noise of the peaks."""
 
 
 class Index(NamedTuple):
-    """Of refraction."""
+    """An index of refraction."""
 
     value: float
     se: float
-    """0 where it was given."""
+    """Standard error; 0 where the index was given."""
 
 
 def index_of(folder: SlabFolder, wavelength_nm: float) -> Index:

@@ -1,4 +1,4 @@
-"""What a dictionary is made for, and what it gives to a fit."""
+"""The sample for which a dictionary is made, and the dictionary that a fit uses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Sample:
     root: Path
     wavelength_nm: float
     index: float
-    """Of refraction, of what surrounds the particles."""
+    """Index of refraction of the medium that surrounds the particles."""
     options: SlabOptions
 
 
@@ -37,7 +37,7 @@ class Spheres:
 
     radii_um: Array
     volume_mm: Array
-    """Share of the sample's volume that makes up a scattering coefficient of 1 per mm."""
+    """Share of the sample's volume that gives a scattering coefficient of 1 per mm."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class ChosenDictionary:
 
     coordinates: Coordinates
     names: tuple[str, ...] = ()
-    """Of the atoms whose weights are the unknowns; none where the unknowns are the phase function itself."""
+    """Names of the atoms whose weights are the unknowns; empty where the unknowns are the phase function itself."""
     spheres: Spheres | None = None
 
 
@@ -57,7 +57,8 @@ def dictionary_of(root: Path, folder: SlabFolder, wavelength_nm: float, options:
     """The dictionary that the options name.
 
     Raises:
-        SettingsError: there is no such dictionary, or an option of it is wrong. CaptureInputError: its file is.
+        SettingsError: there is no such dictionary, or an option of it is wrong.
+        CaptureInputError: the dictionary's file is wrong.
     """
     module, _, function = chosen("dictionary", options.dictionary, DICTIONARIES).door.partition(":")
     door: Door = getattr(import_module(module), function)

@@ -21,14 +21,14 @@ Array = NDArray[np.float64]
 Amplitudes = NDArray[np.complex128]
 
 SMALLEST_SIZE, LARGEST_SIZE = 0.5, 30.0
-"""Size parameters 2 pi n r / wavelength. Below, spheres scatter alike whatever their size; above, the forward peak is
-as narrow as a tent."""
+"""Smallest and largest size parameter 2 pi n r / wavelength. Below, spheres scatter alike whatever their size; above,
+the forward peak is as narrow as a tent."""
 ATOMS = 84
-"""A factor of 1.05 in radius from one to the next. With 1.10 spheres of one size came out 4 % wrong in reduced
-scattering."""
+"""Number of atoms, with a factor of 1.05 in radius from one to the next. With 1.10 spheres of one size came out 4 %
+wrong in reduced scattering."""
 RADII_PER_ATOM = 3
-"""Radii over which an atom is averaged, evenly in their logarithm: the rings of a single large sphere belong to no real
-sample."""
+"""Number of radii over which an atom is averaged, spaced evenly in their logarithm: the rings of a single large sphere
+belong to no real sample."""
 
 
 def spheres(sample: Sample) -> ChosenDictionary:
@@ -38,7 +38,7 @@ def spheres(sample: Sample) -> ChosenDictionary:
         PlatformError: miepython is not installed.
     """
     options = sample.options
-    assert options.particle_index is not None  # the options see to it
+    assert options.particle_index is not None  # the options check this
     relative = complex(options.particle_index, options.particle_absorption) / sample.index
     um_per_size = sample.wavelength_nm / 1000 / (2 * math.pi * sample.index)
     edges = np.geomspace(SMALLEST_SIZE, LARGEST_SIZE, ATOMS + 1)
@@ -46,7 +46,7 @@ def spheres(sample: Sample) -> ChosenDictionary:
     for atom, (low, high) in enumerate(itertools.pairwise(edges)):
         sizes = np.exp(np.linspace(math.log(low), math.log(high), 2 * RADII_PER_ATOM + 1)[1::2])
         told = [scattered(relative, float(size)) for size in sizes]
-        # As many spheres of each radius: cross-sections and volumes add up.
+        # An atom has as many spheres of each radius, so cross-sections and volumes add up.
         values[:, atom] = sum(intensity for intensity, _ in told)
         areas_um2 = sum(efficiency * size**2 for (_, efficiency), size in zip(told, sizes, strict=True)) * math.pi
         contents_um3 = 4 / 3 * math.pi * float((sizes**3).sum())
@@ -57,10 +57,11 @@ def spheres(sample: Sample) -> ChosenDictionary:
 
 
 def scattered(relative_index: complex, size: float) -> tuple[Array, float]:
-    """Light scattered by one sphere at the knots, up to a factor that all spheres share, and its scattering efficiency.
+    """Light scattered by one sphere at the knots (KNOTS,), up to a factor that all spheres share, and its scattering
+    efficiency.
 
     Args:
-        relative_index: of the sphere by its surroundings, imaginary part positive where it absorbs.
+        relative_index: index of the sphere over that of its surroundings, imaginary part positive where it absorbs.
         size: 2 pi n r / wavelength.
     """
     a, b = _coefficients(relative_index, size)
@@ -80,7 +81,7 @@ def _coefficients(relative_index: complex, size: float) -> tuple[Amplitudes, Amp
             "dictionary = mie needs the package miepython; install dentine with its extra mie, or choose another"
             " dictionary."
         ) from problem
-    # There an absorbing sphere has a negative imaginary part.
+    # In miepython an absorbing sphere has a negative imaginary part.
     a, b = an_bn(relative_index.conjugate(), size)
     return np.asarray(a, dtype=np.complex128), np.asarray(b, dtype=np.complex128)
 

@@ -23,16 +23,16 @@ Array = NDArray[np.float64]
 FILES = ("dictionary.csv", "dictionary.npy")
 FIRST_COLUMN = "angle_deg"
 MAX_ATOMS = 200
-"""As many as there are tents: more cannot be told apart at the knots."""
+"""Largest number of atoms, that of the tents: more cannot be told apart at the knots."""
 MAX_BYTES = 16 * 2**20
-"""Far more than 200 atoms at a thousand angles need."""
+"""Largest size of the file, far more than 200 atoms at a thousand angles need."""
 
 
 def table(sample: Sample) -> ChosenDictionary:
     """The atoms of the folder's file.
 
     Raises:
-        CaptureInputError: there is none, or it is no table of phase functions.
+        CaptureInputError: there is no file, or it is no table of phase functions.
     """
     path = table_file(sample.root)
     names, values = _read_csv(path) if path.suffix == ".csv" else _read_npy(path)
@@ -48,7 +48,7 @@ def table_file(root: Path) -> Path:
     """The one file that holds the table.
 
     Raises:
-        CaptureInputError: there is none, or there are two.
+        CaptureInputError: there is no such file, there are two, or it is too large.
     """
     found = [root / name for name in FILES if (root / name).is_file()]
     if not found:

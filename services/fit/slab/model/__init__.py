@@ -1,1 +1,1 @@
-"""What a slab is and sends back: its dictionary of phase functions, the walk, single scattering, the rig."""
+"""The forward model of a slab: its dictionary of phase functions, the walk, single scattering, the rig."""

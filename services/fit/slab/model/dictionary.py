@@ -1,9 +1,9 @@
 """The dictionary of Gkioulekas et al. (2013), section 4.3: 200 tent phase functions, a pure absorber and vacuum.
 
 A mixture of the atoms is a medium whose scattering per angle, f(theta) = sigma_s p(theta), is linear between 200 knots,
-and whose absorption is free. So a fit knows f at the knots (per mm and sr) and sigma_a (per mm); weights are made from
-them on request. Tents at 0 and 180 degrees weigh 1e-4 of the others, which makes the first one almost the same atom as
-vacuum.
+and whose absorption is free. So the unknowns of a fit are f at the knots (per mm and sr) and sigma_a (per mm); weights
+are computed from them on request. Tents at 0 and 180 degrees have 1e-4 of the weight of the others, which makes the
+first one almost the same atom as vacuum.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class Material:
 
     @property
     def scattering_per_mm(self) -> float:
-        """sigma_s."""
+        """Scattering coefficient sigma_s, per mm."""
         return float(self.scattering @ tent_solid_angles())
 
     @property
     def extinction_per_mm(self) -> float:
-        """sigma_t."""
+        """Extinction coefficient sigma_t, per mm."""
         return self.scattering_per_mm + self.absorption_per_mm
 
     @property
@@ -58,7 +58,7 @@ class Material:
 
     @property
     def reduced_scattering_per_mm(self) -> float:
-        """sigma_s' = sigma_s (1 - g)."""
+        """Reduced scattering coefficient sigma_s' = sigma_s (1 - g), per mm."""
         return self.scattering_per_mm * (1 - self.mean_cosine)
 
     @property
@@ -67,7 +67,7 @@ class Material:
         return self.scattering / self.scattering_per_mm
 
     def slope_of_scattering(self) -> Array:
-        """Derivatives of sigma_s by ln f at the knots and by sigma_a (KNOTS + 1,)."""
+        """Derivatives of sigma_s with respect to ln f at the knots and to sigma_a (KNOTS + 1,)."""
         return np.append(self.scattering * tent_solid_angles(), 0.0)
 
     def weights(self) -> Array:
@@ -108,11 +108,11 @@ def _first(angle: Array) -> Array:
 
 
 def henyey_greenstein(scattering_per_mm: float, g: float, absorption_per_mm: float) -> Material:
-    """HG scattering sampled at the knots and scaled to the scattering coefficient asked for."""
+    """HG scattering sampled at the knots and scaled to ``scattering_per_mm``."""
     shape = hg_values(g)
     return Material(scattering_per_mm * shape / float(shape @ tent_solid_angles()), absorption_per_mm)
 
 
 def hg_values(g: float, angles_rad: Array = ANGLES_RAD) -> Array:
-    """HG phase function at some angles, 1/sr; at the knots where none are given."""
+    """HG phase function at the given angles, 1/sr; by default at the knots."""
     return np.asarray((1 - g * g) / (4 * math.pi) / ((1 - g) ** 2 + 4 * g * np.sin(angles_rad / 2) ** 2) ** 1.5)

@@ -1,8 +1,8 @@
-"""Images of a slab and their derivatives by blocks of paths: pure functions of what names them, so they may run
-anywhere.
+"""Images of a slab and their derivatives by blocks of paths. Each block is a pure function of its description, so it
+may run anywhere.
 
-A block is one light's paths of one batch. Its sums depend on the seed and the numbers that name it alone, and sums are
-always taken in the order of the blocks, so the answer is the same on any number of workers.
+A block is one light's paths of one batch. Its sums depend on the seed and the numbers that identify it alone, and sums
+are always added in the order of the blocks, so the answer is the same on any number of workers.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from services.fit.slab.model.tables import tables_of
 Array = NDArray[np.float64]
 
 THICK, THICK_SHARE = 4.0, 0.25
-"""Optical thickness from which late vertices are connected by this share only: 1.5 times faster there, slower below."""
+"""Optical thickness above which only this share of the late vertices is connected to cameras: 1.5 times faster there,
+slower below."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Paths of one light; ``seed`` and ``place`` (step, batch) name its random numbers."""
+    """Paths of one light; ``seed`` and ``place`` (step, batch) determine its random numbers."""
 
     rig: Rig
     light: int
@@ -45,16 +46,16 @@ class BlockSums:
     """Means over a block's paths."""
 
     images: Array
-    """(cameras, pixels), orders two and up."""
+    """(cameras, pixels), scattering orders two and up."""
     rows: Array
-    """(cameras, pixels, KNOTS + 1), empty without scores."""
+    """Sums of shares and path lengths (cameras, pixels, KNOTS + 1), empty without scores."""
     totals: Array
-    """Scattered light that leaves by the light's face, by the other, and what was cut off; per unit of the beam's
+    """Scattered light that leaves by the light's face, by the other face, and that was cut off; per unit of the beam's
     power."""
 
 
 class Blocks(Protocol):
-    """Runs blocks: ``map`` itself, or the workers of a cluster."""
+    """A function that runs blocks: ``map`` itself, or the workers of a cluster."""
 
     def __call__(self, task: Callable[[Block], BlockSums], blocks: Sequence[Block], /) -> Iterable[BlockSums]:
         """Results in the order of the blocks."""
@@ -62,18 +63,20 @@ class Blocks(Protocol):
 
 @dataclass(frozen=True)
 class Batches:
-    """Independent estimates, all orders: images (B, images, pixels) and rows (B, images, pixels, KNOTS + 1)."""
+    """Independent estimates of all scattering orders: images (B, images, pixels) and rows (B, images, pixels, KNOTS +
+    1).
+    """
 
     images: Array
     rows: Array
     single_images: Array
-    """What has scattered once, which is the same in all batches and has no noise (images, pixels)."""
+    """Light that has scattered once, which is the same in all batches and has no noise (images, pixels)."""
     single_rows: Array
-    """(images, pixels, KNOTS + 1)."""
+    """Rows of that light (images, pixels, KNOTS + 1)."""
 
     @property
     def mean(self) -> Array:
-        """Images (images, pixels)."""
+        """Mean of the batches' images (images, pixels)."""
         return np.asarray(self.images.mean(axis=0))
 
 
@@ -100,7 +103,7 @@ def run_block(block: Block) -> BlockSums:
 def render(
     rig: Rig, material: Material, *, seed: int, step: int, batches: int, paths: int, scores: bool, blocks: Blocks = map
 ) -> Batches:
-    """Independent batches of ``paths`` paths a light."""
+    """Render independent batches of ``paths`` paths per light."""
     lights = range(len(rig.lights))
     tasks = [
         Block(rig, light, material, seed, (step, batch), paths, scores) for batch in range(batches) for light in lights
@@ -117,12 +120,12 @@ def render(
 
 
 def _late_share(block: Block) -> float:
-    """Share of late vertices that are connected."""
+    """Share of late vertices that are connected to cameras."""
     return THICK_SHARE if block.material.extinction_per_mm * block.rig.width_mm > THICK else 1.0
 
 
 def _arrays(interface: Interface, views: Views) -> tuple[object, ...]:
-    """What the kernel takes of the glass, the light, the beam and the cameras."""
+    """Arguments of the kernel for the glass, the light, the beam and the cameras."""
     glass = (
         interface.index_outside / interface.index,
         (interface.index_glass or 0.0) / interface.index,

@@ -1,7 +1,8 @@
 """The faces of a cell: Snell's and Fresnel's laws at medium, glass and air, for smooth plane-parallel layers.
 
-Light that is reflected between the two sides of a glass is summed without interference. What a glass's outer side
-reflects comes back displaced by twice its thickness times the tangent; that is kept, as it exceeds a pixel.
+Light that is reflected between the two sides of a glass is summed without interference. Light that a glass's outer side
+reflects comes back displaced by twice its thickness times the tangent; the model keeps this displacement, because it
+exceeds a pixel.
 """
 
 from __future__ import annotations
@@ -44,21 +45,22 @@ class Interface:
         return self.index_outside * math.sin(math.radians(angle_deg)) / self.index
 
     def glass_shift_mm(self, inside_sine: float) -> float:
-        """Lateral way through the glass, signed as the sine."""
+        """Lateral displacement on one way through the glass, mm, signed as the sine."""
         if self.index_glass is None:
             return 0.0
         sine = self.index * inside_sine / self.index_glass
         return self.glass_mm * sine / math.sqrt(1 - sine * sine)
 
     def transmittance(self, inside_sine: float) -> float:
-        """Share of light that passes, either way."""
+        """Share of light that passes, the same in both directions."""
         return 1 - sum(reflection.share for reflection in self.reflections(inside_sine))
 
     def reflections(self, inside_sine: float) -> tuple[Reflection, ...]:
-        """Ways back into the medium for light that arrives from inside: at the glass, then at the glass's outer side.
+        """Reflections back into the medium for light that arrives from inside: at the glass, then at the glass's outer
+        side.
 
-        The light that goes to and fro in the glass more than once, some 1e-4 of what arrives, is counted with its first
-        return.
+        Light that goes to and fro in the glass more than once, some 1e-4 of the arriving light, is counted with its
+        first return.
         """
         cosine = math.sqrt(1 - inside_sine**2)
         if self.index_glass is None:

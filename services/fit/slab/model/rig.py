@@ -1,8 +1,8 @@
-"""What the forward model needs of a folder: each light with the cameras that see it, as plain arrays.
+"""Input of the forward model from a folder: each light with the cameras that see it, as plain arrays.
 
 Every light is turned into a front light: for a back light the cell is mirrored, so that its cameras change sides and
-lateral directions stay. The beam meets the outer face of the cell at x = y = 0, and a pixel is where light leaves the
-outer face.
+lateral directions stay. The beam meets the outer face of the cell at x = y = 0, and a pixel is the place where light
+leaves the outer face.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Grid:
     pitch_y_mm: float
     columns: int
     rows: int
-    """Of one half where folded."""
+    """Number of rows, of one half where folded."""
     folded: bool
 
     @property
@@ -41,7 +41,7 @@ class Grid:
 
     @property
     def area_mm2(self) -> float:
-        """Of the face that one value averages."""
+        """Area of the face over which one value averages, mm2."""
         return self.pitch_x_mm * self.pitch_y_mm * (2 if self.folded else 1)
 
 
@@ -65,12 +65,12 @@ class Views:
     sine: float
     transmittance: float
     shift_mm: float
-    """Of the beam in the glass."""
+    """Displacement of the beam in the glass."""
     far: NDArray[np.bool_]
     """Whether the camera looks at the face that the light does not meet."""
     sines: Array
     scales: Array
-    """Radiance outside, averaged over a pixel, of one unit of power per sr in the medium that reaches the face there,
+    """Radiance outside, averaged over a pixel, for one unit of power per sr in the medium that reaches the face there,
     per mm2."""
     shifts_mm: Array
 
@@ -106,7 +106,7 @@ def rig_of(folder: SlabFolder, wavelength_nm: float, index: float | None = None)
 
 
 def interface_of(cell: Cell, index: float | None = None) -> Interface:
-    """Faces of the cell; a matched one bends nothing."""
+    """Faces of the cell; a matched one refracts nothing."""
     if cell.boundary == "matched":
         return Interface(cell.index_outside, cell.index_outside)
     inside = index or cell.index
@@ -117,7 +117,7 @@ def interface_of(cell: Cell, index: float | None = None) -> Interface:
 
 
 def grid_of(pixels: PixelGrid) -> Grid:
-    """The grid, folded where it can be."""
+    """The grid, folded where it is symmetric in y."""
     (x_from, x_to), (y_from, y_to) = pixels.x_mm, pixels.y_mm
     pitch_x, pitch_y = (x_to - x_from) / pixels.columns, (y_to - y_from) / pixels.rows
     folded = math.isclose(y_from, -y_to) and pixels.rows % 2 == 0

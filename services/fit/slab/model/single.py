@@ -1,8 +1,8 @@
-"""Single scattering by quadrature along the beam, with its scores: exact but for the light of three and more
+"""Single scattering by quadrature along the beam, with its scores: exact except for the light of three and more
 reflections.
 
-A view has one scattering angle per number of reflections of the beam before, and of the light after, the scatter. The
-depth is cut into cells; within a cell the exit point moves evenly, so that the beam's cross-section is averaged in
+A view has one scattering angle per number of reflections of the beam before, and of the light after, the scattering.
+The depth is cut into cells; within a cell the exit point moves evenly, so that the beam's cross-section is averaged in
 closed form.
 """
 
@@ -23,10 +23,11 @@ from services.fit.slab.model.rig import Beam, Grid, Rig, Views
 Array = NDArray[np.float64]
 
 DEPTH_CELLS = 96
-"""At this number an image at sigma_t w = 10 changes by less than 1e-4 when it is doubled."""
+"""Number of depth cells: an image at sigma_t w = 10 changes by less than 1e-4 when it is doubled."""
 DISC_NODES = 48
 MAX_REFLECTIONS = 2
-"""Of beam and scattered light together; near the normal three carry some 1e-5 of the light."""
+"""Largest number of reflections of beam and scattered light together; near the normal three carry some 1e-5 of the
+light."""
 
 
 def single_scattering(rig: Rig, material: Material, *, scores: bool) -> tuple[Array, Array]:
@@ -36,7 +37,7 @@ def single_scattering(rig: Rig, material: Material, *, scores: bool) -> tuple[Ar
     for views in rig.lights:
         for camera, image in enumerate(views.images):
             for cosine, ways, shares in _routes(rig, material, views, camera):
-                # f at the route's one angle, and its two knots.
+                # Interpolate f at the route's one angle from its two knots.
                 place = math.acos(min(max(cosine, -1.0), 1.0)) / SPACING_RAD
                 knot = min(int(place), KNOTS - 2)
                 lower = (knot + 1 - place) * material.scattering[knot]
@@ -51,7 +52,9 @@ def single_scattering(rig: Rig, material: Material, *, scores: bool) -> tuple[Ar
 
 
 def _routes(rig: Rig, material: Material, views: Views, camera: int) -> Iterator[tuple[float, Array, Array]]:
-    """Scattering cosine, way (cells,) and radiance per unit of f (cells, pixels) of every route from beam to camera."""
+    """Scattering cosine, path length (cells,) and radiance per unit of f (cells, pixels) of every route from beam to
+    camera.
+    """
     width, sine, lateral = rig.width_mm, views.sine, float(views.sines[camera])
     inward, outward = math.sqrt(1 - sine**2), math.sqrt(1 - lateral**2)
     for before, after in itertools.product(range(MAX_REFLECTIONS + 1), repeat=2):
@@ -61,7 +64,7 @@ def _routes(rig: Rig, material: Material, views: Views, camera: int) -> Iterator
         towards_far = bool(views.far[camera]) != (after % 2 == 1)
         cosine = sine * lateral + (inward if ahead else -inward) * (outward if towards_far else -outward)
 
-        # Depths of the cells' edges along the pass, and the ways to and from them.
+        # Compute the depths of the cells' edges along the pass, and the path lengths to and from them.
         passed = np.linspace(0, width, DEPTH_CELLS + 1)
         depth = passed if ahead else width - passed
         way_in = (before * width + passed) / inward
@@ -69,7 +72,7 @@ def _routes(rig: Rig, material: Material, views: Views, camera: int) -> Iterator
         ways = way_in + way_out
         exits = way_in * sine + way_out * lateral + views.shift_mm + float(views.shifts_mm[camera])
 
-        # The integral of exp(-sigma_t way) over a cell, which is exact, and its mean way.
+        # Integrate exp(-sigma_t path length) over each cell, which is exact, and take its mean path length.
         step_in, step_out = width / DEPTH_CELLS / inward, ways[1:] - ways[:-1]
         middle = (ways[1:] + ways[:-1]) / 2
         half = material.extinction_per_mm * step_out / 2
@@ -84,7 +87,9 @@ def _routes(rig: Rig, material: Material, views: Views, camera: int) -> Iterator
 def _returns(
     interface: Interface, sine: float, before: int, lateral: float, after: int
 ) -> Iterator[tuple[float, float]]:
-    """Share and displacement of every way to be reflected so many times before and after the scatter."""
+    """Share and displacement for every way to be reflected ``before`` times before and ``after`` times after the
+    scattering.
+    """
     ways = [interface.reflections(sine)] * before + [interface.reflections(lateral)] * after
     for chosen in itertools.product(*ways):
         yield math.prod(way.share for way in chosen), sum(way.shift_mm for way in chosen)

@@ -1,6 +1,4 @@
-"""Random numbers by counter: a stream is a 64-bit state that any (seed, place in the job, path) leads to
-(SplitMix64).
-"""
+"""Random numbers by counter: a stream is a 64-bit state that follows from seed, block and path (SplitMix64)."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ TO_UNIT = 2.0**-53
 
 
 def block_key(*numbers: int) -> np.uint64:
-    """Key of a block of paths from the numbers that name it."""
+    """Key of a block of paths from the numbers that identify it."""
     return np.uint64(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
 
 
@@ -28,7 +26,7 @@ def mixed(state):  # type: ignore[no-untyped-def]  # compiled
 
 @njit(cache=True, inline="always")
 def path_state(key, path):  # type: ignore[no-untyped-def]  # compiled
-    """Where a path's stream starts."""
+    """State at which a path's stream starts."""
     return mixed(key + mixed(np.uint64(path) + GOLDEN))
 
 

@@ -1,4 +1,4 @@
-"""A medium as the walk reads it: its values at the knots and an inverse distribution of scattering angles."""
+"""A medium as the walk's kernel reads it: its values at the knots and an inverse distribution of scattering angles."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material
 Array = NDArray[np.float64]
 
 CELLS_PER_KNOT = 8
-"""Cosines are drawn evenly within a cell; the weight that corrects for it strays by about 1 % at this number."""
+"""Number of cells of cosine per interval of knots. Cosines are drawn uniformly within a cell; the weight that corrects
+for it varies by about 1 % at this number."""
 GUIDE = 4096
-"""Entries of the table from a uniform number to the first cell that can hold it."""
+"""Number of entries of the table from a uniform number to the first cell that can hold it."""
 
 
 class MediumTables(NamedTuple):

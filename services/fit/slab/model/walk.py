@@ -1,9 +1,9 @@
 """The walk of one light: orders two and up, with the scores of all knots, compiled by Numba.
 
-A path is the beam's; at each of its vertices from the second on it is connected to every camera through the flat face.
-A contribution's derivative by ln f_n is itself times (sum over its scatters of the share of knot n in f(theta)) less
-f_n Omega_n times its way, by Eq. 18 of Gkioulekas et al. (2013) as ``optics.md`` corrects it: so each image carries a
-row of KNOTS sums of shares, and one sum of ways.
+A path follows the beam; each of its vertices from the second on is connected to every camera through the flat face. The
+derivative of a contribution with respect to ln f_n is the contribution times (sum over its scatterings of the share of
+knot n in f(theta)) minus f_n Omega_n times its path length, by Eq. 18 of Gkioulekas et al. (2013) as ``optics.md``
+corrects it: so each image carries a row of KNOTS sums of shares, and one sum of path lengths.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from services.fit.slab.model.streams import path_state, uniform
 from services.fit.slab.model.tables import GUIDE
 
 MAX_SCATTERS = 8192
-"""A path ends there; what it still carries is reported."""
+"""Number of scatterings at which a path ends; the weight that it still carries is reported."""
 FIRST_ROULETTE = 0.1
-"""Paths of less weight than this share of the beam survive by halves."""
+"""Share of the beam below which a path's weight is doubled with probability one half, or the path ends."""
 SPARSE_SCATTERS = 48
-"""Up to so many scatters a path's shares are added one by one; beyond, all knots at once are as fast."""
+"""Largest number of scatterings whose shares are added one by one; beyond, adding all knots at once is as fast."""
 REFLECTED_SHARE = 0.125
-"""Probability that a vertex is also connected by way of one more reflection; those carry some 2 % of the light."""
+"""Probability that a vertex is also connected by way of one more reflection; such connections carry some 2 % of the
+light."""
 LATE_ORDER = 8
-"""From this order on only a share of the vertices is connected where the cell is thick."""
+"""Scattering order from which only a share of the vertices is connected where the cell is thick."""
 
 
 @njit(cache=True, inline="always")
@@ -43,8 +44,8 @@ def reflectance(cosine, eta):  # type: ignore[no-untyped-def]  # compiled
 
 @njit(cache=True)
 def meet_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
-    """Whether light comes back from a face, and how far it went sideways in the glass, in units of its lateral
-    direction.
+    """Whether light comes back from a face, its displacement in the glass in units of its lateral direction, and the
+    next random state.
 
     glass: (n_outside / n, n_glass / n or 0, thickness).
     """
@@ -58,7 +59,7 @@ def meet_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
     sine = math.sqrt(max(1 - cosine * cosine, 0.0)) / wall
     inner = math.sqrt(max(1 - sine * sine, 1e-12))
     far = reflectance(inner, outside / wall)
-    # Lateral way per unit of lateral direction in the medium: t tan(a_glass) / sin(a).
+    # Displacement per unit of lateral direction in the medium: t tan(a_glass) / sin(a).
     way = thickness / (wall * inner)
     shift = 0.0
     while True:
@@ -74,7 +75,9 @@ def meet_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
 
 @njit(cache=True)
 def shift_of_a_return(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
-    """How far light went sideways in the glass, given that it comes back."""
+    """Displacement in the glass of light that comes back, in units of its lateral direction, and the next random
+    state.
+    """
     while True:
         back, shift, state = meet_face(cosine, glass, state)
         if back:
@@ -165,7 +168,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
 
     for path in range(paths):
         state = path_state(key, path)
-        # The first scatter is forced: the beam's passes between the faces form a geometric series that is drawn from
+        # The first scattering is forced: the beam's passes between the faces form a geometric series that is sampled
         # exactly.
         weight = light[1] * albedo * collided / (1 - repeat)
         x, y, way = light[2], 0.0, 0.0
@@ -188,7 +191,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
         scatters = 0
         alive = True
         while alive:
-            # Scatter by the phase function; the weight makes up for the even density within a cell.
+            # Scatter by the phase function; the weight corrects for the uniform density within a cell.
             u, state = uniform(state)
             v, state = uniform(state)
             cosine, cell = draw_cosine(u, v, cumulative, cosines, guide)
@@ -201,7 +204,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
             u, state = uniform(state)
             dx, dy, dz = turned(dx, dy, dz, cosine, 2 * math.pi * u)
 
-            # Fly to the next scatter, or out.
+            # Fly to the next scattering, or out.
             u, state = uniform(state)
             step = -math.log(u) / sigma_t
             while True:
