@@ -1,1 +1,1 @@
-"""The inverse: normal equations of independent batches, Gauss-Newton, the prior, the ±."""
+"""The inverse problem: normal equations of independent batches, Gauss-Newton, the prior, the standard errors."""

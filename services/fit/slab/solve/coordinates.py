@@ -1,8 +1,8 @@
-"""The unknowns by which a solver moves a medium, and what is held of them beforehand.
+"""The unknowns in which a solver moves a medium, and their priors.
 
 ``Knots`` are ln f at the 200 knots under a smoothness prior; ``mixture.Mixtures`` are the weights of a dictionary's
-atoms. Both end with sigma_a. The forward model tells derivatives by ln f and sigma_a, and each kind of unknowns takes
-them on by the chain rule.
+atoms. Both end with sigma_a. The forward model gives derivatives with respect to ln f and sigma_a, and each kind of
+unknowns converts them by the chain rule.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from services.fit.slab.solve.prior import RIDGE, SCALES, Quadratic, flag_scales,
 Array = NDArray[np.float64]
 
 LARGEST_CHANGE = 1.0
-"""Of ln f at a knot in one step; each knot is held back by itself, so that the worst one does not slow the others."""
+"""Largest change of ln f at a knot in one step; each knot is limited by itself, so that the worst one does not slow the
+others."""
 
 LONGEST = 0.3
-"""Of ln sigma_s in one step of a thick cell."""
+"""Largest change of ln sigma_s in one step of a thick cell."""
 BROAD = 9
-"""Multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells tell of none that is
-smaller."""
+"""Number of multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells resolve none that
+is smaller."""
 
 
 class Coordinates(Protocol):
@@ -37,24 +38,26 @@ class Coordinates(Protocol):
         """A medium of this kind like the guess, from which the search begins."""
 
     def unknowns(self, material: Material) -> Array:
-        """Of a medium that ``begun`` or ``material_at`` gave."""
+        """Unknowns (U,) of a medium that ``begun`` or ``material_at`` gave."""
 
     def material_at(self, x: Array) -> Material:
         """The medium with these unknowns."""
 
     def chain(self, material: Material) -> Array | None:
-        """Derivatives of ln f and sigma_a by the unknowns (UNKNOWNS, U); None where they are the unknowns
+        """Derivatives of ln f and sigma_a with respect to the unknowns (UNKNOWNS, U); None where they are the unknowns
         themselves.
         """
 
     def scale(self, material: Material, quadratic: Quadratic, *, sharp: bool) -> float | Array:
-        """Scale of the prior, near a medium and as its images suggest; ``sharp`` where it follows that medium."""
+        """Scale of the prior near a medium, chosen from the quadratic of its images; ``sharp`` where it follows that
+        medium.
+        """
 
     def precision(self, scale: float | Array) -> Array:
         """Inverse covariance of the prior (U, U) for one scale."""
 
     def weak_precision(self, material: Material) -> Array:
-        """The same of a prior so weak that what it tells is not taken for a measurement."""
+        """The same for a prior so weak that its information is not taken for a measurement."""
 
     def broad(self) -> Array:
         """Few directions (U, K) that matter in any sample, in which a noisy matrix is judged by itself; none where
@@ -62,16 +65,16 @@ class Coordinates(Protocol):
         """
 
     def reach(self, material: Material) -> Array:
-        """Standard deviations (K,) of how far off a medium may be along these directions."""
+        """Standard deviations (K,) of a medium's error along these directions."""
 
     def minimum(self, matrix: Array, right: Array) -> Array:
         """The x within bounds at which x^T matrix x / 2 - right^T x is least."""
 
     def held_back(self, change: Array, material: Material) -> Array:
-        """A step of which no unknown moves further than a linearisation is good for."""
+        """A step in which no unknown moves further than a linearisation holds."""
 
     def similar(self, change: Array, material: Material) -> Array:
-        """A step in a thick cell, whose images hardly change with sigma_s at a constant sigma_s' but much with
+        """A step adapted to a thick cell, whose images hardly change with sigma_s at a constant sigma_s' but much with
         sigma_s'.
         """
 
@@ -81,14 +84,14 @@ class Coordinates(Protocol):
 
 @dataclass(frozen=True)
 class Knots:
-    """ln f at the knots, and sigma_a not below zero."""
+    """Coordinates ln f at the knots, and sigma_a not below zero."""
 
     def begun(self, guess: Material) -> Material:
         """The guess itself."""
         return guess
 
     def unknowns(self, material: Material) -> Array:
-        """Ln f and sigma_a."""
+        """Ln f and sigma_a (UNKNOWNS,)."""
         return np.append(np.log(material.scattering), material.absorption_per_mm)
 
     def material_at(self, x: Array) -> Material:
@@ -96,19 +99,19 @@ class Knots:
         return Material(np.exp(x[:KNOTS]), max(float(x[-1]), 0.0))
 
     def chain(self, material: Material) -> None:
-        """None: these are what the forward model derives by."""
+        """None, because the forward model's derivatives are with respect to these unknowns."""
 
     def scale(self, material: Material, quadratic: Quadratic, *, sharp: bool) -> float | Array:
-        """The curvature of ln f of most evidence; see ``prior.widened`` for a ``sharp`` one."""
+        """The scale with the largest evidence; see ``prior.widened`` for a ``sharp`` one."""
         every: list[float | Array] = [widened(scale, material) if sharp else scale for scale in SCALES]
         return max(every, key=lambda scale: self.log_evidence(quadratic, scale))
 
     def precision(self, scale: float | Array) -> Array:
-        """Of a smooth ln f; nothing is assumed of the absorption."""
+        """Inverse covariance of a smooth ln f; the absorption has a flat prior."""
         return precision(scale)
 
     def weak_precision(self, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
-        """Of a ln f that may bend as sharply as any."""
+        """Inverse covariance of a ln f that may bend as sharply as any."""
         return precision(flag_scales())
 
     def broad(self) -> Array:
@@ -121,24 +124,28 @@ class Knots:
         return directions
 
     def reach(self, material: Material) -> Array:
-        """As a Henyey-Greenstein start may be: by a factor of e in sigma_s, and less in what turns faster with the
-        angle.
+        """Standard deviations of a Henyey-Greenstein start: a factor of e in sigma_s, and less in directions that vary
+        faster with the angle.
         """
         return np.append(1 / np.maximum(np.arange(BROAD), 1.0) ** 2, 0.1 * material.extinction_per_mm)
 
     def minimum(self, matrix: Array, right: Array) -> Array:
-        """For all unknowns; where the absorption comes out negative, for the others with none."""
+        """The minimum over all unknowns; where its absorption is negative, over the others with an absorption of
+        zero.
+        """
         x = np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
         if x[-1] < 0:
             x = np.append(np.asarray(np.linalg.solve(matrix[:-1, :-1], right[:-1]), dtype=np.float64), 0.0)
         return x
 
     def held_back(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
-        """Each unknown by itself."""
+        """The step with each unknown limited by itself."""
         return np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
 
     def similar(self, change: Array, material: Material) -> Array:
-        """No longer than is good for, and with f scaled so that sigma_s' becomes what the step says to first order."""
+        """The step, limited to ``LONGEST``, with f scaled so that sigma_s' becomes what the step says to first
+        order.
+        """
         slope = reduced_scattering_slope(material)
         length = abs(float(material.slope_of_scattering() @ change)) / material.scattering_per_mm
         step = change * min(1.0, LONGEST / max(length, 1e-300))
@@ -148,13 +155,13 @@ class Knots:
         return np.asarray(step)
 
     def is_bound(self, x: Array) -> NDArray[np.bool_]:
-        """None counts as bound: ln f has no bound, and the ± of an absorption at zero are those of a free one."""
+        """All false: ln f has no bound, and an absorption at zero has the standard error of a free one."""
         return np.zeros(len(x), dtype=bool)
 
     def log_evidence(self, quadratic: Quadratic, scale: float | Array) -> float:
-        """Of a scale of the prior, but for a constant that all scales share.
+        """Log evidence of a scale of the prior, up to a constant that all scales share.
 
-        The mean derivatives are taken as if they were exact: the matrix is then positive, and a scale cannot win by
+        The mean derivatives are treated as if they were exact: the matrix is then positive, and a scale cannot win by
         following directions of negative curvature, which the unbiased matrix has.
         """
         prior = precision(scale)
@@ -169,6 +176,6 @@ class Knots:
 
 
 def reduced_scattering_slope(material: Material) -> Array:
-    """Derivatives of ln sigma_s' by ln f and sigma_a (UNKNOWNS,)."""
+    """Derivatives of ln sigma_s' with respect to ln f and sigma_a (UNKNOWNS,)."""
     parts = material.scattering * (tent_solid_angles() - cosine_moments())
     return np.append(parts / material.reduced_scattering_per_mm, 0.0)

@@ -3,7 +3,7 @@
 init        a material and its normal equations
 step        a scale of the prior by evidence, a damped step, judged on the unbiased misfit of fresh batches
 terminate   the step promises no more than noise does, or the budget of steps is spent
-finish      one more step, from many more paths
+finish      more steps, in stages of many more paths
 """
 
 from __future__ import annotations
@@ -32,44 +32,45 @@ Array = NDArray[np.float64]
 TOLERATED_RISE = 2.0
 """Standard errors by which the objective may rise: fewer would refuse good steps whose comparison is noisy."""
 WEIGHTS_DIFFER = 0.5
-"""Of the misfit, which may rise by that in a thick cell: weights there are mostly those of the paths and are estimated
-anew for each render, and misfits of one medium were seen to differ by a third. A low one would else refuse all steps
-after it."""
+"""Share of the misfit by which it may rise in a thick cell: weights there come mostly from the paths' noise and are
+estimated anew for each render, and misfits of one medium were seen to differ by a third. Otherwise a low misfit would
+refuse all steps after it."""
 MAX_HALVINGS = 4
 WORTHWHILE, WORTHWHILE_THICK = 2.0, 1.0
-"""A step that promises less than so many times what noise alone does waits for more paths; at the end, one that
-promised more is followed by another. Where sigma_t w exceeds ``prior.THICK``, what is left along sigma_s at a constant
-sigma_s' promises little beside the noise of all directions and is still a tenth of sigma_s."""
+"""Ratio of the fall of the objective that a step promises to the fall that noise alone promises. In the search a step
+below it waits for more paths; in the last stages one above it is followed by another. The second value holds in thick
+cells: there the error left in sigma_s at a constant sigma_s' promises little beside the noise of all directions, and is
+still a tenth of sigma_s."""
 UNFINISHED = 5.0
-"""A fit whose last step promised more than so many times what noise does has not converged."""
+"""The same ratio, above which the last step shows that the fit has not converged."""
 NEAR = 0.05
-"""Of ln sigma_s, within which residuals of several media join: what is not linear is then below a thousandth."""
+"""Largest distance in ln sigma_s at which residuals of several media are combined: the nonlinear part is then below a
+thousandth."""
 ENOUGH_PATHS = 0.5
-"""At the end of a fit of a thick cell the variance by its paths is to be at most so many times that by the
-measurements."""
+"""Largest noise of the paths, in units of that of the measurements, at which the fit of a thick cell may end."""
 DAMPING = 1.0
-"""Levenberg term in units of the noise of J: at 0.3 and at 3 the end was the same within its noise, at 0.05 it
+"""Levenberg term in units of the noise of J: with 0.3 and with 3 the end was the same within its noise, with 0.05 it
 strayed."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Work of a fit, by number of paths, so that a fit repeats. Paths are those of a light and batch."""
+    """Work of a fit, counted in paths, so that a fit repeats. Paths are those of a light and batch."""
 
     batches: int = 8
     first_paths: int = 4000
     search_paths: int = 8000
-    """At most, until the last step."""
+    """Largest number of paths in the search."""
     last: tuple[tuple[int, int], ...] = ((15000, 16), (30000, 24))
-    """Paths and batches of the stages at the end."""
+    """Paths and batches of each of the last stages."""
     most_last: int = 4
-    """Steps of a stage."""
+    """Largest number of steps of a stage."""
     most_last_thick: int = 8
-    """The same where sigma_t w exceeds ``prior.THICK``."""
+    """The same in a thick cell."""
     most_steps: int = 10
 
     def scaled(self, effort: float) -> Budget:
-        """The same with so many times the paths."""
+        """The same budget with ``effort`` times the paths."""
         return replace(
             self,
             first_paths=max(1, round(effort * self.first_paths)),
@@ -90,34 +91,34 @@ class State:
 
 @dataclass(frozen=True)
 class Solution:
-    """What the solver ended with; ``converged`` is a value, not an error."""
+    """Result of the solver; ``converged`` is a value, not an error."""
 
     material: Material
     quadratic: Quadratic
-    """Of half the misfit, at the last linearisation."""
+    """Model of half the misfit, at the last linearisation."""
     gradient_noise: Array
     scale: float | Array
     used: int
     steps: int
     converged: bool
     paths: int
-    """In all, over lights and batches."""
+    """Number of all paths, over lights and batches."""
     coordinates: Coordinates
-    """Whose unknowns the quadratic is in."""
+    """Coordinates whose unknowns the quadratic is in."""
     misfit: float
-    """Half of the weighted squares before the last step, Monte Carlo noise of the images left out."""
+    """Half of the weighted squares before the last step, without the Monte Carlo noise of the images."""
     misfit_se: float
     data_noise: Array
     """Covariance of the last gradient's noise by the measurements (U, U)."""
     thick: bool
     """See ``GaussNewton.is_thick``."""
     unsure: Array
-    """What the last step may have been wrong by as the matrix is noisy, before it is solved for (U,)."""
+    """Error of the last step by the noise of the matrix, as a gradient: ``matrix_error`` times the step (U,)."""
 
 
 @dataclass
 class GaussNewton:
-    """One fit; ``render_count`` numbers the random streams."""
+    """One fit; ``renders`` numbers the random streams."""
 
     rig: Rig
     measured: Measurements
@@ -128,19 +129,20 @@ class GaussNewton:
     renders: int = 0
     paths: int = 0
     path_noise: tuple[Array, ...] | None = None
-    """Monte Carlo covariance of one path by light (pixels, C, C), a running mean over the renders before."""
+    """Monte Carlo covariance of one path for each light (pixels, C, C), a running mean over earlier renders."""
     multiple: Array | None = None
-    """What has scattered twice and more (images, pixels), the same mean of renders."""
+    """Light that has scattered twice and more (images, pixels), the same running mean."""
     joined: Joined | None = None
-    """Renders of this stage that later ones join, in a thick cell."""
+    """Renders of this stage that later ones are combined with, in a thick cell."""
     is_searching: bool = False
-    """Whether the fit may still be far off: then steps go by smooth derivatives and along broad directions in any
-    cell."""
+    """Whether the fit may still be far off: then steps use smooth derivatives and broad directions in any cell."""
     kept: StandingFile | None = None
-    """Where to go on from, and where to keep how far the fit has come; None for neither."""
+    """File that stores the state of the fit and from which the fit continues; None for neither."""
 
     def solve(self, guess: Callable[[], Material]) -> Solution:
-        """From a guess to the solution, or from where an earlier attempt stood before a step of the last stages."""
+        """The solution, from a guess, or from the state that an earlier attempt saved before a step of the last
+        stages.
+        """
         standing = None if self.kept is None else self.kept.read()
         if standing is None:
             return self.finish(self.search(guess()))
@@ -149,7 +151,7 @@ class GaussNewton:
         return self.finish(standing)
 
     def search(self, material: Material) -> Standing:
-        """Iterate with few paths, as far as these tell."""
+        """Iterate with few paths, until a step promises no more than their noise does."""
         self.is_searching = True
         state = self.init(self.coordinates.begun(material))
         steps = 0
@@ -165,12 +167,12 @@ class GaussNewton:
         )
 
     def init(self, material: Material) -> State:
-        """The first point."""
+        """The first point of the iteration."""
         paths = self.budget.first_paths
         return State(material, self.linearised(material, paths, self.budget.batches), paths, DAMPING)
 
     def step(self, state: State) -> tuple[State, bool]:
-        """One step, and whether the search has come as far as its paths can tell."""
+        """One step, and whether the search has come as far as the noise of its paths allows."""
         x = self.coordinates.unknowns(state.material)
         quadratic = quadratic_at(x, state.equations)
         prior = self.coordinates.precision(self.coordinates.scale(state.material, quadratic, sharp=False))
@@ -181,7 +183,8 @@ class GaussNewton:
             return state, True
         paths = min(2 * state.paths, self.budget.search_paths) if promise < WORTHWHILE * noise else state.paths
         if paths > state.paths and self.is_thick(state.material):
-            # Weights there are mostly those of the paths, so misfits of different numbers of paths cannot be compared.
+            # Weights there come mostly from the paths' noise, so misfits of different numbers of paths cannot be
+            # compared.
             again = self.linearised(state.material, paths, self.budget.batches)
             return State(state.material, again, paths, state.damping), False
         before = state.equations.misfit + 0.5 * float(x @ prior @ x)
@@ -200,14 +203,14 @@ class GaussNewton:
         ), False
 
     def finish(self, standing: Standing) -> Solution:
-        """Steps from many paths, then from the most: each stage until its paths tell of nothing more."""
+        """Take the steps of the last stages, each stage until its steps promise no more than noise does."""
         while standing.stage < len(self.budget.last):
             if self.kept is not None:
                 self.kept.write(standing)
             material, (paths, batches) = standing.material, self.budget.last[standing.stage]
             equations = self.linearised(material, paths, batches, join=self.is_thick(material))
             x = self.coordinates.unknowns(material)
-            # Where residuals of media near by join, the gradient is that at the mean of these media.
+            # Where residuals of nearby media are combined, the gradient is that at the mean of these media.
             centre = equations.residuals.place if self.joins(material) else x
             quadratic = quadratic_at(centre, equations)
             scale = self.coordinates.scale(material, quadratic, sharp=not self.is_thick(material))
@@ -229,12 +232,12 @@ class GaussNewton:
         )  # fmt: skip
 
     def after(self, standing: Standing, moved: Material, worth: float, rest: float) -> Standing:
-        """The next step of the stage, or the first of the next stage where this one has ended.
+        """The state before the next step of the stage, or before the first of the next stage where this one has ended.
 
         Args:
-            worth: what the last step promised, in units of what noise alone does.
-            rest: noise of the paths in units of that of the measurements, where more of them help: renders of a stage
-                join.
+            worth: fall that the last step promised, in units of the fall that noise alone promises.
+            rest: noise of the paths in units of that of the measurements, where renders of a stage are combined; else
+                0.
         """
         thick = self.is_thick(moved)
         enough, most = (WORTHWHILE_THICK, self.budget.most_last_thick) if thick else (WORTHWHILE, self.budget.most_last)
@@ -257,16 +260,18 @@ class GaussNewton:
         )
 
     def is_thick(self, material: Material) -> bool:
-        """Whether cameras of one side see nearly the same of every path, and sigma_s and g are hardly told apart."""
+        """Whether cameras of one side see nearly the same of every path, so that sigma_s and g are hardly told
+        apart.
+        """
         return is_thick(material, self.rig.width_mm)
 
     def change(
         self, quadratic: Quadratic, prior: Array, equations: NormalEquations, around: Material, damping: float
     ) -> Array:
-        """The step to the damped minimum, no unknown further than is good.
+        """The step to the damped minimum, in which no unknown moves further than the linearisation holds.
 
-        The Levenberg term is about the present point: what noise may have bent is held there. It moves no fixed point,
-        so that repeated steps from fresh paths end where an undamped one would.
+        The Levenberg term is centred on the present point and holds directions whose curvature may be noise. It moves
+        no fixed point, so that repeated steps from fresh paths end where an undamped one would.
         """
         x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
         noise = equations.gradient_noise + equations.data_noise
@@ -284,7 +289,7 @@ class GaussNewton:
         reach = self.coordinates.reach(around)
         second = first + broad_step(quadratic, prior, broad, reach, noise, first)
         if second[-1] < 0:
-            # No absorption below zero: the others go where they are best with none.
+            # Absorption cannot be negative: set it to zero, and minimise over the others.
             first[-1] = 0
             second = first + broad_step(quadratic, prior, broad[:, :-1], reach[:-1], noise, first)
         return self.coordinates.similar(self.coordinates.held_back(second - x, around), around)
@@ -293,7 +298,7 @@ class GaussNewton:
         """Normal equations of fresh batches.
 
         Args:
-            join: whether derivatives of the stage's renders before join. Weights then stay as the first of them had
+            join: whether derivatives of the stage's earlier renders are added. Weights then stay those of the first of
                 them.
         """
         self.renders += 1
@@ -311,7 +316,7 @@ class GaussNewton:
         shape, seen = (self.rig.grid.rows, self.rig.grid.columns), [views.images for views in self.rig.lights]
         own = tuple(smoothed_covariance(estimates.images[:, some], shape) * batches * paths for some in seen)
         # Weights come from earlier renders alone: rare bright paths raise a pixel and its variance together, and
-        # weights that share them with the residuals bent sigma_s' up by several per cent.
+        # weights that share them with the residuals raised sigma_s' by several per cent.
         recent = own if self.path_noise is None else self.path_noise
         earlier = self.joined if join else None
         known = recent if earlier is None else earlier.path_noise
@@ -323,8 +328,8 @@ class GaussNewton:
         self.multiple = (multiple + before) / 2
         noise = [one / (batches * paths) for one in known]
         if not self.is_thick(material):
-            # In a thin cell each camera sees scatters of its own: what they share is little, and its estimate would
-            # only add noise.
+            # In a thin cell each camera sees other scatterings: their noise is hardly correlated, and an estimate of
+            # the correlation would only add noise.
             noise = [one * np.eye(one.shape[1]) for one in noise]
         weights = weights_of(seen, variances, noise)
         self.path_noise = tuple((first + second) / 2 for first, second in zip(own, recent, strict=True))
@@ -340,18 +345,16 @@ class GaussNewton:
         return equations.chained(self.coordinates.chain(material))
 
     def is_broad(self, material: Material) -> bool:
-        """Whether derivatives are made smooth, and a second step goes along broad directions."""
+        """Whether derivatives are smoothed, and a second step goes along broad directions."""
         return self.is_thick(material) or (self.is_searching and self.joins(material))
 
     def joins(self, material: Material) -> bool:
-        """Whether the unknowns are ln f and sigma_a themselves, in which residuals of several media are told at their
-        mean.
-        """
+        """Whether the unknowns are ln f and sigma_a themselves, in which residuals of several media can be combined."""
         return self.coordinates.chain(material) is None
 
     def near(self, earlier: Joined | None, material: Material) -> ResidualSums | None:
-        """Residuals of renders before, where these are of media so near that derivatives tell how they would be
-        here.
+        """Residuals of earlier renders, where their media are so near that derivatives can carry them over to this one;
+        else None.
         """
         if earlier is None or not self.joins(material):
             return None
@@ -360,7 +363,7 @@ class GaussNewton:
         return earlier.residuals if moved < NEAR else None
 
     def smoother(self, multiple: Array, variances: Array, noise: list[Array]) -> Smoother:
-        """Smoothing of derivatives by what renders before have seen; ``noise`` as of ``weights_of``."""
+        """Smoother of derivatives, made from earlier renders; ``noise`` as the covariances of ``weights_of``."""
         own = np.zeros_like(variances)
         for views, one in zip(self.rig.lights, noise, strict=True):
             own[views.images] = np.einsum("pii->ip", one)
@@ -368,7 +371,7 @@ class GaussNewton:
 
 
 def quadratic_at(x: Array, equations: NormalEquations) -> Quadratic:
-    """The model of half the misfit in the unknowns themselves, from their values where it was taken."""
+    """The model of half the misfit in the unknowns themselves, from equations linearised at ``x``."""
     return Quadratic(
         equations.matrix,
         equations.gradient - equations.matrix @ x,
@@ -385,5 +388,5 @@ def promised(quadratic: Quadratic, prior: Array, x: Array, change: Array) -> flo
 
 
 def noise_of_promise(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:
-    """What the gradient's noise alone promises on average."""
+    """Mean fall of the objective that the gradient's noise alone promises."""
     return 0.5 * float(np.trace(np.linalg.lstsq(quadratic.matrix + quadratic.noise + prior, gradient_noise)[0]))

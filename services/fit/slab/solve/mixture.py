@@ -1,7 +1,7 @@
 """Unknowns of a dictionary with few atoms: f = D w with weights w >= 0, and sigma_a >= 0.
 
-Each atom is a phase function p_m at the knots, so that w_m is the part of sigma_s that is its own. Atoms next to each
-other are much alike: the bounds choose few of them, and a wide ridge keeps the others' ± finite.
+Each atom is a phase function p_m at the knots, so that w_m is its part of sigma_s. Neighbouring atoms are much alike:
+the bounds choose few of them, and a wide prior keeps the standard errors of the others finite.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from services.fit.slab.solve.prior import Quadratic
 Array = NDArray[np.float64]
 
 SHARE = 1.0
-"""Standard deviation of a weight's prior, as a share of sigma_s: an atom may be all there is. With 0.1, which the
-evidence took more often than not, one lobe was spread over its neighbours, and its weight came out at half with a ± of
-a tenth."""
+"""Standard deviation of a weight's prior, as a share of sigma_s: one atom may be the whole medium. With 0.1, which the
+evidence preferred more often than not, one lobe was spread over its neighbours, and its weight came out at half with a
+± of a tenth."""
 WEAK_SHARE = 10.0
-"""The same of the prior by which values are flagged."""
+"""The same for the prior by which values are flagged."""
 FIRST_SPREAD = 0.1
-"""Share of sigma_s that all atoms have alike at the beginning, so that light tells of each."""
+"""Share of sigma_s that is spread evenly over all atoms at the beginning, so that images depend on each."""
 DARKEST = 1e-5
-"""Of f, as a share of its mean over all directions: scores divide by f, and a table may hold zeros."""
+"""Smallest f, as a share of its mean over all directions, because scores divide by f and a table may hold zeros."""
 SMALLEST_PER_MM = 1e-6
-"""Of sigma_s from which ``DARKEST`` is reckoned at least."""
+"""Smallest sigma_s to which ``DARKEST`` is applied."""
 LARGEST_SHARE = 0.5
-"""Of sigma_s by which an unknown may change in one step."""
+"""Share of sigma_s by which an unknown may change in one step."""
 PIVOT = 1e-10
-"""Added to the diagonal of a matrix that is scaled to ones there, so that it can be taken apart by Cholesky."""
+"""Term added to the diagonal of a matrix that is scaled to ones there, so that its Cholesky factor exists."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Mixtures:
     """Phase functions at the knots, 1/sr (KNOTS, M); see ``unit_atoms``."""
 
     def begun(self, guess: Material) -> Mixture:
-        """The mix that is nearest to the guess, by power per angle, and a little of every atom."""
+        """The mix that is nearest to the guess, by power per angle, with a little of every atom."""
         root = np.sqrt(tent_solid_angles())
         nearest, _ = optimize.nnls(self.atoms * root[:, None], guess.scattering * root)
         sigma_s, count = guess.scattering_per_mm, self.atoms.shape[1]
@@ -61,18 +61,18 @@ class Mixtures:
         return self.material_at(np.append(weights, guess.absorption_per_mm))
 
     def unknowns(self, material: Material) -> Array:
-        """Weights and sigma_a."""
+        """Weights and sigma_a (M + 1,)."""
         assert isinstance(material, Mixture)
         return np.append(material.atom_weights, material.absorption_per_mm)
 
     def material_at(self, x: Array) -> Mixture:
-        """The mix; nowhere quite dark."""
+        """The mix with these unknowns, with f nowhere zero."""
         weights = np.maximum(x[:-1], 0)
         darkest = DARKEST * max(float(weights.sum()), SMALLEST_PER_MM) / (4 * np.pi)
         return Mixture(np.maximum(self.atoms @ weights, darkest), max(float(x[-1]), 0.0), weights)
 
     def chain(self, material: Material) -> Array:
-        """Derivatives of ln f by the weights are the atoms divided by f."""
+        """Derivatives of ln f with respect to the weights, which are the atoms divided by f (UNKNOWNS, M + 1)."""
         matrix = np.zeros((UNKNOWNS, self.atoms.shape[1] + 1))
         matrix[:KNOTS, :-1] = self.atoms / material.scattering[:, None]
         matrix[KNOTS, -1] = 1
@@ -83,19 +83,19 @@ class Mixtures:
         return SHARE * material.scattering_per_mm
 
     def precision(self, scale: float | Array) -> Array:
-        """Of weights about zero; nothing is assumed of the absorption."""
+        """Inverse covariance of weights about zero; the absorption has a flat prior."""
         return np.diag(np.append(np.full(self.atoms.shape[1], scale**-2.0), 0.0))
 
     def weak_precision(self, material: Material) -> Array:
-        """Of weights that may all be many times what there is."""
+        """The same for weights that may all be many times those of the medium."""
         return self.precision(WEAK_SHARE * material.scattering_per_mm)
 
     def broad(self) -> Array:
-        """None: atoms are few, and each is judged by its bound."""
+        """No directions, because atoms are few and each is judged by its bound."""
         return np.zeros((self.atoms.shape[1] + 1, 0))
 
     def reach(self, material: Material) -> Array:  # noqa: ARG002 - there are no such directions
-        """None."""
+        """No directions."""
         return np.zeros(0)
 
     def similar(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - weights are few and seen
@@ -103,15 +103,15 @@ class Mixtures:
         return change
 
     def minimum(self, matrix: Array, right: Array) -> Array:
-        """By non-negative least squares: with matrix = R^T R, |R x - R^-T right|^2 is least."""
-        # In units in which the diagonal is 1, as an absorption and a weight differ.
+        """The minimum by non-negative least squares: with matrix = R^T R, |R x - R^-T right|^2 is least."""
+        # Scale the diagonal to 1, because an absorption and a weight differ in size.
         unit = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         upper = np.linalg.cholesky(unit[:, None] * matrix * unit + PIVOT * np.eye(len(unit))).T
         x, _ = optimize.nnls(upper, np.linalg.solve(upper.T, unit * right))
         return np.asarray(unit * x)
 
     def held_back(self, change: Array, material: Material) -> Array:
-        """Each unknown by itself; between two points without a negative weight there is none."""
+        """The step with each unknown limited by itself; between two points without a negative weight there is none."""
         most = LARGEST_SHARE * material.scattering_per_mm
         return np.clip(change, -most, most)
 

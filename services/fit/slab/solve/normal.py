@@ -7,13 +7,13 @@ pairs of different batches give unbiased
 
 each over a != b and divided by B (B - 1). One batch alone would add the power of its own noise to all three.
 
-Derivatives of E batches rendered before, with the same weights, may join: then J_a and J_b of the matrix run over all,
-and J_a of the gradient does, with the divisor B (B + E - 1). Their noise is independent of the present images whatever
-medium they were taken at, so the gradient is still zero where images fit. In a thick cell most of its noise is that of
-J times the residuals, and falls with E.
+Derivatives of E earlier batches with the same weights may be added: then J_a and J_b of the matrix run over all
+batches, and so does J_a of the gradient, with the divisor B (B + E - 1). Their noise is independent of the present
+images whatever medium they were taken at, so the gradient is still zero where images fit. In a thick cell most of its
+noise is that of J times the residuals, and falls with E.
 
-Residuals of media near by may join as well, as J tells how they would be here: then the gradient is that at the mean of
-all their media, with the divisor R (B + E - 1) for residuals of R batches.
+Residuals of nearby media may be added as well, because J carries them over to this medium: then the gradient is that at
+the mean of all their media, with the divisor R (B + E - 1) for residuals of R batches.
 """
 
 from __future__ import annotations
@@ -30,21 +30,22 @@ from services.fit.slab.solve.weights import Weights
 Array = NDArray[np.float64]
 
 UNKNOWNS = KNOTS + 1
-"""What the forward model derives by: ln f at the knots, and sigma_a in per mm."""
+"""Number of variables of the forward model's derivatives: ln f at the knots, and sigma_a in per mm."""
 
 
 @dataclass(frozen=True)
 class DerivativeSums:
-    """Sums over batches of whitened derivatives, in either half of the batches."""
+    """Sums over batches of whitened derivatives, for each half of the batches."""
 
     halves: Array
-    """Of the derivatives (2, images * pixels, UNKNOWNS)."""
+    """Sums of the derivatives (2, images * pixels, UNKNOWNS)."""
     own: Array
-    """Of each batch's J^T W J (2, UNKNOWNS, UNKNOWNS)."""
+    """Sums of each batch's J^T W J (2, UNKNOWNS, UNKNOWNS)."""
     counts: tuple[int, int]
+    """Number of batches in each half."""
 
     def __add__(self, other: DerivativeSums) -> DerivativeSums:
-        """Of both sets of batches."""
+        """Sums over both sets of batches."""
         first, second = (a + b for a, b in zip(self.counts, other.counts, strict=True))
         return DerivativeSums(self.halves + other.halves, self.own + other.own, (first, second))
 
@@ -59,7 +60,7 @@ class DerivativeSums:
         return _over_pairs(whole, self.own[0] + self.own[1], self.count)
 
     def matrix_error(self) -> Array:
-        """See ``NormalEquations``."""
+        """See ``NormalEquations.matrix_error``."""
         first, second = (_over_pairs(*of) for of in zip(self.halves, self.own, self.counts, strict=True))
         return np.asarray((first - second) / 2)
 
@@ -74,15 +75,15 @@ class ResidualSums:
     """Sums over batches of whitened residuals, which may be of several media."""
 
     total: Array
-    """(images * pixels,)."""
+    """Sum of the residuals (images * pixels,)."""
     products: Array
-    """Of each batch's J^T W (C - y) (UNKNOWNS,)."""
+    """Sum of each batch's J^T W (C - y) (UNKNOWNS,)."""
     count: int
     place: Array
     """Mean of the media's ln f and sigma_a over the batches (UNKNOWNS,)."""
 
     def __add__(self, other: ResidualSums) -> ResidualSums:
-        """Of both sets of batches."""
+        """Sums over both sets of batches."""
         count = self.count + other.count
         place = (self.count * self.place + other.count * other.place) / count
         return ResidualSums(self.total + other.total, self.products + other.products, count, place)
@@ -100,23 +101,27 @@ class NormalEquations:
     gradient_noise: Array
     """Covariance of the gradient's Monte Carlo noise (U, U), of rank B - 1."""
     noise: Array
-    """Power of the Monte Carlo noise in the mean derivatives (U, U): what the matrix would have too much."""
+    """Power of the Monte Carlo noise in the mean derivatives (U, U), by which the matrix of the mean derivatives is too
+    large."""
     noise_gradient: Array
-    """What the gradient would have too much if each batch met itself."""
+    """Excess of the gradient of the mean derivatives and mean residuals, in which each batch also meets itself (U,)."""
     matrix_error: Array
-    """Half the difference of the matrices of either half of the batches (U, U): about as far as ``matrix`` may be off
-    by chance."""
+    """Half the difference of the matrices of the two halves of the batches (U, U): about the error of ``matrix`` by
+    chance."""
     data_noise: Array
     """Covariance of the gradient's noise by the measurements (U, U)."""
     used: int
-    """Number of pixels."""
+    """Number of values that have weight."""
     derivatives: DerivativeSums
-    """By ln f and sigma_a whatever the unknowns are: what later equations of the same weights may join."""
+    """Sums of derivatives with respect to ln f and sigma_a, whatever the unknowns are; later equations of the same
+    weights may add them."""
     residuals: ResidualSums
-    """The same; the gradient is that at their place."""
+    """Sums of residuals, likewise; the gradient is that at their ``place``."""
 
     def chained(self, chain: Array | None) -> NormalEquations:
-        """The same in other unknowns, by the derivatives (UNKNOWNS, U) of these; None leaves them as they are."""
+        """The same equations in other unknowns, by the derivatives (UNKNOWNS, U) of ln f and sigma_a with respect to
+        these; None leaves the equations as they are.
+        """
         if chain is None:
             return self
         return replace(
@@ -132,7 +137,7 @@ class NormalEquations:
 
 
 def derivative_rows(rows: Array, material: Material) -> Array:
-    """Derivatives by ln f and sigma_a from sums of shares and ways (..., KNOTS + 1)."""
+    """Derivatives with respect to ln f and sigma_a from sums of shares and path lengths (..., KNOTS + 1)."""
     ways = rows[..., KNOTS:]
     return np.concatenate([rows[..., :KNOTS] - ways * (material.scattering * tent_solid_angles()), -ways], axis=-1)
 
@@ -145,12 +150,12 @@ def normal_equations(
     earlier: DerivativeSums | None = None,
     near: ResidualSums | None = None,
 ) -> NormalEquations:
-    """Sums over all pixels that weigh.
+    """Normal equations from all pixels that have weight.
 
     Args:
         values: measurements (images, pixels).
-        earlier: derivatives of batches before, whitened by the same weights.
-        near: residuals of some of these batches, of media near by.
+        earlier: derivatives of earlier batches, whitened by the same weights.
+        near: residuals of some of these batches, of nearby media.
     """
     residuals = weights.whitened(batches.images - values).reshape(len(batches.images), -1)
     count = len(residuals)
@@ -186,12 +191,12 @@ def normal_equations(
     # The gradient is a U-statistic of batches: its variance is that of a batch's part, twice the mean over its pairs.
     parts = terms - terms.mean(axis=0)
     gradient_noise = parts.T @ parts / pairs * (count / seen.count)
-    # The noise of earlier derivatives meets that of the measurements alike in all batches, where no spread shows it: so
-    # it counts here.
+    # The noise of earlier derivatives meets that of the measurements alike in all batches, so their spread does not
+    # show it: it is added here.
     scattered = weights.of_measurements(whole.reshape(jacobians[0].shape)[None])[0].reshape(-1, UNKNOWNS)
     mean = whole / every.count
 
-    # Noise of the misfit: that of the mean residual, and of the residuals' own products.
+    # Estimate the noise of the misfit: that of the mean residual, and of the residuals' own products.
     variance = residuals.var(axis=0, ddof=1) / count
     misfit_se = float(np.sqrt((variance * (np.maximum(products, 0) + variance / 2)).sum()))
     return NormalEquations(

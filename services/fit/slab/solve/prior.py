@@ -1,8 +1,8 @@
-"""Smoothness of ln f: its second derivative by angle is Gaussian, with a scale that the evidence chooses.
+"""Smoothness prior of ln f: its second derivative by angle is Gaussian, with a scale that the evidence chooses.
 
-A phase function is even at both poles, so the second difference there takes the mirrored neighbour: it pulls the slope
-to zero where no camera looks. The prior is not centred on an HG function, which would put a forward peak where none is
-seen.
+A phase function is even at both poles, so the second difference there takes the mirrored neighbour, which pulls the
+slope to zero where no camera looks. The prior is not centred on an HG function, which would put a forward peak where
+none is measured.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ Array = NDArray[np.float64]
 
 SCALES = (3.0, 10.0, 30.0)
 """Standard deviations of d2 ln f / d theta2, per rad2, among which the evidence chooses; HG 0.8 has 60 at its peak, 3
-beyond 20 degrees. Thick cells have the same: there 1 per rad2 drew the fit towards a constant ln f along what images
-hardly tell, sigma_s at a constant sigma_s' (200 nm spheres at sigma_t w = 5.4: sigma_s by -11 % at 640,000 paths, where
-3 does by -2.6 % and 10 by -0.2 %)."""
+beyond 20 degrees. Thick cells have the same: there 1 per rad2 pulled the fit towards a constant ln f along the
+direction that images hardly determine, sigma_s at a constant sigma_s' (200 nm spheres at sigma_t w = 5.4: sigma_s by
+-11 % at 640,000 paths, where 3 does by -2.6 % and 10 by -0.2 %)."""
 SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
-"""Scales of the weak prior by which values are flagged, per rad2: at the poles, far from them, and where the first has
-halved. HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass for a measurement."""
+"""Scales of the weak prior by which values are flagged, per rad2: at the poles and far from them; and the angle from a
+pole at which the first has halved. HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass
+for a measurement."""
 RIDGE = 1e-12
-"""Of the largest curvature, so that a direction that nothing tells of can be solved for."""
+"""Ridge as a share of the largest curvature, so that a direction that nothing determines can be solved for."""
 THICK, THICK_REDUCED = 4.0, 2.5
-"""Of sigma_t w, and of sigma_s' w, from which cameras of one side see nearly the same of every path. A fit may begin
-half off in sigma_t and knows sigma_s' at once: 200 nm spheres at sigma_t w = 5.4 were taken for a thin sample at 3.9,
-and the search stopped there."""
+"""Values of sigma_t w and of sigma_s' w from which cameras of one side see nearly the same of every path. Both count,
+because a fit may begin half off in sigma_t and knows sigma_s' at once: 200 nm spheres at sigma_t w = 5.4 were taken for
+a thin sample at 3.9, and the search stopped there."""
 
 
 def is_thick(material: Material, width_mm: float) -> bool:
@@ -52,8 +53,8 @@ def second_differences() -> Array:
 
 
 def precision(scale: float | Array) -> Array:
-    """Inverse covariance of all unknowns (UNKNOWNS, UNKNOWNS) for one scale or one per knot; nothing is assumed of the
-    absorption.
+    """Inverse covariance of all unknowns (UNKNOWNS, UNKNOWNS) for one scale or one per knot; the absorption has a flat
+    prior.
     """
     bends = second_differences() / np.broadcast_to(scale, KNOTS)[:, None]
     matrix = np.zeros((UNKNOWNS, UNKNOWNS))
@@ -62,13 +63,15 @@ def precision(scale: float | Array) -> Array:
 
 
 def widened(scale: float, material: Material) -> Array:
-    """A scale at each knot (KNOTS,), wider by what the medium bends there: Cauchy's prior by repeated weighting.
+    """A scale at each knot (KNOTS,), widened by the medium's own second derivative there: a Cauchy prior by iterative
+    reweighting.
 
     Between the rings of large spheres ln f has troughs that bend by hundreds per rad2, and elsewhere it bends by tens.
-    With 30 alone, the prior drew sigma_s of 800 nm spheres in blue by -3.3 %, with this by -1.1 %. Wider scales at all
-    knots left other samples to noise: with 100, phase functions of 500 nm spheres came out twice as far off. Near the
-    poles, where no camera may look, what a fit bends is the prior's own, and a peak that follows it runs away (two
-    lobes: 3.4 % off in place of 0.4 %). Thick cells tell of no troughs, and there it only made the ± larger.
+    With 30 alone, the prior pulled sigma_s of 800 nm spheres in blue by -3.3 %, with this by -1.1 %. Wider scales at
+    all knots left other samples to noise: with 100, phase functions of 500 nm spheres came out twice as far off. Near
+    the poles, where no camera may look, the curvature of a fit is the prior's own, and a peak that follows it runs away
+    (two lobes: 3.4 % off in place of 0.4 %). Thick cells resolve no troughs, and there it only made standard errors
+    larger.
     """
     return np.asarray(np.hypot(scale, (1 - _near_poles()) * (second_differences() @ np.log(material.scattering))))
 
@@ -79,7 +82,7 @@ def flag_scales() -> Array:
 
 
 def _near_poles() -> Array:
-    """1 at the poles, half of it at ``POLE_RAD`` from them (KNOTS,)."""
+    """Weight of a knot: 1 at the poles, half of it at ``POLE_RAD`` from them (KNOTS,)."""
     return np.asarray(1 / (1 + (np.minimum(ANGLES_RAD, math.pi - ANGLES_RAD) / POLE_RAD) ** 2))
 
 
@@ -92,8 +95,9 @@ class Quadratic:
     matrix: Array
     linear: Array
     noise: Array
-    """What the Monte Carlo noise of the derivatives would add to the matrix, positive semidefinite."""
+    """Excess of the matrix by the Monte Carlo noise of the derivatives, where they are not paired; positive
+    semidefinite."""
     noise_linear: Array
-    """And to the linear term."""
+    """The same excess of the linear term."""
     error: Array
-    """By about as much the matrix may be off by chance (U, U), of either sign."""
+    """About the error of the matrix by chance (U, U), of either sign."""

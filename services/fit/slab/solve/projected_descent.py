@@ -1,9 +1,9 @@
 """The solver of Gkioulekas et al. (2013): projected stochastic gradient descent on simplex weights, Algorithms 1 and 2.
 
-Kept as a named baseline. As ``optics.md`` corrects it: the image and the derivative of line 9 come from independent
-streams, the average is over as many iterates as are summed, weights are clamped before they are raised to a power, and
-the common offset of all atoms, 99 % of Eq. 19, goes with the vacuum atom. The particle caches of Algorithms 3 and 4
-with their step h are replaced by what they estimate, the path's scores, which have no step.
+It serves as a named baseline. As ``optics.md`` corrects it: the image and the derivative of line 9 come from
+independent streams, the average is over as many iterates as are summed, weights are clamped before they are raised to a
+power, and the common offset of all atoms, 99 % of Eq. 19, goes with the vacuum atom. The particle caches of Algorithms
+3 and 4 with their step h are replaced by the quantity that they estimate, the path's scores, which have no step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 WEIGHT_FLOOR, WEIGHT_POWER = 0.01, 3
 """c and alpha of Eq. 10."""
 SMALLEST_SCATTERING = 1e-9
-"""Of f, per mm and sr, where the projection has set a weight to zero: scores divide by f."""
+"""Smallest f, per mm and sr, for knots whose weight the projection has set to zero, because scores divide by f."""
 FIRST_STEP = 2**29
 """Number of the first render, so that it shares no stream with the other solver."""
 
@@ -36,13 +36,14 @@ class DescentOptions:
     rate: float = 1e-10
     paths: int = 4000
     regulariser: float = 0.0
-    """Of the squared differences of f between knots: smoothing raw weights would smooth p sin(theta) instead."""
+    """Factor of the squared differences of f between knots, because smoothing raw weights would smooth p sin(theta)
+    instead."""
 
 
 def projected(point: Array) -> Array:
     """The nearest point of the simplex (Duchi et al. 2008), by sorting and sums in float64."""
     falling = np.sort(np.asarray(point, dtype=np.float64))[::-1]
-    # Taken from the largest, so that huge coordinates keep their differences.
+    # Subtract the largest coordinate, so that huge coordinates keep their differences.
     falling = falling - falling[0]
     sums = np.cumsum(falling) - 1
     count = np.nonzero(falling - sums / np.arange(1, len(falling) + 1) > 0)[0][-1] + 1
@@ -50,10 +51,10 @@ def projected(point: Array) -> Array:
 
 
 def weight_gradient(rows: Array, material: Material, pulls: Array) -> Array:
-    """Derivative by the weights (KNOTS + 2,) of sum of pulls times images; ``pulls`` (images, pixels).
+    """Derivative with respect to the weights (KNOTS + 2,) of sum of pulls times images; ``pulls`` (images, pixels).
 
-    ``rows`` are sums of shares and ways (images, pixels, KNOTS + 1). Weight n adds sigma_max / Omega_n to f at knot n
-    and sigma_max to the extinction; vacuum adds nothing.
+    ``rows`` are sums of shares and path lengths (images, pixels, KNOTS + 1). Weight n adds sigma_max / Omega_n to f at
+    knot n and sigma_max to the extinction; vacuum adds nothing.
     """
     shares = np.einsum("ip,ipn->n", pulls, rows)
     solid = tent_solid_angles()

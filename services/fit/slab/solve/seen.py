@@ -1,10 +1,10 @@
-"""What a noisy normal matrix is believed of, and the two steps that are made with it: one of all unknowns, and one in
-broad directions.
+"""Directions of a noisy normal matrix that count as measured, and the two steps that use it: one of all unknowns, and
+one along broad directions.
 
 Among two hundred unknowns that are mostly noise some direction always looks measured: eigenvalues of the noise alone
-reach far beyond what any single direction's noise is. So a step of all unknowns is held by all of the noise. Ten broad
-directions, chosen before any image, have only their own to fear. In a thick cell one of these is sigma_s at a constant
-sigma_s'.
+reach far beyond the noise of any single direction. So a step of all unknowns is damped by all of the noise. Ten broad
+directions, chosen before any image, are damped by their own noise only. In a thick cell one of these is sigma_s at a
+constant sigma_s'.
 """
 
 from __future__ import annotations
@@ -20,22 +20,24 @@ from services.fit.slab.solve.prior import RIDGE, Quadratic
 Array = NDArray[np.float64]
 
 MIN_SIGNAL = 0.1
-"""Of the normal matrix, in units of the prior and of its own noise: directions below it count as not measured."""
+"""Smallest eigenvalue of the normal matrix, in units of the prior and of its own noise, at which a direction counts as
+measured."""
 
 
 TURNS = 10
-"""By which a step and the noise that its length makes agree; the second is within a few per cent already."""
+"""Number of iterations by which a step and the noise that its length makes agree; the second is within a few per cent
+already."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The directions that are believed: columns V (U, K) with V^T reference V = 1, and reference V."""
+    """The directions that count as measured: columns V (U, K) with V^T reference V = 1, and reference V."""
 
     vectors: Array
     dual: Array
     signals: Array
     prior: Array
-    """With a ridge, so that it can be inverted."""
+    """Precision of the prior, with a ridge so that it can be inverted (U, U)."""
 
     @property
     def curvature(self) -> Array:
@@ -44,7 +46,7 @@ class Seen:
 
     @property
     def total(self) -> Array:
-        """With the prior (U, U)."""
+        """The normal matrix of these directions and the prior together (U, U)."""
         return self.curvature + self.prior
 
     def projected(self, gradient: Array) -> Array:
@@ -52,8 +54,8 @@ class Seen:
         return np.asarray(self.dual @ (self.vectors.T @ gradient))
 
     def noise(self, covariance: Array) -> Array:
-        """That of a gradient's covariance (U, U); one estimated without bias may have slightly negative eigenvalues, a
-        variance has none.
+        """The part of a gradient's covariance (U, U) in these directions; an unbiased estimate may have slightly
+        negative eigenvalues, which are set to zero because a variance has none.
         """
         values, axes = np.linalg.eigh(self.vectors.T @ covariance @ self.vectors)
         half = self.dual @ axes * np.sqrt(np.maximum(values, 0))
@@ -70,29 +72,31 @@ def seen_of(quadratic: Quadratic, prior: Array) -> Seen:
 
 
 def step_matrix(quadratic: Quadratic, prior: Array, damping: float) -> Array:
-    """What a step is solved with (U, U): ``damping`` times the noise of J holds what noise may have bent."""
+    """Matrix of the damped step (U, U): ``damping`` times the noise of J holds directions whose curvature may be
+    noise.
+    """
     return np.asarray(quadratic.matrix + prior + damping * quadratic.noise + _ridge(quadratic))
 
 
 def broad_step(
     quadratic: Quadratic, prior: Array, broad: Array, reach: Array, gradient_noise: Array, x: Array
 ) -> Array:
-    """A second step (U,) from x, along broad directions alone and not held by the noise of J.
+    """A second step (U,) from x, along broad directions alone and not damped by the noise of J.
 
     That noise adds up over all pixels, but the unbiased matrix is off by its fluctuation alone, which many pixels
-    average. In a thick cell the direction of sigma_s at a constant sigma_s' has less signal than noise: held by all of
-    it, steps went a tenth of their way there, and fits ended where their budget did. Both steps in turn are a cycle of
-    two grids.
+    average. In a thick cell the direction of sigma_s at a constant sigma_s' has less signal than noise: damped by all
+    of it, steps went a tenth of their way there, and fits ended with their budget. The two steps in turn are a two-grid
+    cycle.
 
-    The gradient is taken for a measurement g = -M d + noise of the way d. In directions of signal s and unit noise of J
-    an element of M is off by about h sqrt(1 + s_i + s_j), so an element of g has a variance of h^2 sum_j (1 + s_i +
-    s_j) d_j^2 beside its own. With R the covariance of both, and T what d may be beforehand, the most probable way has
-    (M R^-1 M + T^-1 + prior) d = -M R^-1 g - prior x: all of it where signals stand out, none of it where they do not.
-    As R depends on d, it is found in turns.
+    The gradient is treated as a measurement g = -M d + noise of the displacement d to the minimum. In directions of
+    signal s and unit noise of J an element of M is off by about h sqrt(1 + s_i + s_j), so an element of g has a
+    variance of h^2 sum_j (1 + s_i + s_j) d_j^2 beside its own. With R the covariance of both, and T that of d
+    beforehand, the most probable displacement has (M R^-1 M + T^-1 + prior) d = -M R^-1 g - prior x: all of it where
+    signals stand out, none of it where they do not. As R depends on d, both are found by iteration.
 
     Args:
         broad: directions (U, K).
-        reach: standard deviations (K,) of how far the way may be along them.
+        reach: standard deviations (K,) of the displacement along them.
         gradient_noise: covariance of the gradient (U, U).
     """
     if not broad.size:
@@ -118,9 +122,7 @@ def broad_step(
 
 
 def noise_ratio(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:
-    """By how many times the gradient's noise exceeds that of images that fit, which is the normal matrix with its
-    noise.
-    """
+    """Ratio of the gradient's noise to that of images that fit, which is the normal matrix with its noise."""
     whole = quadratic.matrix + quadratic.noise
     total = whole + prior + _ridge(quadratic)
     both = np.linalg.solve(total, np.stack([gradient_noise, whole]))

@@ -1,13 +1,13 @@
-"""Derivatives of a thick cell's images, made smooth over pixels.
+"""Derivatives of a thick cell's images, smoothed over pixels.
 
-In a thick cell a path scatters tens of times, and the sum of its scores is many times what sigma_s at a constant
-sigma_s' changes an image by. But light that has scattered twice and more is smeared out: its relative derivatives vary
-slowly over an image, as six functions of the place do. So each image's derivatives are replaced by their weighted
-least-squares fit with these functions times the image, single scattering apart, which has no noise. In 200 nm spheres
-at sigma_t w = 9.1 the noise of the normal matrix fell 16-fold in that direction, and the matrix itself stayed the same
-within its error.
+In a thick cell a path scatters tens of times, and the sum of its scores is many times the change of an image with
+sigma_s at a constant sigma_s'. But light that has scattered twice and more is blurred: its relative derivatives vary
+slowly over an image, as six functions of the position do. So each image's derivatives are replaced by their weighted
+least-squares fit with these functions times the image, except for single scattering, which has no noise. In 200 nm
+spheres at sigma_t w = 9.1 the noise of the normal matrix fell 16-fold in that direction, and the matrix itself stayed
+the same within its error.
 
-The fit is linear in the derivatives, and what it is made from is independent of the present paths, so the gradient's
+The fit is linear in the derivatives, and its basis and weights are independent of the present paths, so the gradient's
 mean is still zero where images fit. Nothing is assumed of the images themselves.
 """
 
@@ -24,19 +24,21 @@ from services.fit.slab.model.rig import Grid
 Array = NDArray[np.float64]
 
 CORE = 0.5
-"""Of the cell's width: nearer to the beam the functions of the distance are flat."""
+"""Radius around the beam's axis, in widths of the cell, within which the functions of the distance are flat."""
 FAINTEST = 1e-6
-"""Of an image's largest value, below which a pixel's own counts as this."""
+"""Share of an image's largest value to which darker pixels are raised."""
 
 
 @dataclass(frozen=True)
 class Smoother:
-    """Of one rig's images: derivatives J (pixels, U) of each to outer (inner J), with few columns between."""
+    """Smoother of one rig's images: it turns derivatives J (pixels, U) of each into outer (inner J), with few columns
+    between.
+    """
 
     outer: tuple[Array, ...]
-    """By image (pixels, K)."""
+    """For each image (pixels, K)."""
     inner: tuple[Array, ...]
-    """By image (K, pixels)."""
+    """For each image (K, pixels)."""
 
     def of(self, batches: Batches) -> Batches:
         """The same batches with smooth derivatives."""
@@ -48,11 +50,11 @@ class Smoother:
 
 
 def smoother_of(grid: Grid, width_mm: float, multiple: Array, variances: Array) -> Smoother:
-    """Smoothing for images like these.
+    """Smoother for images like these.
 
     Args:
-        multiple: what has scattered twice and more (images, pixels), of renders before.
-        variances: of the measurements and of renders (images, pixels), infinite where a pixel does not weigh.
+        multiple: light that has scattered twice and more (images, pixels), of earlier renders.
+        variances: variances of the measurements and of renders (images, pixels), infinite where a pixel has no weight.
     """
     functions = _functions(grid, width_mm)
     outer, inner = [], []
@@ -60,14 +62,14 @@ def smoother_of(grid: Grid, width_mm: float, multiple: Array, variances: Array) 
         level = np.maximum(image, FAINTEST * max(float(image.max()), np.finfo(float).tiny))
         weight = level / np.sqrt(variance)
         basis, _ = np.linalg.qr(functions * weight[:, None])
-        # Where a pixel does not weigh, so does none of its derivatives.
+        # Where a pixel has no weight, its derivatives neither enter the fit nor come out of it.
         inner.append(basis.T * (weight / level))
         outer.append(basis * np.divide(level, weight, out=np.zeros_like(level), where=weight > 0)[:, None])
     return Smoother(tuple(outer), tuple(inner))
 
 
 def _functions(grid: Grid, width_mm: float) -> Array:
-    """Of a pixel's place in units of the cell's width, from the beam's axis (pixels, K)."""
+    """The functions of a pixel's position from the beam's axis, in units of the cell's width (pixels, K)."""
     x = (grid.x_from_mm + grid.pitch_x_mm * (np.arange(grid.columns) + 0.5)) / width_mm
     y = (grid.y_from_mm + grid.pitch_y_mm * (np.arange(grid.rows) + 0.5)) / width_mm
     across, along = (one.ravel() for one in np.meshgrid(x, y))

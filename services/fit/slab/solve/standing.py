@@ -1,4 +1,4 @@
-"""Where a fit stands before each step of its last stages, kept so that a new attempt goes on there to the same
+"""The state of a fit before each step of its last stages, stored so that a new attempt continues there to the same
 digits.
 """
 
@@ -26,25 +26,25 @@ FILE = "steps.npz"
 
 @dataclass(frozen=True)
 class Joined:
-    """Renders of one stage whose derivatives go together, and residuals of the last of them."""
+    """Renders of one stage whose derivatives are combined, and residuals of the last of them."""
 
     derivatives: DerivativeSums
     residuals: ResidualSums
     path_noise: tuple[Array, ...]
-    """That their weights were made from; see ``GaussNewton.path_noise``."""
+    """Noise from which their weights were made; see ``GaussNewton.path_noise``."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """All that a step of the last stages depends on, beside the measurements and the options."""
+    """The state on which a step of the last stages depends, beside the measurements and the options."""
 
     material: Material
     stage: int
     step: int
-    """Of the stage, from 0."""
+    """Number of the step within the stage, from 0."""
     search_steps: int
     is_converged: bool
-    """Whether the search before came as far as its paths could tell."""
+    """Whether the search came as far as the noise of its paths allows."""
     renders: int
     paths: int
     path_noise: tuple[Array, ...]
@@ -56,16 +56,16 @@ class Standing:
 
 @dataclass(frozen=True)
 class StandingFile:
-    """Keeps the newest standing of one wavelength in a folder."""
+    """The file that stores the newest state of one wavelength's fit in a folder."""
 
     folder: Path
     of: str
-    """What the result depends on; a standing of anything else is not read."""
+    """Fingerprint of all that the result depends on; a state with another fingerprint is not read."""
     told: Callable[[Standing], None] = lambda _: None
-    """Called with each standing that is kept."""
+    """Called with each state that is stored."""
 
     def write(self, standing: Standing) -> None:
-        """Keep it in place of the one before."""
+        """Store a state in place of the one before."""
         arrays: dict[str, Any] = {name: np.array(getattr(standing, name)) for name in _NUMBERS}
         arrays |= _numbered("path_noise", standing.path_noise) | {"multiple": standing.multiple}
         if (joined := standing.joined) is not None:
@@ -88,7 +88,7 @@ class StandingFile:
         self.told(standing)
 
     def read(self) -> Standing | None:
-        """The newest; None where nothing whole of this fit is there."""
+        """The newest state; None where the folder holds no whole state of this fit."""
         try:
             with np.load(io.BytesIO((self.folder / FILE).read_bytes()), allow_pickle=False) as held:
                 arrays = dict(held)
@@ -103,7 +103,7 @@ class StandingFile:
         )
 
     def remove(self) -> None:
-        """The fit is done."""
+        """Delete the file, because the fit is done."""
         (self.folder / FILE).unlink(missing_ok=True)
 
 

@@ -1,4 +1,4 @@
-"""A first guess: an HG medium of three numbers, which many different images already fix."""
+"""First guess of a fit: an HG medium of three numbers, which many different images already determine."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ Array = NDArray[np.float64]
 
 THICKNESSES = (0.3, 1.0, 3.0, 9.0)
 COSINES = (0.0, 0.7)
+"""Values of sigma_s w and of g that the table combines."""
 FIRST_ALBEDO = 0.97
 LARGEST_COSINE, SMALLEST_COSINE = 0.8, -0.5
-"""The forward peak of a larger cosine may lie where no camera looks; the free fit finds it from here."""
+"""Bounds of g. The forward peak of a larger cosine may lie where no camera looks; the fit of all knots finds it from
+here."""
 MODEL_ERROR = 0.1
-"""Share of a pixel by which an HG medium may be off: it keeps the brightest pixels from deciding alone."""
+"""Error of an HG medium, as a share of a pixel, that the misfit tolerates: it keeps the brightest pixels from deciding
+alone."""
 TABLE_PATHS, STEP_PATHS, BATCHES, STEPS = 1000, 2000, 4, 6
 
 
@@ -62,7 +65,7 @@ def _improved(
     noise = smoothed_variance(batches.images, (rig.grid.rows, rig.grid.columns))
     equations = normal_equations(batches, material, measured.values, independent_weights(tolerated, noise))
 
-    # Chain rule from ln f and sigma_a to the three numbers; the cosine's column by differences of ln p.
+    # Apply the chain rule from ln f and sigma_a to the three numbers; the cosine's column by differences of ln p.
     chain = np.zeros((KNOTS + 1, 3))
     chain[:KNOTS, 0] = 1
     small = 1e-4

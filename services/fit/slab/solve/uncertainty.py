@@ -1,4 +1,6 @@
-"""How sure a fit is: covariance of the unknowns, of what is derived from them, and what the images do not determine."""
+"""Uncertainty of a fit: covariance of the unknowns and of quantities derived from them, and which of these the images
+do not determine.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from services.fit.slab.solve.seen import seen_of
 Array = NDArray[np.float64]
 
 LARGEST_SHARE = 0.1
-"""Standard error, as a share of the value, up to which a value of the phase function is determined."""
+"""Largest standard error, as a share of the value, at which a value of the phase function is determined."""
 LARGEST_COEFFICIENT_SHARE = 0.05
 """The same for coefficients, and in units of 1 for g."""
 
@@ -25,23 +27,23 @@ class Uncertainty:
     """Covariances of ln f and sigma_a (KNOTS + 1, KNOTS + 1)."""
 
     covariance: Array
-    """With the prior's scale that the evidence chose."""
+    """Covariance with the prior's scale that the evidence chose."""
     images_alone: Array
-    """With a prior so weak that it tells nothing: what flags are judged by."""
+    """Covariance with a prior so weak that it adds no information; flags are judged by it."""
     of_unknowns: tuple[Array, Array]
     """Both in the solver's own unknowns (U, U)."""
 
     def standard_error(self, slope: Array) -> float:
-        """Of a quantity, from its derivatives by the unknowns."""
+        """Standard error of a quantity, from its derivatives with respect to ln f and sigma_a (KNOTS + 1,)."""
         return float(np.sqrt(slope @ self.covariance @ slope))
 
     def undetermined_error(self, slope: Array) -> float:
-        """The same as far as the images alone tell."""
+        """The same standard error as far as the images alone determine the quantity."""
         return float(np.sqrt(slope @ self.images_alone @ slope))
 
     def whole_error(self, slope: Array) -> float:
-        """The larger of both, by which a quantity is judged: a fit that ended short of its minimum may say more under
-        the weak prior.
+        """The larger of both, by which a quantity is judged: a fit that ended short of its minimum may have the smaller
+        error under the weak prior.
         """
         return max(self.standard_error(slope), self.undetermined_error(slope))
 
@@ -49,10 +51,10 @@ class Uncertainty:
 def uncertainty_of(solution: Solution) -> Uncertainty:
     """Covariances at a solution.
 
-    The unbiased matrix is indefinite where it is noise, and its mean with the noise in would promise too much: so only
-    directions whose curvature stands out count. In thin cells the images' Monte Carlo noise is in the weights, as the
-    shot noise is. In thick ones, where it is the larger part, the gradient's noise is taken as it was seen between
-    batches, and what is left of the way to the minimum counts as error.
+    The unbiased matrix is indefinite where it is noise, and the matrix with the noise included would promise too much:
+    so only directions whose curvature stands out count. In thin cells the weights contain the images' Monte Carlo
+    noise, as they do the shot noise. In thick ones, where it is the larger part, the gradient's noise is that measured
+    between batches, and the displacement left to the minimum counts as error.
     """
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
@@ -67,7 +69,8 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
         noise = solution.data_noise + solution.gradient_noise + np.outer(solution.unsure, solution.unsure)
         chosen = chosen @ (believed.noise(noise) + priors[0] + held) @ chosen
         left = _left(solution, x, priors[0], chosen)
-        # Flags ask what the prior adds, so the weak one's directions count as far as the weights have it.
+        # Flags ask what the prior adds, so the covariance under the weak prior has only the noise that the weights
+        # contain.
         chosen, alone = chosen + left, alone + left
     if (chain := coordinates.chain(material)) is None:
         return Uncertainty(chosen, alone, (chosen, alone))
@@ -75,38 +78,37 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
 
 
 def _left(solution: Solution, x: Array, prior: Array, known: Array) -> Array:
-    """Square (U, U) of what is left of the way to the minimum within bounds, less what noise alone leaves of it on
-    average.
+    """Outer square (U, U) of the displacement left to the minimum within bounds, reduced by the share that noise alone
+    leaves on average.
     """
     coordinates, quadratic = solution.coordinates, solution.quadratic
     seen = seen_of(quadratic, prior)
     slope = seen.projected(quadratic.linear + quadratic.matrix @ x)
     left = coordinates.minimum(seen.total, seen.curvature @ x - slope) - x
-    # In units of the covariance (U, U) that is known without it, noise leaves one for each direction that is seen.
+    # In units of the covariance (U, U) without this term, noise leaves a squared length of one for each measured
+    # direction.
     length = float(left @ np.linalg.lstsq(known, left)[0])
     share = max(0.0, 1 - len(seen.signals) / max(length, 1e-300))
     return np.asarray(share * np.outer(left, left))
 
 
 def covariance_of(quadratic: Quadratic, prior: Array) -> Array:
-    """Posterior covariance of the unknowns under a prior's precision (U, U), where the weights hold all noise there
-    is.
-    """
+    """Posterior covariance of the unknowns under a prior's precision (U, U), where the weights contain all noise."""
     return np.asarray(np.linalg.inv(seen_of(quadratic, prior).total))
 
 
 def _half_lines(quadratic: Quadratic, prior: Array, x: Array, bound: NDArray[np.bool_]) -> Array:
     """Precision (U,) that a bound adds to the unknowns that lie at it.
 
-    On the half line that is left to it, an unknown of slope s has exp(-s x - a x^2 / 2): a second moment of 1/a where s
-    is small, as without the bound, and of 2/s^2 where it is large.
+    On the half line within the bound, an unknown of slope s has the density exp(-s x - a x^2 / 2): its second moment is
+    1/a where s is small, as without the bound, and 2/s^2 where s is large.
     """
     slope = quadratic.linear + quadratic.noise_linear + (quadratic.matrix + quadratic.noise + prior) @ x
     return np.where(bound, np.maximum(slope, 0) ** 2 / 2, 0.0)
 
 
 def slopes(material: Material) -> dict[str, Array]:
-    """Derivatives of the reported numbers by ln f and sigma_a (KNOTS + 1,)."""
+    """Derivatives of the reported quantities with respect to ln f and sigma_a (KNOTS + 1,)."""
     parts, moments = material.scattering * tent_solid_angles(), material.scattering * cosine_moments()
     sigma_s, g = material.scattering_per_mm, material.mean_cosine
     return {
@@ -119,7 +121,9 @@ def slopes(material: Material) -> dict[str, Array]:
 
 
 def phase_chain(material: Material) -> Array:
-    """Derivatives of ln p at the knots by ln f and sigma_a (KNOTS, UNKNOWNS), as ln p = ln f - ln sigma_s."""
+    """Derivatives of ln p at the knots with respect to ln f and sigma_a (KNOTS, UNKNOWNS), as ln p = ln f - ln
+    sigma_s.
+    """
     return np.asarray(np.eye(KNOTS + 1)[:KNOTS] - material.slope_of_scattering() / material.scattering_per_mm)
 
 

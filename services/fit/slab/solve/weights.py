@@ -1,8 +1,9 @@
-"""Weights of images: the inverse of their covariance, by the measurements' noise and by the paths that rendered them.
+"""Weights of images: the inverse of their covariance, by the measurements' noise and by the noise of the rendered
+paths.
 
 A path is connected to every camera, and in a thick cell cameras of one side see nearly the same of it: at sigma_t w = 5
-the noise of a pixel correlates by 0.95 between them. Weighed as independent, three cameras told each path three times,
-and what they tell by their differences, which that noise hardly touches, was lost in it.
+the noise of a pixel correlates by 0.95 between them. Weighted as independent, three cameras counted each path three
+times, and the information in their differences, which that noise hardly touches, was lost in it.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ class Weights:
     """W = R R^T for each pixel of each light's images; different pixels and lights are independent."""
 
     images: tuple[NDArray[np.int64], ...]
-    """Of each light, C of all."""
+    """Indices of each light's images, C of all."""
     roots: tuple[Array, ...]
-    """R by light (pixels, C, C)."""
+    """R for each light (pixels, C, C)."""
     spreads: Array
-    """Standard deviation of each measurement by its own noise (images, pixels); 0 where it does not weigh."""
+    """Standard deviation of each measurement by its own noise (images, pixels); 0 where the value has no weight."""
     used: NDArray[np.bool_]
-    """Which values weigh (images, pixels)."""
+    """Which values have weight (images, pixels)."""
 
     def whitened(self, stack: Array) -> Array:
         """R^T times a stack of images (B, images, pixels) or of their derivatives (B, images, pixels, U)."""
@@ -40,8 +41,8 @@ class Weights:
         return out
 
     def of_measurements(self, whitened: Array) -> Array:
-        """S^1/2 R x of what was whitened before, with S the variances of the measurements: x^T R^T S R x is their part
-        in W.
+        """S^1/2 R x of an array x that ``whitened`` gave, with S the variances of the measurements: x^T R^T S R x is
+        their part in W.
         """
         out = np.zeros_like(whitened)
         for own, root in zip(self.images, self.roots, strict=True):
@@ -50,12 +51,12 @@ class Weights:
 
 
 def weights_of(images: Sequence[NDArray[np.int64]], variances: Array, covariances: Sequence[Array]) -> Weights:
-    """Weights of measurements beside renders.
+    """Weights from the noise of measurements and of renders.
 
     Args:
-        images: of each light.
-        variances: of the measurements (images, pixels); infinite where a value does not weigh.
-        covariances: of the renders' noise, by light (pixels, C, C).
+        images: indices of each light's images.
+        variances: variances of the measurements (images, pixels); infinite where a value has no weight.
+        covariances: covariances of the renders' noise, for each light (pixels, C, C).
     """
     used = np.isfinite(variances)
     roots = []
@@ -65,7 +66,8 @@ def weights_of(images: Sequence[NDArray[np.int64]], variances: Array, covariance
         total = np.where(both, noise, 0.0)
         diagonal = np.arange(len(own))
         total[:, diagonal, diagonal] += np.where(counts, variances[own].T, 1.0)
-        # total = L L^T, so its inverse is L^-T L^-1. Values that do not weigh stand apart in it, and are left out here.
+        # total = L L^T, so its inverse is L^-T L^-1. Values without weight are independent of the others in it, and are
+        # left out here.
         root = np.linalg.inv(np.linalg.cholesky(total)).transpose(0, 2, 1)
         roots.append(np.where(both, root, 0.0))
     spreads = np.sqrt(np.where(used, variances, 0.0))
@@ -73,7 +75,7 @@ def weights_of(images: Sequence[NDArray[np.int64]], variances: Array, covariance
 
 
 def independent_weights(variances: Array, noise: Array) -> Weights:
-    """Weights of values whose measurements and renders all have noise of their own, with these variances (images,
+    """Weights of values whose measurements and renders all have independent noise, with these variances (images,
     pixels).
     """
     each = [np.array([image]) for image in range(len(variances))]
@@ -96,6 +98,6 @@ def smoothed_covariance(images: Array, shape: tuple[int, int]) -> Array:
 
 
 def smoothed_variance(images: Array, shape: tuple[int, int]) -> Array:
-    """The same of each image by itself: images (B, images, pixels) to variances (images, pixels)."""
+    """The same for each image by itself: images (B, images, pixels) to variances (images, pixels)."""
     each = [smoothed_covariance(images[:, image : image + 1], shape)[:, 0, 0] for image in range(images.shape[1])]
     return np.stack(each)
