@@ -1,1 +1,1 @@
-"""What a slab fit gives: the record, its report, its phase function for Mitsuba."""
+"""Results of a slab fit: the record, its report, its phase function for Mitsuba."""

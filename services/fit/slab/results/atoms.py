@@ -1,4 +1,4 @@
-"""What a fit by a dictionary of few atoms tells of them: parts of the scattering, and sizes where the atoms are
+"""Results of a fit by a dictionary of few atoms: each atom's part of the scattering, and sizes where the atoms are
 spheres.
 """
 
@@ -16,14 +16,14 @@ from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncer
 Array = NDArray[np.float64]
 
 LARGEST_SIZE_SHARE = 0.1
-"""Standard error, as a share of the value, up to which a radius or a volume is determined."""
+"""Largest standard error, as a share of the value, at which a radius or a volume is determined."""
 
 
 def atoms_of(dictionary: ChosenDictionary, material: Material, uncertainty: Uncertainty) -> dict[str, Quantity]:
-    """By the names of ``parameters.json``: ``atoms.<name>`` is an atom's part of sigma_s; nothing where there are no
-    atoms.
+    """Quantities by the names of ``parameters.json``: ``atoms.<name>`` is an atom's part of sigma_s; empty where there
+    are no atoms.
 
-    Of spheres also ``volumes.<name>``, their share of the sample's volume, ``volume_fraction``, which is the sum of
+    For spheres also ``volumes.<name>``, their share of the sample's volume, ``volume_fraction``, which is the sum of
     these, and ``mean_radius``, the mean by volume.
     """
     if not isinstance(material, Mixture):
@@ -61,7 +61,9 @@ def _volumes(dictionary: ChosenDictionary, weights: Array, uncertainty: Uncertai
 
 
 def _quantity(value: float, slope: Array, uncertainty: Uncertainty, unit: SlabUnit, most: float) -> Quantity:
-    """From its derivatives by the weights; determined where the images alone tell it to within ``most``."""
+    """A quantity from its derivatives with respect to the weights; determined where its error by the images alone is at
+    most ``most``.
+    """
     by_unknowns = np.append(slope, 0.0)
     chosen, alone = (float(np.sqrt(by_unknowns @ one @ by_unknowns)) for one in uncertainty.of_unknowns)
     return Quantity(value=value, se=chosen, unit=unit, determined=alone <= most)

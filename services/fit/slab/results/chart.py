@@ -16,14 +16,14 @@ PICTURE_STYLE = (
     "@media(prefers-color-scheme:dark){text{fill:#a9b4b7}.grid{stroke:#3a4549}.series{stroke:#6db5ea}.band{fill:#6db5ea}.prior{fill:#3a4549}}"
     "@media(max-width:450px){text{font-size:17px}}"
 )
-"""Of a chart that stands alone; where a phone shows it at half its size, its letters are larger."""
+"""Style sheet of a chart that stands alone; where a phone shows it at half its size, its letters are larger."""
 DECADES_BELOW = 4
-"""Decades below the peak that are drawn at most: what lies lower is not seen against it in any image."""
+"""Largest number of decades below the peak that are drawn: lower values are not seen against the peak in any image."""
 
 
 def phase_chart(title: str, phase: PhaseFunction) -> str:
-    """Value per sr against the angle, logarithmic, with a band of one standard error; grey where the images do not
-    tell.
+    """Chart of the value per sr against the angle, logarithmic, with a band of one standard error; grey where the
+    images do not determine it.
     """
     low, high = _limits(phase)
 

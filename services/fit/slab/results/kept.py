@@ -1,4 +1,4 @@
-"""What is kept of a wavelength that is done: its result and its images, and of which data and options."""
+"""The stored result of a finished wavelength: its fit, its images, and the fingerprint of its data and options."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ LATER_OPTIONS = ("dictionary", "particle_index", "particle_absorption")
 
 
 class Kept(Record):
-    """``fit.json`` of a wavelength's folder; written last, so a folder that has it is whole."""
+    """Content of ``fit.json`` in a wavelength's folder; it is written last, so a folder that has it is whole."""
 
     of: str
-    """See ``fingerprint``."""
+    """Identifies data and options; see ``fingerprint``."""
     fit: SlabFit
 
 
@@ -45,12 +45,12 @@ class Images:
 
 
 def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
-    """Identifies all that a wavelength's result depends on."""
+    """A digest that identifies all that a wavelength's result depends on."""
     folder, digest = read_folder(root), hashlib.sha256()
-    # Options at these defaults are left out, so that what earlier versions kept is taken.
+    # Leave out options at these defaults, so that results stored by earlier versions are still used.
     later = {name for name in LATER_OPTIONS if getattr(options, name) == SlabOptions.model_fields[name].default}
     told = options.model_dump_json(exclude=later)
-    # So are exposures where there are none.
+    # Leave out exposures too where there are none.
     described = folder.model_dump_json(exclude=None if folder.exposures else {"exposures"})
     for part in (numerics_name(), described, told, f"{wavelength_nm:g}"):
         digest.update(part.encode() + b"\n")
@@ -80,7 +80,7 @@ def keep(place: Path, mark: str, wavelength: Wavelength) -> None:
 
 
 def read_kept(place: Path) -> Kept | None:
-    """What is kept in a folder; None where nothing whole is."""
+    """The result stored in a folder; None where the folder holds no whole result."""
     try:
         return Kept.model_validate_json((place / RESULT).read_bytes())
     except (FileNotFoundError, ValidationError):

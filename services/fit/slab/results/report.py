@@ -47,7 +47,7 @@ def write_report(
 
     Args:
         images: by wavelength, nm.
-        provenance: label and text of where it comes from.
+        provenance: labels and texts on the origin of the result.
     """
     template = page_template(Path(__file__).parent / "report.html.j2")
     page = template.render(
@@ -70,7 +70,7 @@ def write_report(
 
 
 def _notes(report: SlabReport) -> list[str]:
-    # What holds of all wavelengths is said once.
+    # Write a note that holds for all wavelengths once.
     every = [note for note in report.fits[0].notes if all(note in fit.notes for fit in report.fits)]
     return every + [
         f"{fit.wavelength_nm:g} nm: {note}" for fit in report.fits for note in fit.notes if note not in every
@@ -89,7 +89,7 @@ def _errors(report: SlabReport, name: str) -> dict[str, Any] | None:
 
 def _row(report: SlabReport, name: str) -> dict[str, Any]:
     told: list[Quantity] = [getattr(fit.parameters, name) for fit in report.fits]
-    # An index that was given has no error of its own to tell.
+    # An index that was given has no standard error.
     cells = [
         cell(Estimate(value=one.value, se=one.se or None, unit=one.unit, determined=one.determined)) for one in told
     ]
@@ -97,7 +97,7 @@ def _row(report: SlabReport, name: str) -> dict[str, Any]:
 
 
 def _atoms(fit: SlabFit) -> list[dict[str, Any]]:
-    """Rows of what the dictionary's atoms add up to, and of those that are there."""
+    """Rows of the sums over the dictionary's atoms, and of those atoms that are present."""
     there = {name: one for name, one in fit.atoms.items() if one.value > 0}
     return [
         {
@@ -110,7 +110,7 @@ def _atoms(fit: SlabFit) -> list[dict[str, Any]]:
 
 
 def _atom_label(name: str) -> str:
-    """``atoms.radius=0.250um`` for people."""
+    """Readable label of an atom such as ``atoms.radius=0.250um``."""
     what, _, atom = name.partition(".")
     told = atom.replace("=", " ").removesuffix("um") + (" µm" if atom.endswith("um") else "")
     return f"{'volume' if what == 'volumes' else 'σs'} of {told}"

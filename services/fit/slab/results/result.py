@@ -29,7 +29,7 @@ class Quantity(Record):
 
 
 class Parameters(Record):
-    """Of one wavelength."""
+    """Coefficients of one wavelength."""
 
     sigma_t: Quantity
     sigma_s: Quantity
@@ -40,7 +40,7 @@ class Parameters(Record):
 
 
 class PhaseFunction(Record):
-    """At the dictionary's knots, normalised so that 2 pi times the integral of p sin(theta) is 1."""
+    """Phase function at the dictionary's knots, normalised so that 2 pi times the integral of p sin(theta) is 1."""
 
     theta_deg: tuple[float, ...]
     value_per_sr: tuple[float, ...]
@@ -61,14 +61,14 @@ class PhaseFunction(Record):
 
 
 class Errors(Record):
-    """Images predicted against measured, noise of both taken out."""
+    """Relative errors of predicted against measured images, without the noise of either."""
 
     fit_error: float
     held_out_error: float | None
 
 
 class SlabFit(Record):
-    """All that is told of one wavelength."""
+    """Result of one wavelength."""
 
     wavelength_nm: float
     parameters: Parameters
@@ -86,7 +86,7 @@ class SlabFit(Record):
 def parameters_of(material: Material, uncertainty: Uncertainty, index: Index) -> Parameters:
     """The coefficients with their standard errors.
 
-    One of a small value is judged by the extinction that it is part of.
+    The absorption, which may be small, is judged relative to the extinction that it is part of.
     """
     values = {
         "sigma_t": material.extinction_per_mm,
@@ -121,7 +121,7 @@ def phase_of(material: Material, uncertainty: Uncertainty) -> PhaseFunction:
 def image_error(
     first: NDArray[np.float64], second: NDArray[np.float64], values: NDArray[np.float64], variances: NDArray[np.float64]
 ) -> float:
-    """Relative error from two independent renders, the measurements' noise taken out of both sums."""
+    """Relative error from two independent renders, with the measurements' noise subtracted from both sums."""
     usable = np.isfinite(variances)
     y, noise = values[usable], float(variances[usable].sum())
     square = (float((first[usable] - y) @ (second[usable] - y)) - noise) / max(float(y @ y) - noise, 1e-300)

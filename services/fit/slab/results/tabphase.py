@@ -12,8 +12,8 @@ from services.fit.slab.model.dictionary import ANGLES_RAD
 from services.fit.slab.results.result import SlabFit
 
 COSINES = 20_001
-"""Nodes of the table, at equal steps of the cosine: at the forward peak they are then 0.6 degrees apart, less than the
-dictionary's 0.9."""
+"""Number of nodes of the table, at equal steps of the cosine: at the forward peak they are then 0.6 degrees apart, less
+than the dictionary's 0.9."""
 EDGE_TO_WIDTH = 10.0
 """Lateral size of the scene's slab, in widths of the cell."""
 
@@ -43,7 +43,7 @@ def tabphase_values(phase_per_sr: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values from a cosine of -1, backward, to 1, forward, at equal steps (COSINES,): the order of Mitsuba's plugin.
 
     Args:
-        phase_per_sr: at the dictionary's angles, from 0 to 180 degrees; linear between them.
+        phase_per_sr: phase function at the dictionary's angles, from 0 to 180 degrees; linear between them.
     """
     angles = np.arccos(np.linspace(-1.0, 1.0, COSINES))
     return np.interp(angles, ANGLES_RAD, phase_per_sr)
@@ -55,7 +55,7 @@ def values_text(fit: SlabFit) -> str:
 
 
 def scene_xml(fit: SlabFit, cell: Cell) -> str:
-    """A slab of the cell's width before a camera, in even light."""
+    """Scene of a slab of the cell's width before a camera, in even light."""
     told = fit.parameters
     bsdf = '<bsdf type="null"/>'
     if cell.boundary == "smooth":

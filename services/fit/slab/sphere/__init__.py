@@ -1,1 +1,3 @@
-"""Totals of a slab from an integrating sphere to absorption and reduced scattering, and a slab over black and white."""
+"""Absorption and reduced scattering of a slab from its totals in an integrating sphere, and its look over black and
+white.
+"""

@@ -1,7 +1,7 @@
-"""What a sphere reads of a slab whose totals are known: theory of Pickering et al. (Appl. Opt. 32, 399, 1993) with
-baffles.
+"""Readings of an integrating sphere for a slab whose totals are known: theory of Pickering et al. (Appl. Opt. 32, 399,
+1993) with baffles.
 
-Light in a sphere goes to and fro until the detector, an open port or the sample takes it; its gain depends on the
+Light in a sphere goes to and fro until the detector, an open port or the sample absorbs it; its gain depends on the
 sample, which lies in the wall. Substituting the standard for the sample changes that gain, and the reading is off by
 the ratio.
 """
@@ -17,7 +17,7 @@ from services.fit.slab.sphere.totals import Totals
 
 @dataclass(frozen=True)
 class Readings:
-    """What the instrument says."""
+    """Readings of the instrument."""
 
     R: float
     T: float
@@ -39,17 +39,21 @@ def expected(totals: Totals, file: SphereFile, reading: TotalsReading) -> Readin
 
 
 def _reflection(file: SphereFile, reading: TotalsReading, scattered: float, mirror: float, sample: float) -> float:
-    """A reading against the standard; both are lit first, and the third port is the open entrance."""
+    """Reflectance reading relative to the standard; the beam meets both first, and the third port is the open
+    entrance.
+    """
     if (sphere := _with_wall(file.reflection_sphere, reading.reflection_wall)) is None:
         return scattered + mirror
-    # Behind a baffle light meets the wall first. A mirror's light meets it whole, scattered light loses the entrance's
-    # share.
+    # Behind a baffle light meets the wall first. The wall receives all of the mirror's light, but scattered light less
+    # the entrance's share.
     spared = 1 - _area(sphere, sphere.third_port_mm) if sphere.baffle else 1.0
     return (scattered + mirror / spared) * _gain(sphere, sample) / _gain(sphere, file.standard_reflectance)
 
 
 def _transmission(file: SphereFile, reading: TotalsReading, scattered: float, through: float, sample: float) -> float:
-    """A reading against the beam with no sample; the third port, where the beam ends, holds a white cap."""
+    """Transmittance reading relative to the beam with no sample; the third port, where the beam ends, holds a white
+    cap.
+    """
     if (sphere := _with_wall(file.transmission_sphere, reading.transmission_wall)) is None:
         return scattered + through
     cap = 1.0 if file.unscattered_included else 0.0
@@ -59,11 +63,11 @@ def _transmission(file: SphereFile, reading: TotalsReading, scattered: float, th
 
 
 def _gain(sphere: Sphere, sample: float, third: float = 0.0) -> float:
-    """How often light on average meets the detector, relative to a sphere of black walls.
+    """Mean number of times that light meets the detector, relative to a sphere of black walls.
 
     Args:
         sample: reflectance of the sample for diffuse light.
-        third: reflectance of what lies in the third port.
+        third: reflectance of the cap in the third port, 0 for an open port.
     """
     sample_area, third_area, detector_area = (
         _area(sphere, port) for port in (sphere.sample_port_mm, sphere.third_port_mm, sphere.detector_port_mm)

@@ -1,7 +1,7 @@
-"""From readings to absorption and reduced scattering, each with its standard error.
+"""Absorption and reduced scattering from readings, each with its standard error.
 
 Two totals fix two coefficients. The collimated transmittance, where it was measured, gives the extinction by itself, so
-g follows as well; otherwise g is what the file says, on which the reduced coefficient hardly depends.
+g follows as well; otherwise g is the value in the file, on which the reduced coefficient hardly depends.
 """
 
 from __future__ import annotations
@@ -26,25 +26,26 @@ from services.fit.slab.sphere.totals import NODES, Optics, slab_totals
 Array = NDArray[np.float64]
 
 ASSUMED_SE = 0.005
-"""Of R and T where the file gives none, as a share of the incident power: a laboratory's sphere repeats to about
-this."""
+"""Standard error of R and T where the file gives none, as a share of the incident power: a laboratory's sphere repeats
+to about this."""
 ASSUMED_UNSCATTERED_SHARE = 0.05
 """Standard error of the collimated transmittance where the file gives none, as a share of its value."""
 SEARCH_NODES = 8
-"""Enough to tell which corner of the grid a slab lies in."""
+"""Number of nodes in the search, enough to tell in which corner of the grid a slab lies."""
 SEARCH = tuple(product(np.geomspace(0.02, 60, 8), np.geomspace(0.003, 8, 6)))
-"""Reduced scattering and absorption, each times the width, among which a fit starts."""
+"""Grid of reduced scattering and absorption, each times the width, from which a fit takes its start."""
 MIN_THICKNESS, MAX_THICKNESS = 1e-6, 1e4
-"""Bounds of both, times the width; a slab at the lower one absorbs, or scatters, nothing that a reading could tell."""
+"""Bounds of both, times the width; at the lower one a slab absorbs, or scatters, too little for any reading to show."""
 MAX_G, MIN_G = 0.998, -0.95
 MAX_MISS = 2e-5
-"""Readings that are missed by more belong to no slab of this index and width; a solution meets them to 1e-10."""
+"""Largest difference between fitted and measured readings of a slab of this index and width; a solution meets them to
+1e-10."""
 DIFFERENCE = 1e-4
 """Relative step of derivatives."""
 
 
 class SphereFit(Record):
-    """What is told of one wavelength."""
+    """Result of one wavelength."""
 
     name: str
     sigma_a: Quantity
@@ -54,7 +55,7 @@ class SphereFit(Record):
     """Null where the collimated transmittance was not measured, as is sigma_t."""
     sigma_t: Quantity | None
     R: float
-    """As measured, as are T and T_unscattered."""
+    """Measured value, as are T and T_unscattered."""
     T: float
     T_unscattered: float | None
     R_fitted: float
@@ -65,12 +66,12 @@ class SphereFit(Record):
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit with what a slab of the same medium over a backing needs."""
+    """A fit with the medium and covariance from which ``translucency`` computes the same medium over a backing."""
 
     fit: SphereFit
     optics: Optics
     covariance: Array
-    """Of sigma_a and sigma_s_reduced, per mm (2, 2)."""
+    """Covariance of sigma_a and sigma_s_reduced, in units of mm^-2 (2, 2)."""
 
 
 def interface_of(cell: Cell) -> Interface:
@@ -95,7 +96,7 @@ class _Problem:
     nodes: int
 
     def fit(self, name: str) -> Fitted:
-        """The slab that reads as measured."""
+        """Fit the slab whose readings are the measured ones."""
         width, reading = self.file.cell.width_mm, self.reading
         extinction = self.extinction_per_mm()
         measured = np.array([reading.R, reading.T])
@@ -114,7 +115,9 @@ class _Problem:
         return self._told(name, absorption, reduced, extinction, fitted, errors)
 
     def extinction_per_mm(self) -> float | None:
-        """From the collimated transmittance t^2 x / (1 - r^2 x^2), x = exp(-sigma_t w), all reflections summed."""
+        """Extinction from the collimated transmittance t^2 x / (1 - r^2 x^2), x = exp(-sigma_t w), all reflections
+        summed; None where it was not measured.
+        """
         measured = self.reading.T_unscattered
         if measured is None:
             return None
@@ -124,13 +127,13 @@ class _Problem:
         return max(-math.log(min(x, 1.0)), MIN_THICKNESS) / self.file.cell.width_mm
 
     def optics(self, absorption: float, reduced: float, extinction: float | None) -> Optics:
-        """The medium; where the extinction is known, g is what is left, within what a phase function can have."""
+        """The medium; where the extinction is known, g follows from it, clipped to the range of a phase function."""
         g = self.file.g if extinction is None else 1 - reduced / max(extinction - absorption, 1e-12)
         g = min(max(g, MIN_G), MAX_G)
         return Optics(absorption, reduced / (1 - g), g)
 
     def readings(self, absorption: float, reduced: float, extinction: float | None, nodes: int) -> Array:
-        """R and T as the instrument would tell them."""
+        """R and T as the instrument would read them."""
         told = self.expected(self.optics(absorption, reduced, extinction), nodes)
         return np.array([told.R, told.T])
 
@@ -171,7 +174,7 @@ class _Problem:
     def _covariance(
         self, absorption: float, reduced: float, extinction: float | None, errors: Array
     ) -> tuple[Array, float]:
-        """Of sigma_a, sigma_s_reduced, sigma_s and g (4, 4), and the standard error of the extinction."""
+        """Covariance of sigma_a, sigma_s_reduced, sigma_s and g (4, 4), and the standard error of the extinction."""
         point = np.array([absorption, reduced, extinction or 0.0])
         columns = []
         for k in range(3):
@@ -233,7 +236,9 @@ class _Problem:
 
 
 def _quantity(value: float, se: float, unit: str, reference: float | None = None) -> Quantity:
-    """Judged by its own size or by ``reference``; what was given and not measured has a reference of 0."""
+    """A quantity judged by its own size or by ``reference``; a reference of 0 stands for a value that was given and not
+    measured.
+    """
     size = abs(value) if reference is None else reference
     determined = size > 0 and se <= LARGEST_COEFFICIENT_SHARE * size
     return Quantity.model_validate({"value": value, "se": se, "unit": unit, "determined": determined})

@@ -1,4 +1,4 @@
-"""What a laboratory hands in: a JSON file of the project's own vocabulary, or the .rxt file of Prahl's IAD."""
+"""Input files of a laboratory: a JSON file in the project's own vocabulary, or the .rxt file of Prahl's IAD."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Wall = Annotated[float, Field(ge=0, lt=1)]
 
 RXT_MARK = "IAD1"
 RXT_HEADER = 18
-"""Numbers before the readings of an .rxt file."""
+"""Count of numbers before the readings of an .rxt file."""
 MAX_RXT_COLUMNS = 5
-"""M_R, M_T, M_U, and the wall's reflectance in either sphere."""
+"""Largest number of readings in a line: M_R, M_T, M_U, and the wall's reflectance in either sphere."""
 
 
 class Sphere(Record):
@@ -155,7 +155,7 @@ def _read_rxt(path: Path) -> SphereFile:
 
 
 def _numbers(path: Path) -> list[tuple[int, list[float]]]:
-    """Lines that hold numbers, with their number in the file."""
+    """Lines that hold numbers, each with its number in the file."""
     rows = []
     text = path.read_text(encoding="utf-8", errors="replace")
     for number, line in enumerate(text.removeprefix(RXT_MARK).splitlines(), start=1):
@@ -186,7 +186,7 @@ def _reading(path: Path, line: int, row: list[float], columns: int) -> TotalsRea
         wavelength_nm=row[0] if len(row) > columns else None,
         R=values[0],
         T=values[1],
-        T_unscattered=unscattered or None,  # IAD takes nothing measured where 0 stands
+        T_unscattered=unscattered or None,  # because 0 means "not measured" in IAD
         reflection_wall=reflection_wall,
         transmission_wall=transmission_wall,
     )

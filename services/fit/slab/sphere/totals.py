@@ -9,9 +9,9 @@ so a slab that is lit alike from both sides (even), or with opposite signs (odd)
 
     G even = L^-T V k tanh(k tau/2) V^T L^-1,   G odd the same with coth,   B = L L^T,   L^T A L = V k^2 V^T,
 
-and half the sum and half the difference of both answers are R and T for light from one side. Nothing is stepped, so a
-slab may be as thick as it likes. The forward peak of the phase function is taken out of the scattering (delta-M,
-Wiscombe 1977).
+and half the sum and half the difference of both answers are R and T for light from one side. There are no steps in
+depth, so a slab may be arbitrarily thick. The forward peak of the phase function is removed from the scattering
+(delta-M, Wiscombe 1977).
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from services.fit.slab.model.interface import Interface
 Array = NDArray[np.float64]
 
 NODES = 32
-"""Nodes a range of cosines. With 32 no tabulated slab up to g = 0.9 is off by more than 4e-5; with 96 by more than
-1e-7."""
+"""Number of nodes in each range of cosines. With 32 no tabulated slab up to g = 0.9 is off by more than 4e-5; with 96
+by more than 1e-7."""
 BEAM_WEIGHT = 1e-10
-"""Weight of the node that carries the beam: so small that what is scattered into it changes no total, and far above
+"""Weight of the node that carries the beam: so small that light scattered into it changes no total, and far above
 rounding."""
 WHITE_RATE = 1e-22
-"""Least squared decay rate in units of the largest: the slowest mode of a white slab does not decay, and rounding may
-make its square negative."""
+"""Smallest squared decay rate in units of the largest: the slowest mode of a white slab does not decay, and rounding
+may make its square negative."""
 MIN_DEPTH = 1e-12
-"""Half the optical thickness below which a slab is as good as clear."""
+"""Half the optical thickness below which a slab counts as clear."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class Totals:
     """Shares of the incident power for a collimated beam along the normal, and for diffuse light of equal radiance."""
 
     reflectance: float
-    """Of the beam, the mirror reflection of the faces included."""
+    """Reflectance of the beam, the mirror reflection of the faces included."""
     transmittance: float
-    """Of the beam, the unscattered light included."""
+    """Transmittance of the beam, the unscattered light included."""
     reflectance_unscattered: float
     transmittance_unscattered: float
     reflectance_diffuse: float
@@ -75,16 +75,17 @@ class _Quadrature:
     cosines: Array
     weights: Array
     transmittances: Array
-    """Of a face, at each node."""
+    """Transmittance of a face at each node."""
     diffuse: Array
-    """Share of diffuse light from outside that meets each node, before the face takes its part."""
+    """Share of diffuse light from outside that arrives at each node, before the face reflects its part."""
 
 
 def slab_totals(optics: Optics, width_mm: float, interface: Interface, nodes: int = NODES) -> Totals:
     """Totals of a slab with the same interface at both faces; ``width_mm`` may be infinite.
 
     Args:
-        nodes: of each of the two ranges of cosines, inside and outside total reflection; more are more accurate.
+        nodes: number of nodes in each of the two ranges of cosines, inside and outside total reflection; more are more
+            accurate.
     """
     quadrature = _quadrature(interface, nodes)
     beam = np.zeros_like(quadrature.cosines)

@@ -1,7 +1,7 @@
-"""How translucent a slab looks, as dental laboratories state it: the same slab over a black and over a white backing.
+"""Translucency of a slab, as dental laboratories state it: the same slab over a black and over a white backing.
 
 The translucency parameter TP is the CIELAB difference of both (Johnston et al. 1995), the contrast ratio the quotient
-of their luminances Y over black and white. Both are told under daylight D65 for the observer of CIE 1931.
+of their luminances Y over black and white. Both are computed under daylight D65 for the observer of CIE 1931.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from services.fit.slab.sphere.totals import Optics, Totals, slab_totals
 Array = NDArray[np.float64]
 
 MAX_GAP_NM = 25.0
-"""Spectra with wider steps, or that begin after 420 or end before 680 nm, tell no colour."""
+"""Largest step of a spectrum that gives a colour. A spectrum must also begin at 420 nm or before and end at 680 nm or
+after."""
 FIRST_NM, LAST_NM = 420.0, 680.0
 
 
@@ -49,9 +50,9 @@ class Translucency(Record):
 class _Spectrum:
     nm: Array
     reflectance: Array
-    """Over black and white (2, wavelengths)."""
+    """Reflectance over black and over white (2, wavelengths)."""
     covariance: Array
-    """Of both, by wavelength (wavelengths, 2, 2)."""
+    """Covariance of both at each wavelength (wavelengths, 2, 2)."""
 
 
 def over_backing(totals: Totals, backing: float) -> float:
@@ -69,7 +70,7 @@ def lab_of(xyz: Array, white: Array) -> Array:
 
 
 def translucency_of(file: SphereFile, fits: list[Fitted], black: float, white: float) -> Translucency | None:
-    """From the fitted media of all wavelengths; None where they do not cover the visible range."""
+    """Translucency from the fitted media of all wavelengths; None where they do not cover the visible range."""
     spectrum = _spectrum(file, fits, (black, white))
     if spectrum is None:
         return None
