@@ -1,5 +1,5 @@
 """The unbounded domain in which parameters are fitted, and its chain-rule factors (teeth 2018 Eq. 22, 24; signs as in
-optics).
+optics.md).
 
 ===========  =====================  =======================  ==========================
 parameter    natural                d natural / d x          kept inside
@@ -85,7 +85,7 @@ def kind_of(name: str) -> str:
 
 
 def to_dual(kind: str, value: float) -> float:
-    """Coordinate x of a natural value, clipped to the kind's bounds."""
+    """Coordinate x of a natural value, clipped to the bounds of its kind."""
     low, high = BOUNDS[kind]
     tiny = 1e-300
     if kind == "sigma":
@@ -132,7 +132,9 @@ def natural_derivative(kind: str, x: float) -> float:
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One unbounded coordinate and the parameters that share its value (one, or the same one of both media)."""
+    """One unbounded coordinate and the parameters that share its value: one parameter, or the same one of both
+    media.
+    """
 
     targets: tuple[str, ...]
     prior_mean: float | None = None
@@ -142,7 +144,7 @@ class Coordinate:
 
     @property
     def name(self) -> str:
-        """``enamel.sigma``, or ``tooth.sigma`` when it drives both media."""
+        """Name of the coordinate: ``enamel.sigma``, or ``tooth.sigma`` where both media share it."""
         return self.targets[0] if len(self.targets) == 1 else f"tooth.{self.kind}"
 
     @property
@@ -159,7 +161,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Domain:
-    """The coordinates of one fit; parameters they do not name stay as in the tissue they are applied to.
+    """The coordinates of one fit; parameters that they do not name stay as in the tissue to which they are applied.
 
     A vector x (F,) holds the tissue's coordinates, then the instrument's errors.
     """
@@ -180,7 +182,7 @@ class Domain:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the natural parameters, the order in which the engine is asked for derivatives."""
+        """Names of the natural parameters, in the order in which the engine returns derivatives."""
         return tuple(target for c in self.coordinates for target in c.targets)
 
     @property
@@ -260,7 +262,7 @@ class Domain:
 
     def x_of(self, tissue: Optics, errors: Mapping[str, float] = MappingProxyType({})) -> NDArray[np.float64]:
         """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value, an error that is not
-        given 0.
+        given is 0.
         """
         held = _at_cosines(tissue, dict.fromkeys(self.cosines, HELD_G))
 

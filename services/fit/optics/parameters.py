@@ -31,13 +31,13 @@ class Medium:
     g2: float = 0.0
     """Mean cosine of the second lobe."""
     table: PhaseTable | None = None
-    """Phase function in place of the lobes."""
+    """Tabulated phase function that replaces the lobes; None where the lobes hold."""
 
     def require_lobes(self, place: str) -> None:
         """Refuse a tabulated phase function where only lobes can be written.
 
         Raises:
-            InputError: names the place.
+            InputError: the medium has a table; names ``place``.
         """
         if self.table is not None:
             raise InputError(f"{place} cannot hold a phase table; fit lobes to it first.")

@@ -28,7 +28,7 @@ class PhaseTable:
     """
 
     angles_rad: tuple[float, ...]
-    """From 0 to pi, increasing."""
+    """Scattering angles from 0 to pi, increasing."""
     values: tuple[float, ...]
     """Phase function at each angle, 1/sr."""
 
@@ -87,7 +87,7 @@ class Hemisphere:
     deviations: NDArray[np.float64]
     """1 - |cos theta|, from 0 at the pole to 1."""
     values: NDArray[np.float64]
-    """1/sr"""
+    """Phase function at each node, 1/sr."""
     cumulative: NDArray[np.float64]
     """Share of the half's light between the pole and each node."""
     share: float

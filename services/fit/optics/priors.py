@@ -44,7 +44,7 @@ to 1."""
 
 @dataclass(frozen=True)
 class Measured:
-    """One source's reduced scattering and absorption, per mm; absorption None where it gives none."""
+    """Reduced scattering and absorption of one source, per mm; the absorption is None where the source gives none."""
 
     tissue: str
     wavelength_nm: float

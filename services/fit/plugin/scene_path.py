@@ -34,7 +34,7 @@ DARK_DEPTH = 40.0
 
 @dataclass
 class Path:
-    """State of every lane."""
+    """State of every lane's path."""
 
     sampler: Any
     ray: mi.Ray3f
@@ -82,7 +82,7 @@ class Flight:
     shines: mi.Bool
     """Whether the flight meets a rough face from outside, which could reflect it."""
     reflected: mi.Float
-    """Reflectance of the outer face that is met."""
+    """Reflectance of the outer face that the flight meets."""
 
     @property
     def turns(self) -> mi.Bool:

@@ -28,7 +28,7 @@ class ToothShapes:
 
 
 class SceneTeeth:
-    """The teeth of one scene at their present places.
+    """The teeth of one scene, with their surfaces where they are when this is built.
 
     A lane's *place* holds bit ENAMEL inside an enamel surface and bit DENTIN inside a dentin surface, so teeth may not
     overlap.

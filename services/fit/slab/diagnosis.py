@@ -29,8 +29,8 @@ MAX_AT_MAXIMUM = 4
 """Largest number of pixels that may share an image's largest value: so many are alike by symmetry in an image without
 noise."""
 MAX_MISFIT_SIGMAS = 5.0
-"""Standard errors by which squared residuals may exceed the noise before a dictionary is doubted: the chance is 3e-7 a
-fit."""
+"""Largest excess of the squared residuals over the noise, in standard errors, before a dictionary is doubted: the
+chance is 3e-7 a fit."""
 MIN_LIT = 0.5
 """Smallest share of an image's maximum at which a pixel counts for the position of the beam."""
 MAX_OFF = 1.0

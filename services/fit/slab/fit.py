@@ -52,7 +52,7 @@ def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = ma
     """Fit every wavelength of a folder.
 
     Args:
-        blocks: runs blocks of paths; ``map`` does so here, one after the other.
+        blocks: function that runs blocks of paths; ``map`` runs them in this process, one after the other.
 
     Raises:
         CaptureInputError: the folder cannot be read.

@@ -33,9 +33,9 @@ class Measurements:
     names: tuple[str, ...]
     """Camera and light of each image."""
     assumed_noise: bool
-    """Whether some image came without its variance."""
+    """Whether some image had no variance of its own."""
     faults: tuple[str, ...] = ()
-    """Sentences on what seems wrong with the images; see ``diagnosis``."""
+    """Sentences on faults of the images; see ``diagnosis``."""
 
 
 def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measurements:

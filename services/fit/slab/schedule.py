@@ -30,13 +30,13 @@ between workers carries ten times that. Larger sums stay on their worker."""
 
 @dataclass(frozen=True)
 class WavelengthTask:
-    """One wavelength of a job."""
+    """The fit of one wavelength of a job."""
 
     root: Path
     wavelength_nm: float
     options: SlabOptions
     place: Path
-    """Folder in which its result is kept."""
+    """Folder in which the result is stored."""
     flag: Path
     """File whose existence means that the job is cancelled."""
 

@@ -353,7 +353,7 @@ def _phase_fields(layer: Layer) -> tuple[str, ...]:
 
 
 def _spread_of_border(layers: tuple[Layer, ...], score: tuple[int, str]) -> float:
-    """Coefficient of one score when the border's motion is spread evenly over the two layers it separates."""
+    """Coefficient of one score in the derivative to the border's depth; see ``accumulate``."""
     number, name = score
     layer = layers[number - 1]
     return (1 if number == 1 else -1) * layer.sigma / layer.thickness_mm if name == "sigma" else 0.0

@@ -49,10 +49,12 @@ class Engine:
     """A scene built once per process; tissue parameters and dentin shape change per call without rebuilding it."""
 
     def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
-        """Build the scene. Selects the variant and thread count if none is set yet.
+        """Build the scene. It also selects the variant and the thread count if none is set yet.
 
         Raises:
-            PlatformError: no usable libLLVM. MeshError: a surface cannot bound a medium. InputError: no usable light.
+            PlatformError: no usable libLLVM.
+            MeshError: a surface cannot bound a medium.
+            InputError: no usable light, or an index of refraction or border width out of its range.
         """
         require_surfaces(recipe)
         reach_mm = float(np.linalg.norm(recipe.vertices_mm(), axis=1).max())

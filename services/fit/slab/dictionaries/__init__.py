@@ -1,1 +1,1 @@
-"""Dictionaries of phase functions, one a file; ``services/core/slab/dictionaries.py`` lists them."""
+"""Dictionaries of phase functions, one in each file; ``services/core/slab/dictionaries.py`` lists them."""

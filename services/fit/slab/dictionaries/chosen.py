@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sample:
-    """One wavelength of a folder."""
+    """The sample in a folder at one wavelength."""
 
     root: Path
     wavelength_nm: float

@@ -1,4 +1,4 @@
-"""Dictionary ``table``: phase functions of one's own, one a column, from a file in the slab folder.
+"""Dictionary ``table``: the user's own phase functions, one in each column of a file in the slab folder.
 
 ``dictionary.csv`` has a line of names, the first ``angle_deg``, then a line for each angle; ``dictionary.npy`` is an
 array of floats with the same columns. Angles go from 0 to 180 degrees; values are in any unit, as each column is scaled

@@ -43,15 +43,14 @@ class Block:
 
 @dataclass(frozen=True)
 class BlockSums:
-    """Means over a block's paths."""
+    """Means over a block's paths, per unit of the beam's power."""
 
     images: Array
     """(cameras, pixels), scattering orders two and up."""
     rows: Array
     """Sums of shares and path lengths (cameras, pixels, KNOTS + 1), empty without scores."""
     totals: Array
-    """Scattered light that leaves by the light's face, by the other face, and that was cut off; per unit of the beam's
-    power."""
+    """Scattered light that leaves by the light's face, by the other face, and that was cut off (3,)."""
 
 
 class Blocks(Protocol):

@@ -17,7 +17,7 @@ class Reflection(NamedTuple):
 
     share: float
     shift_mm: float
-    """Displacement along the light's lateral direction."""
+    """Displacement along the light's lateral direction, mm."""
 
 
 def fresnel(cosine: float, eta: float) -> float:

@@ -51,8 +51,9 @@ class Beam:
 
     disc: bool
     x_mm: float
-    """Standard deviation or half-axis along x, stretched by the slant."""
+    """Standard deviation (Gaussian beam) or half-axis (disc) along x, stretched by the slant."""
     y_mm: float
+    """The same along y."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,14 @@ class Views:
     """One light and its cameras (C,). Sines are lateral directions in the medium, signed."""
 
     images: NDArray[np.int64]
-    """Position of each view in the folder's list."""
+    """Position of each camera's image in the folder's list."""
     beam: Beam
     sine: float
     transmittance: float
     shift_mm: float
-    """Displacement of the beam in the glass."""
+    """Displacement of the beam in the glass, mm."""
     far: NDArray[np.bool_]
-    """Whether the camera looks at the face that the light does not meet."""
+    """Whether the camera looks at the face opposite the light."""
     sines: Array
     scales: Array
     """Radiance outside, averaged over a pixel, for one unit of power per sr in the medium that reaches the face there,

@@ -25,11 +25,11 @@ class MediumTables(NamedTuple):
     extinction_per_mm: float
     albedo: float
     cumulative: Array
-    """Probability up to the end of each cell."""
+    """Probability up to the end of each cell (M,)."""
     cosines: Array
     """Edges of the cells (M + 1,)."""
     densities: Array
-    """sigma_s times the density per sr with which a cell's directions are drawn."""
+    """sigma_s times the density per sr with which a cell's directions are drawn (M,)."""
     guide: NDArray[np.int64]
 
 

@@ -1,4 +1,4 @@
-"""The phase function with its band as an inline SVG that takes its colours from the page."""
+"""The phase function with its band of one standard error, as an inline SVG that takes its colours from the page."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def phase_chart(title: str, phase: PhaseFunction) -> str:
 
 
 def phase_picture(title: str, phase: PhaseFunction) -> str:
-    """The chart as a file of its own, with the colours of the report, light or dark as the page that shows it."""
+    """The chart as a file of its own, in the colours of the report, light or dark as the page that shows it."""
     chart = phase_chart(title, phase)
     opening = f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" class="chart"'
     return chart.replace('<svg class="chart"', opening, 1).replace(">", f"><style>{PICTURE_STYLE}</style>", 1)

@@ -33,7 +33,7 @@ ATOM_LABELS = {"volume_fraction": "volume of all spheres", "mean_radius": "mean 
 RESIDUAL_OF_WHITE = 0.1
 """Share of an image's white at which the residual's colours end."""
 MAX_PICTURES = 12
-"""Images shown of each wavelength; the held-out ones come first."""
+"""Largest number of images shown for each wavelength; the held-out ones come first."""
 
 
 def write_report(

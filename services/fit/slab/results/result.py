@@ -48,7 +48,7 @@ class PhaseFunction(Record):
     determined: tuple[bool, ...]
 
     def undetermined_bands_deg(self) -> tuple[tuple[float, float], ...]:
-        """Ranges of angle whose values come from the prior."""
+        """Ranges of angle, degrees, whose values come from the prior."""
         bands: list[tuple[float, float]] = []
         open_at: float | None = None
         for theta, determined in zip(self.theta_deg, self.determined, strict=True):
@@ -108,7 +108,7 @@ def parameters_of(material: Material, uncertainty: Uncertainty, index: Index) ->
 
 
 def phase_of(material: Material, uncertainty: Uncertainty) -> PhaseFunction:
-    """The phase function with its bands."""
+    """The phase function with its standard errors."""
     errors, determined = phase_errors(material, uncertainty)
     return PhaseFunction(
         theta_deg=tuple(np.degrees(ANGLES_RAD).tolist()),
@@ -134,7 +134,7 @@ class SlabReport(Record):
     fits: tuple[SlabFit, ...]
 
     def verdict(self) -> Verdict:
-        """The judgement of all wavelengths together, each in place of a channel."""
+        """The verdict on all wavelengths together, where each wavelength takes the place of a channel."""
         held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
         judged = FitReport(

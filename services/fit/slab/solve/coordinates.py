@@ -35,7 +35,7 @@ class Coordinates(Protocol):
     """One kind of unknowns x (U,)."""
 
     def begun(self, guess: Material) -> Material:
-        """A medium of this kind like the guess, from which the search begins."""
+        """A medium of this kind near the guess, from which the search begins."""
 
     def unknowns(self, material: Material) -> Array:
         """Unknowns (U,) of a medium that ``begun`` or ``material_at`` gave."""
@@ -68,7 +68,7 @@ class Coordinates(Protocol):
         """Standard deviations (K,) of a medium's error along these directions."""
 
     def minimum(self, matrix: Array, right: Array) -> Array:
-        """The x within bounds at which x^T matrix x / 2 - right^T x is least."""
+        """The x (U,) within bounds at which x^T matrix x / 2 - right^T x is least."""
 
     def held_back(self, change: Array, material: Material) -> Array:
         """A step in which no unknown moves further than a linearisation holds."""
@@ -79,7 +79,7 @@ class Coordinates(Protocol):
         """
 
     def is_bound(self, x: Array) -> NDArray[np.bool_]:
-        """Which unknowns lie at a bound that they may not pass."""
+        """Mask (U,) of the unknowns that lie at a bound which they may not pass."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Knots:
     """Coordinates ln f at the knots, and sigma_a not below zero."""
 
     def begun(self, guess: Material) -> Material:
-        """The guess itself."""
+        """The guess itself, which is such a medium."""
         return guess
 
     def unknowns(self, material: Material) -> Array:
@@ -115,8 +115,8 @@ class Knots:
         return precision(flag_scales())
 
     def broad(self) -> Array:
-        """Cosines of multiples of the angle, of which the first is sigma_s and the second about g, and the
-        absorption.
+        """Cosines of multiples of the angle, and the absorption (UNKNOWNS, BROAD + 1); the first cosine is a change of
+        sigma_s, the second about one of g.
         """
         directions = np.zeros((UNKNOWNS, BROAD + 1))
         directions[:KNOTS, :BROAD] = np.cos(np.outer(ANGLES_RAD, np.arange(BROAD)))

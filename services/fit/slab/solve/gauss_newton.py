@@ -30,7 +30,8 @@ from services.fit.slab.solve.weights import smoothed_covariance, weights_of
 Array = NDArray[np.float64]
 
 TOLERATED_RISE = 2.0
-"""Standard errors by which the objective may rise: fewer would refuse good steps whose comparison is noisy."""
+"""Number of standard errors by which the objective may rise: fewer would refuse good steps whose comparison is
+noisy."""
 WEIGHTS_DIFFER = 0.5
 """Share of the misfit by which it may rise in a thick cell: weights there come mostly from the paths' noise and are
 estimated anew for each render, and misfits of one medium were seen to differ by a third. Otherwise a low misfit would
@@ -81,7 +82,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class State:
-    """A point of the iteration."""
+    """One point of the iteration."""
 
     material: Material
     equations: NormalEquations

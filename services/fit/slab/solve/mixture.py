@@ -38,7 +38,7 @@ PIVOT = 1e-10
 
 @dataclass(frozen=True)
 class Mixture(Material):
-    """A medium made of atoms."""
+    """A medium made of a dictionary's atoms."""
 
     atom_weights: Array
     """Part of sigma_s of each atom, per mm (M,)."""
@@ -46,7 +46,7 @@ class Mixture(Material):
 
 @dataclass(frozen=True)
 class Mixtures:
-    """See ``coordinates.Coordinates``; unknowns are the weights of M atoms and sigma_a."""
+    """Coordinates of a mix; see ``coordinates.Coordinates``. Unknowns are the weights of M atoms and sigma_a."""
 
     atoms: Array
     """Phase functions at the knots, 1/sr (KNOTS, M); see ``unit_atoms``."""
@@ -99,7 +99,7 @@ class Mixtures:
         return np.zeros(0)
 
     def similar(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - weights are few and seen
-        """The step itself."""
+        """The step itself, as weights are few."""
         return change
 
     def minimum(self, matrix: Array, right: Array) -> Array:
@@ -116,7 +116,7 @@ class Mixtures:
         return np.clip(change, -most, most)
 
     def is_bound(self, x: Array) -> NDArray[np.bool_]:
-        """Weights and absorption that are zero."""
+        """Mask (M + 1,) of the weights and the absorption that are zero."""
         return x <= 0
 
 

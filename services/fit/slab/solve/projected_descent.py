@@ -76,7 +76,7 @@ def descend(
     options: DescentOptions | None = None,
     blocks: Blocks = map,
 ) -> Material:
-    """The average of the iterates from a start."""
+    """The average of the iterates from a start; arguments as of ``GaussNewton``."""
     options = options or DescentOptions()
     used = np.isfinite(measured.variances) & ~measured.held_out[:, None]
     weights = np.where(used, image_weights(np.where(used, measured.values, 0)), 0)
@@ -97,7 +97,7 @@ def descend(
 
 
 def floored(point: Array) -> Material:
-    """The medium of weights, with a little scattering at every angle."""
+    """The medium of simplex weights, with a little scattering at every angle."""
     material = mixture(point)
     return Material(np.maximum(material.scattering, SMALLEST_SCATTERING), material.absorption_per_mm)
 

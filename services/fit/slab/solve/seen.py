@@ -36,6 +36,7 @@ class Seen:
     vectors: Array
     dual: Array
     signals: Array
+    """Eigenvalue of the normal matrix in each direction, in units of the reference (K,)."""
     prior: Array
     """Precision of the prior, with a ridge so that it can be inverted (U, U)."""
 
@@ -50,7 +51,7 @@ class Seen:
         return self.curvature + self.prior
 
     def projected(self, gradient: Array) -> Array:
-        """A gradient's part in these directions (U,)."""
+        """The part of a gradient in these directions (U,)."""
         return np.asarray(self.dual @ (self.vectors.T @ gradient))
 
     def noise(self, covariance: Array) -> Array:
@@ -63,7 +64,7 @@ class Seen:
 
 
 def seen_of(quadratic: Quadratic, prior: Array) -> Seen:
-    """Judge the normal matrix by its noise and a prior's precision (U, U)."""
+    """Find the directions of the normal matrix that stand out from its noise and a prior's precision (U, U)."""
     whole = prior + _ridge(quadratic)
     reference = whole + quadratic.noise
     signals, vectors = linalg.eigh(quadratic.matrix, reference)

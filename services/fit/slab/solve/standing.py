@@ -48,9 +48,9 @@ class Standing:
     renders: int
     paths: int
     path_noise: tuple[Array, ...]
-    """See ``GaussNewton``."""
+    """See ``GaussNewton.path_noise``."""
     multiple: Array
-    """See ``GaussNewton``."""
+    """See ``GaussNewton.multiple``."""
     joined: Joined | None
 
 

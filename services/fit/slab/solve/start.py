@@ -30,7 +30,7 @@ TABLE_PATHS, STEP_PATHS, BATCHES, STEPS = 1000, 2000, 4, 6
 
 
 def start(rig: Rig, measured: Measurements, seed: int, blocks: Blocks) -> Material:
-    """The best of a table of HG media, then Gauss-Newton in ln sigma_s, g and sigma_a."""
+    """The best of a table of HG media, improved by Gauss-Newton steps in ln sigma_s, g and sigma_a."""
     fitted = np.isfinite(measured.variances) & ~measured.held_out[:, None]
     tolerated = measured.variances + (MODEL_ERROR * np.maximum(measured.values, 0)) ** 2
     best, lowest = None, math.inf

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 LARGEST_SHARE = 0.1
 """Largest standard error, as a share of the value, at which a value of the phase function is determined."""
 LARGEST_COEFFICIENT_SHARE = 0.05
-"""The same for coefficients, and in units of 1 for g."""
+"""Largest standard error at which a coefficient is determined, as a share of its value, and for g in units of 1."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Uncertainty:
     images_alone: Array
     """Covariance with a prior so weak that it adds no information; flags are judged by it."""
     of_unknowns: tuple[Array, Array]
-    """Both in the solver's own unknowns (U, U)."""
+    """Both covariances in the solver's own unknowns (U, U)."""
 
     def standard_error(self, slope: Array) -> float:
         """Standard error of a quantity, from its derivatives with respect to ln f and sigma_a (KNOTS + 1,)."""

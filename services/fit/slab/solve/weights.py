@@ -22,7 +22,7 @@ NEIGHBOURHOOD = 3
 
 @dataclass(frozen=True)
 class Weights:
-    """W = R R^T for each pixel of each light's images; different pixels and lights are independent."""
+    """Weights W = R R^T of each pixel of each light's images; different pixels and lights are independent."""
 
     images: tuple[NDArray[np.int64], ...]
     """Indices of each light's images, C of all."""

@@ -25,7 +25,7 @@ class Readings:
 
 
 def expected(totals: Totals, file: SphereFile, reading: TotalsReading) -> Readings:
-    """Readings of a slab."""
+    """The readings that the instrument gives for a slab."""
     diffuse = reading.source == "diffuse"
     r = totals.reflectance_diffuse if diffuse else totals.reflectance
     t = totals.transmittance_diffuse if diffuse else totals.transmittance

@@ -85,7 +85,7 @@ def interface_of(cell: Cell) -> Interface:
 
 
 def fit_readings(file: SphereFile, nodes: int = NODES) -> list[Fitted]:
-    """Fit every wavelength by itself."""
+    """Fit every wavelength separately."""
     return [_Problem(file, reading, nodes).fit(name) for name, reading in file.named()]
 
 
@@ -138,7 +138,7 @@ class _Problem:
         return np.array([told.R, told.T])
 
     def expected(self, optics: Optics, nodes: int) -> Readings:
-        """All readings of a medium."""
+        """All readings of the instrument for a medium."""
         totals = slab_totals(optics, self.file.cell.width_mm, interface_of(self.file.cell), nodes)
         return expected(totals, self.file, self.reading)
 

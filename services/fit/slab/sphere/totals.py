@@ -50,7 +50,7 @@ class Optics:
 
     @property
     def extinction_per_mm(self) -> float:
-        """Absorption and scattering together."""
+        """Extinction coefficient: absorption and scattering together."""
         return self.absorption_per_mm + self.scattering_per_mm
 
 
@@ -105,7 +105,8 @@ def slab_totals(optics: Optics, width_mm: float, interface: Interface, nodes: in
 
 
 def _quadrature(interface: Interface, nodes: int) -> _Quadrature:
-    """Gauss-Legendre in the cosine in the medium where all light is reflected, and in the cosine outside elsewhere.
+    """Gauss-Legendre nodes in the cosine in the medium where all light is reflected, and in the cosine outside
+    elsewhere.
 
     Fresnel's laws are smooth in the outer cosine, and have a square root in the inner one at the edge of total
     reflection.
@@ -145,7 +146,7 @@ def _exits(
 
 
 def _admittances(optics: Optics, width_mm: float, quadrature: _Quadrature, nodes: int) -> tuple[Array, Array]:
-    """The matrices G of even and odd light."""
+    """The matrices G for even and odd light (nodes, nodes)."""
     peak = optics.g**nodes
     scattering = optics.scattering_per_mm * (1 - peak)
     extinction = optics.absorption_per_mm + scattering

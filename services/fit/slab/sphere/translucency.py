@@ -62,7 +62,7 @@ def over_backing(totals: Totals, backing: float) -> float:
 
 
 def lab_of(xyz: Array, white: Array) -> Array:
-    """CIELAB (..., 3) of tristimulus values."""
+    """CIELAB (..., 3) of tristimulus values (..., 3); ``white`` holds those of the illuminant."""
     ratio = xyz / white
     edge = 6 / 29
     f = np.where(ratio > edge**3, np.cbrt(ratio), ratio / (3 * edge**2) + 4 / 29)

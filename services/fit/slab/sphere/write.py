@@ -1,4 +1,4 @@
-"""A folder of results: ``parameters.json``, ``readings.json`` and, for a spectrum, ``translucency.json``."""
+"""Write a folder of results: ``parameters.json``, ``readings.json`` and, for a spectrum, ``translucency.json``."""
 
 from __future__ import annotations
 

@@ -36,13 +36,16 @@ class Crossing:
 
     point: mi.Point3f
     omega: mi.Vector3f
+    """Propagation direction of the path."""
     normal: mi.Vector3f
     before: mi.UInt32
     """Place on the side from which the path came."""
     after: mi.UInt32
+    """Place on the other side."""
     throughput: mi.Float
+    """Throughput of the path up to the crossing, albedos included."""
     shifts: list[mi.Float]
-    """dt_b per shape mode."""
+    """dt_b of each shape mode, mm."""
     importance: mi.Float
     """Importance of the kept crossing."""
     total: mi.Float

@@ -32,7 +32,8 @@ TEXEL_MM = 0.15
 MARGIN_MM = 1.0
 """Distance in mm from the sphere around the scene to the start of a map's rays."""
 DARK_DEPTH = 40.0
-"""Optical depth past which a connection is dark: exp(-40) is below float32 resolution of any sum it could join."""
+"""Optical depth beyond which a connection is dark: exp(-40) is below float32 resolution of any sum that it could
+join."""
 WIDEST = 3.0
 """Largest half-width of a map, over the radius of the sphere around the scene."""
 
@@ -54,7 +55,7 @@ class LightView:
     """Whether the map is certain; elsewhere the lengths are meaningless."""
 
     def lengths(self, media: tuple[int, ...]) -> list[mi.Float]:
-        """Path length in mm inside each of some media."""
+        """Path length in mm inside each of ``media``."""
         found = []
         for medium in media:
             of_this = [
@@ -85,9 +86,13 @@ class MapRay:
     """Distance in mm from the plane across the scene's centre, negative before it."""
     place: mi.UInt32
     entry: mi.Float
+    """Distance travelled to the entry into the outer surface, mm."""
     dentin_entry: mi.Float
+    """Distance travelled to the entry into dentin, mm."""
     dentin_exit: mi.Float
+    """Distance travelled to the exit from dentin, mm."""
     surface: mi.Float
+    """Transmittance of the outer face."""
     meetings: mi.UInt32
     """Surfaces met so far, coded in bits."""
     limit: mi.Float
@@ -106,7 +111,9 @@ class MapCell:
     corners: list[list[mi.UInt32]]
     """Table words of each grid point."""
     u: mi.Float
+    """Fraction of a cell along a row of the grid."""
     v: mi.Float
+    """Fraction of a cell across the rows."""
     inside: mi.Bool
     """Whether the vertex lies on the map."""
 
@@ -154,7 +161,7 @@ class LightMaps:
         dr.eval(self._frames)
 
     def of(self, chosen: list[int]) -> LightMaps:
-        """The maps of some of the lights."""
+        """The maps of the ``chosen`` lights."""
         maps = copy(self)
         maps.keep(chosen)
         return maps

@@ -74,7 +74,7 @@ class PointLights:
 
 @dataclass
 class ChosenLight:
-    """A light, the direction to it, its strength, and the total strength of all candidates."""
+    """A light, the unit direction to it, its strength, and the total strength of all candidates."""
 
     index: mi.UInt32
     direction: mi.Vector3f
@@ -93,7 +93,7 @@ class ShadowRay:
     surface: mi.Float
     """Transmittance of the faces crossed."""
     lengths: list[mi.Float]
-    """Path length in mm inside each medium asked for."""
+    """Path length in mm inside each of the ``measured`` media."""
     border: list[mi.Float]
     """d ln T / dc per shape mode: (sigma_B - sigma_A) dt/dc per crossing (teeth 2018 Eq. 30-32)."""
     stains: list[FaceCrossing]

@@ -56,7 +56,7 @@ class Vertex:
 
 @dataclass
 class Doubt:
-    """The one light of a vertex whose look-up a shadow ray may check."""
+    """The light of a vertex whose look-up a shadow ray may check."""
 
     light: mi.UInt32
     direction: mi.Vector3f
@@ -76,7 +76,7 @@ class Doubt:
 
 
 class Connections:
-    """Connects vertices of one geometry under one plan."""
+    """Connections from the vertices of walks through one geometry under one plan."""
 
     def __init__(
         self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, book: Scores, ior: mi.Float | None
@@ -91,7 +91,7 @@ class Connections:
         )
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.turns = lights.turns
-        """Steps of the walk per connection."""
+        """Number of steps of the walk per connection."""
 
     def no_vertex(self) -> Vertex:
         """An empty reservoir."""

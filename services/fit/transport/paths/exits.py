@@ -1,10 +1,10 @@
-"""Places and directions where scattered light leaves a slab: rings about the point of entry, radiance at chosen
+"""Places and directions in which scattered light leaves a slab: rings about the point of entry, radiance at chosen
 cosines.
 
 Every flight is connected to every exit cosine by the mean over its possible collisions, along one random azimuth, the
 same for all cosines: on a straight flight in one layer the phase function towards an exit is constant and the
-transmittance an integral of exponentials, so neither the place of the collision nor a grazing exit adds noise. Between
-partly reflecting faces the light's further way out is summed as a geometric series.
+transmittance an integral of exponentials, so neither the place of the collision nor a grazing exit adds noise. Light
+that partly reflecting faces send to and fro on its way out is summed as a geometric series.
 """
 
 from __future__ import annotations

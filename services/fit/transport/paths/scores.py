@@ -28,7 +28,7 @@ class Plan:
     faces: bool = False
     """Count the light that leaves the slab's faces instead of connecting to lights."""
     bend: bool = False
-    """Fresnel at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
+    """Use Fresnel's law at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
     exit_cosines: tuple[float, ...] = ()
     """With ``faces``: also the radiance that leaves at these cosines."""
     ring_edges_mm: tuple[float, ...] = ()
@@ -37,7 +37,8 @@ class Plan:
     order_edges: tuple[int, ...] = ()
     """Split images by scattering order at these edges."""
     stains: bool = False
-    """Instead of images, compute the derivative of their sum, weighted by a cotangent, to the texels of stains."""
+    """Instead of images, compute the derivative of their sum, weighted by a cotangent, with respect to the texels of
+    stains."""
     most_steps: int | None = None
     """Number of flights after which a path ends, for media in which some never end; with ``faces`` the throughput of
     paths ended in this way is counted in a third slot."""
@@ -64,7 +65,7 @@ class Scatterings:
 
 
 class Scores:
-    """The accumulated d ln(path) / d(parameter) of each lane, only for parameters that are free."""
+    """The accumulated d ln(path contribution) / d(parameter) of each lane, only for parameters that are free."""
 
     def __init__(self, plan: Plan, media: Media, *, mixing: bool = False) -> None:
         self.plan, self.media = plan, media

@@ -41,8 +41,11 @@ class PathStart:
     rng: mi.PCG32
     origin: mi.Point3f
     omega: mi.Vector3f
+    """Unit propagation direction."""
     place: mi.UInt32
+    """Solids or slab layer that the origin lies in; see ``geometry``."""
     weight: mi.Float
+    """Throughput at the start."""
 
 
 class CameraStart:

@@ -20,15 +20,18 @@ class Walker:
     rng: mi.PCG32
     origin: mi.Point3f
     omega: mi.Vector3f
+    """Unit propagation direction."""
     place: mi.UInt32
+    """Solids or slab layer that the origin lies in; see ``geometry``."""
     weight: mi.Float
     """Throughput without the albedos, which follow from ``so_far``."""
     reference: mi.Float
-    """Throughput against which roulette compares."""
+    """Throughput with which Russian roulette compares the present one."""
     so_far: Scatterings
     steps: list[mi.UInt32]
-    """Flights so far; empty unless they are limited."""
+    """Number of flights so far; empty unless it is limited."""
     sums: list[mi.Float]
+    """Scores of the media's parameters so far."""
     border_sums: list[mi.Float]
     """Scores of the shape modes so far."""
     kept: Crossing
@@ -54,10 +57,14 @@ class Flight:
     """Result of one free flight."""
 
     medium: mi.UInt32
+    """Medium of the flight, 0 for empty space."""
     sigma: mi.Float
+    """Extinction of that medium, per mm."""
     hit: Hit
     distance: mi.Float
+    """Sampled distance to the next scattering, mm."""
     scatters: mi.Bool
+    """Whether the path scatters before any surface."""
     meets: mi.Bool
     """Whether a surface is reached."""
     reflects: mi.Bool

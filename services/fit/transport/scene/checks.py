@@ -56,7 +56,8 @@ def require_surfaces(recipe: SceneRecipe) -> None:
     """Refuse surfaces that cannot bound media, and more teeth than a scene can hold.
 
     Raises:
-        MeshError: names the surface. InputError: no tooth, or too many.
+        MeshError: names the surface.
+        InputError: no tooth, or too many.
     """
     if not 0 < len(recipe.teeth) <= MAX_TEETH:
         raise InputError(f"The scene has {len(recipe.teeth)} teeth; give 1 to {MAX_TEETH}.")
@@ -72,7 +73,7 @@ def require_surfaces(recipe: SceneRecipe) -> None:
 
 
 def require_view(view: View, recipe: SceneRecipe) -> None:
-    """Refuse a view without pixels, with pixels or lights that do not exist, or from where the tooth is.
+    """Refuse a view without pixels, with pixels or lights that do not exist, or with its camera inside a tooth's box.
 
     Raises:
         InputError: names the camera.

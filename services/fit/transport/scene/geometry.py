@@ -31,8 +31,10 @@ class Hit:
     """The next surface along a ray; ``distance`` is infinite where there is none."""
 
     distance: mi.Float
+    """Distance along the ray, mm."""
     valid: mi.Bool
     normal: mi.Normal3f
+    """Outward unit normal; +z for the planes of a slab."""
     outer: mi.Bool
     """Whether the surface is an outer one: not a border between enamel and dentin, or between layers."""
     opaque: mi.Bool
@@ -40,7 +42,9 @@ class Hit:
     surface: mi.UInt32
     """Number of the surface, in scenes of several."""
     primitive: mi.UInt32
+    """Number of the triangle that was hit."""
     uv: mi.Point2f
+    """Barycentric weights of the triangle's second and third corner."""
 
 
 class Geometry(Protocol):
@@ -145,7 +149,7 @@ class SlabGeometry:
         return dr.select(place > self.layers, 0, place)
 
     def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:  # noqa: ARG002 - meshes need the hit
-        """Neighbouring layer."""
+        """The neighbouring layer, by the sign of the direction's z."""
         return dr.select(direction.z > 0, place + 1, place - 1)
 
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:  # noqa: ARG002 - meshes need it
@@ -165,11 +169,11 @@ class SlabGeometry:
         return mi.Bool(False)
 
     def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:  # noqa: ARG002 - borders are sharp everywhere
-        """The layer alone."""
+        """The layer's own medium, because borders of a slab are sharp."""
         return Mixed(self.medium(place), self.medium(place), mi.Float(1), mi.Float(0))
 
     def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:  # noqa: ARG002 - borders are sharp everywhere
-        """Nothing mixes, so nothing changes."""
+        """Zero for every mode, because no media mix."""
         return [mi.Float(0) for _ in range(self.modes_of[tooth])]
 
     def depths(self, z: mi.Float, sigma: Sequence[mi.Float]) -> tuple[mi.Float, mi.Float]:

@@ -155,7 +155,7 @@ class PhaseFunction:
         return dr.select(self.tables.known(self.index), self.tables.sample(self.index, omega, u, v), onward)
 
     def scores(self, fields: frozenset[str], omega: mi.Vector3f, omega_out: mi.Vector3f) -> dict[str, mi.Float]:
-        """Derivatives d ln(density) / d(field) for the lobe fields asked for (teeth 2018 Eq. 12, 13)."""
+        """Derivatives d ln(density) / d(field) for those of ``fields`` that the lobes have (teeth 2018 Eq. 12, 13)."""
         m1 = phase.deviation(self.g1, omega, omega_out)
         if not self.two_lobes:
             return {"g1": phase.score_g(self.g1, m1)} if "g1" in fields else {}

@@ -30,7 +30,7 @@ Shapes = tuple[tuple[float, ...], ...]
 
 
 class MeshGeometry:
-    """The surfaces of one scene at their present places."""
+    """The surfaces of one scene, with the dentin at its present shape."""
 
     def __init__(self, recipe: SceneRecipe) -> None:
         self.recipe = recipe
@@ -112,8 +112,8 @@ class MeshGeometry:
         return changed
 
     def _dentin_now(self, moved: list[NDArray[np.float64]]) -> tuple[Mesh, NDArray[np.float64]]:
-        """All dentin as one mesh, and the displacements (M, V, 3) of its vertices; a tooth's modes move its own
-        alone.
+        """All dentin as one mesh, and the displacements (M, V, 3) of its vertices; a mode moves the dentin of its own
+        tooth alone.
         """
         first = np.cumsum([0] + [len(vertices) for vertices in moved])
         dentins = list(self._dentins.values())
@@ -126,7 +126,7 @@ class MeshGeometry:
         return Mesh(np.concatenate(moved), faces), modes
 
     def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
-        """Enamel and dentin of the tooth at a point; elsewhere the medium alone."""
+        """Mixture of enamel and dentin in a tooth; elsewhere the medium alone."""
         assert self._border is not None
         medium, tooth = self.medium(place), self.inside(place)
         in_tooth = tooth < self.teeth
@@ -170,7 +170,7 @@ class MeshGeometry:
         return self.textures.transmittance(hit, active)
 
     def on_stain(self, hit: Hit, before: mi.UInt32, after: mi.UInt32) -> mi.Bool:
-        """Whether a tooth's outer face is crossed that is not hidden within another tooth."""
+        """Whether a ray crosses a tooth's outer face that does not lie hidden within another tooth."""
         if self.single:
             return hit.valid & hit.outer
         return hit.valid & (hit.surface < self.teeth) & (self.inside(before) != self.inside(after))

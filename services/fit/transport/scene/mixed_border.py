@@ -72,7 +72,7 @@ class MixedBorder:
         return share, small / dr.square(1 + small) * self._inverse_scale
 
     def motion(self, point: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
-        """Change of q with each mode's weight, mm."""
+        """Change of the signed distance q with each mode's weight, mm."""
         return [self._look(texture, point, active) for texture in self._motion]
 
     def _look(self, texture: mi.Texture3f, point: mi.Point3f, active: mi.Bool) -> mi.Float:

@@ -76,7 +76,7 @@ def parameter_names(recipe: SceneRecipe) -> dict[str, Parameter]:
 
 
 def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
-    """A scene's media in the order of their numbers, checked; the wall's reflectance is the last one's albedo.
+    """A scene's media in the order of their numbers, checked; the wall is the last, with its reflectance as albedo.
 
     Raises:
         InputError: a part is missing or too many, or a parameter is outside its physical range.
