@@ -45,7 +45,7 @@ BOUNDS = {
 """Lower and upper bound of the coordinate x of each kind of parameter."""
 HELD_G = 0.8
 """Mean cosine of the similar medium whose sigma and alpha are coordinates where the mean cosine is a coordinate too;
-also the mean cosine of a single lobe where it is none."""
+elsewhere the mean cosine of a single lobe."""
 STEP_SCALE = {
     "sigma": math.log(2.0),
     "alpha": 0.4,

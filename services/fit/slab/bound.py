@@ -92,7 +92,9 @@ def curvature_of(
     paths: int | None = None,
     blocks: Blocks = map,
 ) -> Quadratic:
-    """Quadratic model of half the misfit in ln f and sigma_a that such images give; arguments as of ``bound_of``."""
+    """Quadratic model of half the misfit in ln f and sigma_a for images with shot noise; arguments as of
+    ``bound_of``.
+    """
     thick = is_thick(material, rig.width_mm)
     batches = render(
         rig, material, seed=seed, step=FIRST_STEP, batches=BATCHES, paths=paths or PATHS, scores=True, blocks=blocks

@@ -104,7 +104,11 @@ class Sums:
         self.first, self.second = np.zeros((self.rows, 2)), np.zeros((self.rows, 2))
 
     def add(self, table: NDArray[np.float64], samples: int) -> None:
-        """Add a pass: sums (lanes, rows, 2) over ``samples`` paths per lane."""
+        """Add a pass: sums (lanes, rows, 2) over ``samples`` paths per lane.
+
+        Raises:
+            NonFiniteError: a sum is NaN or infinite.
+        """
         if not np.isfinite(table).all():
             raise NonFiniteError(
                 f"{np.count_nonzero(~np.isfinite(table))} of {table.size} slab sums are not finite; report the"

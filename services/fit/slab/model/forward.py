@@ -80,7 +80,11 @@ class Batches:
 
 
 def run_block(block: Block) -> BlockSums:
-    """Trace one block."""
+    """Trace one block.
+
+    Raises:
+        NonFiniteError: a sum is NaN or infinite.
+    """
     from services.fit.slab.model.streams import block_key
     from services.fit.slab.model.walk import trace
 

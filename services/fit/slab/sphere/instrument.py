@@ -39,8 +39,8 @@ def expected(totals: Totals, file: SphereFile, reading: TotalsReading) -> Readin
 
 
 def _reflection(file: SphereFile, reading: TotalsReading, scattered: float, mirror: float, sample: float) -> float:
-    """Reflectance reading relative to the standard; the beam meets both first, and the third port is the open
-    entrance.
+    """Reflectance reading relative to the standard. The beam meets sample and standard first; the third port is the
+    open entrance.
     """
     if (sphere := _with_wall(file.reflection_sphere, reading.reflection_wall)) is None:
         return scattered + mirror

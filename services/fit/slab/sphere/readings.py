@@ -155,7 +155,11 @@ def _read_rxt(path: Path) -> SphereFile:
 
 
 def _numbers(path: Path) -> list[tuple[int, list[float]]]:
-    """Lines that hold numbers, each with its number in the file."""
+    """Lines that hold numbers, each with its number in the file.
+
+    Raises:
+        CaptureInputError: a line holds other text, or a number that is not finite.
+    """
     rows = []
     text = path.read_text(encoding="utf-8", errors="replace")
     for number, line in enumerate(text.removeprefix(RXT_MARK).splitlines(), start=1):

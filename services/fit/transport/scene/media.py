@@ -72,7 +72,11 @@ class Media:
     """Parameters of media 1..M; index 0 is empty space."""
 
     def __init__(self, media: Sequence[Medium | Sequence[Medium]]) -> None:
-        """Take each medium once for all lanes, or as a sequence of one per lane."""
+        """Take each medium once for all lanes, or as a sequence of one per lane.
+
+        Raises:
+            InputError: media that differ from lane to lane have phase tables.
+        """
         self.count = len(media)
         each = [[entry] if isinstance(entry, Medium) else entry for entry in media]
         self.two_lobes = any(m.beta < 1 for entry in each for m in entry)
