@@ -37,18 +37,19 @@ WEIGHTS_DIFFER = 0.5
 estimated anew for each render, and misfits of one medium were seen to differ by a third. Otherwise a low misfit would
 refuse all steps after it."""
 MAX_HALVINGS = 4
+"""Largest number of times that a refused step is halved."""
 WORTHWHILE, WORTHWHILE_THICK = 2.0, 1.0
 """Ratio of the fall of the objective that a step promises to the fall that noise alone promises. In the search a step
-below it waits for more paths; in the last stages one above it is followed by another. The second value holds in thick
-cells: there the error left in sigma_s at a constant sigma_s' promises little beside the noise of all directions, and is
-still a tenth of sigma_s."""
+below the first value waits for more paths; in the last stages a step above it is followed by another. There the second
+value holds in a thick cell, because the error left in sigma_s at a constant sigma_s' promises little beside the noise
+of all directions, and is still a tenth of sigma_s."""
 UNFINISHED = 5.0
 """The same ratio, above which the last step shows that the fit has not converged."""
 NEAR = 0.05
 """Largest distance in ln sigma_s at which residuals of several media are combined: the nonlinear part is then below a
 thousandth."""
 ENOUGH_PATHS = 0.5
-"""Largest noise of the paths, in units of that of the measurements, at which the fit of a thick cell may end."""
+"""Largest variance by the paths, in units of that by the measurements, at which the fit of a thick cell may end."""
 DAMPING = 1.0
 """Levenberg term in units of the noise of J: with 0.3 and with 3 the end was the same within its noise, with 0.05 it
 strayed."""
@@ -152,7 +153,9 @@ class GaussNewton:
         return self.finish(standing)
 
     def search(self, material: Material) -> Standing:
-        """Iterate with few paths, until a step promises no more than their noise does."""
+        """Iterate with few paths, until a step promises no more than their noise does or the budget of steps is
+        spent.
+        """
         self.is_searching = True
         state = self.init(self.coordinates.begun(material))
         steps = 0
@@ -237,8 +240,8 @@ class GaussNewton:
 
         Args:
             worth: fall that the last step promised, in units of the fall that noise alone promises.
-            rest: noise of the paths in units of that of the measurements, where renders of a stage are combined; else
-                0.
+            rest: variance by the paths in units of that by the measurements, where renders of a stage are combined;
+                else 0.
         """
         thick = self.is_thick(moved)
         enough, most = (WORTHWHILE_THICK, self.budget.most_last_thick) if thick else (WORTHWHILE, self.budget.most_last)
