@@ -45,7 +45,7 @@ class Crossing:
     throughput: mi.Float
     """Throughput of the path up to the crossing, albedos included."""
     shifts: list[mi.Float]
-    """dt_b of each shape mode, mm."""
+    """dt_b of each shape mode."""
     importance: mi.Float
     """Importance of the kept crossing."""
     total: mi.Float

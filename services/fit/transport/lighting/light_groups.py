@@ -1,5 +1,4 @@
-"""Groups of lights. A connection looks up one light of every group, because of many lights only few matter to one
-vertex.
+"""Groups of lights. A connection looks up one light of every group, because few of many lights matter to one vertex.
 
 A vertex scatters most of its light into a lobe, so that most lights contribute little through it. Each group holds
 lights from all around the tooth, and one of them is chosen in proportion to its contribution at full transmittance,
