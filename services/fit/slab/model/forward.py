@@ -24,8 +24,8 @@ from services.fit.slab.model.tables import tables_of
 Array = NDArray[np.float64]
 
 THICK, THICK_SHARE = 4.0, 0.25
-"""Optical thickness above which only this share of the late vertices is connected to cameras: 1.5 times faster there,
-slower below."""
+"""Optical thickness above which only ``THICK_SHARE`` of the late vertices are connected to cameras: 1.5 times faster
+there, slower below."""
 
 
 @dataclass(frozen=True)

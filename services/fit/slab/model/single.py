@@ -23,7 +23,7 @@ from services.fit.slab.model.rig import Beam, Grid, Rig, Views
 Array = NDArray[np.float64]
 
 DEPTH_CELLS = 96
-"""Number of depth cells: an image at sigma_t w = 10 changes by less than 1e-4 when it is doubled."""
+"""Number of depth cells: an image at sigma_t w = 10 changes by less than 1e-4 when this number is doubled."""
 DISC_NODES = 48
 MAX_REFLECTIONS = 2
 """Largest number of reflections of beam and scattered light together; near the normal three carry some 1e-5 of the
