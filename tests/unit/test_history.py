@@ -56,7 +56,7 @@ def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatc
     monkeypatch.setattr(
         "services.api.jobs.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked)
     )
-    histories = Histories(most_bytes=2000)
+    histories = Histories(max_bytes=2000)
     for number in range(3):
         log.append(1, step(number))
         for _ in range(2):
@@ -69,7 +69,7 @@ def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatc
 
 
 def test_names_of_channels_that_nothing_is_known_of_count_as_what_they_take(log: EventLog) -> None:
-    histories = Histories(most_bytes=100_000)
+    histories = Histories(max_bytes=100_000)
     for number in range(1000):
         histories.read(log, 500, f"{number:0100}")
     assert len(histories._kept) < 120

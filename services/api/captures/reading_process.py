@@ -26,9 +26,9 @@ GROWN_BYTES = 64 * 2**20
 what was parsed stays with the process."""
 
 
-def main(most_bytes: int) -> None:
+def main(max_bytes: int) -> None:
     """Answer requests until the pipe is closed, or the memory has grown by ``GROWN_BYTES``."""
-    _bound(most_bytes)
+    _bound(max_bytes)
     start_bytes = _peak_bytes()
     for line in sys.stdin.buffer:
         answer = _answer(json.loads(line))
@@ -55,10 +55,10 @@ def _answer(asked: dict[str, Any]) -> dict[str, Any]:
         }
 
 
-def _bound(most_bytes: int) -> None:
+def _bound(max_bytes: int) -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     bounds = {
-        resource.RLIMIT_AS: pages * resource.getpagesize() + most_bytes,
+        resource.RLIMIT_AS: pages * resource.getpagesize() + max_bytes,
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_FSIZE: 0,
     }

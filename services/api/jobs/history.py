@@ -115,11 +115,11 @@ class Histories:
     Rows of the event table never change, so that a curve is read again only once its job has a newer event.
 
     Args:
-        most_bytes: largest size of the cache in bytes; the curves that were read longest ago are dropped first.
+        max_bytes: largest size of the cache in bytes; the curves that were read longest ago are dropped first.
     """
 
-    def __init__(self, most_bytes: int = 2**24) -> None:
-        self._most_bytes, self._bytes = most_bytes, 0
+    def __init__(self, max_bytes: int = 2**24) -> None:
+        self._max_bytes, self._bytes = max_bytes, 0
         self._kept: OrderedDict[tuple[str, int, str | None], tuple[int, bytes]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -135,7 +135,7 @@ class Histories:
             self._drop(key)
             self._kept[key] = newest, text
             self._bytes += _kept_bytes(channel, text)
-            while self._bytes > self._most_bytes:
+            while self._bytes > self._max_bytes:
                 self._drop(next(iter(self._kept)))
         return text
 
