@@ -1,4 +1,4 @@
-"""How bright teeth are against a white surface in their place: what is dark, and what units are wrong."""
+"""Brightness of the teeth relative to a white surface in their place; finds dark images and wrong units."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from services.preprocess.projection import Footprint
 from services.preprocess.source import LightImage, View
 
 PLAUSIBLE = (1e-3, 10.0)
-"""Radiance of teeth over that of a white diffuser. Real teeth give 0.1 to 1; a unit that is wrong by 1000 moves this by
-1e6."""
+"""Smallest and largest plausible ratio of the teeth's radiance to that of a white diffuser in their place. Real teeth
+give 0.1 to 1; a length unit that is wrong by a factor of 1000 changes the ratio by 1e6."""
 ODD_LIGHT = 30.0
-"""A light this much brighter or dimmer than the others, against what its calibration says, is told."""
+"""A light is reported if the teeth's brightness ratio under it differs by more than this factor from the median over
+all lights."""
 NAMED = 3
-"""Dark images that are named."""
+"""Largest number of dark images that a note lists by name."""
 COMPARED_PIXELS = 50_000
+"""Approximate number of an image's pixels at which the white diffuser is evaluated."""
 CERTAIN = 4.0
-"""Standard errors above which an image's light counts as seen."""
+"""Number of standard errors by which an image's summed radiance must exceed zero; otherwise the image is dark."""
 
 
 class ImageLight(Record):
-    """How much light one image shows: sums over its pixels, or over an even share of them."""
+    """Light that one image shows, as sums over its chosen pixels or over a regular subset of them."""
 
     measured: float = Field(description="radiance over all channels")
     white: float = Field(description="the same of a white diffuser in the teeth's place")
@@ -36,7 +38,7 @@ class ImageLight(Record):
 
 
 def light_of(image: LightImage, view: View, light: Light, chosen: NDArray[np.bool_]) -> ImageLight | None:
-    """What the chosen pixels (H, W) of an image show; None where there are none."""
+    """Sum radiance and incident light over the chosen pixels (H, W) of an image; None if no pixel is chosen."""
     import cv2
 
     mask = chosen.astype(np.uint8)
@@ -49,7 +51,7 @@ def light_of(image: LightImage, view: View, light: Light, chosen: NDArray[np.boo
     )
     if measured <= CERTAIN * np.sqrt(variance):
         return ImageLight(measured=0.0, white=0.0, cosine=0.0, dark=True)
-    # A plausibility needs no more than every n-th pixel in x and y
+    # Take every n-th pixel in x and y, which is enough for a test of plausibility
     step = max(1, int(np.sqrt(count / COMPARED_PIXELS)))
     cosine, distance_mm = _incidence(view.footprint, view.camera, light, chosen, step)
     if not len(cosine):
@@ -61,7 +63,7 @@ def light_of(image: LightImage, view: View, light: Light, chosen: NDArray[np.boo
 
 @dataclass
 class _Sums:
-    # Over one light's pixels: radiance measured, that of a white diffuser, and the cosine at which light falls on it.
+    # Sums over all pixels under one light: measured radiance, radiance of a white diffuser, and cosine of incidence.
     measured: float = 0.0
     white: float = 0.0
     cosine: float = 0.0
@@ -73,14 +75,14 @@ class _Sums:
 
 @dataclass
 class Brightness:
-    """Sums over the images of a capture."""
+    """Measured and expected light of a capture, summed by light over its images."""
 
     dark: list[tuple[str, str]] = field(default_factory=list)
     """(camera, light) of images in which no tooth is above the noise."""
     _lights: dict[str, _Sums] = field(default_factory=lambda: defaultdict(_Sums))
 
     def add(self, camera: str, light: str, shown: ImageLight | None) -> None:
-        """Count what an image shows."""
+        """Add the sums of one image, or note that it is dark; None adds nothing."""
         if shown is None:
             return
         if shown.dark:
@@ -92,10 +94,10 @@ class Brightness:
         sums.cosine += shown.cosine
 
     def require_plausible(self) -> None:
-        """Refuse a capture whose brightness no tooth has.
+        """Refuse a capture whose teeth are implausibly bright or dark.
 
         Raises:
-            CaptureInputError: says by how much.
+            CaptureInputError: the ratio to a white surface is outside ``PLAUSIBLE``; the message gives the ratio.
         """
         measured, white = (
             sum(sums.measured for sums in self._lights.values()),
@@ -109,13 +111,14 @@ class Brightness:
             )
 
     def notes(self) -> tuple[str, ...]:
-        """Sentences on dark images and on lights unlike the others."""
+        """Sentences about dark images and about lights whose brightness ratio differs from the others'."""
         notes = []
         if self.dark:
             which = ", ".join(f"camera {camera} under light {light}" for camera, light in self.dark[:NAMED])
             more = f" and {len(self.dark) - NAMED} more" if len(self.dark) > NAMED else ""
             notes.append(f"Dark and left out: {which}{more}; check that these lights were on, then capture them again.")
-        # Only lights from the front: behind a tooth, what shines through has little to do with a white surface.
+        # Compare only lights from the front, because light that shines through a tooth from behind says little about
+        # the brightness of a white surface.
         front = 0.1 * max((sums.cosine for sums in self._lights.values()), default=0.0)
         ratios = {light: sums.ratio for light, sums in self._lights.items() if sums.cosine > front}
         typical = float(np.median(list(ratios.values()))) if ratios else 1.0
@@ -131,8 +134,8 @@ class Brightness:
 def _incidence(
     footprint: Footprint, camera: Camera, light: Light, chosen: NDArray[np.bool_], step: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    # Cosine (N,) at which a light falls on the chosen pixels' surface, 0 from behind, and its distance in mm; shadows
-    # are not looked for.
+    # Cosine of incidence (N,) at the chosen pixels' surface points, 0 for light from behind, and the light's distance
+    # (N,) in mm; shadows are ignored.
     y, x = np.nonzero(chosen[::step, ::step])
     y, x = y * step, x * step
     towards = np.asarray(light.position_mm) - footprint.points_at(camera, y, x)

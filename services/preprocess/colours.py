@@ -1,4 +1,4 @@
-"""Whether the frames of a camera agree which channel is red and which is blue."""
+"""Check that the frames of a camera agree on which channel is red and which is blue."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Record
 
 SWAPPED_FACTOR = 1.5
-"""How far red to blue must be from the other frames' before channels are taken for swapped; lights of one kind differ
-by 10 %."""
+"""Factor by which a frame's ratio of red to blue must differ from that of the frames before it for its channels to
+count as swapped. Lights of one kind differ by 10 %."""
 MIN_OTHERS = 2
-"""Frames that must agree before one is said to differ."""
+"""Smallest number of agreeing earlier frames against which a frame is judged."""
 
 
 class FrameColour(Record):
-    """Colour of what a frame shows of the subject."""
+    """Ratio of red to blue over the subject in one frame."""
 
     file: str
     label: str
@@ -25,10 +25,10 @@ class FrameColour(Record):
 
 
 def require_like_colours(colours: Sequence[FrameColour], camera: str) -> None:
-    """Refuse frames of which one has red and blue exchanged against those before it.
+    """Refuse frames if one of them has red and blue exchanged relative to the frames before it.
 
     Raises:
-        CaptureInputError: names the frame.
+        CaptureInputError: a frame's channels look exchanged; the message names the frame.
     """
     limit = float(np.log(SWAPPED_FACTOR))
     for number, own in enumerate(colours):

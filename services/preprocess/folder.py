@@ -1,4 +1,4 @@
-"""A capture that comes as a folder: ``capture.json``, linear float images, optional variances."""
+"""A capture in the form of a folder: ``capture.json``, linear float images and optional variance images."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from services.preprocess.source import Image, LightImage, Motions, View
 from services.preprocess.stabilisation.seen import SeenFlow
 from services.preprocess.window import bands
 
-# Dead pixels are masked, also all of one tooth in a jaw; more than this share of all that is shown means the file is
-# broken
+# Largest share of the covered pixels that may be non-finite. Dead pixels are only masked, even where they are all of
+# one tooth in a jaw; above this share the file is taken to be broken
 NOT_FINITE_LIMIT = 0.5
 NAMES_SHOWN = 3
-"""Lights that a note names, of those without an image."""
+"""Largest number of lights without an image that a note lists by name."""
 
 
 class FolderSource:
-    """Reads a folder capture; everything but the pixels is checked before the first image is opened."""
+    """Reader of a folder capture; everything except the pixels is checked before the first image is read."""
 
     measures_motion = False
 
@@ -34,11 +34,12 @@ class FolderSource:
         """Open ``root/capture.json``.
 
         Args:
-            noise_relative: assumed noise where no variance is given, fraction of the value.
-            noise_floor: and of the image's maximum.
+            root: folder of the capture.
+            noise_relative: standard deviation, as a fraction of a pixel's value, for images without a variance file.
+            noise_floor: standard deviation, as a fraction of the image's maximum, that is added in quadrature.
 
         Raises:
-            CaptureInputError: names what is missing or contradictory.
+            CaptureInputError: an entry is missing or contradicts another; the message names it.
         """
         self.root = root
         self.notes: tuple[str, ...] = ()
@@ -90,7 +91,7 @@ class FolderSource:
         return tuple(k for k, light in enumerate(self.description.lights) if (name, light.name) in self._entries)
 
     def identity(self) -> str:
-        """See ``Source``: every image's size and time of change, so that one that was exported again counts."""
+        """See ``Source``. It includes every file's size and modification time, so a new export changes it."""
         lines = [self.description.model_dump_json(), repr(self._noise)]
         for entry in self._entries.values():
             for file in filter(None, (entry.file, entry.variance_file)):
@@ -99,7 +100,7 @@ class FolderSource:
         return "\n".join(lines)
 
     def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
-        """See ``Source``; images of a folder are taken to show the subject unmoved."""
+        """See ``Source``. Empty, because the images of a folder are assumed to show an unmoved subject."""
         return ()
 
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:  # noqa: ARG002
@@ -111,7 +112,7 @@ class FolderSource:
         return None
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:  # noqa: ARG002
-        """See ``Source``. A variance file is the variance of the pixel's value and used as it is."""
+        """See ``Source``. A variance file holds the variances of the pixel values and is used unchanged."""
         for light in lights:
             yield light, self._image(self._entries[view.whole.name, self.description.lights[light].name], view)
 
@@ -139,7 +140,7 @@ class FolderSource:
             variance = self._assumed(radiance, peak)
         for rows in bands(covered.shape):
             spread = variance[rows]
-            # A weight is 1/variance, so a variance of zero is as unusable as NaN
+            # Flag pixels whose variance is zero or not finite, because their weight 1/variance is undefined
             usable = np.isfinite(spread) & (spread > 0)
             if not usable.all():
                 bits[rows][~usable.all(axis=-1)] = MaskBit.NOT_FINITE
@@ -147,7 +148,7 @@ class FolderSource:
         return LightImage(radiance, variance, bits)
 
     def _assumed(self, radiance: Image, peak: float) -> Image:
-        """The variance (H, W, C) that the job's options assume where none is given; ``peak`` is the brightest value."""
+        """Variance (H, W, C) by the job's noise options; ``peak`` is the image's largest absolute value."""
         relative, floor = self._noise
         variance = np.empty_like(radiance)
         for rows in bands(radiance.shape[:2]):

@@ -1,4 +1,4 @@
-"""Which source a job's capture is."""
+"""Open a job's capture as the source that matches its form: folder, raw folder or published rig capture."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from services.preprocess.tasks.spread import threads_here
 
 
 def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
-    """The folder or store that ``spec.capture`` names, or else the job's published capture.
+    """Open the folder or store that ``spec.capture`` names, or else the job's own published capture.
 
     Args:
-        verify: compare a published capture's files with their checksums first.
+        root: folder of the job.
+        verify: whether to compare a published capture's files with their checksums first.
 
     Raises:
-        CaptureInputError: it cannot be read, contradicts itself, or its calibration is beyond its limits. StoreError: a
-            published capture is damaged.
+        CaptureInputError: the capture cannot be read or contradicts itself, or its calibration exceeds its limits.
+        StoreError: a published capture is damaged.
     """
     if spec.capture is not None and is_raw_folder(spec.capture):
         raw = RawSource(
@@ -59,7 +60,12 @@ def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
 def _calibrated(
     source: FolderSource | RigSource | RawSource, calibration: Calibration, name: str, spec: JobSpec
 ) -> Source:
-    """The source with what its calibration says of itself, and of its lights at the teeth."""
+    """Check a calibration's limits, add notes on it to the source, and apply its lights' lobes at the teeth's centre.
+
+    Raises:
+        CaptureInputError: the calibration exceeds its limits and was not accepted, or a light shines away from the
+            teeth.
+    """
     name = name or (spec.calibration.stem if spec.calibration is not None else "")
     require_within_limits(calibration, name, accepted=spec.accept_calibration)
     if (old := warning_of_age(calibration, name, time.time())) is not None:

@@ -1,4 +1,4 @@
-"""Which surface each pixel of a camera sees: an exact z-buffer of the scanned meshes, no ray tracer needed."""
+"""Surface that each pixel of a camera sees, by an exact z-buffer of the scanned meshes; it needs no ray tracer."""
 
 from __future__ import annotations
 
@@ -12,18 +12,24 @@ from services.core.geometry import Camera, Mesh
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-# Candidate (triangle, sample) pairs held at once; about 200 bytes each, so 40 MB, near a processor's cache
+# Approximate number of candidate (triangle, sample) pairs held at once. Each takes about 200 bytes, so a batch takes
+# 40 MB, near the size of a processor's cache
 BATCH = 200_000
-# Least barycentric coordinate of a sample inside a triangle: an edge belongs to both of its triangles, rounding
-# included
+# Smallest barycentric coordinate of a sample that counts as inside a triangle. It is below zero so that a sample on an
+# edge belongs to both adjacent triangles in spite of rounding
 EDGE = -1e-9
 
 
 @dataclass(frozen=True)
 class Footprint:
-    """What one camera sees of the meshes.
+    """Surfaces that one camera sees, by pixel.
 
-    Arrays are (height, width); ``mesh`` is the tooth's number, -1 where none is seen.
+    Attributes:
+        mesh: (H, W) number of the mesh seen at the pixel's centre, -1 where none is.
+        depth_mm: (H, W) depth of the nearest surface along the camera's axis, occluders included; infinite where there
+            is none.
+        normal: (H, W, 3) unit normal of that surface in world axes; zero where there is none.
+        covered: (H, W) whether the pixel's centre and its four corners all see one of the meshes.
     """
 
     mesh: NDArray[np.int16]
@@ -32,7 +38,7 @@ class Footprint:
     covered: BoolArray
 
     def points_mm(self, camera: Camera, rows: slice) -> NDArray[np.float32]:
-        """World positions (rows, width, 3) of the visible surface; NaN where nothing is hit."""
+        """World positions (rows, width, 3) in mm of the visible surface; NaN where no mesh is seen."""
         height, width = self.mesh.shape
         y, x = np.mgrid[0:height, 0:width][:, rows]
         points = self.points_at(camera, y, x)
@@ -40,7 +46,7 @@ class Footprint:
         return points.astype(np.float32)
 
     def points_at(self, camera: Camera, y: NDArray[np.intp], x: NDArray[np.intp]) -> FloatArray:
-        """World positions (..., 3) of the surface that the pixels of these rows and columns (...) see."""
+        """World positions (..., 3) in mm of the surface that the pixels at rows y and columns x (...) see."""
         pose = np.asarray(camera.camera_from_world)
         local = np.stack([x + 0.5, y + 0.5, np.ones(x.shape)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
         local *= np.where(self.mesh[y, x] >= 0, self.depth_mm[y, x], 0)[..., None]
@@ -48,10 +54,10 @@ class Footprint:
 
 
 def project(camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = ()) -> Footprint:
-    """Project teeth into a camera; ``occluders`` hide them.
+    """Project teeth into a camera; ``occluders`` hide them and are not labelled.
 
     A pixel is ``covered`` where its centre and its four corners see a tooth, so that no light from beside the teeth
-    enters it.
+    enters it. A mesh with a vertex behind the camera is left out.
     """
     width, height = camera.size
     meshes = (*teeth, *occluders)
@@ -64,7 +70,7 @@ def project(camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = (
 
 
 def vertex_normals(mesh: Mesh) -> FloatArray:
-    """Area-weighted unit normals (V, 3)."""
+    """Unit normals (V, 3) at the vertices, averaged over adjacent faces with their areas as weights."""
     a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
     normals = np.zeros_like(mesh.vertices_mm)
@@ -77,8 +83,9 @@ def vertex_normals(mesh: Mesh) -> FloatArray:
 def _rasterise(
     camera: Camera, meshes: Sequence[Mesh], shape: tuple[int, int], offset_px: float, *, with_normals: bool = True
 ) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.float32]]:
-    """Nearest mesh, its depth and, where asked for, its smooth normal at sample points (column + offset, row +
-    offset).
+    """Find the nearest mesh, its depth in mm and, on request, its interpolated normal at the sample points.
+
+    Sample points lie at (column + offset, row + offset) in pixels.
     """
     rows, columns = shape
     nearness = np.zeros(rows * columns)
@@ -99,11 +106,11 @@ def _rasterise(
         count = np.where(area < 0, span[:, 0] * span[:, 1], 0)
         kept = np.flatnonzero(count)
         for batch in _batches(kept, count):
-            # Enumerate every sample inside each triangle's box
+            # Enumerate every sample inside each triangle's bounding box
             triangle = np.repeat(batch, count[batch])
             step = np.arange(len(triangle)) - np.repeat(np.cumsum(count[batch]) - count[batch], count[batch])
             x, y = low[triangle, 0] + step % span[triangle, 0], low[triangle, 1] + step // span[triangle, 0]
-            # Barycentric coordinates; edges count as inside so that neighbours leave no gap
+            # Compute barycentric coordinates; edges count as inside so that adjacent triangles leave no gap
             x_from, y_from = x - corners[triangle, 0, 0], y - corners[triangle, 0, 1]
             b1 = (x_from * edge2[triangle, 1] - y_from * edge2[triangle, 0]) / area[triangle]
             b2 = (edge1[triangle, 0] * y_from - edge1[triangle, 1] * x_from) / area[triangle]
@@ -129,6 +136,6 @@ def _rasterise(
 
 
 def _batches(triangles: NDArray[np.intp], count: NDArray[np.int64]) -> list[NDArray[np.intp]]:
-    """Split triangles so that no part enumerates many more than BATCH samples."""
+    """Split triangles into parts that enumerate about BATCH samples each."""
     total = np.cumsum(count[triangles])
     return [part for part in np.split(triangles, np.flatnonzero(np.diff(total // BATCH)) + 1) if len(part)]

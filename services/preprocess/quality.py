@@ -1,4 +1,4 @@
-"""What the preparation did, in numbers and small pictures."""
+"""Quality of prepared images, in numbers and small pictures."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from services.core.records import MaskBit
 from services.preprocess.source import Image
 
 PICTURE_PX = 480
+"""Longest side of a picture, pixels."""
 STOPS = 10
-"""Factors of two below an image's brightest pixel that are told apart: a sensor of 12 bits resolves the tenth."""
+"""Number of brightness classes below an image's brightest pixel, each one stop (a factor of two) wide. A sensor of 12
+bits resolves the tenth."""
 SHOWN_PIXELS = 200_000
-"""Of an image, for medians."""
-# Blue, green, red: highlights red, saturated yellow, moved violet, not finite cyan, shadow blue, unlit grey, by hand
-# green
+"""Approximate number of an image's pixels from which its medians are computed."""
+# Colours of masked pixels as (blue, green, red): highlights red, saturated yellow, moved violet, not finite cyan,
+# shadow blue, manual green
 COLOURS = {
     MaskBit.HIGHLIGHT: (60, 60, 230),
     MaskBit.SATURATED: (60, 220, 230),
@@ -31,7 +33,7 @@ COLOURS = {
 
 
 class ImageQuality(Record):
-    """One image."""
+    """Quality of one image."""
 
     camera: str
     light: str
@@ -50,7 +52,7 @@ class ImageQuality(Record):
 
 
 class CameraFlow(Record):
-    """Flow between the first tracking frame of a camera and the one that moved most, over the teeth."""
+    """Optical flow over the teeth between a camera's first tracking frame and the one that moved most."""
 
     camera: str
     frame: int = Field(description="number of the frame that moved most")
@@ -75,10 +77,14 @@ def assess(
     motion_error_px: float | None = None,
     stops: tuple[tuple[int, ...], tuple[float | None, ...]] = ((0,) * STOPS, (None,) * STOPS),
 ) -> ImageQuality:
-    """Count what was masked among the tooth's pixels.
+    """Count the masked pixels among an image's tooth pixels.
 
     Args:
-        stops: of ``by_stop``.
+        bits: (H, W) mask bits; 0 is a valid pixel.
+        covered: (H, W) tooth pixels.
+        motion_px: median displacement over the teeth.
+        motion_error_px: estimated error of the motion.
+        stops: result of ``by_stop``.
     """
     pixels = int(np.count_nonzero(covered))
     # How many pixels have each combination of bits
@@ -105,10 +111,15 @@ def assess(
 def by_stop(
     radiance: Image, variance: Image, chosen: NDArray[np.bool_]
 ) -> tuple[tuple[int, ...], tuple[float | None, ...]]:
-    """How many pixels lie in each stop below the brightest, and their median relative noise; by means of channels.
+    """Count the pixels in each stop below the brightest one, and find their median relative noise.
+
+    Both use each pixel's mean over the channels. The darkest stop also counts everything below it.
 
     Args:
         radiance, variance: (H, W, C). chosen: (H, W) pixels that have a value.
+
+    Returns:
+        Counts (STOPS,), and median of standard deviation over value (STOPS,), None in an empty stop.
     """
     step = max(1, int(np.sqrt(chosen.size / SHOWN_PIXELS)))
     few = chosen[::step, ::step]
@@ -125,7 +136,7 @@ def by_stop(
 
 
 def unusable_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:
-    """A sentence on pixels without a finite value or a positive variance, where there are any."""
+    """A sentence about pixels without a finite value or a positive variance; empty if there are none."""
     name = (MaskBit.NOT_FINITE.name or "").lower()
     counts = [round(image.masked.get(name, 0.0) * image.tooth_pixels) for image in images]
     if not any(counts):
@@ -140,7 +151,7 @@ def unusable_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:
 
 
 def write_picture(path: Path, radiance: Image, bits: NDArray[np.uint16]) -> None:
-    """Write a PNG of the image, masked tooth pixels in colour and everything beside the teeth dimmed."""
+    """Write a PNG of the image, with masked tooth pixels in colour and everything beside the teeth dimmed."""
     import cv2
 
     step = max(1, -(-max(bits.shape) // PICTURE_PX))

@@ -1,4 +1,4 @@
-"""What flow sees in one camera before and after its motion is taken out, in numbers and two small pictures."""
+"""Optical flow of one camera before and after stabilisation, in numbers and two small pictures."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from services.preprocess.stabilisation.seen import SeenFlow
 
 Image = NDArray[np.float32]
 MIN_SCALE_PX = 0.5
-"""Flow drawn in full colour is no less: smaller ones are the flow's own errors and would look like motion."""
+"""Smallest flow, pixels, that is drawn in full colour. Smaller flow is mostly the method's own error and would look
+like motion."""
 
 
 def camera_flow(camera: str, flow: SeenFlow) -> CameraFlow | None:
-    """Numbers of a flow; None where it shows no tooth."""
+    """Median and 95th percentile of a camera's flow over the teeth; None if no pixel shows a tooth."""
     if not flow.teeth.any():
         return None
     lengths = [np.linalg.norm(field[flow.teeth], axis=-1) for field in (flow.before, flow.after)]
@@ -27,8 +28,9 @@ def camera_flow(camera: str, flow: SeenFlow) -> CameraFlow | None:
 
 
 def write_flow(folder: Path, flow: SeenFlow, numbers: CameraFlow) -> None:
-    """Write ``<camera>_before.png`` and ``<camera>_after.png``: hue is direction, pure colour is ``scale_px`` or more,
-    white is none.
+    """Write the flow as ``<camera>_before.png`` and ``<camera>_after.png``.
+
+    Hue shows the direction. Full saturation means a flow of ``scale_px`` or more, white means no flow.
     """
     import cv2
 
@@ -40,11 +42,11 @@ def write_flow(folder: Path, flow: SeenFlow, numbers: CameraFlow) -> None:
 
 
 def _picture(field: Image, teeth: NDArray[np.bool_], scale_px: float) -> NDArray[np.uint8]:
-    """Blue, green, red (h, w, 3); black beside the teeth."""
+    """Picture (h, w, 3) of a flow field (h, w, 2) in blue, green, red; black beside the teeth."""
     import cv2
 
     length, angle_deg = cv2.cartToPolar(field[..., 0], field[..., 1], angleInDegrees=True)
-    # OpenCV's hue of a byte counts in steps of two degrees
+    # Convert to OpenCV's 8-bit hue, which counts in steps of two degrees
     hue, colour = angle_deg / 2 % 180, 255 * np.minimum(length / scale_px, 1)
     bright = np.where(teeth, np.float32(255), np.float32(0))
     return np.asarray(

@@ -1,4 +1,4 @@
-"""A page about a prepared capture: motion, coverage, levels, noise and every image with what is masked in it."""
+"""HTML page about a prepared capture: motion, coverage, levels, noise, and every image with its masked pixels."""
 
 from __future__ import annotations
 
@@ -14,19 +14,24 @@ from services.preprocess.quality import STOPS, CameraFlow, ImageQuality
 
 TEMPLATE = Path(__file__).parent / "quality.html.j2"
 WIDTH, HEIGHT = 320, 120
-"""Of a chart, in pixels."""
+"""Width and height of a chart on the page, pixels."""
 
 
 @dataclass(frozen=True)
 class CameraPage:
-    """What the page says of one camera.
+    """Content of the page for one camera.
 
     Attributes:
-        motion: by image the motion in pixels that was taken out, and how wrong it may be; None where nothing tells.
-        coverage: by tooth its FDI number and by image the share of its valid pixels in the image that shows most of it.
-        levels: by stop below each image's brightest pixel the share of all teeth's pixels, and the bar's height.
-        flow: what flow sees before and after the motion is taken out; None where no two frames share their light.
-        noise: SVG points of relative noise by stop, and the largest, per cent.
+        name: of the camera.
+        images: quality of the camera's images.
+        motion: for each image the light, the displacement removed and its estimated error, pixels; None where unknown.
+        coverage: for each tooth the FDI number and, for each image, its valid pixels as a share of those in the image
+            that shows most of it.
+        levels: for each stop below an image's brightest pixel the share of all tooth pixels, and the bar's height in
+            pixels.
+        flow: optical flow before and after stabilisation; None where no two frames share their light.
+        noise: points of an SVG polyline, relative noise by stop.
+        most_noise: largest relative noise, per cent.
     """
 
     name: str
@@ -43,8 +48,10 @@ def write_page(folder: Path, images: Sequence[ImageQuality], flows: Sequence[Cam
     """Write ``quality/index.html`` beside the pictures.
 
     Args:
-        folder: of the stage.
-        flows: of cameras whose motion was measured in one light; their pictures are in ``quality/flow``.
+        folder: folder of the stage.
+        images: quality of all images of the capture.
+        flows: optical flow of the cameras whose motion was measured under one light; their pictures are in
+            ``quality/flow``.
         notes: sentences the operator should read first.
     """
     flow_of = {flow.camera: flow for flow in flows}

@@ -1,4 +1,4 @@
-"""From counts to radiance: black, gain, light, noise, saturation, and several exposures of one light."""
+"""Conversion of counts to radiance: black, gain, light level, noise, saturation, and exposures of one light merged."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Radiometry:
-    """One camera's response, linear above its measured black.
+    """Response of one camera, linear above its measured black.
 
     Attributes:
         black: (H, W, C) mean of the black frames, counts.
-        black_frames: how many were averaged.
-        manifest: gain, range and noise of the sensor.
+        black_frames: number of black frames averaged.
+        manifest: record with the sensor's gain, range and noise.
     """
 
     black: Image
@@ -28,14 +28,14 @@ class Radiometry:
     manifest: CaptureManifest
 
     def at(self, rows: slice, columns: slice) -> Radiometry:
-        """That of some of the pixels."""
+        """The same response for a part of the image."""
         return replace(self, black=self.black[rows, columns])
 
     def radiance(self, counts: NDArray[np.uint16], frame: FrameRecord) -> tuple[Image, Image, BoolArray]:
-        """Radiance at level 1 and 1 s, its variance, both (H, W, C), and where a channel is saturated (H, W).
+        """Radiance scaled to light level 1 and 1 s, its variance, both (H, W, C), and saturated pixels (H, W).
 
-        The noise is that of the sensor model, ``(relative * signal)² + (floor * full scale)²``, with rounding to counts
-        and the black mean's own noise added.
+        The variance is that of the sensor model, ``(relative * signal)² + (floor * full scale)²``, plus the variances
+        of rounding to counts and of the mean black frame. A pixel is saturated if any of its channels is.
         """
         m = self.manifest
         full_scale = 2**m.bits - 1
@@ -53,20 +53,20 @@ class Radiometry:
 
 
 class Merge:
-    """Exposures of the same light joined by inverse variance; a saturated pixel has weight 0.
+    """Merge of exposures of the same light, weighted by inverse variance; a saturated pixel has weight 0.
 
-    Where every exposure is saturated there is no value: radiance 0, flagged (never 0/0).
+    Where every exposure is saturated, radiance and variance are 0 and the pixel is flagged (never 0/0).
     """
 
     def __init__(self) -> None:
         self._exposures: list[tuple[Image, Image, BoolArray]] = []
 
     def add(self, radiance: Image, variance: Image, saturated: BoolArray) -> None:
-        """Add one exposure, aligned with the others. What is given may be overwritten."""
+        """Add one exposure that is aligned with the others. The arrays may be overwritten."""
         self._exposures.append((radiance, variance, saturated))
 
     def result(self) -> tuple[Image, Image, BoolArray]:
-        """Radiance and variance (H, W, C), and where no exposure was usable (H, W)."""
+        """Merged radiance and variance (H, W, C), and the pixels (H, W) without a usable exposure."""
         if len(self._exposures) == 1:
             radiance, variance, lost = self._exposures[0]
             lost = lost.copy()

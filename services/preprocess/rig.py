@@ -1,4 +1,4 @@
-"""A captured rig: counts become radiance, and every frame is brought to where the teeth were at first."""
+"""A published rig capture as a source: counts become radiance, and every frame is aligned with the first one."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ from services.preprocess.stabilisation.motion import Displacement, ViewMotion, f
 from services.preprocess.stabilisation.seen import SeenFlow
 from services.preprocess.window import Window, bands
 
-# Below this, resampling would blur more than it aligns
+# Largest median displacement, pixels, that is left in a frame, because resampling would blur more than it aligns
 STILL_PX = 0.1
-# A frame whose interpolated motion is less certain than this is not used
+# Largest estimated error of a frame's interpolated motion, pixels; an image made from a less certain frame is masked
 UNCERTAIN_PX = 0.5
-# A sample that lies farther beyond the outermost pixels' centres is dimmed by the black around the image, by as much
+# Distance beyond the outermost pixel centres, pixels, up to which a sample is accepted. Interpolation mixes in the
+# black border by this fraction
 BEYOND_PX = 1e-3
+# Largest number of black frames that are averaged
 BLACK_FRAMES = 8
-# A cubic in time has four coefficients
+# Smallest number of tracking frames: a cubic in time has four coefficients
 MIN_TRACKING = 4
 
 Counts = Callable[[FrameRecord], NDArray[np.uint16]]
 
 
 class RigSource:
-    """Reads a published capture."""
+    """Reader of a published rig capture."""
 
     held_out: tuple[tuple[str, str], ...] = ()
     measures_motion = True
@@ -43,7 +45,7 @@ class RigSource:
         """Check the frame table.
 
         Raises:
-            CaptureInputError: no black frame, or a light without a frame.
+            CaptureInputError: there is no black frame, or a light has no frame.
         """
         self.root, self._manifest, self.description = root, manifest, manifest.description
         require_consistent(self.description, f"Capture {root}")
@@ -78,7 +80,7 @@ class RigSource:
         return tuple(range(len(self._frames)))
 
     def identity(self) -> str:
-        """See ``Source``; the manifest of a published capture holds a checksum of every file."""
+        """See ``Source``. It includes the capture's manifest, which holds a checksum of every file."""
         return self.description.model_dump_json() + (self.root / MANIFEST).read_text()
 
     def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
@@ -89,7 +91,8 @@ class RigSource:
         """See ``Source``."""
         motion = self._motion(view)
         array = StoredArray(self.root / "capture.zarr")
-        # Without the black image, whose noise would be the same in every frame and speak for no motion at all
+        # Subtract the median of the black image instead of the image itself, whose noise would be the same in every
+        # frame and bias the match towards no motion
         level = kept_array(
             view.kept("level"), lambda: np.asarray(np.median(self._black_image(view, array, motion.window)))
         )
@@ -110,7 +113,7 @@ class RigSource:
         return motion.seen_flow(picture, motions)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
-        """See ``Source``: one frame at a time, its radiance and its variance."""
+        """See ``Source``. The frames of one light are read, aligned and merged at a time."""
         motion = self._motion(view)
         array = StoredArray(self.root / "capture.zarr")
         black = self._black_image(view, array, motion.window)
@@ -128,7 +131,7 @@ class RigSource:
         return ViewMotion(view, jaws(sorted(self._manifest.fdi)), self._manifest.frames)
 
     def _black_image(self, view: View, array: StoredArray, window: Window) -> Image:
-        """Mean (H, W, C) of the black frames, counts; made once for a view that keeps it."""
+        """Mean (H, W, C) of the black frames, counts; computed once if the view has a scratch folder."""
 
         def mean() -> Image:
             black = np.zeros((*window.shape, len(self.description.channels)), dtype=np.float32)
@@ -149,7 +152,7 @@ def _image(
     counts: Counts,
     window: Window,
 ) -> LightImage:
-    """One light's frames, each as if nothing had moved, joined; a few rows at a time."""
+    """Align one light's frames with the first frame of the capture and merge them, a few rows at a time."""
     read = [counts(frame) for frame in frames]
     height, width = window.shape
     channels = read[0].shape[-1]
@@ -190,20 +193,23 @@ def _image(
 def _resampled(
     counts: NDArray[np.uint16], places: Image, radiometry: Radiometry, frame: FrameRecord
 ) -> tuple[tuple[Image, Image, NDArray[np.bool_]], NDArray[np.bool_]]:
-    """Radiance, variance and saturation where the pixels have gone to, and which of them mix in what lies beyond the
-    frame.
+    """Sample radiance, variance and saturation at the displaced pixels.
 
-    Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right.
+    Interpolation correlates the noise of neighbouring pixels. The variance is not reduced for it, so that sums over
+    pixels have the right variance.
 
     Args:
-        places: x and y (2, H, W) as indices into ``counts``.
+        places: x and y (2, H, W) of the displaced pixels as indices into ``counts``; overwritten.
+
+    Returns:
+        Radiance and variance (H, W, C), saturated pixels (H, W); and the samples (H, W) that lie beyond the frame.
     """
     import cv2
 
     height, width = counts.shape[:2]
     x, y = places
     beyond = (x < -BEYOND_PX) | (x > width - 1 + BEYOND_PX) | (y < -BEYOND_PX) | (y > height - 1 + BEYOND_PX)
-    # Only what is sampled
+    # Convert only the part of the frame that is sampled
     rows, columns = _reached(y, height), _reached(x, width)
     y -= np.float32(rows.start)
     x -= np.float32(columns.start)
@@ -220,6 +226,6 @@ def _resampled(
 
 
 def _reached(places: Image, size: int) -> slice:
-    """Rows or columns of an image between which samples lie, and one more on each side."""
+    """Range of rows or columns of an image that holds all samples, and one more on each side."""
     first = int(np.clip(np.floor(places.min()), 1, size) - 1)
     return slice(first, max(int(np.clip(np.ceil(places.max()), 0, size - 2) + 2), first + 1))

@@ -1,4 +1,4 @@
-"""What the tasks of one preparation leave to each other, as files that are there whole or not at all."""
+"""Arrays that the tasks of one preparation share, as files that are either complete or absent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ A = TypeVar("A", bound=np.generic)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
-    """Write an array as ``.npy``; whoever reads sees it whole."""
+    """Write an array as ``.npy`` atomically, so that a reader never sees a part of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.partial")
     with partial.open("xb") as stream:
@@ -23,10 +23,11 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def kept_array(path: Path | None, make: Callable[[], NDArray[A]]) -> NDArray[A]:
-    """The array of a file, mapped from the disk; where there is none yet it is made and left there for others.
+    """Memory-map the array in a file; if the file does not exist, make the array and write it first.
 
     Args:
-        path: None to make it each time.
+        path: the ``.npy`` file; None to make the array each time and write nothing.
+        make: computes the array.
     """
     if path is None:
         return make()

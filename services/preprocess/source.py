@@ -1,4 +1,4 @@
-"""What the preparation reads: one image per camera and light, from a folder or from a captured rig."""
+"""Interface through which the preparation reads any capture: one image per camera and light."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from services.preprocess.window import Window
 Image = NDArray[np.float32]
 Bits = NDArray[np.uint16]
 Motions = Mapping[int, NDArray[np.float64]]
-"""Frame number -> coefficients (bodies, TERMS, 2) of its displacement, as ``stabilise`` defines them."""
+"""Frame number -> coefficients (bodies, TERMS, 2) of the frame's displacement, as ``stabilise`` defines them."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What is prepared of one camera's images: the window that shows the subject, (H, W) in all that follows.
+    """The part of one camera's images that is prepared: the window (H, W) that shows the subject.
 
     Attributes:
-        number: place of the camera in the capture.
-        whole: the camera as it is.
+        number: index of the camera in the capture.
+        whole: the camera with its whole image.
         window: rows and columns of the whole image.
-        camera: the camera whose whole image is the window.
-        footprint: what it sees of the subject.
-        scratch: folder in which what the camera's images share may be kept; None where nothing is kept.
+        camera: the same camera cropped to the window.
+        footprint: surfaces of the subject that the cropped camera sees.
+        scratch: folder for arrays that the camera's images share; None to store none.
     """
 
     number: int
@@ -44,24 +44,24 @@ class View:
     scratch: Path | None = None
 
     def kept(self, name: str) -> Path | None:
-        """The file of an array that the camera's images share; None where nothing is kept."""
+        """Path of an array that the camera's images share; None if the view has no scratch folder."""
         return None if self.scratch is None else self.scratch / f"{name}.npy"
 
 
 @dataclass(frozen=True)
 class LightImage:
-    """One camera's view under one light; arrays hold the view's window.
+    """One camera's image under one light; arrays hold the view's window.
 
     Attributes:
-        radiance, variance: (H, W, C); where a value is not finite it is 0 and flagged.
-        bits: (H, W), what the source knows: saturated, moved, not finite.
+        radiance, variance: (H, W, C); a value that is not finite is replaced by 0 and flagged.
+        bits: (H, W), mask bits that the source sets: saturated, moved, not finite.
         displacement: (h, w, 2), pixels, at every ``stored_step``-th pixel of the whole image; None where motion is not
             measured.
-        motion_px: median over the teeth; None where motion is not measured.
-        motion_error_px: by how much the motion may be wrong where the teeth are, as its interpolation in time tells;
-            None where nothing tells.
+        motion_px: median displacement over the teeth; None where motion is not measured.
+        motion_error_px: estimated error of the motion at the teeth, from its interpolation in time; None where it
+            cannot be estimated.
         warped: whether the pixels were resampled.
-        colour: of a frame whose order of channels may be wrong; None where nothing tells.
+        colour: ratio of red to blue, to check the order of channels; None where the source does not measure it.
     """
 
     radiance: Image
@@ -75,7 +75,7 @@ class LightImage:
 
 
 class Source(Protocol):
-    """A capture to prepare."""
+    """A capture that can be prepared."""
 
     @property
     def root(self) -> Path:
@@ -83,11 +83,11 @@ class Source(Protocol):
 
     @property
     def description(self) -> FolderCapture:
-        """Cameras, lights, channels."""
+        """Cameras, lights and channels of the capture."""
 
     @property
     def held_out(self) -> tuple[tuple[str, str], ...]:
-        """(camera, light) pairs that the source itself keeps from the fit."""
+        """(camera, light) pairs that the capture itself marks as held out from the fit."""
 
     @property
     def measures_motion(self) -> bool:
@@ -98,30 +98,30 @@ class Source(Protocol):
         """Sentences the operator should read before trusting the result."""
 
     def lights_of(self, camera: int) -> tuple[int, ...]:
-        """Indices of the lights this camera has an image of."""
+        """Indices of the lights under which this camera has an image."""
 
     def identity(self) -> str:
-        """A text that changes whenever a file does that the images are made of."""
+        """A text that changes whenever a file from which the images are made changes."""
 
     def matched(self, camera: int) -> tuple[int, ...]:
-        """Numbers of the frames whose motion is to be measured; none where motion is not measured."""
+        """Numbers of the camera's frames whose motion must be measured; empty where motion is not measured."""
 
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
-        """Frame number and coefficients (bodies, TERMS, 2) of its motion since the first frame, one at a time.
+        """Yield each frame's number and the coefficients (bodies, TERMS, 2) of its motion since the first frame.
 
         Raises:
-            CaptureInputError: moved too far to be aligned; names the frame and the camera.
+            CaptureInputError: the subject moved too far to be aligned; the message names the frame and the camera.
         """
 
     def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
-        """What flow sees before and after the motion is taken out; None where no two frames share their light."""
+        """Optical flow before and after stabilisation; None where no two frames share their light."""
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
-        """Light index and image, one at a time.
+        """Yield each light's index and image.
 
         Args:
-            motions: of all that ``matched`` names.
+            motions: coefficients of all frames that ``matched`` returns.
 
         Raises:
-            CaptureInputError: names the file or frame, camera and light.
+            CaptureInputError: an image cannot be read; the message names the file or frame, camera and light.
         """

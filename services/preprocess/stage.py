@@ -11,14 +11,14 @@ from services.core.stage import StageContext
 from services.core.store import StageWriter
 
 PACKAGES = ("cv2", "imagecodecs", "jinja2", "rtree", "tifffile")
-"""What the extra ``preprocess`` brings, by the names under which it is imported."""
+"""Import names of the packages that the extra ``preprocess`` installs."""
 
 
 def check() -> None:
-    """Import what a preparation needs.
+    """Import every module and package that a preparation needs.
 
     Raises:
-        PlatformError: something is missing.
+        PlatformError: a package is missing.
     """
     require_packages(PACKAGES, "preprocess")
     for module in ("opening", "tasks.blocks", "tasks.plan", "tasks.progress", "tasks.spread", "tasks.summary"):
@@ -28,14 +28,14 @@ def check() -> None:
 def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     """Prepare ``spec.capture``, or the job's own published capture, and publish ``prepared``.
 
-    Images are made in blocks, on all workers that may run this stage. What an attempt that ended has left is gone on
-    with.
+    Images are made in blocks, on all workers that may run this stage. Blocks that an earlier attempt has finished are
+    not made again.
 
     Raises:
         CaptureInputError: a file, frame, camera or light is missing or malformed. MeshError: a surface cannot bound a
             medium.
         SettingsError: an option names an unknown light or channel. StoreError: the capture store is damaged.
-            JobCancelledError.
+            JobCancelledError: the job was cancelled.
     """
     from services.preprocess.masking.masks import HandMasks
     from services.preprocess.masking.valid import require_plausible_scale
@@ -80,7 +80,8 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         ]
         for _ in workers.run(blocks_of(spec, files, "match", frames, workers.threads)):
             context.raise_if_cancelled()
-        # Neither of what follows waits for the other; comparisons, a camera's whole one in a block, come first
+        # Run comparing and developing together, as neither needs the other. Comparisons come first, because a camera's
+        # whole comparison is one block
         uncompared = [k for k in range(len(cameras)) if source.measures_motion and files.flow(k) is None]
         compare = [Block(spec, files, "compare", k) for k in uncompared]
         missing = [[j for j in own if files.image(k, j) is None] for k, own in enumerate(lights)]

@@ -1,5 +1,5 @@
-"""What a capture shows: teeth, and around them gums and the wall of the mouth, which a jaw's fit explains and a single
-tooth's does not.
+"""Surfaces that a capture shows: teeth, gums and the wall of the mouth. A jaw's fit models all of them, a single
+tooth's fit only teeth.
 """
 
 from __future__ import annotations
@@ -24,46 +24,46 @@ NOTHING = -1
 class Subject:
     """The surfaces of a capture.
 
-    Numbers in a footprint: teeth by their place, then one for gums and one for the wall, -1 for nothing.
+    Numbers in a footprint: teeth by their index, then one number for the gums and one for the wall, -1 for no surface.
     """
 
     teeth: tuple[Tooth, ...]
     gums: Mesh | None
     cavity: Mesh | None
-    """Open, seen from either side."""
+    """Wall of the mouth, an open surface that is visible from both sides."""
     whole: bool
-    """Whether gums and wall are to be fitted too; else gums are in the way."""
+    """Whether gums and wall are fitted too; otherwise gums are occluders."""
     others: tuple[Mesh, ...] = ()
-    """Teeth that are not to be fitted, and so are in the way."""
+    """Outer surfaces of teeth that are not fitted and therefore are occluders."""
 
     @property
     def gums_number(self) -> int:
-        """Of gums in a footprint."""
+        """Number of the gums in a footprint."""
         return len(self.teeth)
 
     @property
     def cavity_number(self) -> int:
-        """Of the wall in a footprint."""
+        """Number of the wall in a footprint."""
         return len(self.teeth) + 1
 
     @property
     def in_the_way(self) -> tuple[Mesh, ...]:
-        """What hides and shades, and is not to be fitted."""
+        """Occluders: surfaces that hide and shade others and are not fitted."""
         return self.others if self.gums is None or self.whole else (*self.others, self.gums)
 
     def fitted_meshes(self) -> list[Mesh]:
-        """What a camera's window is to hold."""
+        """Surfaces that are fitted, and that a camera's window must contain."""
         around = [mesh for mesh in (self.gums, self.cavity) if mesh is not None and self.whole]
         return [tooth.outer for tooth in self.teeth] + around
 
     def view_of(self, number: int, camera: Camera) -> View:
-        """What is prepared of a camera's images."""
+        """Window and footprint of the subject in one camera's images."""
         window = window_of(camera, self.fitted_meshes())
         cropped = window.cropped(camera)
         return View(number, camera, window, cropped, self.seen_by(cropped))
 
     def seen_by(self, camera: Camera) -> Footprint:
-        """What a camera sees of all that is to be fitted."""
+        """Footprint of all fitted surfaces in a camera, with the occluders taken into account."""
         outers = [tooth.outer for tooth in self.teeth]
         if not self.whole:
             return project(camera, outers, self.in_the_way)
@@ -77,27 +77,27 @@ class Subject:
         return replace(footprint, mesh=numbers[footprint.mesh])
 
     def glossy(self, footprint: Footprint) -> tuple[NDArray[np.bool_], ...]:
-        """Masks (H, W) of the surfaces that reflect, apart because their colours differ."""
+        """Masks (H, W) of the glossy surfaces, one for teeth and one for gums because their colours differ."""
         teeth = (footprint.mesh >= 0) & (footprint.mesh < len(self.teeth))
         return (teeth, footprint.mesh == self.gums_number) if self.whole else (teeth,)
 
     def pixels_of_teeth(self, footprint: Footprint, bits: NDArray[np.uint16]) -> NDArray[np.int64]:
-        """How many valid pixels (teeth,) show each tooth."""
+        """Numbers (teeth,) of valid pixels that show each tooth."""
         labels = footprint.mesh[(bits == 0) & (footprint.mesh >= 0)]
         return np.bincount(labels, minlength=len(self.teeth))[: len(self.teeth)]
 
 
 def read_subject(root: Path, whole: bool, fdi: int | None = None) -> Subject:
-    """Read ``teeth/``, ``gums.ply`` and, where all is to be fitted, ``cavity.ply`` of a capture.
+    """Read ``teeth/``, ``gums.ply`` and, if everything is fitted, ``cavity.ply`` of a capture.
 
     Args:
-        root: of the capture.
-        whole: whether gums and wall are to be fitted too.
-        fdi: the one tooth that is to be fitted; None for all.
+        root: folder of the capture.
+        whole: whether gums and wall are fitted too.
+        fdi: number of the only tooth to fit; None for all.
 
     Raises:
-        CaptureInputError: no tooth is there, or not this one, or a file cannot be read. MeshError: a surface cannot
-            bound a medium.
+        CaptureInputError: there is no tooth, or not the one asked for, or a file cannot be read. MeshError: a surface
+            cannot bound a medium.
     """
     teeth, gums = read_teeth(root), _optional(root / "gums.ply")
     chosen = tuple(tooth for tooth in teeth if fdi in {None, tooth.fdi})

@@ -1,4 +1,4 @@
-"""The part of a camera's image that shows what is to be fitted: nothing else is read, computed or stored."""
+"""The part of a camera's image that shows the fitted surfaces; nothing else is read, computed or stored."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from services.core.geometry import Camera, Mesh, Vector3
 
 MARGIN_PX = 32
-"""Pixels kept around what is to be fitted: the checks of the pose look at its outline from outside."""
+"""Smallest margin around the fitted surfaces, pixels: the checks of the pose read pixels outside their outline."""
 MARGIN_SHARE = 0.05
-"""The same as a share of the longer side, for cameras with many pixels."""
+"""Smallest margin as a share of the longer side, for cameras with many pixels."""
 BAND_PIXELS = 1 << 16
-"""Pixels that are worked on at once: a dozen float32 arrays of so many stay in a processor's cache."""
+"""Approximate number of pixels processed at once: a dozen float32 arrays of this size fit in a processor's cache."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """Rows ``top`` to ``bottom`` and columns ``left`` to ``right`` of an image, ends excluded, in pixels."""
+    """Rows ``top`` to ``bottom`` and columns ``left`` to ``right`` of an image in pixels, ends excluded."""
 
     top: int
     bottom: int
@@ -28,21 +28,21 @@ class Window:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Numbers of rows and columns."""
         return self.bottom - self.top, self.right - self.left
 
     @property
     def rows(self) -> slice:
-        """Of the whole image."""
+        """Rows of the whole image."""
         return slice(self.top, self.bottom)
 
     @property
     def columns(self) -> slice:
-        """Of the whole image."""
+        """Columns of the whole image."""
         return slice(self.left, self.right)
 
     def grown(self, by_px: int, size: tuple[int, int]) -> Window:
-        """The same with so many pixels more on each side, as far as an image of ``size`` (width, height) has them."""
+        """Window enlarged by ``by_px`` pixels on each side, within an image of ``size`` (width, height)."""
         return Window(
             max(self.top - by_px, 0),
             min(self.bottom + by_px, size[1]),
@@ -51,14 +51,14 @@ class Window:
         )
 
     def within(self, outer: Window) -> tuple[slice, slice]:
-        """Rows and columns of this window in an array that holds the outer one."""
+        """Rows and columns of this window in an array that holds the outer window."""
         return (
             slice(self.top - outer.top, self.bottom - outer.top),
             slice(self.left - outer.left, self.right - outer.left),
         )
 
     def cropped(self, camera: Camera) -> Camera:
-        """The camera whose whole image is this window."""
+        """Camera whose whole image is this window of the given camera's image."""
         first, second, last = camera.K
         K: tuple[Vector3, Vector3, Vector3] = (
             (first[0], first[1], first[2] - self.left),
@@ -69,8 +69,9 @@ class Window:
 
 
 def window_of(camera: Camera, meshes: Sequence[Mesh]) -> Window:
-    """The smallest window that holds the meshes' images and a margin; the whole image where they reach behind the
-    camera or beside it.
+    """Smallest window that holds the meshes' images and a margin.
+
+    It is the whole image if a mesh reaches behind the camera or none lies in the image.
     """
     width, height = camera.size
     whole = Window(0, height, 0, width)
@@ -87,13 +88,13 @@ def window_of(camera: Camera, meshes: Sequence[Mesh]) -> Window:
 
 
 def bands(shape: tuple[int, int]) -> Iterator[slice]:
-    """Rows of an image of (height, width), a few at a time."""
+    """Split an image of (height, width) into slices of a few rows."""
     step = max(1, BAND_PIXELS // max(shape[1], 1))
     for top in range(0, shape[0], step):
         yield slice(top, min(top + step, shape[0]))
 
 
 def bands_of(rows: slice, width: int) -> Iterator[slice]:
-    """Some rows of an image of so many columns, a few at a time."""
+    """Split some rows of an image of ``width`` columns into slices of a few rows."""
     for part in bands((rows.stop - rows.start, width)):
         yield slice(rows.start + part.start, rows.start + part.stop)

@@ -1,1 +1,1 @@
-"""Which pixels a fit may use: highlights, shadows, masks by hand."""
+"""Masks of the pixels that a fit may use: highlights, shadows and manual masks."""

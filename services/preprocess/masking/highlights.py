@@ -1,8 +1,9 @@
-"""Which pixels show a surface reflection instead of light that was inside the tooth.
+"""Mask of the pixels that show a surface reflection instead of light that was inside the tooth.
 
-Mallick et al. 2005 rotate RGB so that one axis, S, is the light's colour; a reflection adds to S alone. Teeth are
-nearly light-coloured, so ‖UV‖ is small and noisy: here S against UV becomes one linear functional per pixel with its
-variance, and is joined by what the scan knows, how far each normal is from the mirror direction.
+Mallick et al. 2005 rotate RGB so that one axis, S, is the light's colour; a reflection adds to S alone. Teeth have
+nearly the light's colour, so ‖UV‖ is small and noisy. Here the comparison of S with UV is one linear functional per
+pixel with a known variance. It is combined with the scan's geometry: the angle of each normal from the mirror
+direction.
 """
 
 from __future__ import annotations
@@ -22,33 +23,33 @@ from services.preprocess.window import bands
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 FITTED_PIXELS = 100_000
+"""Largest number of pixels to which shading is fitted."""
 
 
 @dataclass(frozen=True)
 class HighlightOptions:
-    """Thresholds. Fractions are of the pixel's brightness along the light's colour."""
+    """Thresholds of the highlight mask. Fractions are relative to a pixel's brightness along the light's colour."""
 
-    tolerated: float = 0.02  # reflection left in the data; below twice the sensor noise of 1 %
-    strong: float = 0.10  # starts a highlight
-    weak: float = 0.03  # continues it
-    strong_sigma: float = 5.0  # 6e-7 false alarms per pixel
-    weak_sigma: float = 2.5
+    tolerated: float = 0.02  # largest reflected fraction left in the data; below twice the sensor noise of 1 %
+    strong: float = 0.10  # reflected fraction that starts a highlight
+    weak: float = 0.03  # reflected fraction that continues a highlight
+    strong_sigma: float = 5.0  # standard errors that start a highlight; 6e-7 false alarms per pixel
+    weak_sigma: float = 2.5  # standard errors that continue a highlight
     cone_deg: float = 40.0  # widest half-angle at which a wet tooth still reflects visibly, scan error included
-    lobe_deg: float = 25.0  # outside this half-angle the diffuse colour and shading are learned
-    colour_error: float = 0.05  # how far a tooth's chroma strays from its neighbourhood's
-    shading_error: float = 0.15  # how far shading strays from a quadratic in the normal
+    lobe_deg: float = 25.0  # outside this half-angle the diffuse colour and shading are estimated
+    colour_error: float = 0.05  # relative deviation of a tooth's chroma from that of its neighbourhood
+    shading_error: float = 0.15  # relative deviation of shading from a quadratic in the normal
 
 
 def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
-    """Cosine (H, W) of the angle between the surface normal and the half vector of light and view; -1 where no surface
-    is.
+    """Cosine (H, W) of the angle between the surface normal and the half vector of light and view; -1 without surface.
 
-    A pixel's ray is a + b x + c y from the camera's eye, so all that is needed are products of the normal with a few
-    fixed vectors and polynomials of the pixel's place.
+    The ray of pixel (x, y) is a + b x + c y from the camera's centre, so the computation needs only products of the
+    normal with a few fixed vectors and polynomials of the pixel's position.
     """
     pose, inverse_K = np.asarray(camera.camera_from_world), np.linalg.inv(np.asarray(camera.K))
     eye = -pose[:3, :3].T @ pose[:3, 3]
-    # Directions in the world of the camera's pixel (0, 0), of a step in x and of a step in y; the depth is along the
+    # Find the world directions of pixel (0, 0), of a step in x and of a step in y, each for unit depth along the
     # camera's axis
     start, step_x, step_y = (
         pose[:3, :3].T @ inverse_K @ vector
@@ -84,7 +85,7 @@ def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
         at_start, by_x, by_y, light_cosine = (by_normal[:, k].reshape(depth.shape) for k in range(4))
         ray_cosine = at_start + by_x * x[columns]
         ray_cosine += by_y * y[rows]
-        # Of the ray, and of the vector from the surface to the light
+        # Compute the ray's length at unit depth, and the distance from the surface to the light
         ray_length = np.sqrt(ray_squared[rows] @ powers[:, columns])
         along = towards[rows] @ powers[:2, columns]
         depth_squared = depth * ray_length
@@ -93,6 +94,7 @@ def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
         distance = np.sqrt(np.maximum(dot - depth * along + np.float32(to_light @ to_light), np.float32(1e-12)))
         light_cosine = (light_cosine - depth * ray_cosine) / distance
         ray_cosine /= ray_length
+        # Take the cosine with the half vector (l + v) / |l + v|, where |l + v|² = 2 + 2 l·v
         between = dot / (distance * depth * ray_length)
         half = np.sqrt(np.maximum(2 + 2 * between, np.float32(1e-12)))
         np.copyto(cosines[rows, columns], (light_cosine - ray_cosine) / half, where=seen)
@@ -112,13 +114,13 @@ def highlight_mask(
     """Mask (H, W) of pixels that a surface reflection brightens by more than ``options.tolerated``.
 
     Args:
-        radiance, variance: (H, W, C), linear, and its variance.
-        usable: (H, W), pixels whose whole footprint is tooth and whose value is good.
-        saturated: (H, W), tooth pixels without a value because too bright; near the mirror direction they are a
-            highlight's core.
+        radiance, variance: (H, W, C), linear radiance and its variance.
+        usable: (H, W), pixels whose whole footprint is tooth and whose value is valid.
+        saturated: (H, W), saturated tooth pixels; near the mirror direction they belong to a highlight's core.
         cosines: (H, W) from ``half_cosines``.
         normal: (H, W, 3), outward.
-        light_colour: the light's intensity per channel.
+        light_colour: the light's intensity per channel (C,).
+        options: thresholds; None for the defaults.
     """
     import cv2
 
@@ -137,8 +139,7 @@ def highlight_mask(
     shading = _fit_shading(brightness, far, normal, o)
     colour = _fit_colour(radiance, brightness, usable, far, axis) if radiance.shape[-1] >= 3 else None
 
-    # A few rows at a time: both estimates of the reflected part joined by their inverse variances, and what they say of
-    # each pixel
+    # Estimate the reflected part of each pixel and test it against the thresholds, a few rows at a time
     weak, strong = burnt.astype(np.uint8), burnt
     profile = LobeProfile()
     for rows in bands(usable.shape):
@@ -159,7 +160,7 @@ def highlight_mask(
     if half_angle == 0 and not strong.any():
         return mask
 
-    # Hysteresis: a strong core, continued through weak neighbours, and one pixel of bloom
+    # Apply hysteresis: keep connected weak pixels that contain a strong one, and add one pixel of bloom around them
     count, labels = cv2.connectedComponents(weak, connectivity=8)
     of_core = np.zeros(count, dtype=np.uint8)
     of_core[labels[strong]] = 1
@@ -171,7 +172,7 @@ def highlight_mask(
 
 
 def along_axis(image: Image, axis: NDArray[np.float64]) -> Image:
-    """Product (H, W) of every pixel (H, W, C) with a vector (C,)."""
+    """Scalar product (H, W) of every pixel of an image (H, W, C) with a vector (C,)."""
     return np.asarray(image.reshape(-1, image.shape[-1]) @ axis.astype(np.float32), dtype=np.float32).reshape(
         image.shape[:2]
     )
@@ -182,8 +183,10 @@ class _Shading:
     """Diffuse shading as a quadratic in the normal.
 
     Attributes:
-        quadratic: (3, 3) symmetric, linear: (3,), constant: its coefficients.
-        misfit: standard deviation of what it leaves, as a fraction.
+        quadratic: (3, 3) symmetric matrix of the quadratic part.
+        linear: (3,) coefficients of the linear part.
+        constant: constant part.
+        misfit: relative standard deviation of the residual, at least ``shading_error``.
     """
 
     quadratic: NDArray[np.float32]
@@ -202,8 +205,11 @@ class _Shading:
 
 @dataclass(frozen=True)
 class _Colour:
-    """Diffuse chroma: its direction (C,), and the inverse (H, W) of its ratio to the brightness in the
-    neighbourhood.
+    """Diffuse chroma of an image.
+
+    Attributes:
+        direction: (C,) unit vector of the chroma, perpendicular to the light's colour.
+        inverse_ratio: (H, W) brightness over chroma of diffuse light in each pixel's neighbourhood.
     """
 
     direction: NDArray[np.float64]
@@ -221,11 +227,10 @@ def _reflected(
     colour: _Colour | None,
     o: HighlightOptions,
 ) -> tuple[Image, Image]:
-    """Reflected part and inverse variance (h, w) by shading and by colour together; weight 0 where neither says
-    anything.
+    """Estimate the reflected part of the brightness (h, w) and its inverse variance (h, w), 0 where unknown.
 
-    With v = UV·d along the tooth's own chroma d and ρ = v/S of diffuse light, S − v/ρ is the reflection; its variance
-    grows as 1/ρ².
+    The estimates from shading and from colour are combined by inverse variance. Colour: with v = UV·d along the tooth's
+    own chroma d, and ρ = v/S of diffuse light, the reflection is S − v/ρ; its variance grows as 1/ρ².
     """
     tiny = np.float32(1e-30)
     flat = variance.reshape(-1, variance.shape[-1])
@@ -252,21 +257,21 @@ def _reflected(
 
 
 def _fit_shading(brightness: Image, far: BoolArray, normal: Image, o: HighlightOptions) -> _Shading | None:
-    """Shading (nine coefficients) of diffuse pixels; None where too few are lit."""
+    """Fit the shading (nine coefficients) of the diffuse pixels ``far``; None if too few of them are lit."""
     chosen = _strided(far, FITTED_PIXELS)
     if not len(chosen):
         return None
-    # Nine coefficients need no more than evenly strided pixels
+    # Use only lit pixels; evenly strided ones are enough for nine coefficients
     level = brightness.ravel()[chosen]
     lit = level > 0.1 * np.quantile(level, 0.95)
     chosen, level = chosen[lit], level[lit].astype(np.float64)
     if len(chosen) < 90:
         return None
     terms = np.stack(tuple(_quadratic(normal.reshape(-1, 3)[chosen].astype(np.float64))), axis=-1)
-    # A small ridge keeps directions that the visible normals do not span at zero
+    # Solve with a small ridge, which keeps coefficients near zero that the visible normals do not determine
     matrix = terms.T @ terms
     c = np.linalg.solve(matrix + 1e-4 * np.trace(matrix) / 9 * np.eye(9), terms.T @ level)
-    # The fit's own misfit says how far to trust it
+    # Take the relative residual as the model's error
     misfit = max(o.shading_error, float(np.sqrt(np.mean((level - terms @ c) ** 2)) / level.mean()))
     quadratic = np.array(
         [[c[7], c[4] / 2, c[6] / 2], [c[4] / 2, -c[7], c[5] / 2], [c[6] / 2, c[5] / 2, 3 * c[8]]], dtype=np.float32
@@ -275,13 +280,13 @@ def _fit_shading(brightness: Image, far: BoolArray, normal: Image, o: HighlightO
 
 
 def _strided(mask: BoolArray, most: int) -> NDArray[np.intp]:
-    """Flat indices of at most so many of a mask's pixels, evenly strided."""
+    """Flat indices of at most ``most`` of a mask's pixels, evenly strided."""
     inside = np.flatnonzero(mask)
     return inside[:: max(1, -(-len(inside) // most))]
 
 
 def _quadratic(normal: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    """The nine monomials of a normal (..., 3) up to degree two, as spherical harmonics up to scale."""
+    """Yield nine polynomials of a normal (..., 3) up to degree two: the spherical harmonics up to scale."""
     x, y, z = (normal[..., k] for k in range(3))
     yield np.ones_like(x)
     yield from (x, y, z)
@@ -295,9 +300,7 @@ def _quadratic(normal: NDArray[Any]) -> Iterator[NDArray[Any]]:
 def _fit_colour(
     radiance: Image, brightness: Image, usable: BoolArray, far: BoolArray, axis: NDArray[np.float64]
 ) -> _Colour | None:
-    """Chroma of diffuse light, and its ratio to the brightness around each pixel; None where there is none to learn
-    from.
-    """
+    """Estimate the diffuse chroma from the pixels ``far``; None if they are too few or have none."""
     import cv2
 
     if np.count_nonzero(far) < 20:
@@ -311,13 +314,14 @@ def _fit_colour(
     if length <= 0:
         return None
     direction = chroma / length
-    # Diffuse ratio in the neighbourhood, falling back to the image's where no diffuse pixel is near
+    # Average the ratio of chroma to brightness over each neighbourhood; where no diffuse pixel is near, it falls back
+    # to the image's mean
     along = along_axis(radiance, direction)
     mean_along, mean_brightness = (float(cv2.mean(image, far.astype(np.uint8))[0]) for image in (along, brightness))
     reach = max(2.0, 0.15 * float(np.sqrt(np.count_nonzero(usable))))
     along *= far_map
     factor = max(1, int(reach / 6))
-    # A wide blur is made on a reduced image, which it cannot tell apart
+    # Blur a reduced image, because a wide blur removes the detail that the reduction loses
     known = _wide_blur(far_map, reach, factor) + 0.05
     local_along = (_wide_blur(along, reach, factor) + 0.05 * mean_along) / known
     np.multiply(brightness, far_map, out=far_map)
@@ -330,7 +334,7 @@ def _fit_colour(
 
 
 def _wide_blur(image: Image, sigma_px: float, factor: int) -> Image:
-    """Gaussian blur of an image reduced by ``factor``."""
+    """Reduce an image (H, W) by ``factor`` and blur it by a Gaussian of ``sigma_px`` pixels of the full image."""
     import cv2
 
     height, width = image.shape

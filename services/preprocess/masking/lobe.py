@@ -1,9 +1,9 @@
-"""How far from the mirror direction a surface's reflection reaches in one image.
+"""Angle from the mirror direction up to which a surface's reflection reaches in one image.
 
-Averaged over all pixels at one angle between normal and half vector, reflections are seen that single pixels hide in
-noise. Their shape is that of a microfacet distribution (Walter et al. 2007, equations 25, Beckmann, and 33, GGX).
-So what is seen near the mirror direction tells how much is left where it is fainter than the errors of the diffuse
-light from which it is parted: there a broad lobe would be taken for diffuse light.
+The average over all pixels at one angle between normal and half vector reveals reflections that noise hides in single
+pixels. Their profile has the shape of a microfacet distribution (Walter et al. 2007, equations 25, Beckmann, and 33,
+GGX). A distribution fitted near the mirror direction predicts the reflection farther out, where it is weaker than the
+error of the diffuse light and a broad lobe would be mistaken for diffuse light.
 """
 
 from __future__ import annotations
@@ -16,29 +16,33 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 PROFILE_DEG = 50
-"""Half-angle to which light is summed: farther out surfaces turn from the light and shading is no quadratic."""
+"""Half-angle of the profile, degrees: farther out surfaces turn from the light and shading is not quadratic."""
 ROUGHNESS = np.geomspace(0.02, 0.45, 30)
-"""Of the distributions tried, in steps of 11 %. The last hardly falls within the profile: it proves no reflection."""
+"""Roughness of the distributions tried, in steps of 11 %. The last distribution hardly decreases within the profile, so
+a best fit there is no evidence of a reflection."""
 SIGMA = 5.0
-"""A lobe's amplitude is told from none by so many standard errors."""
+"""Number of standard errors by which a lobe's amplitude must exceed zero."""
 CORE_SHARE = 0.15
-"""Least part of its light that a lobe's core reflects: errors of shading reach 0.12 where none is, GGX 0.3 has 0.25."""
+"""Smallest reflected fraction of the light in a lobe's core. Errors of shading reach 0.12 without a reflection; a GGX
+lobe of roughness 0.3 has 0.25."""
 DIFFUSE_ERROR = 0.02
-"""Error of the diffuse light at one angle, as a part of the image's mean or of what is there, whichever is more."""
+"""Error of the diffuse light at one angle, as a fraction of the image's mean or of the light at this angle, whichever
+is larger."""
 SHAPE_ERROR = 0.1
-"""How far a real lobe strays from the distribution, as a part of itself."""
+"""Deviation of a real lobe from the distribution, as a fraction of the lobe."""
 
 
 @dataclass(frozen=True)
 class _Lobe:
-    """A distribution with its amplitude, and how well it describes the profile.
+    """Distribution fitted to the profile.
 
     Attributes:
+        roughness: of the distribution.
         by_angle: amplitude times distribution, at the profile's angles.
-        error: standard error of the amplitude, as a part of it; negative where the amplitude is.
-        bias: part of all light by which the reflection came out too small, as diffuse light was learned from pixels
-            that reflect too.
-        misfit: weighted sum of squares.
+        error: relative standard error of the amplitude; negative if the amplitude is negative.
+        bias: fraction of all light by which the reflection is underestimated, because diffuse light was learned from
+            pixels that reflect too.
+        misfit: weighted sum of squared residuals.
     """
 
     roughness: float
@@ -49,7 +53,7 @@ class _Lobe:
 
 
 class LobeProfile:
-    """Light and its reflected part, summed by whole degrees from the mirror direction."""
+    """Light and its reflected part, summed by whole degrees between normal and half vector."""
 
     def __init__(self) -> None:
         self._total, self._reflected, self._variance, self._count = (np.zeros(PROFILE_DEG) for _ in range(4))
@@ -61,10 +65,11 @@ class LobeProfile:
         reflected: NDArray[np.float32],
         weight: NDArray[np.float32],
     ) -> None:
-        """Add pixels (N,) within ``PROFILE_DEG``; one of weight 0 tells nothing.
+        """Add pixels (N,) within ``PROFILE_DEG``; pixels of weight 0 are ignored.
 
         Args:
-            cosines: of the angle between normal and half vector.
+            cosines: cosines of the angle between normal and half vector.
+            brightness: light of the pixels along the light's colour.
             reflected, weight: estimate of the reflected part of the brightness, and its inverse variance.
         """
         told = weight > 0
@@ -82,13 +87,13 @@ class LobeProfile:
         return np.asarray(np.bincount(degrees, values, minlength=PROFILE_DEG)[:PROFILE_DEG], dtype=np.float64)
 
     def half_angle(self, tolerated: float, widest_deg: float) -> float:
-        """Half-angle in rad within which the reflection exceeds a part of the diffuse light; 0 where no lobe is seen.
+        """Half-angle in rad within which the reflection exceeds a fraction of the diffuse light; 0 if no lobe is found.
 
         Args:
-            tolerated: that part. widest_deg: the result is never more.
+            tolerated: the fraction. widest_deg: upper limit of the result.
         """
         used = np.flatnonzero(self._total > 0)
-        # A distribution, its amplitude and a bias need some more angles than that
+        # Require clearly more angles than the unknowns roughness, amplitude and bias
         if len(used) < 10:
             return 0.0
         total, reflected, count = self._total[used], self._reflected[used], self._count[used]
@@ -97,7 +102,7 @@ class LobeProfile:
         lobe = min(
             _lobes(used.astype(np.float64) + 0.5, total, reflected, count, 1 / spread), key=lambda one: one.misfit
         )
-        # None where its amplitude is noise, where it is as broad as shading, or where its core reflects too little
+        # Reject a lobe whose amplitude is noise, that is as broad as shading, or whose core reflects too little
         core = lobe.by_angle > lobe.by_angle.max() / 2
         seen = reflected[core].sum() / total[core].sum() + lobe.bias if core.any() else 0.0
         if not 0 < lobe.error < 1 / SIGMA or lobe.roughness == ROUGHNESS[-1] or seen < CORE_SHARE:
@@ -109,10 +114,10 @@ class LobeProfile:
 
 
 def _lobes(degrees: Array, total: Array, reflected: Array, count: Array, weight: Array) -> Iterator[_Lobe]:
-    """GGX and Beckmann distributions, each fitted by weighted least squares together with a bias.
+    """Fit each GGX and Beckmann distribution by weighted least squares, together with a bias.
 
-    Learned from pixels that reflect a part s of their diffuse light, diffuse light comes out (1 + s) times too bright.
-    What is taken for the reflection is then (1 + s) times the reflection less s times all light.
+    If diffuse light is learned from pixels that also reflect a fraction s of it, it is overestimated by the factor
+    1 + s. The estimated reflection is then (1 + s) times the true one minus s times all light.
     """
     cosines_squared = np.cos(np.radians(degrees)) ** 2
     for roughness in ROUGHNESS:
@@ -120,10 +125,10 @@ def _lobes(degrees: Array, total: Array, reflected: Array, count: Array, weight:
         ggx = squared / (cosines_squared * (squared - 1) + 1) ** 2
         beckmann = np.exp((1 - 1 / cosines_squared) / squared) / (squared * cosines_squared**2)
         for facets in (ggx, beckmann):
-            # Nothing of a lobe can be seen at these angles
+            # Skip a distribution that is almost zero at all these angles
             if facets.max() * squared < 1e-9:
                 continue
-            # The normal equations of two unknowns, unless the distribution is no other than all light
+            # Solve the normal equations for amplitude and bias; skip a distribution that is proportional to all light
             own, other = facets * count, -total
             square, mixed, other_square = (
                 (weight * one * two).sum() for one, two in ((own, own), (own, other), (other, other))

@@ -1,4 +1,4 @@
-"""Masks by hand, decoded for the images they belong to."""
+"""Manual masks, decoded for the images to which they belong."""
 
 from __future__ import annotations
 
@@ -13,13 +13,17 @@ from services.core.records import FolderCapture, MaskBit
 
 
 class HandMasks:
-    """A job's masks as they were when the preparation began."""
+    """Manual masks of a job, as they were when this object was made."""
 
     def __init__(self, root: Path, description: FolderCapture) -> None:
-        """Read them.
+        """Read the masks.
+
+        Args:
+            root: folder of the job.
+            description: cameras and lights of the capture.
 
         Raises:
-            CaptureInputError: one is of no camera or light of the capture.
+            CaptureInputError: a mask belongs to no camera or light of the capture.
         """
         self._root, self._masks = root, read_masks(root)
         self.digest = digest_of(self._masks)
@@ -35,10 +39,14 @@ class HandMasks:
                 )
 
     def bits(self, camera: str, light: str, size: tuple[int, int]) -> NDArray[np.uint16]:
-        """MANUAL where the mask of this light, or the one of all lights, is set; ``size`` is (width, height).
+        """Mask bits (H, W): MANUAL where the mask of this light or the one for all lights is set, else 0.
+
+        Args:
+            camera: name of the camera. light: name of the light.
+            size: (width, height) of the camera's image.
 
         Raises:
-            CaptureInputError: a mask is no image of this size.
+            CaptureInputError: a mask is not an image of this size.
         """
         bits = np.zeros(size[::-1], dtype=np.uint16)
         for of in ((camera, light), (camera, ALL_LIGHTS)):

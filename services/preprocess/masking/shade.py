@@ -1,4 +1,4 @@
-"""Finds the shadows in a camera's stored images and flags them, once all of its images are there."""
+"""Find the shadows in a camera's stored images and flag them, once all of its images are stored."""
 
 from __future__ import annotations
 
@@ -20,19 +20,27 @@ from services.preprocess.subject import Subject
 from services.preprocess.tasks.attempt_files import AttemptFiles
 
 PIXEL_MM = 0.25
-"""Shadows are looked for in images averaged to about this pixel: finer than their edges, which light inside a tooth
-makes soft."""
+"""Approximate pixel size, mm on the tooth, to which images are averaged before shadows are searched. It is finer than a
+shadow's edge, which light inside a tooth makes soft."""
 MIN_LIGHTS = 6
-"""With fewer lights most of a pixel's images may lie in shadow, and nothing says how bright it would be."""
+"""Smallest number of lights that are compared. With fewer lights most of a pixel's images may lie in shadow, so its
+unshadowed brightness is unknown."""
 SHADOWED = 0.5
-"""A pixel is left out above this confidence: it is then more likely shadowed than not."""
+"""Confidence above which a pixel is flagged: it is then more likely shadowed than not."""
 NO_VALUE = np.uint16(MaskBit.HIGHLIGHT | MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.MOTION | MaskBit.UNLIT)
-"""Pixels whose brightness is not the tooth's."""
+"""Mask bits of pixels whose value is not the brightness of the tooth."""
 
 
 @dataclass(frozen=True)
 class _Coarse:
-    """A view averaged over squares of ``step`` pixels; arrays are (h, w)."""
+    """A view averaged over squares of ``step`` pixels.
+
+    Attributes:
+        step: side of a square, pixels.
+        points_mm: (h, w, 3) mean world position of the surface.
+        normal: (h, w, 3) mean unit normal.
+        seen: (h, w) squares that hold a covered pixel.
+    """
 
     step: int
     points_mm: Image
@@ -40,7 +48,7 @@ class _Coarse:
     seen: NDArray[np.bool_]
 
     def mean(self, values: NDArray[Any], weight: NDArray[np.float32]) -> tuple[Image, Image]:
-        """Weighted mean (h, w, …) of an image and the weights' sums (h, w)."""
+        """Weighted mean (h, w, …) of an image (H, W, …) over the squares, and the sums (h, w) of the weights."""
         sums = _squares(weight, self.step)
         weighted = _squares(values * (weight if values.ndim == weight.ndim else weight[..., None]), self.step)
         divisor = np.maximum(sums, 1e-6)
@@ -48,13 +56,13 @@ class _Coarse:
 
 
 def shade(files: AttemptFiles, source: Source, subject: Subject, view: View, context: StageContext) -> None:
-    """Flag SHADOW in all images of a camera and store how sure that is, in per cent.
+    """Flag SHADOW in all images of a camera and store the confidence in per cent.
 
-    Surfaces that the fit renders throw their shadows there; gums and teeth that it does not render shade here by their
-    geometry, and what no scan shows by comparing the camera's lights.
+    The fit itself renders the shadows of fitted surfaces. Here, shadows of gums and teeth that are not fitted are found
+    from their geometry, and shadows of objects without a scan by comparing the camera's lights.
 
     Raises:
-        JobCancelledError. FencedError: another attempt has begun.
+        JobCancelledError: the job was cancelled. FencedError: another attempt has begun.
     """
     camera, lights = view.number, source.lights_of(view.number)
     coarse = _averaged(view)
@@ -94,13 +102,13 @@ def _averaged(view: View) -> _Coarse:
 
 
 def _pixel_mm(camera: Camera, footprint: Footprint) -> float:
-    """Size of a pixel on the teeth, median over the covered ones."""
+    """Size of a pixel on the teeth in mm, median over the covered pixels."""
     depth = footprint.depth_mm[footprint.covered]
     return float(np.median(depth)) / camera.K[0][0] if len(depth) else PIXEL_MM
 
 
 def _brightness(files: AttemptFiles, view: View, light: int, coarse: _Coarse) -> tuple[Image, Image]:
-    """Mean over channels of an image and its variance; infinite where a square holds no pixel with a value."""
+    """Mean of an image over channels (h, w) and its variance (h, w), infinite in squares without a usable pixel."""
     radiance, variance, valid = (_read(files, view, name, light) for name in ("radiance", "variance", "valid"))
     weight = (view.footprint.covered & (valid & NO_VALUE == 0)).astype(np.float32)
     value, sums = coarse.mean(radiance.mean(axis=-1), weight)
@@ -109,7 +117,7 @@ def _brightness(files: AttemptFiles, view: View, light: int, coarse: _Coarse) ->
 
 
 def _light_on(coarse: _Coarse, lamp: Light, rendered: Sequence[Any]) -> tuple[Image, Image]:
-    """Irradiance of a light on what it reaches past known surfaces, and the cosine of its angle."""
+    """Irradiance (h, w) of a light where rendered surfaces do not shade it, and cosine of incidence (h, w)."""
     way = np.asarray(lamp.position_mm, dtype=np.float32) - coarse.points_mm
     facing = (way * coarse.normal).sum(axis=-1) / np.maximum(np.linalg.norm(way, axis=-1), 1e-6)
     reached = reached_by(coarse.points_mm, coarse.normal, lamp.position_mm, rendered)
@@ -118,9 +126,9 @@ def _light_on(coarse: _Coarse, lamp: Light, rendered: Sequence[Any]) -> tuple[Im
 
 
 def _flag(files: AttemptFiles, subject: Subject, view: View, camera: int, light: int, confidence: Image) -> None:
-    """Write one image's flags, confidence and picture, and say that it is done."""
-    # Where a worker died between the flags and the record, the files no longer have the record's sizes; all but flags
-    # is as it was
+    """Write one image's flags, confidence and picture, and record that its shadows are flagged."""
+    # Read the record without a check of file sizes: if a worker died after writing flags and before the record, the
+    # flags' files differ from the record and everything else still matches it
     done = files.record(camera, light)
     assert done is not None, "images are stored before shadows are looked for"
     bits = _read(files, view, "valid", light)
@@ -150,13 +158,13 @@ def _flag(files: AttemptFiles, subject: Subject, view: View, camera: int, light:
 
 
 def _squares(values: NDArray[Any], step: int) -> NDArray[np.float32]:
-    """Sums (h, w, …) over squares of ``step`` pixels; those at the far edges are smaller."""
+    """Sums (h, w, …) over squares of ``step`` pixels; squares at the right and lower edges may be smaller."""
     rows = np.add.reduceat(values, np.arange(0, values.shape[0], step), axis=0)
     return np.asarray(np.add.reduceat(rows, np.arange(0, values.shape[1], step), axis=1), dtype=np.float32)
 
 
 def _finer(confidence: Image, step: int, covered: NDArray[np.bool_]) -> Image:
-    """A coarse image at every pixel that shows a tooth."""
+    """Repeat a coarse image (h, w) at full resolution (H, W); 0 at pixels that are not covered."""
     fine = confidence.repeat(step, axis=0).repeat(step, axis=1)[: covered.shape[0], : covered.shape[1]]
     return np.where(covered, fine, np.float32(0))
 

@@ -1,10 +1,10 @@
-"""Shadows of what no scan shows, lips and retractor, found by comparing a light with the camera's other lights.
+"""Shadows of objects without a scan, such as lips and retractor, found by comparing a camera's lights with each other.
 
-A pixel lies in a light's shadow where less than half of the direct light that would reach it unoccluded does. What
-reaches a pixel of known normal is known but for the shadow, and a tooth's brightness is about proportional to it once
-the light has spread inside. So a pixel's images under all lights share one factor, its brightness under unit
-irradiance, and a shadow is an image that falls short of it. Known surfaces' shadows are in the expected irradiance, as
-the fit renders them.
+A pixel lies in a light's shadow if it receives less than half of the direct light that would reach it unoccluded. The
+unoccluded irradiance follows from the pixel's position and normal, and a tooth's brightness is about proportional to
+the irradiance once that is blurred by the spread of light inside the tooth. So a pixel has about the same brightness
+per unit irradiance under all lights, and it is shadowed under a light with a clearly lower one. Shadows of known
+surfaces are part of the expected irradiance, because the fit renders them.
 """
 
 from __future__ import annotations
@@ -20,41 +20,44 @@ from services.preprocess.projection import project
 
 Image = NDArray[np.float32]
 SHADOW_PIXEL_MM = 0.25
-"""Pixel of what a light sees: a shadow's edge is known to so much, a quarter of what light spreads inside a tooth."""
+"""Pixel size, mm on the surface, of the depth map seen from a light. It is the accuracy of a shadow's edge, a quarter
+of the distance that light spreads inside a tooth."""
 DEPTH_BIAS_MM = 0.3
-"""A surface this much nearer to a light shades what lies behind it; less may be the surface itself: scans are rough by
-so much."""
+"""Smallest distance in mm by which a surface must be nearer to the light to shade a point. A smaller difference may be
+the point's own surface, because scans are rough by this much."""
 MIN_COSINE = 0.05
-"""Of the angle between light and normal below which a surface's slant is taken for this one's, 87 degrees."""
+"""Smallest cosine between light and normal that is used for a surface's slant, 87 degrees; smaller ones are raised to
+it."""
 
 
 @dataclass(frozen=True)
 class ShadowRule:
-    """When a pixel counts as shadowed.
+    """Parameters that decide when a pixel counts as shadowed.
 
-    Lengths are millimetres on the tooth, ratios are of the brightness that other lights let expect.
+    Lengths are millimetres on the tooth. Ratios are relative to the brightness expected from the other lights.
     """
 
     spread_mm: float = 1.6
-    """Light enters enamel and leaves again about so far away (standard deviation); a shadow's edge is as soft."""
+    """Standard deviation of the distance between the points where light enters and leaves enamel; a shadow's edge is as
+    soft."""
     spread_share: float = 0.75
-    """Of a tooth's light that has spread so; the rest leaves where it entered."""
+    """Fraction of a tooth's light that has spread by this distance; the rest leaves where it entered."""
     smooth_mm: float = 0.5
-    """Brightness is compared over about so much (standard deviation), finer than light spreads, so that one pixel's
-    noise decides nothing."""
+    """Standard deviation of the Gaussian that smooths brightness before the comparison, so that one pixel's noise
+    decides nothing. It is finer than the spread of light."""
     telling: float = 0.4
-    """A light tells of a pixel's brightness if it gives this much of the irradiance of the pixel's best light; grazing
-    ones are known worst."""
+    """Smallest irradiance, as a fraction of that of the pixel's best light, of a light that counts for the pixel's
+    unshadowed brightness. Grazing lights are left out because their irradiance is the least certain."""
     facing: float = 0.03
-    """Cosine of the light's angle below which a pixel glows mainly by light from beside it and says nothing."""
+    """Cosine of incidence below which a pixel is lit mainly by light from its neighbourhood and is not judged."""
     bright_quantile: float = 0.65
-    """Of a pixel's ratios under all lights, taken for unshadowed: most lights are not shadowed, and noise must not
-    choose."""
+    """Quantile of a pixel's ratios under all lights that is taken as the unshadowed one. Most lights are not shadowed,
+    and a maximum would be chosen by noise."""
     certain: float = 0.47
-    """A ratio below it is a shadow by definition."""
+    """Ratio below which a pixel is shadowed by definition."""
     possible: float = 0.57
-    """A ratio below it is a shadow where it touches a certain one: light that has spread inside brightens a shadow's
-    rim."""
+    """Ratio below which a pixel is shadowed if it is connected to a certain one, because light that has spread inside
+    the tooth brightens a shadow's rim."""
     model_error: float = 0.12
     """Relative error of the expected brightness: view-dependent reflection and light that leaves far from where it
     entered."""
@@ -63,8 +66,15 @@ class ShadowRule:
 def expected_irradiance(
     points_mm: Image, normal: Image, position_mm: tuple[float, float, float], unoccluded: NDArray[np.bool_] | None
 ) -> Image:
-    """Irradiance (H, W) of a unit point light, 1/mm²; 0 where the surface turns away, where known surfaces shade it, or
-    nothing is seen.
+    """Irradiance (H, W) of a point light of unit intensity, 1/mm².
+
+    It is 0 where the surface faces away, where known surfaces shade it, and where there is no surface.
+
+    Args:
+        points_mm: (H, W, 3) world positions of the surface.
+        normal: (H, W, 3) unit normals.
+        position_mm: position of the light.
+        unoccluded: (H, W) points that the light reaches; None if it reaches all.
     """
     way = np.asarray(position_mm, dtype=np.float32) - points_mm
     squared = (way * way).sum(axis=-1)
@@ -78,9 +88,7 @@ def expected_irradiance(
 def reached_by(
     points_mm: Image, normal: Image, position_mm: tuple[float, float, float], meshes: Sequence[Mesh]
 ) -> NDArray[np.bool_]:
-    """Whether known surfaces let a point light through to each point (H, W), by what the light itself would see of
-    them.
-    """
+    """Whether a point light reaches each point (H, W) past known surfaces, by a shadow map rendered from the light."""
     eye = _camera_at(position_mm, meshes)
     nearest = project(eye, meshes)
     height, width = points_mm.shape[:2]
@@ -88,7 +96,8 @@ def reached_by(
     column, row = (np.floor(np.nan_to_num(pixels[:, k], nan=-1.0)).astype(np.int64) for k in range(2))
     inside = (column >= 0) & (row >= 0) & (column < eye.size[0]) & (row < eye.size[1])
     first = nearest.depth_mm[np.where(inside, row, 0), np.where(inside, column, 0)]
-    # A surface seen at a slant is nearer across one of the light's pixels by the pixel times the tangent of the angle.
+    # Allow for the slant: across one pixel of the map a surface's depth varies by the pixel size times the tangent of
+    # the angle of incidence.
     way = np.asarray(position_mm) - points_mm
     cosine = np.clip((way * normal).sum(axis=-1) / np.linalg.norm(way, axis=-1), MIN_COSINE, 1).ravel()
     slant_mm = SHADOW_PIXEL_MM * np.sqrt(1 / cosine**2 - 1)
@@ -97,7 +106,7 @@ def reached_by(
 
 
 def _camera_at(position_mm: tuple[float, float, float], meshes: Sequence[Mesh]) -> Camera:
-    """A camera in a light's place that frames the meshes, with pixels of ``SHADOW_PIXEL_MM`` on them."""
+    """Camera at a light's position that frames the meshes with pixels of ``SHADOW_PIXEL_MM`` at their centre."""
     vertices = np.concatenate([mesh.vertices_mm for mesh in meshes])
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     forward = centre - np.asarray(position_mm)
@@ -127,7 +136,7 @@ def shadow_confidence(
     pixel_mm: float,
     rule: ShadowRule | None = None,
 ) -> Image:
-    """Probability (L, H, W) that each pixel lies in each light's shadow; 0 where nothing can be said.
+    """Probability (L, H, W) that each pixel lies in each light's shadow; 0 where it cannot be judged.
 
     Args:
         radiance, variance: (L, H, W), of one channel or their sum; pixels without a value have infinite variance.
@@ -135,10 +144,13 @@ def shadow_confidence(
         facing: (L, H, W), cosine of the angle between normal and light.
         seen: (H, W), pixels that show a tooth.
         pixel_mm: size of a pixel on the tooth.
+        rule: parameters; None for the defaults.
     """
     from scipy.stats import norm
 
     rule = rule or ShadowRule()
+    # Expect brightness in proportion to the irradiance, a part of it blurred by the spread of light inside the tooth;
+    # smooth it and the image alike
     inside = np.stack([_spread(layer, seen, rule.spread_mm / pixel_mm) for layer in irradiance])
     known = seen & np.isfinite(variance)
     smooth_px = rule.smooth_mm / pixel_mm
@@ -147,17 +159,19 @@ def shadow_confidence(
         np.stack([_spread(layer, told, smooth_px) for layer, told in zip(stack, known, strict=True)])
         for stack in (expected, radiance)
     )
+    # Take a high quantile of a pixel's brightness per irradiance over its well-lit images as the unshadowed one
     tells = known & (facing > rule.facing) & (expected > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         response = np.where(tells, radiance / expected, np.nan)
     bright = expected >= rule.telling * np.where(tells, expected, 0).max(axis=0)
     brightness = _upper(np.where(bright, response, np.nan), rule.bright_quantile)
-    # A value without any certainty has an infinite error, and its probability is one half
+    # Compare each image with it; a value of infinite error gets the probability one half
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         ratio = response / brightness
         error = np.sqrt(variance) / (expected * brightness)
         ratio, error = np.where(tells, ratio, np.nan), np.where(tells, error, np.nan)
         total = np.sqrt(rule.model_error**2 + error**2)
+    # Raise the threshold of likely pixels that are connected to a certain one
     certain = ratio < rule.certain
     likely = ratio < rule.possible
     touched = np.stack([_touching(seeds, grown) for seeds, grown in zip(certain, likely, strict=True)])
@@ -168,7 +182,7 @@ def shadow_confidence(
 
 
 def _spread(layer: Image, seen: NDArray[np.bool_], sigma_px: float) -> Image:
-    """Mean of what surrounds each pixel on the tooth, by a Gaussian weight."""
+    """Gaussian-weighted mean around each pixel over the pixels ``seen``; 0 elsewhere."""
     import cv2
 
     weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), max(sigma_px, 0.1))
@@ -177,7 +191,7 @@ def _spread(layer: Image, seen: NDArray[np.bool_], sigma_px: float) -> Image:
 
 
 def _upper(response: Image, quantile: float) -> Image:
-    """A quantile (H, W) over lights of a stack (L, H, W) with gaps; NaN where all are gaps."""
+    """Quantile (H, W) over the lights of a stack (L, H, W), NaN values left out; NaN where all are NaN."""
     ordered = np.sort(response, axis=0)  # NaN comes last
     count = np.isfinite(response).sum(axis=0)
     place = np.clip(np.rint(quantile * (count - 1)), 0, None).astype(np.int64)
@@ -185,7 +199,7 @@ def _upper(response: Image, quantile: float) -> Image:
 
 
 def _touching(seeds: NDArray[np.bool_], grown: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The connected parts of ``grown`` that hold a seed."""
+    """Connected components of ``grown`` that contain a seed."""
     import cv2
 
     _, labels = cv2.connectedComponents(grown.astype(np.uint8), connectivity=8)

@@ -1,4 +1,4 @@
-"""Which pixels the fit may use, and why not the others."""
+"""Mask bits of an image: the pixels that the fit may use, and the reasons against the others."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def valid_bits(
     light: Light,
     glossy: tuple[NDArray[np.bool_], ...] | None = None,
 ) -> NDArray[np.uint16]:
-    """Mask bits (H, W); 0 is a pixel to fit.
+    """Mask bits (H, W) of an image; 0 is a pixel to fit.
 
-    Shading is no reason to mask: a tooth glows where its surface turns from the light. OUTSIDE keeps pixels whose whole
-    footprint is to be fitted, and one pixel less along the outline where the image was resampled, which mixes it with
-    its surroundings.
+    Surfaces that face away from the light are not masked, because light from inside a tooth leaves there too. OUTSIDE
+    flags all pixels whose footprint is not wholly on the fitted surfaces. In a resampled image it also flags one more
+    pixel along the outline, because interpolation mixes that pixel with its surroundings.
 
     Args:
-        glossy: masks (H, W) of surfaces that reflect, each of its own colour; None for one that is everything.
+        glossy: masks (H, W) of glossy surfaces, each of its own colour; None for a single one, all covered pixels.
     """
     import cv2
 
@@ -43,7 +43,7 @@ def valid_bits(
     usable = footprint.covered & (image.bits & np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE) == 0)
     cosines = half_cosines(camera, light, footprint)
     for part in (footprint.covered,) if glossy is None else glossy:
-        # Nothing above and below a surface is looked at
+        # Work on the rows that show this surface only
         rows = _span(np.asarray(part.any(axis=1)))
         own = part[rows]
         highlight = highlight_mask(
@@ -60,16 +60,18 @@ def valid_bits(
 
 
 def _span(used: NDArray[np.bool_]) -> slice:
-    """From the first to the last that is used."""
+    """Slice from the first to the last true element; empty if there is none."""
     found = np.flatnonzero(used)
     return slice(int(found[0]), int(found[-1]) + 1) if len(found) else slice(0, 0)
 
 
 def require_plausible_scale(cameras: tuple[Camera, ...], lights: tuple[Light, ...], teeth: tuple[Tooth, ...]) -> None:
-    """Refuse poses whose unit is not the meshes' millimetre: someone stands inside the teeth, or sees them as a point.
+    """Refuse poses in another unit than the meshes' millimetres.
+
+    Such a pose is found by a camera or light inside the teeth, or by teeth that are smaller than 4 pixels.
 
     Raises:
-        CaptureInputError: names the camera or light.
+        CaptureInputError: a pose is implausible; the message names the camera or light.
     """
     vertices = np.concatenate([tooth.outer.vertices_mm for tooth in teeth])
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -101,7 +103,7 @@ def require_seen(footprint: Footprint, teeth: int, camera: Camera) -> None:
     """Refuse a camera that sees no tooth.
 
     Raises:
-        CaptureInputError: names the camera.
+        CaptureInputError: no tooth projects into the image; the message names the camera.
     """
     if not (footprint.covered & (footprint.mesh < teeth)).any():
         raise CaptureInputError(

@@ -1,4 +1,4 @@
-"""What one camera's own frames tell of it: black, noise, linearity, fall of light; and its lit frames above black."""
+"""Black level, noise, linearity and vignetting of one camera, measured from its own frames; exposures above black."""
 
 from __future__ import annotations
 
@@ -28,20 +28,27 @@ from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
 Part = tuple[slice, slice] | tuple[NDArray[np.intp], ...]
-"""Rows and columns of a frame, as one indexes an array by them."""
+"""Rows and columns of a frame, in a form that can index an array."""
 
 MEASURES = "measures.json"
-"""In the scratch folder of a camera."""
+"""Name of the file in a camera's scratch folder that holds its ``Measures``."""
 FRAMES_MEASURED = 8
-"""Black frames, and pairs of lit ones, that are looked at: more tell little more."""
+"""Largest number of black frames, and of pairs of lit frames, that are measured: more would add little."""
 BRIGHT_BLACK = 0.25
-"""Of full scale: a frame with a higher median is no black one."""
+"""Largest median of a black frame, as a fraction of full scale."""
 PIXELS_MEASURED = 1_000_000
-"""Of a frame, for its noise: they tell a variance to 0.14 %."""
+"""Largest number of a frame's pixels from which noise is measured; so many determine a variance to 0.14 %."""
 
 
 class Measures(Record):
-    """What the frames of a camera told, so that no other block of the same preparation has to measure it again."""
+    """Measurements from a camera's frames, stored so that no other block of the same preparation repeats them.
+
+    Attributes:
+        read_counts, counts_per_electron, relative: parameters of the ``NoiseModel``.
+        curve: a, b of the ``Linearity``.
+        vignetting: a, b, c of the ``Lens``.
+        notes: sentences about what was measured or assumed.
+    """
 
     read_counts: float
     counts_per_electron: float
@@ -55,8 +62,8 @@ class CameraFrames:
     """One camera of a raw folder.
 
     Attributes:
-        noise: model of its noise. lens: distortion and fall of light. linearity: of its counts.
-        notes: what was measured, and what had to be assumed, one sentence each.
+        noise: noise model. lens: distortion and vignetting. linearity: linearity of the counts.
+        notes: one sentence for each measured or assumed quantity.
     """
 
     def __init__(
@@ -67,17 +74,19 @@ class CameraFrames:
         assumed_noise: tuple[float, float],
         scratch: Path | None = None,
     ) -> None:
-        """Measure what the frames tell.
+        """Measure noise, linearity and vignetting from the frames, or read earlier measurements.
 
         Args:
-            camera: as calibrated.
-            assumed_noise: fraction of the value, and of full scale, where neither frames nor calibration tell the
-                noise.
-            scratch: folder in which what was measured is kept and looked for; None to measure it anew.
+            root: the raw folder.
+            folder: its description.
+            camera: the camera as calibrated.
+            assumed_noise: standard deviations as fractions of the value and of full scale, used where neither frames
+                nor calibration determine the noise.
+            scratch: folder in which measurements are stored and looked for; None to measure each time.
 
         Raises:
-            CaptureInputError: a frame cannot be read, no black is known, or frames contradict each other; names the
-                frame.
+            CaptureInputError: a frame cannot be read, no black level is known, or frames contradict each other; the
+                message names the frame.
         """
         self._root, self._folder, self.calibrated, self._scratch = root, folder, camera, scratch
         self.raw = folder.camera_named(camera.name)
@@ -116,32 +125,34 @@ class CameraFrames:
 
     def _take(self, told: Measures) -> None:
         self.noise = NoiseModel(told.read_counts, told.counts_per_electron, told.relative)
-        # How far single blocks are off is told by the notes, and asked for nowhere else.
+        # Leave the deviations of single blocks empty, because only the notes report them.
         self.linearity = Linearity(np.empty(0), told.curve, float(self._full))
         self.lens = Lens(self.calibrated, told.vignetting)
         self.notes += told.notes
 
     def exposure(self, frame: RawFrame) -> Exposure:
-        """Counts of a whole frame above black, linear, without the room's light; (H, W) of a mosaic, else (H, W, C).
+        """Linear counts of a whole frame above black and ambient light; (H, W) of a mosaic, else (H, W, C).
 
         Raises:
-            CaptureInputError: it cannot be read; names it.
+            CaptureInputError: the frame cannot be read; the message names it.
         """
         return self.exposure_of(frame, read_counts(self._root, self._folder, frame), (slice(None), slice(None)))
 
     def counts(self, frame: RawFrame, region: Window) -> Counts:
-        """Counts of a part of a frame as they were read; nothing of the rest is kept.
+        """Raw counts of a part of a frame, copied so that the whole frame is not kept in memory.
 
         Raises:
-            CaptureInputError: it cannot be read; names it.
+            CaptureInputError: the frame cannot be read; the message names it.
         """
         return read_counts(self._root, self._folder, frame)[region.rows, region.columns].copy()
 
     def exposure_of(self, frame: RawFrame, counts: Counts, part: Part) -> Exposure:
-        """Some of a frame's counts as an exposure.
+        """Convert a part of a frame's counts to an exposure.
 
         Args:
-            part: where these counts lie in the frame.
+            frame: description of the frame.
+            counts: raw counts of the part.
+            part: rows and columns of the part in the frame.
         """
         black, variance = self._black(frame)
         above = np.subtract(counts, black[part] if black.ndim > 1 else black, dtype=np.float32)
@@ -153,7 +164,10 @@ class CameraFrames:
         return Exposure(signal, variance, headroom, seconds * frame.level, frame.gain)
 
     def _black(self, frame: RawFrame) -> tuple[Image, float]:
-        """Mean of the black frames nearest in gain and exposure, or one number for all pixels, and its variance."""
+        """Mean of the black frames nearest in gain and exposure, or the calibration's black level; and its variance.
+
+        Both are in counts. The calibration's level is one number for all pixels, with variance 0.
+        """
         if not self._black_frames:
             assert self.calibrated.black_counts is not None
             return np.array(self.calibrated.black_counts, dtype=np.float32), 0.0
@@ -170,7 +184,7 @@ class CameraFrames:
         return self._blacks[key], float(self.noise.variance(zero, nearest.gain)) / len(own)
 
     def _mean_of_black(self, frames: Sequence[RawFrame]) -> Image:
-        """Mean counts of black frames of one gain and exposure; made once for all blocks that share a folder."""
+        """Mean counts of black frames of one gain and exposure; computed once for all blocks that share a folder."""
         name = f"black-{frames[0].gain!r}-{frames[0].exposure_s!r}.npy"
 
         def mean() -> Image:
@@ -204,11 +218,11 @@ class CameraFrames:
         )
 
     def _measured_noise(self, relative: float, floor: float) -> NoiseModel:
-        """Of its own frames; what they do not tell is the calibration's, and what that does not is assumed and
+        """Noise model measured from the camera's own frames, else taken from the calibration, else assumed and
         noted.
         """
         name, calibrated = self.raw.name, self.calibrated
-        # The black's own noise is asked for while it is measured, and counts for nothing there.
+        # Set a noise model of zero, because exposures ask for the black level's noise while noise is being measured.
         self.noise = NoiseModel(0.0, 0.0)
         read = self._read_noise()
         measured = shot_noise(self._lit_pairs(), read)
@@ -240,8 +254,9 @@ class CameraFrames:
         return float(np.sqrt(np.average([v**2 for _, v in known], weights=[w for w, _ in known]))) if known else None
 
     def _lit_pairs(self) -> Iterator[LitPair]:
-        """Pairs of one exposure and one thing; flat ones where there are some, else those of lights and of all
-        lights.
+        """Yield pairs of frames of one scene with the same exposure: of flat frames if possible, else of light frames.
+
+        The pixels are thinned out to about ``PIXELS_MEASURED``.
         """
         flats = self._folder.frames_of(self.raw.name, "flat")
         groups = [own for own in _alike(flats) if len(own) > 1]
@@ -254,7 +269,7 @@ class CameraFrames:
             yield LitPair(a, b, first.gain)
 
     def _measured_linearity(self) -> Linearity:
-        """Of flat frames in several exposures, else of lights in several exposures."""
+        """Linearity measured from flat frames in several exposures, else from light frames in several exposures."""
         name = self.raw.name
         is_known = np.isfinite(self._full)
         found = measure_linearity(list(self._series()), float(self._full)) if is_known else self.linearity
@@ -275,14 +290,14 @@ class CameraFrames:
         if not ladders:
             ladders = [own for own in _ladders(self._folder.frames_of(self.raw.name, "light")) if len(own) > 1]
         pairs = [pair for own in ladders for pair in pairwise(own)]
-        # From all ladders alike, as some lights are brighter than others
+        # Choose pairs evenly from all series, because some lights are brighter than others
         for pair in pairs[:: max(1, len(pairs) // FRAMES_MEASURED)]:
             shorter, longer = (self.exposure(frame) for frame in pair)
             require_like_exposures(self._root, pair, (shorter, longer), self._folder.channels)
             yield Series(self._by_colour(shorter), self._by_colour(longer), longer.factor / shorter.factor)
 
     def _by_colour(self, exposure: Exposure) -> Image:
-        """Counts above black with the four pixels of a mosaic's pattern apart, NaN where about full."""
+        """Counts above black with the four pixels of a mosaic's pattern as channels; NaN where nearly saturated."""
         near_full = exposure.headroom < (1 - NEAR_FULL) * self._full
         signal = np.where(near_full, np.nan, exposure.signal).astype(np.float32)
         if self.raw.mosaic == "none":
@@ -307,7 +322,7 @@ class CameraFrames:
         return Lens(self.calibrated, vignetting or (0.0, 0.0, 0.0))
 
     def _measured_ambient(self) -> Image | None:
-        """Counts per second at gain 1 of the room's own light."""
+        """Ambient light of the room, counts per second at gain 1; None without dark-room frames."""
         frames = self._folder.frames_of(self.raw.name, "dark-room")
         if not frames:
             return None
@@ -318,12 +333,12 @@ class CameraFrames:
 
 
 def _unsaturated(exposure: Exposure) -> Image:
-    """Counts above black, NaN where full."""
+    """Counts above black, NaN where saturated."""
     return np.where(exposure.headroom > 0, exposure.signal, np.nan).astype(np.float32)
 
 
 def _alike(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
-    """Frames of one thing under one light with the same exposure."""
+    """Group frames of one scene under one light with the same exposure, gain and level."""
     groups: dict[object, list[RawFrame]] = defaultdict(list)
     for frame in frames:
         groups[_scene(frame), frame.exposure_s, frame.gain, frame.level].append(frame)
@@ -331,7 +346,7 @@ def _alike(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
 
 
 def _ladders(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
-    """Frames of one thing under one light, one of each exposure, from the shortest to the longest."""
+    """Group frames of one scene under one light, one frame for each exposure, from the shortest to the longest."""
     groups: dict[object, dict[float, RawFrame]] = defaultdict(dict)
     for frame in frames:
         groups[_scene(frame)].setdefault(frame.exposure_s * frame.gain * frame.level, frame)

@@ -1,4 +1,4 @@
-"""What frames of a raw folder say against each other."""
+"""Checks of a raw folder's frames against each other."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ from services.preprocess.colours import FrameColour
 Image = NDArray[np.float32]
 
 EXPOSURE_OFF = 1.5
-"""Factor by which a frame may be brighter or darker than another exposure of its light lets expect."""
+"""Largest factor by which a frame may be brighter or darker than expected from another exposure of its light."""
 CUT_SHARE = 0.8
-"""Of full scale, at which counts are cut off for that: sensors bend above."""
+"""Fraction of full scale at which counts are clipped for this comparison, because sensors are not linear above it."""
 TELLING_SHARE = 0.01
-"""Of full scale: darker frames tell nothing of their exposure."""
+"""Smallest mean, as a fraction of full scale, of a frame that is compared; a darker one does not show its exposure."""
 TELLING_CONTRAST = 0.2
-"""Standard deviation of a picture by its mean, from which on it is compared with another exposure of the same."""
+"""Smallest ratio of a picture's standard deviation to its mean at which it is compared with another exposure."""
 MIN_CORRELATION = 0.5
-"""Of two exposures of the same; 12 bits of noise leave 0.9, and a tooth that moved by a tenth of its width 0.7."""
+"""Smallest correlation of two exposures of the same scene. Noise of 12 bits leaves 0.9, and a tooth that moved by a
+tenth of its width 0.7."""
 
 
 def missing_exposures(folder: RawFolder) -> Iterator[str]:
-    """A sentence for each camera and light that lacks an exposure which that camera's other lights have."""
+    """Yield a sentence for each camera and light that lacks an exposure which most of the camera's lights have."""
     for camera in folder.camera:
         exposures: dict[str, set[float]] = {}
         for frame in folder.frames_of(camera.name, "light"):
@@ -48,9 +49,7 @@ def missing_exposures(folder: RawFolder) -> Iterator[str]:
 
 
 def colour_of(frame: RawFrame, channels: tuple[str, ...], radiance: NDArray[np.float32]) -> FrameColour | None:
-    """How red a frame's pixels (N, C), in the order of ``channels``, are against their blue; None where that cannot be
-    told.
-    """
+    """Ratio of red to blue of a frame's pixels (N, C), in the order of ``channels``; None if it is undefined."""
     if not {"red", "blue"} <= set(channels) or not radiance.size:
         return None
     red, blue = (float(np.abs(radiance[..., channels.index(one)]).mean(dtype=np.float64)) for one in ("red", "blue"))
@@ -62,13 +61,16 @@ def colour_of(frame: RawFrame, channels: tuple[str, ...], radiance: NDArray[np.f
 def require_like_exposures(
     root: Path, frames: Sequence[RawFrame], exposures: Sequence[Exposure], channels: tuple[str, ...]
 ) -> None:
-    """Refuse exposures of one light that contradict each other, channel by channel.
+    """Refuse exposures of one light that contradict each other in any channel.
 
     Args:
-        exposures: of the frames, (H, W) of a mosaic or (H, W, C) in the order of ``channels``.
+        root: the raw folder.
+        frames: frames of the light.
+        exposures: exposures of the frames, (H, W) of a mosaic or (H, W, C) in the order of ``channels``.
+        channels: names of the channels.
 
     Raises:
-        CaptureInputError: names the longer exposure's frame.
+        CaptureInputError: two exposures contradict each other; the message names the longer exposure's frame.
     """
     order = sorted(zip(frames, exposures, strict=True), key=lambda one: one[1].factor)
     for (shorter, first), (longer, second) in pairwise(order):
@@ -101,10 +103,14 @@ def require_like_exposures(
 
 
 def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
-    """Logarithm of how much brighter than expected a longer exposure is, per channel; None where too little is seen to
-    tell.
+    """Logarithm, by channel, of a longer exposure's mean over the mean expected from a shorter one.
 
-    Both are cut off below full, so that pixels which are full in the longer one, or would be, agree.
+    It is None if the frames are too dark or full scale is unknown. Both exposures are clipped below full scale, so that
+    pixels which are saturated in the longer one, or would be, agree.
+
+    Args:
+        first: the shorter exposure.
+        signal, headroom, factor: signal, headroom and exposure factor of the longer one.
     """
     full = float(np.max(headroom + signal))
     if not np.isfinite(full):
@@ -118,9 +124,7 @@ def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) ->
 
 
 def _shows_the_same(first: Exposure, second: Exposure) -> bool:
-    """Whether two exposures go up and down together, channels apart; pictures without contrast do not tell
-    otherwise.
-    """
+    """Whether two exposures correlate in every channel; channels without contrast are not compared."""
     seen = (first.headroom > 0) & (second.headroom > 0)
     planes = [np.moveaxis(np.atleast_3d(image), -1, 0) for image in (first.signal, second.signal, seen)]
     for a, b, usable in zip(*planes, strict=True):

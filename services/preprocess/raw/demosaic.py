@@ -1,4 +1,4 @@
-"""All channels of every pixel of a mosaic, by linear filters, and the variance that sums over pixels then have."""
+"""Demosaicing by linear filters, and the variance per pixel that gives sums over pixels the right variance."""
 
 from __future__ import annotations
 
@@ -12,28 +12,31 @@ Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 
 SUPPORT = 5
-"""Pixels along the edge of a filter: what is full spoils as many around it."""
-# Malvar, He and Cutler 2004, figure 2, in units of 1/8: bilinear interpolation with the other channels' curvature
-# added.
+"""Side of a filter in pixels; a saturated pixel spoils the square of this side around it."""
+# Filters of Malvar, He and Cutler 2004, figure 2, in units of 1/8: bilinear interpolation plus the curvature of the
+# other channels.
 _GREEN = np.array([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]])
 _BESIDE = np.array([[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]])
 _ACROSS = np.array([[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]])
 _SITES_OF_FOUR = (1, 2, 1)
-"""How many of the four pixels of a pattern see red, green and blue."""
+"""Numbers of pixels that see red, green and blue among the four of a pattern."""
 
 
 def channel_means(values: Image, mosaic: Mosaic) -> NDArray[np.float32]:
-    """Mean brightness (3,) of red, green and blue in a mosaic (H, W)."""
+    """Mean brightness (3,) of the red, green and blue pixels of a mosaic (H, W)."""
     means = [np.mean([abs(float(own.mean())) for c, own in sites(values, mosaic) if c == k]) for k in range(3)]
     return np.array(means, dtype=np.float32)
 
 
 def demosaic(values: Image, mosaic: Mosaic, means: NDArray[np.float32] | None = None) -> Image:
-    """Image (H, W, 3) of a mosaic (H, W).
+    """Interpolate a mosaic (H, W) to an image (H, W, 3).
 
     Args:
-        means: of the channels of the whole photograph that this is a part of; None where it is the whole. They are
-            brought to one mean before and back after, since the filters take edges of one channel for those of another.
+        values: (H, W) linear counts.
+        mosaic: pattern at pixel (0, 0).
+        means: channel means (3,) of the whole photograph, if ``values`` is a part of it; None to compute them. The
+            channels are scaled to one mean for the filters and scaled back afterwards, because the filters take over
+            edges of one channel into the others.
     """
     means = channel_means(values, mosaic) if means is None else means
     scale = np.where(means > 0, means / max(float(means.max()), 1e-30), 1).astype(np.float32)
@@ -57,10 +60,14 @@ def demosaic(values: Image, mosaic: Mosaic, means: NDArray[np.float32] | None = 
 
 
 def demosaic_variance(variance: Image, mosaic: Mosaic) -> Image:
-    """Variance (H, W, 3) per pixel with which a sum over many pixels has its right error.
+    """Variance (H, W, 3) per pixel that gives sums over many pixels the right variance.
 
-    Interpolated pixels share noise with their neighbours. A channel that one pixel in four sees has four times the
-    variance of such a pixel, as if its pixels were independent.
+    Interpolated pixels share noise with their neighbours. A channel that one pixel in four measures is therefore given
+    four times the variance of such a pixel, so that its pixels can be treated as independent.
+
+    Args:
+        variance: (H, W) variance of the mosaic's pixels.
+        mosaic: pattern at pixel (0, 0).
     """
     import cv2
 
@@ -77,7 +84,7 @@ def demosaic_variance(variance: Image, mosaic: Mosaic) -> Image:
 
 
 def spoiled(lost: BoolArray) -> BoolArray:
-    """Pixels (H, W) whose filters reach one that is lost."""
+    """Pixels (H, W) whose demosaicing filter reaches a lost pixel (H, W)."""
     import cv2
 
     return np.asarray(cv2.dilate(lost.astype(np.uint8), np.ones((SUPPORT, SUPPORT), np.uint8)) > 0)
@@ -90,5 +97,5 @@ def _kernels() -> dict[str, NDArray[np.float64]]:
 def _filter(values: Image, kernel: NDArray[np.float64]) -> Image:
     import cv2
 
-    # Mirrored without repeating the border, which keeps the pattern's parity.
+    # Mirror without repeating the border pixel, which keeps the parity of the pattern.
     return np.asarray(cv2.filter2D(values, -1, (kernel / 8).astype(np.float32), borderType=cv2.BORDER_REFLECT_101))

@@ -1,4 +1,4 @@
-"""Lens distortion and the fall of light, taken out by resampling an image once."""
+"""Lens distortion and vignetting, and their removal by resampling an image once."""
 
 from __future__ import annotations
 
@@ -16,40 +16,42 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 EVEN = 2
-"""A mosaic's pattern repeats every two pixels, so what is cut out begins at even ones."""
+"""Period of a mosaic's pattern, pixels. A part cut out of a photograph begins at a multiple of it."""
 REACH_PX = 4
-"""Pixels around what is sampled that demosaicing and interpolation look at."""
+"""Margin in pixels around samples that demosaicing and interpolation read."""
 BEYOND_PX = 1e-3
-"""A sample that lies farther beyond the outermost pixels' centres is dimmed by the black around the image, by as
-much."""
+"""Distance beyond the outermost pixel centres, pixels, up to which a sample is accepted. Interpolation mixes in the
+black around the image by this fraction."""
 FLAT_BLOCK = 16
-"""Pixels along a block of a flat field, whose mean is fitted: the fall of light is smooth."""
+"""Side in pixels of a block of a flat field, whose mean is fitted: vignetting is smooth."""
 MIN_BLOCKS = 16
-"""Blocks along an image's shorter side at least, as far as it has pixels."""
+"""Smallest number of blocks along an image's shorter side, as far as it has enough pixels."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The lens of a calibrated camera.
+    """Distortion and vignetting of a calibrated camera's lens.
 
     Attributes:
-        vignetting: a, b, c of the fall of light; zeros where there is none.
+        camera: the calibrated camera.
+        vignetting: a, b, c of the factor 1 + a q + b q² + c q³; zeros for a lens without vignetting. q is
+            ``squared_distance``.
     """
 
     camera: CalibratedCamera
     vignetting: tuple[float, float, float]
 
     def source(self, window: Window) -> Image | None:
-        """Where a window of the pinhole's image lies in the photograph: x, y (H, W, 2) as indices, centres at whole
-        numbers.
+        """Positions in the photograph of the pixels of a window of the undistorted image.
 
-        None for a lens without distortion.
+        Returns:
+            x, y (H, W, 2) as indices, with pixel centres at whole numbers; None for a lens without distortion.
         """
         import cv2
 
         if self.camera.distortion is None or not any(self.camera.distortion):
             return None
-        # OpenCV's pixel centres are whole numbers, ours half ones.
+        # Shift the principal point, because pixel centres are whole numbers in OpenCV and half-integers here.
         K = np.asarray(self.camera.K, dtype=np.float64) - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         shown = K - np.array([[0, 0, window.left], [0, 0, window.top], [0, 0, 0]])
         maps = cv2.initUndistortRectifyMap(
@@ -58,7 +60,7 @@ class Lens:
         return np.ascontiguousarray(np.stack(maps, axis=-1), dtype=np.float32)
 
     def fall(self, x: Image, y: Image) -> Image | None:
-        """By how much an even source is dimmed at indices of the photograph; None where nowhere."""
+        """Relative brightness of a uniform source at pixel indices of the photograph; None without vignetting."""
         if not any(self.vignetting):
             return None
         a, b, c = self.vignetting
@@ -67,10 +69,10 @@ class Lens:
 
 
 class Sampler:
-    """Brings photographs to a window of the pinhole's image, distortion and motion in one interpolation.
+    """Resampler of photographs to a window of the undistorted image, for distortion and motion in one interpolation.
 
     Attributes:
-        region: the part of the photograph that is needed; it begins at even pixels.
+        region: the part of the photograph that is needed; its top and left are even.
     """
 
     def __init__(self, lens: Lens, window: Window) -> None:
@@ -90,23 +92,23 @@ class Sampler:
 
     @property
     def is_still_exact(self) -> bool:
-        """Whether pixels of an unmoved subject are taken as they are."""
+        """Whether the pixels of an unmoved subject need no interpolation."""
         return self._source is None
 
     def places(self, in_window: Image) -> Image:
-        """Indices x, y (2, H, W) of the photograph for indices of the window."""
+        """Indices x, y (2, H, W) in the photograph of positions x, y (2, H, W) given as indices in the window."""
         import cv2
 
         if self._source is None:
             return in_window + np.array([self._window.left, self._window.top], dtype=np.float32)[:, None, None]
-        # The lens's map is smooth, and continued beyond the window by its edge.
+        # Interpolate the lens's map, which is smooth; beyond the window its edge values are used.
         x, y = np.ascontiguousarray(in_window, dtype=np.float32)
         found = cv2.remap(self._source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.ascontiguousarray(np.moveaxis(found, -1, 0))
 
     def source(self, places: Sequence[Image]) -> Window:
-        """The rows of ``region`` that places (2, h, W) sample, with what demosaicing and interpolation look at around
-        them.
+        """Part of ``region`` whose rows contain the given places (2, h, W) and the margin for demosaicing and
+        interpolation.
         """
         low, high = min(float(one[1].min()) for one in places), max(float(one[1].max()) for one in places)
         region = self.region
@@ -116,17 +118,22 @@ class Sampler:
         return Window(top, bottom, region.left, region.right)
 
     def sampled(self, image: Image, places: Image, held: Window | None = None) -> Image:
-        """Values (H, W, C) of an image at indices of the photograph; 0 outside of it.
+        """Interpolate an image linearly at indices of the photograph; 0 outside the image.
 
         Args:
-            held: the part of the photograph that the image is; None for ``region``.
+            image: (h, w) or (h, w, C).
+            places: x, y (2, H, W) as indices of the photograph.
+            held: the part of the photograph that the image covers; None for ``region``.
+
+        Returns:
+            Values (H, W, C).
         """
         import cv2
 
         held = self.region if held is None else held
         x, y = (np.ascontiguousarray(places[k] - np.float32(start)) for k, start in ((0, held.left), (1, held.top)))
         planes = np.atleast_3d(image)
-        # OpenCV takes four channels at most at once.
+        # Split the channels, because OpenCV's remap takes at most four at once.
         parts = [
             np.atleast_3d(cv2.remap(np.ascontiguousarray(planes[..., k : k + 4]), x, y, cv2.INTER_LINEAR))
             for k in range(0, planes.shape[2], 4)
@@ -134,7 +141,7 @@ class Sampler:
         return np.concatenate(parts, axis=2).astype(np.float32)
 
     def beyond(self, places: Image) -> BoolArray:
-        """Which places mix in what lies beyond the photograph."""
+        """Places (H, W) that lie beyond the photograph, so that interpolation mixes in black."""
         (x, y), (width, height) = places, self._size
         return np.asarray(
             (x < -BEYOND_PX) | (x > width - 1 + BEYOND_PX) | (y < -BEYOND_PX) | (y > height - 1 + BEYOND_PX)
@@ -142,7 +149,7 @@ class Sampler:
 
 
 def squared_distance(camera: CalibratedCamera, x_px: NDArray[np.floating], y_px: NDArray[np.floating]) -> FloatArray:
-    """q: squared distance from the principal point in units of half the image's diagonal."""
+    """Squared distance q from the principal point, in units of half the image's diagonal."""
     width, height = camera.size
     return np.asarray(
         ((x_px - camera.K[0][2]) ** 2 + (y_px - camera.K[1][2]) ** 2) * 4 / (width**2 + height**2), dtype=np.float64
@@ -150,9 +157,10 @@ def squared_distance(camera: CalibratedCamera, x_px: NDArray[np.floating], y_px:
 
 
 def fitted_vignetting(camera: CalibratedCamera, flat: Image) -> tuple[float, float, float]:
-    """a, b, c of the fall of light from an image (H, W, C) of an even source, by least squares; channels share them.
+    """Fit the vignetting a, b, c to an image (H, W, C) of a uniform source by least squares.
 
-    Blocks with a pixel that is not finite count for nothing.
+    The result is the mean over the channels, weighted by their usable blocks. Blocks with a pixel that is not finite
+    are left out.
     """
     step = max(1, min(FLAT_BLOCK, *(length // MIN_BLOCKS for length in flat.shape[:2])))
     height, width = (length // step * step for length in flat.shape[:2])

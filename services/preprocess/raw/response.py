@@ -1,4 +1,4 @@
-"""How a camera's counts follow the light, from series of exposures of the same thing."""
+"""Linearity of a camera's counts, measured from exposures of the same scene."""
 
 from __future__ import annotations
 
@@ -12,30 +12,35 @@ Image = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
 MIN_DEVIATION = 0.03
-"""Smaller curves are left: on real 8-bit frames of a linear sensor edges and shutter times feigned one of 2.9 %."""
+"""Smallest relative deviation from linearity that is corrected. On real 8-bit frames of a linear sensor, edges and
+shutter times gave a spurious deviation of 2.9 %."""
 MIN_SIGMAS = 4.0
-"""A deviation less certain than this is noise."""
+"""Smallest deviation in standard errors; a less certain one is taken for noise."""
 MIN_SHARE = 0.04
-"""Of full scale, 10 of 8 bits: below it a block's mean is mostly what is left of black."""
+"""Smallest mean of a block as a fraction of full scale, 10 of 8 bits. Below it the error of the black level
+dominates."""
 NEAR_FULL = 0.95
-"""Of full scale: pixels above have been full in part where a file was made smaller."""
+"""Fraction of full scale above which a pixel counts as saturated. In a file that was made smaller, such a pixel may be
+the mean of saturated and unsaturated ones."""
 MUST_EXPLAIN = 0.3
-"""Share of the typical deviation that a curve must take away; one that takes less follows flicker and edges."""
+"""Smallest fraction by which a curve must reduce the median deviation; a curve that reduces it less follows flicker and
+edges."""
 BLOCK = 16
-"""Pixels along a block's edge whose mean is compared."""
+"""Side in pixels of a block whose means are compared."""
 MAX_CONTRAST = 0.2
-"""Standard deviation of a block by its mean: beyond it, an edge lies in it, which pixels full in part are brightest
-at."""
+"""Largest ratio of a block's standard deviation to its mean. Above it the block contains an edge, where partly
+saturated pixels are the brightest."""
 MIN_BLOCKS = 8
+"""Smallest number of blocks from which linearity is measured."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Two exposures of the same thing.
+    """Two exposures of the same scene.
 
     Attributes:
-        shorter, longer: counts above black, (H, W) or (H, W, C); full pixels are NaN.
-        ratio: of exposure times gain times level, longer to shorter.
+        shorter, longer: counts above black, (H, W) or (H, W, C); saturated pixels are NaN.
+        ratio: ratio of exposure time × gain × level, longer to shorter.
     """
 
     shorter: Image
@@ -45,11 +50,12 @@ class Series:
 
 @dataclass(frozen=True)
 class Linearity:
-    """What series of exposures tell.
+    """Linearity of a camera's counts.
 
     Attributes:
-        ratios: (longer / shorter) / (ratio of the exposures) of every pair of blocks; 1 for a linear camera.
-        curve: a, b of linear = s (1 + a x + b x²), x = s / full; zeros where the camera is linear.
+        ratios: (N,) (longer / shorter) / (ratio of the exposures) of every pair of blocks; 1 for a linear camera.
+        curve: a, b of linear = s (1 + a x + b x²), x = s / full; zeros for a linear camera.
+        full: counts at saturation.
     """
 
     ratios: FloatArray
@@ -62,7 +68,7 @@ class Linearity:
         return self.curve == (0.0, 0.0)
 
     def linearised(self, signal: Image) -> Image:
-        """Counts above black in proportion to the light."""
+        """Convert counts above black to counts proportional to the light."""
         if self.is_linear:
             return signal
         x = signal / np.float32(self.full)
@@ -71,9 +77,10 @@ class Linearity:
 
 
 def measure_linearity(series: Sequence[Series], full: float) -> Linearity:
-    """Compare exposures block by block, and fit a curve where they contradict a linear camera.
+    """Compare exposures block by block, and fit a curve if they contradict a linear camera.
 
     Args:
+        series: pairs of exposures.
         full: counts at saturation, which scale the curve.
     """
     pairs = [np.concatenate(found, axis=1) for found in [list(_blocks(one, full)) for one in series] if found]
@@ -85,11 +92,17 @@ def measure_linearity(series: Sequence[Series], full: float) -> Linearity:
 
 
 def _curve(x: FloatArray, y: FloatArray, observed: FloatArray) -> tuple[float, float]:
-    """a, b such that log(f(y) / f(x)) equals the ratio of exposures, by Gauss-Newton; zeros unless clearly other than
-    that.
+    """Fit the curve f(s) = s (1 + a s + b s²) by Gauss-Newton; zeros unless the deviation from linearity is clear.
 
-    A black that is off by a part of a count bends the dark end in its own way, so such an offset is fitted along and
-    left out.
+    log(f(y) / f(x)) must equal the logarithm of the exposures' ratio. An error of the black level by a part of a count
+    also bends the curve at its dark end, so an offset is fitted with it and discarded.
+
+    Args:
+        x, y: (N,) block means of the shorter and the longer exposure as fractions of full scale.
+        observed: (N,) log(y / x) minus the logarithm of the exposures' ratio.
+
+    Returns:
+        a, b.
     """
     a, b, offset = 0.0, 0.0, 0.0
     for _ in range(12):
@@ -98,7 +111,7 @@ def _curve(x: FloatArray, y: FloatArray, observed: FloatArray) -> tuple[float, f
             return 0.0, 0.0
         design = np.stack([y / at_y - x / at_x, y**2 / at_y - x**2 / at_x, 1 / (y + offset) - 1 / (x + offset)], axis=1)
         residual = observed + np.log(at_y / at_x) + np.log1p(offset / y) - np.log1p(offset / x)
-        # Blocks at edges that moved do not vote.
+        # Weight the residuals robustly (Cauchy), so that blocks at edges that moved have little influence.
         scale = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-6
         weight = 1 / (1 + (residual / scale) ** 2)
         normal = (design * weight[:, None]).T @ design + 1e-9 * np.eye(3)
@@ -119,7 +132,10 @@ def _curve(x: FloatArray, y: FloatArray, observed: FloatArray) -> tuple[float, f
 
 
 def _blocks(series: Series, full: float) -> Iterator[FloatArray]:
-    """Means of blocks that are seen whole by both exposures, and the logarithm of their ratio: (3, N) a channel."""
+    """Yield for each channel (3, N): block means of the shorter and longer exposure, and log of the exposures' ratio.
+
+    Blocks with a saturated pixel, an edge or too little light are left out.
+    """
     shorter, longer = (np.atleast_3d(image) for image in (series.shorter, series.longer))
     edge = max(1, min(BLOCK, shorter.shape[0] // 2, shorter.shape[1] // 2))
     height, width = (length // edge * edge for length in shorter.shape[:2])

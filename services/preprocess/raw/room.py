@@ -1,4 +1,4 @@
-"""How many rows of a photograph are worked on at once, so that a process keeps within its memory."""
+"""Number of rows of a photograph that are processed at once, so that a process stays within its memory."""
 
 from __future__ import annotations
 
@@ -11,34 +11,37 @@ from services.preprocess.window import Window
 
 GIB = 2**30
 PROCESS_BYTES = 400 * 2**20
-"""Of an interpreter with its libraries, and of a scan."""
+"""Bytes of an interpreter with its libraries, and of a scan."""
 MOTION_BYTES = 13
-"""For each pixel of the region: relief and outline of what moves, and where the lens takes it from."""
+"""Bytes per pixel of the region for relief and outline of the moving bodies, and for the map of the lens."""
 SHOWN_BYTES = 19
-"""For each pixel of the view: the footprint, mapped from its file."""
+"""Bytes per pixel of the view for the footprint, which is mapped from its file."""
 JUDGED_BYTES = 48
-"""And what masks are made of, or what is compressed to be stored."""
+"""Bytes per pixel of the view while masks are made or arrays are compressed for storage."""
 FLOAT_BYTES = 4
 EXPOSURE_VALUES = 2
-"""Single-precision numbers of a count: signal and headroom."""
+"""Number of float32 values per count of each exposure: signal and headroom."""
 MERGED_VALUES = 12
-"""And while exposures are merged, all together."""
+"""Number of further float32 values per count while exposures are merged, for all exposures together."""
 COLOUR_VALUES = 34
-"""And of a pixel while a mosaic's channels are filled in, or colours are put together, and interpolated."""
+"""Number of further float32 values per pixel while channels are demosaiced or concatenated, and interpolated."""
 OVERLAP_ROWS = 64
-"""Rows that a strip needs besides its own: what filters look at, and a rotation by a degree of 3600 columns."""
+"""Number of rows that a strip needs besides its own, for the filters' support and a rotation by one degree over 3600
+columns."""
 MIN_ROWS = 64
-"""Lower strips would read more rows for others than for themselves."""
+"""Smallest height of a strip, rows. Lower strips would read more overlap than rows of their own."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """What one image of a raw camera takes.
+    """Memory that one image of a raw camera takes.
 
     Attributes:
-        memory_bytes: most that the process may take.
-        channels: of the images.
-        window: of the view. region: of the photograph that it is made of.
+        memory_bytes: upper limit for the process.
+        camera: description of the camera.
+        channels: number of channels of the images.
+        window: window of the view.
+        region: part of the photograph from which the view is made.
     """
 
     memory_bytes: float
@@ -48,13 +51,13 @@ class Room:
     region: Window
 
     def rows(self, exposures: int) -> int:
-        """Rows of the view to work on at once.
+        """Number of rows of the view to process at once.
 
         Args:
-            exposures: of one light.
+            exposures: number of exposures of one light.
 
         Raises:
-            SettingsError: even the fewest take too much.
+            SettingsError: even the smallest strip takes too much memory.
         """
         height = self.window.shape[0]
         free = self.memory_bytes - self._held_bytes(exposures) - self._read_bytes(exposures)
@@ -68,24 +71,24 @@ class Room:
         return rows
 
     def peak_bytes(self, exposures: int, rows: int) -> float:
-        """Most that is taken while an image is made so many rows at a time, and then judged and stored."""
+        """Largest memory in bytes while an image is made in strips of ``rows`` rows, and then masked and stored."""
         made = self._read_bytes(exposures) + (rows + OVERLAP_ROWS) * self._row_bytes(exposures)
         return self._held_bytes(exposures) + max(made, JUDGED_BYTES * _pixels(self.window))
 
     def _held_bytes(self, exposures: int) -> float:
-        """The process, what is known of the view, black images, and the image that is made."""
+        """Bytes held throughout: process, footprint and motion of the view, black images, and the image being made."""
         image = 2 * FLOAT_BYTES * self.channels + 2
         black = FLOAT_BYTES * exposures * self._sites
         view = (image + SHOWN_BYTES) * _pixels(self.window)
         return PROCESS_BYTES + view + (black + MOTION_BYTES) * _pixels(self.region)
 
     def _read_bytes(self, exposures: int) -> float:
-        """Counts of all exposures, while the last of them is decoded."""
+        """Bytes of the counts of all exposures while the last of them is decoded."""
         width, height = self.camera.size
         return self._count_bytes * self._sites * (exposures * _pixels(self.region) + 2 * width * height)
 
     def _row_bytes(self, exposures: int) -> float:
-        """One row of the photograph, while it becomes one of the view."""
+        """Bytes of one row of the photograph while it is converted to a row of the view."""
         merged = self._sites * (EXPOSURE_VALUES * exposures + MERGED_VALUES)
         return FLOAT_BYTES * (merged + COLOUR_VALUES) * self.region.shape[1]
 
@@ -103,6 +106,6 @@ def _pixels(window: Window) -> int:
 
 
 def strips(height: int, rows: int) -> Iterator[slice]:
-    """Rows of an image of so many, as many at a time as are given."""
+    """Split ``height`` rows into slices of ``rows`` rows."""
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))

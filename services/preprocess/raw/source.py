@@ -1,4 +1,4 @@
-"""A raw folder as a capture to prepare: its frames become radiance, one camera and light at a time."""
+"""A raw folder as a source: its frames become radiance, one camera and light at a time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from services.preprocess.stabilisation.seen import SeenFlow
 
 
 class RawSource:
-    """Reads a raw folder with the calibration of its rig."""
+    """Reader of a raw folder with the calibration of its rig."""
 
     held_out: tuple[tuple[str, str], ...] = ()
     measures_motion = True
@@ -41,14 +41,14 @@ class RawSource:
 
         Args:
             frames_root: the raw folder.
-            calibration: that of the job, in place of the folder's own.
-            noise_relative: assumed noise where nothing tells it, fraction of the value.
-            noise_floor: and of full scale.
-            teeth_root: folder of the teeth, where it is not the raw folder.
-            memory_bytes: most that this process may take to make images.
+            calibration: the job's calibration, which replaces the folder's own; None for the folder's own.
+            noise_relative: standard deviation as a fraction of the value, assumed if the noise is not measured.
+            noise_floor: standard deviation as a fraction of full scale, assumed likewise.
+            teeth_root: folder of the teeth; None for the raw folder.
+            memory_bytes: largest memory that this process may use to make images.
 
         Raises:
-            CaptureInputError: names what is missing or contradictory.
+            CaptureInputError: an entry is missing or contradicts another; the message names it.
         """
         self.root = teeth_root or frames_root
         self._frames_root, self._noise = frames_root, (noise_relative, noise_floor)
@@ -74,7 +74,7 @@ class RawSource:
         return tuple(k for k, light in enumerate(self.description.lights) if light.name in lit)
 
     def identity(self) -> str:
-        """See ``Source``: every frame's size and time of change, so that one that was exported again counts."""
+        """See ``Source``. It includes every frame's size and modification time, so a new export changes it."""
         lines = [self.description.model_dump_json(), self._folder.model_dump_json(), repr(self._noise)]
         lines.append(self.calibration.model_dump_json())
         paths = [path for frame in self._folder.frame if (path := self._frames_root / frame.file).is_file()]
@@ -101,7 +101,7 @@ class RawSource:
         return raw.motion.seen_flow(lambda row: raw.brightness([taken[row.index]]), motions)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
-        """See ``Source``: the exposures of one light at a time, merged."""
+        """See ``Source``. The exposures of each light are merged."""
         raw, taken = self._raw_view(view), self._of(view.whole.name)
         table = self._table(view.whole.name)
         for light in lights:
@@ -143,7 +143,7 @@ def _row(index: int, frame: RawFrame) -> FrameRecord:
 
 
 def _in_time(frames: Iterator[RawFrame]) -> list[RawFrame]:
-    """In the order in which they were taken: by their times where all have one, else as they are listed."""
+    """Sort frames by the time at which they were taken; if one has no time, keep the order of the list."""
     listed = list(frames)
     if any(frame.time_s is None for frame in listed):
         return listed

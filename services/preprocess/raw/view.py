@@ -1,4 +1,4 @@
-"""One camera's photographs as images of a pinhole in which the subject stays where it was at first."""
+"""One camera's photographs resampled to images of an ideal pinhole camera, aligned with the first frame."""
 
 from __future__ import annotations
 
@@ -25,19 +25,21 @@ from services.preprocess.window import Window, bands_of
 
 BoolArray = NDArray[np.bool_]
 Values = tuple[Image, Image, BoolArray, BoolArray]
-"""Radiance, variance (H, W, C), where it is lost, and where it lies beyond the photograph (H, W)."""
+"""Radiance and variance (H, W, C), lost pixels (H, W), and pixels that lie beyond the photograph (H, W)."""
 
 COMPARED_PIXELS = 1_000_000
-"""Of a photograph, to hold exposures against each other: they tell a mean to a thousandth of a pixel's contrast."""
+"""Approximate number of a photograph's pixels with which exposures are compared. They determine a mean to a thousandth
+of the pixels' contrast."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One photograph, read.
+    """One photograph that was read.
 
     Attributes:
-        counts: of the sampler's region, (H, W) or (H, W, C).
-        move: of the subject since the first frame.
+        frame: description of the frame.
+        counts: raw counts of the sampler's region, (H, W) or (H, W, C).
+        move: displacement of the subject since the first frame.
     """
 
     frame: RawFrame
@@ -46,10 +48,10 @@ class Shot:
 
 
 class RawView:
-    """The photographs of one camera, brought to a view, a strip of rows at a time.
+    """Photographs of one camera, resampled to a view, a strip of rows at a time.
 
     Attributes:
-        motion: of the subject in it.
+        motion: motion of the subject in the view.
     """
 
     def __init__(
@@ -61,10 +63,15 @@ class RawView:
         channels: tuple[str, ...],
         memory_bytes: float,
     ) -> None:
-        """Lay out what is read.
+        """Prepare the sampling; no frame is read yet.
 
         Args:
-            memory_bytes: most that this process may take; strips are as high as it allows.
+            root: the raw folder.
+            frames: measured properties of the camera.
+            view: window and footprint.
+            motion: motion of the subject.
+            channels: names of the channels.
+            memory_bytes: largest memory of this process; strips are as high as it allows.
         """
         self._root, self._frames, self._view, self.motion, self._channels = root, frames, view, motion, channels
         self._mosaic, camera = frames.raw.mosaic, frames.calibrated
@@ -77,8 +84,9 @@ class RawView:
         )
 
     def brightness(self, frames: Sequence[RawFrame]) -> Image:
-        """Mean of the channels of one frame, or of one light's exposures, in ``motion.window`` (H, W), undistorted; its
-        unit does not matter.
+        """Undistorted mean over channels (H, W) of one frame, or of one light's exposures, in ``motion.window``.
+
+        Its unit is arbitrary.
         """
         taken = [self._frames.counts(frame, self._sampler.region) for frame in frames]
         means = self._means([self._sparse(frame, counts) for frame, counts in zip(frames, taken, strict=True)])
@@ -96,8 +104,9 @@ class RawView:
         return image
 
     def _light(self, exposures: Sequence[Exposure]) -> Image:
-        """What was seen above black, in one unit; where every exposure is full, as bright as the shortest says, not
-        dark.
+        """Merge exposures above black; a pixel that is saturated in all of them keeps the shortest one's value.
+
+        A single exposure is returned in counts, merged ones in counts per unit of the exposure factor.
         """
         if len(exposures) == 1:
             return exposures[0].signal
@@ -106,11 +115,13 @@ class RawView:
         return np.where(lost, shortest.signal / np.float32(shortest.factor), rate)
 
     def image(self, frames: Sequence[RawFrame], moves: Sequence[Displacement]) -> LightImage:
-        """The exposures of one light, merged before they are interpolated where the subject was still between them, and
-        after otherwise.
+        """Merge the exposures of one light into an image.
+
+        They are merged before interpolation if the subject did not move between them, and afterwards otherwise.
 
         Raises:
-            CaptureInputError: they contradict each other; names the frame. SettingsError: there is too little memory.
+            CaptureInputError: the exposures contradict each other; the message names the frame. SettingsError: there is
+                too little memory.
         """
         strip_rows = self._room.rows(len(frames))
         shots = [
@@ -142,7 +153,7 @@ class RawView:
         return LightImage(radiance, variance, bits, *moved, colour, max(told, default=None))
 
     def _groups(self, shots: Sequence[Shot]) -> list[list[Shot]]:
-        """Exposures that show the subject at one place."""
+        """Group exposures that show the subject at the same place: all of them, or each on its own."""
         height, width = self._view.window.shape
         middle = slice(height // 2, height // 2 + 1)
         covered = self._view.footprint.covered[middle]
@@ -154,7 +165,7 @@ class RawView:
         return [list(shots)] if apart < STILL_PX else [[shot] for shot in shots]
 
     def _sparse(self, frame: RawFrame, counts: Counts) -> Exposure:
-        """An exposure of evenly spaced cells of the region, which tell what all of it has in common."""
+        """Exposure of evenly spaced cells of the region, for statistics of the whole region."""
         region, cell = self._sampler.region, 1 if self._mosaic == "none" else EVEN
         step = cell * max(1, int(np.sqrt(counts.shape[0] * counts.shape[1] / COMPARED_PIXELS)))
         rows, columns = (
@@ -164,17 +175,17 @@ class RawView:
         return self._frames.exposure_of(frame, counts[there], np.ix_(rows + region.top, columns + region.left))
 
     def _means(self, sparse: Sequence[Exposure]) -> NDArray[np.float32] | None:
-        """Mean brightness of a mosaic's channels; None of other cameras."""
+        """Mean brightness (3,) of a mosaic's channels; None for a camera without a mosaic."""
         rate, _, _ = merge(sparse, self._frames.noise)
         return None if self._mosaic == "none" else channel_means(rate, self._mosaic)
 
     def _exposure(self, frame: RawFrame, counts: Counts, held: Window) -> Exposure:
-        """An exposure of a part of the region."""
+        """Exposure of the part ``held`` of the region."""
         return self._frames.exposure_of(frame, counts[held.within(self._sampler.region)], (held.rows, held.columns))
 
     def _colours(self, shots: Sequence[Shot], held: Window, means: NDArray[np.float32] | None) -> Image:
-        """Counts a second, their variances (C of each) and 1 where they are lost (H, W, 2 C + 1), of a part of the
-        region.
+        """Merge exposures in a part of the region; (H, W, 2 C + 1): C rates in counts per second, C variances, and 1
+        where the pixel is lost.
         """
         exposures = [self._exposure(shot.frame, shot.counts, held) for shot in shots]
         rate, variance, lost = merge(exposures, self._frames.noise)
@@ -189,9 +200,10 @@ class RawView:
         return np.concatenate([rate, variance, spoilt[..., None]], axis=-1, dtype=np.float32)
 
     def _strip(self, shots: Sequence[Shot], strip: slice, means: NDArray[np.float32] | None, *, warped: bool) -> Values:
-        """Some rows of the view from exposures that show the subject at one place.
+        """Make some rows of the view from exposures that show the subject at the same place.
 
-        Neighbours share noise after interpolation; the variance kept unreduced makes sums over pixels right.
+        Interpolation correlates the noise of neighbouring pixels. The variance is not reduced for it, so that sums over
+        pixels have the right variance.
         """
         height, width, count = strip.stop - strip.start, self._view.window.shape[1], len(self._channels)
         parts = list(bands_of(strip, width))
@@ -216,7 +228,7 @@ class RawView:
         return radiance, variance, lost, beyond
 
     def _places(self, move: Displacement, rows: slice, *, warped: bool) -> Image:
-        """Indices x, y (2, rows, W) of the photograph of some rows of the view."""
+        """Positions in the photograph of some rows of the view: x, y (2, rows, W) as indices."""
         window = self._view.window
         if not warped:
             return _indices(slice(window.top + rows.start, window.top + rows.stop), window.columns)
@@ -227,13 +239,13 @@ class RawView:
 
 
 def _indices(rows: slice, columns: slice) -> Image:
-    """Indices x and y (2, H, W)."""
+    """Indices x and y (2, H, W) of all pixels in some rows and columns."""
     y, x = np.mgrid[rows, columns]
     return np.stack([x, y]).astype(np.float32)
 
 
 def _joined(parts: Sequence[Values]) -> Values:
-    """Aligned exposures joined by inverse variance; a pixel is lost where it is in all of them."""
+    """Merge aligned exposures by inverse variance; a pixel is lost if it is lost in all of them."""
     if len(parts) == 1:
         radiance, variance, lost, beyond = parts[0]
         return np.where(lost[..., None], 0, radiance), np.where(lost[..., None], 0, variance), lost, beyond

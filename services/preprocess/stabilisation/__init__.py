@@ -1,1 +1,1 @@
-"""How the jaws moved between frames, and frames as if they had not."""
+"""Measurement of the jaws' motion between frames, and alignment of frames with the first one."""

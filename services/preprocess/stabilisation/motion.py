@@ -18,31 +18,35 @@ from services.preprocess.stabilisation.stabilise import TERMS, Aligner, Feature,
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
-# Beyond this share of a jaw's shorter side the coarse-to-fine alignment may lock on to the wrong edge
+# Largest accepted median displacement, as a fraction of a jaw's shorter side: beyond it the coarse-to-fine alignment
+# may lock on to the wrong edge
 LIMIT_OF_EXTENT = 1 / 6
-# Room around the teeth for the largest motion that is accepted, whose median is limited and not its maximum
+# Margin around the view for the largest accepted motion, as a multiple of that limit and in pixels. It exceeds the
+# limit, because the limit holds for the median displacement and not for the maximum
 REACH_OF_LIMIT, REACH_PX = 1.25, 8
+# Largest number of pixels at which a displacement field is stored
 STORED_PIXELS = 250_000
+# Approximate number of pixels from which the median displacement is computed
 MEDIAN_PIXELS = 20_000
 
 
 def stored_step(shape: tuple[int, int]) -> int:
-    """Displacements are stored at every so many pixels: the field is smooth."""
+    """Spacing in pixels at which the displacements of an image (height, width) are stored: the field is smooth."""
     return int(np.ceil(np.sqrt(shape[0] * shape[1] / STORED_PIXELS)))
 
 
 def jaws(fdi: Sequence[int]) -> list[list[int]]:
-    """Positions of the upper and of the lower teeth in a list of FDI numbers; each jaw moves as one body."""
+    """Indices of the upper and of the lower teeth in a list of FDI numbers; each jaw moves as one rigid body."""
     upper = [k for k, number in enumerate(fdi) if number // 10 in {1, 2, 5, 6}]
     return [group for group in (upper, [k for k in range(len(fdi)) if k not in upper]) if group]
 
 
 def frames_to_match(frames: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
-    """Tracking frames, which share one light; with fewer than two of them every light is matched to the first by its
-    edges.
+    """Frames whose motion is measured: the tracking frames, which share one light, or else one frame for each light.
 
-    Of a light's exposures that follow one another the first stands for all: a short one may be all noise and a long one
-    full, so that neither shows an edge, and between them edges tell no motion that a subject makes in that time.
+    With fewer than two tracking frames every light is matched to the first frame by its edges. Of consecutive exposures
+    of one light the first represents all. A short exposure may be all noise and a long one saturated, so that neither
+    shows an edge, and the subject hardly moves between them.
     """
     tracking = tuple(frame for frame in frames if frame.kind == "tracking")
     if len(tracking) >= 2:
@@ -51,18 +55,18 @@ def frames_to_match(frames: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
 
 
 def exposures_together(frames: Sequence[FrameRecord]) -> list[tuple[FrameRecord, ...]]:
-    """Frames in order, those of one kind and light that follow one another together."""
+    """Group consecutive frames of the same kind and light, in order."""
     return [tuple(own) for _, own in groupby(frames, key=lambda frame: (frame.kind, frame.light))]
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """Where the reference's pixels are in one frame.
+    """Displacement of the reference frame's pixels in another frame.
 
     Attributes:
-        coefficients: (bodies, TERMS, 2).
-        median_px: median length over the teeth.
-        error_px: estimated error of its interpolation in time; 0 where nothing tells.
+        coefficients: (bodies, TERMS, 2), pixels.
+        median_px: median length over a jaw's teeth, of the jaw that moved most.
+        error_px: estimated error of the interpolation in time; 0 where it cannot be estimated.
     """
 
     coefficients: FloatArray
@@ -71,23 +75,24 @@ class Displacement:
 
     @property
     def told_error_px(self) -> float | None:
-        """The error, or None where nothing tells it."""
+        """Estimated error in pixels; None where it cannot be estimated."""
         return self.error_px or None
 
 
 class ViewMotion:
-    """Measures motion against the first frame and gives it for every light frame.
+    """Motion of the subject relative to the first frame, for every light frame.
 
-    Between tracking frames it is measured and then interpolated over the frame number: frames are triggered evenly, and
-    the number is free of the host's clock.
+    It is measured between tracking frames and interpolated over the frame number, because frames are triggered at even
+    intervals and the number does not depend on the host's clock.
     """
 
     def __init__(self, view: View, bodies: Sequence[Sequence[int]], frames: Sequence[FrameRecord]) -> None:
-        """Lay out what each body can do.
+        """Prepare the possible displacements of each body.
 
         Args:
-            bodies: the footprint's mesh numbers of each rigid body.
-            frames: all of the capture.
+            view: window and footprint of the camera.
+            bodies: mesh numbers in the footprint, for each rigid body.
+            frames: all frames of the capture.
         """
         self._view = view
         self._used = frames_to_match(frames)
@@ -97,12 +102,12 @@ class ViewMotion:
         sides = [_shorter_side(one) for one in seen if one.any()]
         reach = int(np.ceil(REACH_OF_LIMIT * LIMIT_OF_EXTENT * max(sides))) + REACH_PX
         self.window: Window = view.window.grown(reach, view.whole.size)
-        """Where a pixel of the view may come from: as many pixels larger as a jaw may move."""
+        """The view's window enlarged by the largest accepted motion."""
         self._inner = view.window.within(self.window)
         around = _placed(view.footprint, self.window.shape, self._inner)
         laid = [SurfaceFlow(around, meshes, view.kept(f"relief-{k}")) for k, meshes in enumerate(bodies)]
         self._bodies = [body for body in laid if body.seen.any()]
-        # Medians need no more than evenly strided pixels
+        # Compute medians from evenly strided pixels only
         self._step = max(1, int(np.sqrt(np.prod(view.window.shape) / MEDIAN_PIXELS)))
 
     def measure(
@@ -111,15 +116,16 @@ class ViewMotion:
         picture: Callable[[FrameRecord], NDArray[np.generic]],
         level: float = 0.0,
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Frame number and coefficients (bodies, TERMS, 2), one at a time.
+        """Yield each frame's number and the coefficients (bodies, TERMS, 2) of its displacement.
 
         Args:
             frames: numbers of some of ``frames_to_match``.
-            picture: values (H, W) or (H, W, C) in ``window``, linear in light above ``level``, of a frame, and of those
-                that it stands for.
+            picture: gives the values (H, W) or (H, W, C) of a frame, or of the frames that it represents, in
+                ``window``; they are linear in light above ``level``.
+            level: value of a pixel without light.
 
         Raises:
-            CaptureInputError: moved too far to be aligned; names the frame and the camera.
+            CaptureInputError: the subject moved too far to be aligned; the message names the frame and the camera.
         """
         if not frames:
             return
@@ -146,7 +152,12 @@ class ViewMotion:
             yield frame.index, found
 
     def at(self, frame: FrameRecord, motions: Motions) -> Displacement:
-        """Motion of one frame, from those of all ``frames_to_match``."""
+        """Displacement of one frame.
+
+        Args:
+            frame: any frame of the capture.
+            motions: coefficients of all ``frames_to_match``.
+        """
         index = np.array([used.index for used in self._used], dtype=np.float64)
         if self._interpolated:
             knots = np.stack([motions[used.index] for used in self._used])
@@ -155,13 +166,13 @@ class ViewMotion:
             coefficients = motions[self._stands_for[frame.index]]
             error = np.zeros_like(coefficients)
         medians = [self._median(body, c) for body, c in zip(self._bodies, coefficients, strict=True)]
-        # The shift's error stands for the field's: the other terms are small beside it
+        # Take the error of the shift as that of the field, because the other terms are small beside it
         return Displacement(
             coefficients, max(medians, default=0.0), float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
         )
 
     def places(self, displacement: Displacement, rows: slice) -> Image:
-        """Where some rows of the view are found in a frame: x and y (2, rows, width) as indices into ``window``."""
+        """Positions in a frame of some rows of the view: x and y (2, rows, width) as indices into ``window``."""
         own_rows, columns = self._rows(rows), self._inner[1]
         places = self._bodies[0].places(displacement.coefficients[0], own_rows, columns)
         for body, coefficients in zip(self._bodies[1:], displacement.coefficients[1:], strict=True):
@@ -171,16 +182,17 @@ class ViewMotion:
         return places
 
     def seen_flow(self, picture: Callable[[FrameRecord], NDArray[np.generic]], motions: Motions) -> SeenFlow | None:
-        """Flow of the tracking frame that moved most, before and after; None where fewer than two share their light.
+        """Optical flow to the tracking frame that moved most, before and after stabilisation; None without two of them.
 
         Args:
-            picture: values in ``window`` of a frame. motions: of all ``frames_to_match``.
+            picture: gives the values of a frame in ``window``.
+            motions: coefficients of all ``frames_to_match``.
         """
         if not self._interpolated or len(self._used) < 2 or not self._bodies:
             return None
         moves = [self.at(frame, motions) for frame in self._used]
         farthest = max(range(len(moves)), key=lambda k: moves[k].median_px)
-        # The first frame has not moved; where none has, any other shows as much
+        # If no frame moved, compare the last one with the first
         farthest = farthest or len(moves) - 1
         places = self.places(moves[farthest], slice(0, self._view.window.shape[0]))
         first, moved = (picture(self._used[k]) for k in (0, farthest))
@@ -190,7 +202,7 @@ class ViewMotion:
     def stored(self, displacement: Displacement) -> Image:
         """Displacement (h, w, 2) at every ``stored_step``-th pixel of the whole image that lies in the view.
 
-        Pixels beside all teeth move with the first jaw.
+        Pixels that show no tooth get the displacement of the first jaw.
         """
         width, height = self._view.whole.size
         step = stored_step((height, width))
@@ -223,7 +235,7 @@ def _shorter_side(seen: NDArray[np.bool_]) -> int:
 
 
 def _placed(footprint: Footprint, shape: tuple[int, int], inner: tuple[slice, slice]) -> Footprint:
-    """A footprint in a larger window, where nothing is seen around it."""
+    """Embed a footprint in a larger window without surfaces around it; the normals are not enlarged."""
     mesh, covered = np.full(shape, -1, dtype=np.int16), np.zeros(shape, dtype=bool)
     depth_mm = np.full(shape, np.inf, dtype=np.float32)
     mesh[inner], covered[inner], depth_mm[inner] = footprint.mesh, footprint.covered, footprint.depth_mm

@@ -1,7 +1,7 @@
-"""What dense optical flow sees between two tracking frames, before and after the measured motion is taken out.
+"""Dense optical flow between two tracking frames, before and after stabilisation.
 
-Flow knows neither the scan nor the motion that was measured, so what it still sees afterwards is an independent
-judgement.
+The flow uses neither the scan nor the measured motion, so the flow that remains after stabilisation is an independent
+check.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
 FLOW_SIDE_PX = 1500
-"""Longer side of the images compared: flow has errors of some 0.1 px of its own, and a larger image takes seconds."""
+"""Largest side of the compared images, pixels: the flow's own errors are about 0.1 px, and a larger image takes
+seconds."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +22,9 @@ class SeenFlow:
     """Flow from the first tracking frame to the one that moved most.
 
     Attributes:
-        frame: number of that frame.
-        before, after: (h, w, 2), pixels of the photograph, x and y, at every pixel of the reduced view.
-        teeth: (h, w), which of them show teeth.
+        frame: number of the frame that moved most.
+        before, after: (h, w, 2), x and y in pixels of the photograph, at every pixel of the reduced view.
+        teeth: (h, w), pixels of the reduced view that show teeth.
     """
 
     frame: int
@@ -40,13 +41,14 @@ def seen_flow(
     places: Image,
     seen: NDArray[np.bool_],
 ) -> SeenFlow:
-    """Flow before and after a frame is sampled at the places where its pixels went.
+    """Compute the flow to a frame as it is, and to the same frame resampled at the displaced pixels.
 
     Args:
-        reference, moved: first tracking frame and another, each (H, W) or (H, W, C), in the window around the view.
-        inner: the view in that window, (h, w) pixels.
-        places: (2, h, w), x and y as indices into ``moved``.
-        seen: (h, w), which pixels show teeth.
+        frame: number of the frame.
+        reference, moved: first tracking frame and this one, each (H, W) or (H, W, C), in the window around the view.
+        inner: rows and columns of the view in that window, (h, w) pixels.
+        places: (2, h, w), x and y of the displaced pixels as indices into ``moved``.
+        seen: (h, w), pixels that show teeth.
     """
     import cv2
 
@@ -58,7 +60,7 @@ def seen_flow(
         cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (_grey(reference)[inner], grey[inner], back)
     )
     teeth = cv2.resize(seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    # One scale for all, or a change of exposure would be seen as a change of place
+    # Scale all three images alike; with separate scales a change of exposure would appear as motion
     low, high = np.quantile(first[teeth], [0.01, 0.99]) if teeth.any() else (0.0, 1.0)
     first, second, third = (
         (255 * np.clip((image - low) / max(high - low, 1e-30), 0, 1)).astype(np.uint8)
@@ -69,7 +71,10 @@ def seen_flow(
 
 
 def _flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Image:
-    """Dense inverse search (Kroeger et al. 2016) down to the finest scale; none in images smaller than its patches."""
+    """Flow (h, w, 2) by dense inverse search (Kroeger et al. 2016) down to the finest scale.
+
+    It is zero in images smaller than the method's patches.
+    """
     import cv2
 
     if min(first.shape) < 16:

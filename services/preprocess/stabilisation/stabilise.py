@@ -1,10 +1,10 @@
-"""How the subject moved between two frames of a camera, and the frame as if it had not.
+"""Motion of the subject between two frames of a camera, and a frame resampled as if the subject had not moved.
 
-Only tooth pixels are kept, and teeth of one jaw are one rigid body of known shape. Its image moves by a smooth field: a
-shift, a linear and a quadratic part, and a parallax in proportion to the scan's relief. Direct alignment (Lucas &
-Kanade 1981, with the parametric warps of Baker & Matthews 2004, section 2, and Irani & Anandan's plane plus parallax,
-1996) finds those few coefficients from all pixels at once. Dense flow, which has two unknowns per pixel, follows
-shading and reflections instead of the tooth; docs/measured/preparation.md has the comparison.
+Only tooth pixels are used, and the teeth of one jaw are one rigid body of known shape. Its image moves by a smooth
+field: a shift, a linear and a quadratic part, and a parallax in proportion to the scan's relief. Direct alignment
+(Lucas & Kanade 1981, with the parametric warps of Baker & Matthews 2004, section 2, and Irani & Anandan's plane plus
+parallax, 1996) finds these few coefficients from all pixels at once. Dense flow, which has two unknowns per pixel,
+follows shading and reflections instead of the tooth; docs/measured/preparation.md has the comparison.
 """
 
 from __future__ import annotations
@@ -25,20 +25,23 @@ Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 
-# 1, x, y, relief, x², xy, y²
+# Number of terms of a displacement field: 1, x, y, relief, x², xy, y²
 TERMS = 7
 Feature = Literal["texture", "edges"]
-# Same light: the terms' standard deviations before anything is seen, as shares of the body's shorter side; the shift is
-# free. A nod or turn by a few degrees moves a tooth's outline by this much.
+# Prior standard deviations of the terms after the shift, between frames under the same light, as fractions of the
+# body's shorter side; the shift has no prior. A nod or turn by a few degrees moves a tooth's outline by this much.
 LIKELY_SHARE = (0.02, 0.02, 0.02, 0.007, 0.007, 0.007)
-# Features are made with Gaussians of 2 px, so that residuals of about 4π 2² pixels are one observation
+# Number of pixels that count as one observation. Features are made with Gaussians of 2 px, so that residuals of about
+# 4π 2² pixels are correlated
 CORRELATED_PX = 50.0
-# Another light: edges of the lit side alone are left, so all but the shift is held; relative to the mean curvature of
-# the cost
+# Ridge of each term between frames under different lights, relative to the mean curvature of the cost. Only edges of
+# the lit side remain then, so all terms but the shift are held near zero
 EDGE_RIDGE = (0, 10, 10, 100, 100, 100, 100)
-# Matching runs near the fit's 1/5 of 20 megapixels, and on evenly strided pixels: a few coefficients need no more
+# Largest number of pixels of a frame reduced for matching: the fit's 1/5 of the resolution of 20 megapixels
 SOLVE_PIXELS = 800_000
+# Largest number of evenly strided pixels that are matched at each level: a few coefficients need no more
 MATCHED_PIXELS = 200_000
+# Width in pixels of the band beside a body's outline in which its relief is continued and pixels are matched
 BAND_PX = 6
 
 
@@ -46,9 +49,9 @@ class SurfaceFlow:
     """Displacement fields that one rigid body can have in one camera's image.
 
     Args:
-        footprint: what the camera sees at the reference time.
-        meshes: indices of the body's meshes in the footprint.
-        kept: file in which the relief is looked for, and left where it is not found; None to make it here.
+        footprint: surfaces that the camera sees at the reference time.
+        meshes: numbers of the body's meshes in the footprint.
+        kept: file of the relief, read if it exists and else written; None to compute the relief and write nothing.
     """
 
     def __init__(self, footprint: Footprint, meshes: Sequence[int], kept: Path | None = None) -> None:
@@ -63,7 +66,7 @@ class SurfaceFlow:
         self.extent_px = float(min(np.ptp(columns), np.ptp(rows)) + 1)
 
     def terms(self, relief: Image, x_px: Image, y_px: Image) -> Image:
-        """Basis values (..., TERMS) at pixel indices."""
+        """Basis values (..., TERMS) at pixel indices x, y (...) with the given relief (...)."""
         x, y = ((v - c) / self._scale_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
         return np.stack([np.ones_like(relief), x, y, relief, x * x, x * y, y * y], axis=-1).astype(np.float32)
 
@@ -76,12 +79,12 @@ class SurfaceFlow:
         return np.moveaxis(self._planes(coefficients, rows, columns, moved=0), 0, -1)
 
     def places(self, coefficients: FloatArray, rows: slice, columns: slice) -> Image:
-        """Where reference pixels are in the frame: x and y (2, rows, columns) in pixels."""
+        """Positions of the reference's pixels in the frame: x and y (2, rows, columns) in pixels."""
         return self._planes(coefficients, rows, columns, moved=1)
 
     def _planes(self, coefficients: FloatArray, rows: slice, columns: slice, moved: int) -> Image:
-        # Displacements, plus ``moved`` times the pixel's own place. The polynomial is a product of (rows, 3) and (3,
-        # columns).
+        # Compute displacements (2, rows, columns), plus ``moved`` times the pixel's own position. The polynomial is a
+        # product of (rows, 3) and (3, columns).
         relief = self._relief[rows, columns]
         y_px, x_px = (np.arange(n)[cut] for n, cut in zip(self._relief.shape, (rows, columns), strict=True))
         x, y = ((v - c) / self._scale_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
@@ -96,7 +99,7 @@ class SurfaceFlow:
         return planes
 
     def reduced(self, factor: int) -> tuple[BoolArray, Image]:
-        """Region used for matching and basis (h, w, TERMS), both reduced by ``factor``."""
+        """Region (h, w) used for matching, and basis values (h, w, TERMS), both reduced by ``factor``."""
         import cv2
 
         size = (max(1, self._relief.shape[1] // factor), max(1, self._relief.shape[0] // factor))
@@ -112,7 +115,10 @@ class SurfaceFlow:
 
 
 def _relief(depth_mm: Image, seen: BoolArray) -> Image:
-    """Depth (H, W) in standard deviations, continued beyond the outline so that the outline itself can be matched."""
+    """Relief (H, W): depth minus its mean, in standard deviations.
+
+    It is continued beyond the outline, so that the outline itself can be matched.
+    """
     import cv2
 
     depth = np.where(seen, depth_mm, 0).astype(np.float32)
@@ -132,13 +138,13 @@ class _Level:
 
 
 class Aligner:
-    """Aligns frames of one camera to its reference frame, for one body.
+    """Alignment of one camera's frames with its reference frame, for one body.
 
     Args:
         flow: the body's possible displacements.
         reference: (H, W) or (H, W, C), the reference frame, linear in light.
         feature: ``texture`` between frames under the same light, ``edges`` between different lights.
-        level: what a frame holds without light.
+        level: value of a pixel without light.
     """
 
     def __init__(self, flow: SurfaceFlow, reference: NDArray[np.generic], feature: Feature, level: float = 0.0) -> None:
@@ -159,7 +165,12 @@ class Aligner:
             self._levels.append(_Level(image, matched, terms, float(self._factor * 2**number)))
 
     def solve(self, frame: NDArray[np.generic], iterations: int = 30) -> FloatArray:
-        """Coefficients (TERMS, 2) of the displacement from the reference to the frame, coarse to fine."""
+        """Solve for the coefficients (TERMS, 2) of the displacement from the reference to the frame, coarse to fine.
+
+        Args:
+            frame: (H, W) or (H, W, C), linear in light.
+            iterations: largest number of Gauss-Newton steps at each level; a third of them at the finest level.
+        """
         import cv2
 
         coefficients = np.zeros((TERMS, 2))
@@ -168,9 +179,9 @@ class Aligner:
             y, x = np.mgrid[0 : moving.shape[0], 0 : moving.shape[1]].astype(np.float32)
             basis = level.terms.reshape(-1, TERMS)[level.matched] / level.pixel_px
             fixed_x, fixed_y = _gradient(level.feature)
-            # The finest level only polishes; far motion is found below it
+            # Take fewer steps at the finest level, which only refines the motion found at the coarser levels
             for _ in range(iterations if level is not self._levels[0] else iterations // 3):
-                # Sample the frame where the reference pixel has gone; the gradient is the mean of both images'
+                # Sample the frame at the displaced pixels; use the mean of both images' gradients
                 shift = level.terms @ coefficients.astype(np.float32) / level.pixel_px
                 warped = cv2.remap(
                     moving, x + shift[..., 0], y + shift[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -178,7 +189,8 @@ class Aligner:
                 moved_x, moved_y = _gradient(warped)
                 slope = 0.5 * np.stack([fixed_x + moved_x, fixed_y + moved_y], axis=-1).reshape(-1, 2)[level.matched]
                 residual = (warped - level.feature).ravel()[level.matched]
-                # Geman-McClure weights at one robust standard deviation: reflections and lips do not vote
+                # Weight residuals by Geman-McClure at one robust standard deviation, so that reflections and lips have
+                # little influence
                 scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
                 weight = 1 / (1 + (residual / scale) ** 2) ** 2
                 jacobian = np.concatenate([slope[:, :1] * basis, slope[:, 1:] * basis], axis=1).astype(np.float64)
@@ -192,10 +204,10 @@ class Aligner:
         return coefficients
 
     def _damping(self, scale: float, hessian: FloatArray) -> FloatArray:
-        """What is added to the cost's curvature (2 TERMS,), 1/px² of ``scale``², and pulls each term towards no motion.
+        """Diagonal (2 TERMS,) added to the cost's Hessian, which pulls each term towards zero, in ``scale``² per px².
 
-        Between frames of one light the estimate is the most likely one: contrast speaks with its residuals' standard
-        deviation ``scale``, and what it does not tell stays near no motion.
+        Between frames of one light the result is the maximum a posteriori estimate: residuals have the standard
+        deviation ``scale``, and terms that the image does not determine stay near zero.
         """
         if self._feature == "edges":
             return np.asarray(np.tile(EDGE_RIDGE, 2) * np.trace(hessian) / (2 * TERMS) + 1e-12)
@@ -204,13 +216,16 @@ class Aligner:
 
 
 def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[FloatArray, FloatArray]:
-    """Values at ``time`` by the cubic through the four nearest knots, and an error estimate.
+    """Interpolate values at ``time`` by the cubic through the four nearest knots, and estimate the error.
 
-    The estimate is the difference to the parabola through the three nearest, larger than the cubic's own error where
-    motion is smooth; with fewer than three knots it is zero, since nothing is known.
+    The error estimate is the difference to the parabola through the three nearest knots, which is larger than the
+    cubic's own error where motion is smooth. With fewer than three knots it is zero, because nothing is known.
 
     Args:
-        times: (K,) distinct. values: (K, ...).
+        times: (K,) distinct knots. values: (K, ...). time: time of the result.
+
+    Returns:
+        Values (...) and their estimated error (...).
     """
     nearest = np.argsort(np.abs(times - time), kind="stable")[:4]
     full = _lagrange(times[nearest], values[nearest], time)
@@ -241,11 +256,11 @@ def warp(image: NDArray[np.generic], displacement: Image) -> Image:
 
 
 def _features(image: Image, feature: Feature) -> Image:
-    """What of an image survives the change of light between the frames compared.
+    """Features (H, W) of an image that do not depend on the change of light between the compared frames.
 
-    ``texture``: local mean and contrast removed, so that slow shading counts little and outlines and stains count
-    alike. ``edges``: gradient magnitude relative to its neighbourhood, so that neither the sign nor the size of an edge
-    matters.
+    ``texture``: local mean and contrast are removed, so that slow shading has little weight, and outlines and stains
+    have equal weight. ``edges``: gradient magnitude relative to its neighbourhood, so that neither the sign nor the
+    size of an edge matters.
     """
     import cv2
 
@@ -259,14 +274,15 @@ def _features(image: Image, feature: Feature) -> Image:
 
 
 def reduce_grey(image: NDArray[np.generic], factor: int, level: float = 0.0) -> Image:
-    """Mean over the channels of (H, W) or (H, W, C) and over squares of ``factor`` pixels, above ``level``; what is
-    left of a square is dropped.
+    """Average an image (H, W) or (H, W, C) over channels and squares of ``factor`` pixels, and subtract ``level``.
+
+    Incomplete squares at the right and lower edges are dropped.
     """
     import cv2
 
     height, width = (max(1, n // factor) for n in image.shape[:2])
     grey = np.empty((height, width), dtype=np.float32)
-    # Some rows at a time, so that whole numbers are never held as floating-point ones all at once
+    # Convert some rows at a time, so that the whole image is never held in floating point
     for band in bands((height, width * factor * factor)):
         rows = image[band.start * factor : band.stop * factor, : width * factor].astype(np.float32)
         small = rows if factor == 1 else cv2.resize(rows, (width, band.stop - band.start), interpolation=cv2.INTER_AREA)
@@ -276,7 +292,7 @@ def reduce_grey(image: NDArray[np.generic], factor: int, level: float = 0.0) -> 
 
 
 def _pyramid(image: Image, feature: Feature) -> list[Image]:
-    """Features of the image, then halved while their shorter side has 40 pixels."""
+    """Pyramid of the image's features, halved while their shorter side has at least 40 pixels."""
     levels = [_features(image, feature)]
     while min(levels[-1].shape) >= 40:
         levels.append(_halve(levels[-1]))

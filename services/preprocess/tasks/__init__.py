@@ -1,1 +1,1 @@
-"""The Dask tasks that a preparation is made of, and what they leave for each other."""
+"""Dask tasks of a preparation, and the files that they share."""

@@ -1,16 +1,16 @@
-"""The folder in which a preparation is made, and what of an earlier attempt at it can be gone on with.
+"""Folders in which a preparation is made, and the results of an earlier attempt from which it can be resumed.
 
 ::
 
     JOB/
       .prepared.<attempt>/      the store being written; where a job names a URL, a file in it says where its arrays are
       .prepared.work/
-        plan.json               digest of all that the store depends on
+        plan.json               digest of all inputs of the store
         <camera>/               footprint, relief, black image and its level as .npy, view.json, measures.json,
                                 flow.json, motion-<frame>.json, image-<light>.json
 
-A record is written last, once what it speaks of is on the disk, so a kill at any moment costs what was being made and
-nothing else.
+A record is written after the files that it describes are on the disk, so a kill at any moment loses only the results
+that were being made.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ R = TypeVar("R", bound=Record)
 STAGE = "prepared"
 ARRAYS = "prepared.zarr"
 OF_AN_IMAGE = ("radiance", "variance", "valid", "motion", "shadow")
-"""The arrays in which each image has a shard of its own."""
+"""Names of the arrays in which each image has a shard of its own."""
 WORK = ".prepared.work"
 PLAN = "plan.json"
 FOOTPRINT = ("mesh", "depth_mm", "normal", "covered")
@@ -47,10 +47,10 @@ class _Plan(Record):
 
 
 class AttemptFiles:
-    """One attempt's hold on the folders; it travels to the workers.
+    """Files of one attempt; the object is sent to the workers.
 
     Args:
-        writer: of the stage.
+        writer: writer of the stage, which holds the attempt's lease.
     """
 
     def __init__(self, writer: StageWriter) -> None:
@@ -58,36 +58,39 @@ class AttemptFiles:
 
     @property
     def folder(self) -> Path:
-        """Of the store being written."""
+        """Folder of the store being written."""
         return self.writer.folder
 
     @property
     def work(self) -> Path:
-        """Of what is not published."""
+        """Folder of the work files, which are not published."""
         return self.writer.root / WORK
 
     @property
     def arrays(self) -> Path:
-        """Where the arrays lie, or the file that says at which URL they are."""
+        """Folder of the arrays, or the file that holds their URL."""
         return self.folder / ARRAYS
 
     def begin(self, digest: str, url: str | None = None) -> bool:
-        """Take over what an attempt at the same store has left, or clear all away; returns whether there was something.
+        """Take over the files of an earlier attempt with the same inputs, or remove them all and start anew.
 
         Args:
-            digest: of all that the store depends on.
-            url: below which the arrays are to be kept; None to keep them in the folder.
+            digest: digest of all inputs of the store.
+            url: URL below which the arrays are stored; None to store them in the folder.
+
+        Returns:
+            Whether an earlier attempt was taken over.
 
         Raises:
             StoreError: the server of the arrays refuses or does not answer.
-            PlatformError: what speaks to it is not installed.
+            PlatformError: the package that accesses this kind of URL is not installed.
         """
         earlier = sorted(self._attempts(), key=lambda path: int(path.name.rpartition(".")[2]))
         left = [path for path in earlier if (path / ARRAYS).exists()]
         plan = _read(self.work / PLAN, _Plan)
         kept = left[-1] if plan is not None and plan.digest == digest and left else None
         if kept is None:
-            # First what says that there is something to go on with
+            # Remove the plan first, because it declares the other files as resumable
             (self.work / PLAN).unlink(missing_ok=True)
             shutil.rmtree(self.work, ignore_errors=True)
         for path in earlier:
@@ -105,23 +108,23 @@ class AttemptFiles:
         return kept is not None
 
     def announce(self, digest: str) -> None:
-        """The empty store is there, to be gone on with from now on."""
+        """Record that the empty store exists, from which moment a later attempt can resume it."""
         write_record(self.work / PLAN, _Plan(digest=digest))
 
     def end(self) -> None:
-        """Remove what is not published."""
+        """Remove the work files."""
         shutil.rmtree(self.work, ignore_errors=True)
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """An array of the store being written."""
+        """Open an array of the store being written."""
         return writable_array(self.arrays / name)
 
     def scratch(self, camera: int) -> Path:
-        """Folder of what a camera's blocks share."""
+        """Folder of the files that a camera's blocks share."""
         return self.work / str(camera)
 
     def put_view(self, view: View) -> None:
-        """Keep a camera's window and footprint."""
+        """Write a camera's window and footprint."""
         folder = self.scratch(view.number)
         for name in FOOTPRINT:
             write_array(folder / f"{name}.npy", getattr(view.footprint, name))
@@ -129,7 +132,7 @@ class AttemptFiles:
         self._put(folder / "view.json", ViewDone(window=(window.top, window.bottom, window.left, window.right)))
 
     def view(self, camera: int, whole: Camera) -> View | None:
-        """A camera's view, its arrays mapped from the disk; None where it has not been found yet."""
+        """A camera's view with memory-mapped arrays; None if it has not been written yet."""
         folder = self.scratch(camera)
         done = _read(folder / "view.json", ViewDone)
         if done is None:
@@ -139,28 +142,31 @@ class AttemptFiles:
         return View(camera, whole, window, window.cropped(whole), Footprint(**arrays), folder)
 
     def put_motion(self, camera: int, frame: int, motion: FrameMotion) -> None:
-        """Keep a frame's motion."""
+        """Write the motion of one frame."""
         self._put(self.scratch(camera) / f"motion-{frame}.json", motion)
 
     def motions(self, camera: int, frames: tuple[int, ...]) -> Motions:
-        """What is known of some frames' motion."""
+        """Motions of those of the given frames for which they have been written."""
         found = {frame: _read(self.scratch(camera) / f"motion-{frame}.json", FrameMotion) for frame in frames}
         return {frame: np.asarray(one.coefficients) for frame, one in found.items() if one is not None}
 
     def put_flow(self, camera: int, done: FlowDone) -> None:
-        """Say that a camera's flow was looked at and its pictures are written."""
+        """Record that a camera's optical flow was computed and its pictures are written."""
         self._put(self.scratch(camera) / "flow.json", done)
 
     def flow(self, camera: int) -> FlowDone | None:
-        """What flow sees of a camera's motion; None where it was not looked at yet."""
+        """Record of a camera's optical flow; None if it has not been computed yet."""
         return _read(self.scratch(camera) / "flow.json", FlowDone)
 
     def put_image(self, camera: int, light: int, done: ImageDone) -> None:
-        """Say that an image is stored."""
+        """Record that an image is stored."""
         self._put(self.scratch(camera) / f"image-{light}.json", done)
 
     def image(self, camera: int, light: int) -> ImageDone | None:
-        """What was made of an image; None where it is not stored whole. What a server has acknowledged is."""
+        """Record of an image; None if one of its files is missing or has another size.
+
+        Objects on a server are not checked here, because the server has acknowledged them.
+        """
         done = self.record(camera, light)
         if done is None:
             return None
@@ -172,16 +178,16 @@ class AttemptFiles:
         return done if is_whole else None
 
     def record(self, camera: int, light: int) -> ImageDone | None:
-        """What was last said of an image, whether or not its files are still those."""
+        """Last record of an image, whether or not its files still match it; None if there is none."""
         return _read(self.scratch(camera) / f"image-{light}.json", ImageDone)
 
     def is_shaded(self, camera: int, light: int) -> bool:
-        """Whether an image is stored and shadows were looked for in it."""
+        """Whether an image is stored and its shadows have been flagged."""
         done = self.image(camera, light)
         return done is not None and done.shaded
 
     def files_of(self, camera: int, light: int, picture: Path) -> dict[str, StoredFile]:
-        """The files of an image as they are now."""
+        """Sizes and checksums of an image's present files, by path in the stage's folder."""
         shards = sorted(self.arrays.glob(f"*/c/{camera}/{light}/**/*")) if self.arrays.is_dir() else []
         found = {}
         for path in [*shards, picture]:
@@ -192,7 +198,7 @@ class AttemptFiles:
         return found
 
     def objects_of(self, camera: int, light: int) -> dict[str, StoredObject]:
-        """The objects of an image as the server lists them now; none where the arrays lie on this disk."""
+        """Objects of an image as the server lists them; empty if the arrays lie on this disk."""
         remote = remote_folder(self.arrays)
         if remote is None:
             return {}
@@ -200,10 +206,10 @@ class AttemptFiles:
         return {name: one for listing in listings for name, one in listing.items()}
 
     def seal(self, images: Iterable[ImageDone]) -> None:
-        """Write into the file that stands for the arrays what the server holds, once all images are there.
+        """Write the list of the server's objects into the file that stands for the arrays, once all images are stored.
 
         Raises:
-            CorruptStoreError: names an object that is not there as it was written.
+            CorruptStoreError: an object on the server is missing or differs from the one written; the message names it.
         """
         remote = remote_folder(self.arrays)
         if remote is None:
@@ -214,7 +220,7 @@ class AttemptFiles:
         write_record(self.arrays, RemoteFolder(url=remote.url, objects=there))
 
     def _forget_what_is_gone(self) -> None:
-        """Remove the records of images of which a server no longer has every object, so that they are made again."""
+        """Remove the records of images of which the server lacks an object, so that these images are made again."""
         remote = remote_folder(self.arrays)
         there = {} if remote is None else remote.listed()
         for path in self.work.glob("*/image-*.json"):
@@ -223,7 +229,7 @@ class AttemptFiles:
                 path.unlink()
 
     def _put(self, path: Path, record: Record) -> None:
-        # An attempt that was overtaken says nothing any more
+        # Refuse to write a record if a later attempt holds the lease
         self.writer.require_lease()
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, record.model_dump_json().encode())

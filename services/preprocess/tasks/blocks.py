@@ -1,12 +1,12 @@
-"""The blocks that a preparation is made of.
+"""Blocks of work of a preparation.
 
-Each is one Dask task; it skips what is done already, so any of them may run again. ::
+Each block is one Dask task. A block skips results that exist already, so it can safely run again. ::
 
     look (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows
     are asked for
                                                  └──> compare (camera), where motion is measured
 
-One block writes an image's shards and no other does.
+Each image's shards are written by one block at a time.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone
 
 NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)
-"""Pixels that tell nothing of an image's levels and noise."""
+"""Mask bits of pixels that are left out of an image's brightness levels and noise."""
 Step = Literal["look", "match", "compare", "develop", "shade"]
 BLOCKS_PER_THREAD = 4
-"""So many blocks for each thread leave none without work for long at the end."""
+"""Number of blocks for each thread, high enough that no thread is idle for long at the end."""
 LARGEST_BLOCK = 8
-"""Images; more would make progress and a cancel wait."""
+"""Largest number of images in a block; with more, progress reports and a cancel would be late."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,11 @@ class Block:
     """One step for some frames or lights of one camera.
 
     Attributes:
-        items: frame numbers of ``match``, light indices of ``develop``.
+        spec: description of the job.
+        files: files of the attempt.
+        step: step to run.
+        camera: index of the camera.
+        items: frame numbers for ``match``, light indices for ``develop``, else empty.
     """
 
     spec: JobSpec
@@ -57,11 +61,11 @@ class Block:
     items: tuple[int, ...] = ()
 
     def __call__(self) -> None:
-        """Do what is not done yet.
+        """Run the step for those items that have no result yet.
 
         Raises:
-            CaptureInputError, StoreError: as ``Source`` and ``require_seen`` say. JobCancelledError. FencedError:
-                another attempt has begun.
+            CaptureInputError, StoreError: as ``Source`` and ``require_seen`` document. JobCancelledError: the job was
+                cancelled. FencedError: another attempt has begun.
         """
         context = LocalContext(self.files.writer.root, self.files.writer.attempt)
         context.raise_if_cancelled()
@@ -98,7 +102,12 @@ class Block:
 def blocks_of(
     spec: JobSpec, files: AttemptFiles, step: Step, items: Sequence[Sequence[int]], threads: int
 ) -> tuple[Block, ...]:
-    """One step for some frames or lights of each camera, in as many blocks as keep all threads busy."""
+    """Split one step for the given frames or lights of each camera into enough blocks to keep all threads busy.
+
+    Args:
+        items: frame numbers or light indices of each camera.
+        threads: number of blocks that run at once.
+    """
     size = -(-sum(len(own) for own in items) // (BLOCKS_PER_THREAD * threads))
     size = min(max(size, 1), LARGEST_BLOCK)
     return tuple(
@@ -109,7 +118,7 @@ def blocks_of(
 
 
 def images_of(block: Block, files: AttemptFiles) -> Iterator[ImageDone]:
-    """What a block has made."""
+    """Records of the images that a block has made."""
     files.writer.require_lease()
     for light in block.items:
         done = files.image(block.camera, light)
@@ -118,7 +127,7 @@ def images_of(block: Block, files: AttemptFiles) -> Iterator[ImageDone]:
 
 
 def _look(files: AttemptFiles, source: Source, subject: Subject, camera: int) -> None:
-    """Find a camera's window and footprint; what has no image is said to be unlit."""
+    """Find a camera's window and footprint, and mark the lights without an image as unlit."""
     whole = source.description.cameras[camera]
     view = subject.view_of(camera, whole)
     require_seen(view.footprint, len(subject.teeth), whole)
@@ -132,7 +141,7 @@ def _look(files: AttemptFiles, source: Source, subject: Subject, camera: int) ->
 
 
 def _compare(files: AttemptFiles, source: Source, view: View, motions: Motions) -> None:
-    """Draw what flow sees before and after the motion is taken out."""
+    """Write the pictures of optical flow before and after stabilisation."""
     seen = source.seen_flow(view, motions)
     flow = None if seen is None else camera_flow(view.whole.name, seen)
     if seen is not None and flow is not None:
@@ -142,7 +151,7 @@ def _compare(files: AttemptFiles, source: Source, view: View, motions: Motions) 
 
 @dataclass(frozen=True)
 class ImageWriter:
-    """All that a camera's images need to be judged and stored."""
+    """Masks, assesses and stores the images of one camera."""
 
     files: AttemptFiles
     source: Source
@@ -151,7 +160,13 @@ class ImageWriter:
     view: View
 
     def store(self, light: int, image: LightImage, began_s: float) -> ImageDone:
-        """Mask one image, store it and say what it is."""
+        """Mask one image, store it and return its record.
+
+        Args:
+            light: index of the light.
+            image: the image under this light.
+            began_s: monotonic time at which work on the image began.
+        """
         camera, lamp = self.view.whole, self.source.description.lights[light]
         footprint, window = self.view.footprint, self.view.window
         bits = valid_bits(image, footprint, self.view.camera, lamp, self.subject.glossy(footprint))
@@ -177,7 +192,7 @@ class ImageWriter:
         )
 
     def store_masked(self, light: int, image: LightImage, bits: Bits) -> None:
-        """Write an image's arrays and its mask (H, W)."""
+        """Write an image's arrays and its mask bits (H, W)."""
         place, window = (self.view.number, light), self.view.window
         for name, values in (("radiance", image.radiance), ("variance", image.variance)):
             self.files.array(name)[*place, window.rows, window.columns] = values

@@ -1,4 +1,4 @@
-"""What a preparation is to make, before any pixel is read."""
+"""Plan of a preparation, made before any pixel is read: its arrays, the digest of its inputs, the held-out images."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ from services.preprocess.source import Source
 from services.preprocess.stabilisation.motion import stored_step
 
 FORMAT = 9
-"""Of the store and of what attempts leave for each other; counts up with every change of either or of what pixels
-become."""
+"""Version of the prepared store and of the work files that one attempt leaves for the next. Raise it whenever either
+format changes, or when the same input gives other pixels."""
 INDIFFERENT = frozenset({"workers", "priority", "memory_gib"})
-"""Options that change no pixel."""
+"""Names of the options that change no pixel."""
 
 
 def create_arrays(store: Path, source: Source, *, with_shadows: bool) -> None:
-    """Radiance, variance, valid, surface and, where they are asked for or measured, shadow and motion; one shard per
-    image, so that each has one writer.
+    """Create the arrays radiance, variance, valid and surface, and on demand shadow and motion.
+
+    Each image has a shard of its own, so that each shard has one writer.
+
+    Args:
+        store: folder of the arrays.
+        source: the capture; motion is created if it measures motion.
+        with_shadows: whether to create shadow.
     """
     description = source.description
     height, width = (max(camera.size[axis] for camera in description.cameras) for axis in (1, 0))
@@ -53,7 +59,7 @@ def create_arrays(store: Path, source: Source, *, with_shadows: bool) -> None:
 
 
 def digest_of_inputs(spec: JobSpec, source: Source, masks: HandMasks) -> str:
-    """SHA-256 of all that the store depends on: another one means that nothing made so far can be gone on with."""
+    """SHA-256 of all inputs of the store; results made with another digest cannot be resumed."""
     digest = hashlib.sha256()
     parts = [str(FORMAT), spec.model_dump_json(exclude=set(INDIFFERENT)), source.identity(), masks.digest]
     for path in sorted(source.root.rglob("*.ply")):
@@ -64,7 +70,8 @@ def digest_of_inputs(spec: JobSpec, source: Source, masks: HandMasks) -> str:
 
 
 def held_out_images(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...]:
-    """(camera, light) pairs kept from the fit: as the job says, else as the capture marks, else every fourth light.
+    """(camera, light) pairs held out from the fit: by the job's options, else the capture's marks, else every fourth
+    light.
 
     Raises:
         SettingsError: a light or camera is unknown, or none is left to fit.

@@ -1,4 +1,4 @@
-"""What a preparation tells while it runs."""
+"""Progress reports of a running preparation."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from services.core.stage import StageContext, StageEvent
 from services.preprocess.tasks.records import ImageDone
 
 ENOUGH = 3
-"""Images before a time is told: the first ones also load libraries."""
+"""Smallest number of finished images from which the remaining time is estimated; the first ones also load libraries."""
 LIKELY = (0.1, 0.9)
-"""Shares of the images that were faster than the two times that are told."""
+"""Quantiles of the time per image from which the lower and upper remaining times are estimated."""
 
 
 class Progress:
-    """Reports each image, and between what times the rest will be done.
+    """Reporter of each finished image and of a range for the remaining time.
 
     Args:
-        images: of the whole capture. cameras: how many.
+        images: number of images of the whole capture. cameras: number of cameras.
     """
 
     def __init__(self, context: StageContext, images: int, cameras: int) -> None:
@@ -26,13 +26,13 @@ class Progress:
         self._tell("started", f"{images} images of {cameras} cameras.")
 
     def begin(self, missing: int, threads: int) -> None:
-        """So many images are to be made, so many at once."""
+        """Begin with ``missing`` images to make, ``threads`` of them at once."""
         self._left, self._threads = missing, threads
         if missing < self._images:
             self._tell("log", f"{self._images - missing} of {self._images} images are prepared already.")
 
     def tell(self, done: ImageDone) -> None:
-        """One image more is stored."""
+        """Report one more stored image."""
         self._left -= 1
         self._seconds.append(done.seconds)
         quality, share = done.quality, 1 - self._left / self._images
@@ -49,17 +49,17 @@ class Progress:
             self._tell("log", f"Camera {quality.camera}, light {quality.light} has no valid pixel left ({reasons}).")
 
     def shade(self, cameras: int) -> None:
-        """Shadows are to be looked for in the images of so many cameras."""
+        """Report that shadows are searched in the images of this number of cameras."""
         self._tell("log", f"Shadows are looked for in the images of {cameras} cameras.")
 
     def finish(self) -> None:
-        """All is published."""
+        """Report that the store is published."""
         message = f"{self._images} images are prepared."
         self._context.report(StageEvent(stage="prepare", kind="finished", message=message, done=1.0))
 
     def _left_s(self) -> tuple[float, float] | None:
-        """Between how many seconds the rest will take: as if all images took as long as a fast and as a slow one so
-        far.
+        """Range of the remaining time in seconds: all images taken to be as fast, or as slow, as the ``LIKELY``
+        quantiles so far.
         """
         if len(self._seconds) < ENOUGH or not self._left:
             return None

@@ -1,4 +1,4 @@
-"""What the blocks of a preparation leave behind, one record a thing, so that nothing that is done is done again."""
+"""Records of finished work that the blocks of a preparation write, so that no work is done twice."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from services.preprocess.window import Window
 
 
 class ViewDone(Record):
-    """One camera's view was found; its footprint lies beside this."""
+    """Record that one camera's window was found; its footprint lies beside this file."""
 
     window: tuple[int, int, int, int] = Field(description="top, bottom, left, right in pixels of the whole image")
 
     def of(self) -> Window:
-        """The window."""
+        """Return the window."""
         return Window(*self.window)
 
 
 class FrameMotion(Record):
-    """One frame's motion was measured."""
+    """Record of one frame's measured motion."""
 
     coefficients: tuple[tuple[tuple[float, float], ...], ...] = Field(
         description="(bodies, terms, 2) of the displacement in pixels since the first frame"
@@ -31,20 +31,20 @@ class FrameMotion(Record):
 
 
 class FlowDone(Record):
-    """It was looked at what flow sees of a camera's motion."""
+    """Record that a camera's optical flow before and after stabilisation was computed."""
 
     flow: CameraFlow | None = Field(description="null where no two frames share their light")
 
 
 class StoredFile(Record):
-    """A file of an image, as it was written."""
+    """Size in bytes and checksum of a file of an image, as written."""
 
     bytes: int
     sha256: str
 
 
 class ImageDone(Record):
-    """One image was prepared and stored."""
+    """Record of one image that was prepared and stored."""
 
     quality: ImageQuality
     tooth_pixels: tuple[int, ...] = Field(description="valid pixels that show each tooth")

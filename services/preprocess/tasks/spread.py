@@ -1,5 +1,5 @@
-"""Where the blocks of a preparation run: on the workers of the Dask cluster that this code is a task of, else here, one
-after the other.
+"""Executors for the blocks of a preparation: the workers of the Dask cluster if this code runs as a Dask task, else
+this process, one block after the other.
 """
 
 from __future__ import annotations
@@ -15,33 +15,38 @@ B = TypeVar("B", bound=Callable[[], Any])
 
 
 class Spread(Protocol):
-    """Runs blocks that wait for no other."""
+    """Executor of blocks that do not depend on each other."""
 
     threads: int
-    """How many run at once."""
+    """Number of blocks that run at once."""
 
     def run(self, blocks: Sequence[B]) -> Iterator[B]:
-        """Each block once it has ended. Raises what a block raised; those that have not begun then never do."""
+        """Yield each block once it has ended.
+
+        An exception of a block is raised here; blocks that have not begun by then never run.
+        """
 
 
 class Here:
-    """Runs each block when its end is asked for."""
+    """Executor in this process; it runs each block when the caller asks for the next one."""
 
     threads = 1
 
     def run(self, blocks: Sequence[B]) -> Iterator[B]:
-        """See Spread."""
+        """See ``Spread``."""
         for block in blocks:
             block()
             yield block
 
 
 class OnWorkers:
-    """Runs blocks on the workers that the surrounding task may run on.
+    """Executor on the workers that may run the surrounding Dask task.
 
     Args:
-        key: of the surrounding task; the blocks' begin with it, which tells whose they are.
-        needs: Dask resources of a worker that may run them.
+        client: Dask client.
+        key: key of the surrounding task; the blocks' keys begin with it, which shows to which task they belong.
+        needs: Dask resources that a worker must have to run the blocks.
+        priority: priority of the job.
     """
 
     def __init__(self, client: Any, key: str, needs: dict[str, float], priority: Priority) -> None:
@@ -56,7 +61,7 @@ class OnWorkers:
         self.threads = max(1, sum(able))
 
     def run(self, blocks: Sequence[B]) -> Iterator[B]:
-        """See Spread. A block whose worker dies runs again on another."""
+        """See ``Spread``. A block whose worker dies runs again on another worker."""
         from distributed import as_completed
 
         pending = {}
@@ -80,7 +85,9 @@ class OnWorkers:
 
 
 def threads_here() -> int:
-    """How many blocks this process may run at once, and share its memory among: as many as its worker has threads."""
+    """Number of blocks that this process may run at once and that share its memory: its Dask worker's threads, else
+    1.
+    """
     from distributed import get_worker
 
     try:
@@ -91,7 +98,10 @@ def threads_here() -> int:
 
 @contextmanager
 def spread(priority: Priority) -> Iterator[Spread]:
-    """Inside a Dask task its cluster, holding no thread meanwhile; elsewhere this process."""
+    """Give the executor for blocks: inside a Dask task its cluster, elsewhere this process.
+
+    The Dask task occupies no worker thread while it waits for its blocks.
+    """
     from distributed import get_worker, worker_client
 
     try:

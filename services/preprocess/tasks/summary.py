@@ -1,4 +1,4 @@
-"""What all images of a preparation come to: refusals, notes, the quality report and the stage's record."""
+"""Summary of all images of a preparation: refusals, notes, the quality report and the stage's manifest."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import ImageDone
 
 Known = dict[str, tuple[int, str]]
-"""Size and SHA-256 of files by their path in the store."""
+"""Path of a file in the store -> its size in bytes and its SHA-256."""
 
 
 def summarise(
@@ -33,15 +33,19 @@ def summarise(
     masks: str,
     context: StageContext,
 ) -> tuple[PreparedManifest, Known]:
-    """Judge the capture as a whole and write what goes with the store.
+    """Check the capture as a whole, and write the quality report, its page and the meshes into the store.
 
     Args:
-        held_out: (camera, light) pairs kept from the fit.
-        masks: digest of the masks by hand.
+        held_out: (camera, light) pairs held out from the fit.
+        masks: digest of the manual masks.
+
+    Returns:
+        The stage's manifest, and size and checksum of the images' files.
 
     Raises:
-        CaptureInputError: no pixel is valid, no tooth is as bright as these, or channels look exchanged. FencedError:
-            another attempt has begun. StoreError: a server of the arrays refuses, does not answer or has lost one.
+        CaptureInputError: no pixel is valid, the teeth's brightness is implausible, or channels look exchanged.
+            FencedError: another attempt has begun. StoreError: the server of the arrays refuses, does not answer or has
+            lost an object.
     """
     files.writer.require_lease()
     images = _images(files, source)
@@ -70,7 +74,7 @@ def summarise(
         raise CaptureInputError(f"Every image of {source.root} {what}; {remedy}.")
     brightness.require_plausible()
     fdi = tuple(tooth.fdi for tooth in subject.teeth)
-    # What a source finds out while it reads is told once
+    # Collect the notes that sources made while they read, each once
     told = dict.fromkeys([*source.notes, *(note for done in images for note in done.notes)])
     notes = [*told, *brightness.notes(), *unusable_note(reports)]
     if hidden := [str(number) for number, count in zip(fdi, seen, strict=True) if count == 0]:
@@ -86,7 +90,7 @@ def summarise(
     write_record(files.folder / "quality.json", QualityReport(images=covered, flows=flows))
     write_page(files.folder, covered, flows, notes)
     _copy_meshes(source.root, files.folder, fdi)
-    # What a kill has left of a file that was being written
+    # Remove partly written files that a killed process left
     for partial in files.folder.rglob("*.partial"):
         partial.unlink()
     files.seal(images)
@@ -112,7 +116,7 @@ def summarise(
 
 
 def _images(files: AttemptFiles, source: Source) -> list[ImageDone]:
-    """All images, in the order of cameras and lights, whichever was done first."""
+    """Records of all images in the order of cameras and lights."""
     found = [files.image(k, j) for k in range(len(source.description.cameras)) for j in source.lights_of(k)]
     assert all(done is not None for done in found), "every block has ended"
     return [done for done in found if done is not None]
