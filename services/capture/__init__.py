@@ -1,1 +1,1 @@
-"""Plan, dome and cameras, real and simulated; writes the capture store."""
+"""Capture with a rig: plan, dome and cameras, real and simulated; writes the capture store."""

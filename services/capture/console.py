@@ -1,13 +1,13 @@
-"""The dome by hand: a process that a server starts and tells over its pipes what to do.
+"""Manual control of the dome: a process that a server starts and that receives commands over its pipes.
 
 ::
 
     python -m services.capture.console '{"address": "host:port", ...}'    DomeCommand lines in, DomeAnswer lines out
 
-Commands run side by side, so that ALL OFF and the status wait for nobody; one at a time drives the dome. The process
-ends with its standard input, that is with whoever started it, kill -9 included, and leaves the dome dark. A light that
-it holds goes dark by itself when its time is over, which is kept here and by the controller's strobe, and within the
-watchdog period if this process is killed.
+Commands run concurrently, so that ALL OFF and the status never wait; only one command at a time drives the dome. The
+process ends when its standard input closes, so also when its parent is killed, and leaves the dome dark. A light that
+is on goes dark when its time is over, by this process and also by the controller's strobe. If this process is killed,
+it goes dark within the watchdog period.
 """
 
 from __future__ import annotations
@@ -30,18 +30,20 @@ from services.core.errors import DentineError, DomeBusyError, RigError, RigStopp
 from services.core.settings import DomeSettings
 
 TICK_S = 0.1
+"""Interval at which a light that is on is checked, seconds."""
 PATIENCE_S = 1.0
-"""How long a command waits for another one that drives the dome."""
+"""Time that a command waits for another one that drives the dome, seconds."""
 DOSE_S = 1e4
-"""Light adds up over this time (IEC 62471), so that a limit is for all lights by hand since the dome was last left dark
-for so long."""
+"""Time over which doses of light add up (IEC 62471), seconds. A limit holds for all manual light since the dome was
+last dark for this long."""
 SHARED_LIMITS = ("watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s")
-"""A preflight's rig may ask for less than the server allows, never for more."""
+"""Names of the limits for which the smaller of the preflight rig's and the server's values is used."""
 SIMULATED_LIGHTS = 155
+"""Number of lights of a simulated dome."""
 
 
 class Console:
-    """Works one dome; ``close`` leaves it dark."""
+    """Driver of one dome by commands; ``close`` leaves the dome dark."""
 
     def __init__(self, host: str, port: int, settings: DomeSettings) -> None:
         self._host, self._port, self._settings = host, port, settings
@@ -70,7 +72,7 @@ class Console:
             )
 
     def close(self) -> None:
-        """End dark, also in mid-preflight."""
+        """Make the dome dark and end, also in the middle of a preflight."""
         self._ending.set()
         if not self._driving.acquire(timeout=PATIENCE_S):
             with suppress(RigError):
@@ -111,7 +113,7 @@ class Console:
         try:
             return all_off(self._host, self._port)
         except BaseException:
-            # The controller may have no connection left to give; the driver here has one.
+            # Use the driver's own connection, because the controller may accept no further one.
             if (dome := self._dome) is not None:
                 dome.give_up()
             raise
@@ -161,8 +163,8 @@ class Console:
             self._budget.spent_s.clear()
 
     def _require_wanted(self, command: DomeCommand) -> None:
-        # Before the watchdog is armed, which would undo ALL OFF, and after it: what comes later is refused light by the
-        # controller.
+        # Checked before the watchdog is armed, because arming would undo ALL OFF, and again afterwards. After an ALL
+        # OFF that comes later, the controller itself refuses light.
         with self._ordering:
             is_overtaken = command.number < self._newest_off
         if is_overtaken:
@@ -176,7 +178,7 @@ class Console:
             observer.close()
 
     def _keep(self) -> None:
-        # Darkens a light whose time is over, or that no longer is as it was set.
+        # Darkens a light whose time is over, or that differs from the commanded one.
         while not self._ending.wait(TICK_S):
             with self._driving:
                 if self._dome is None:

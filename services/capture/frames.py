@@ -1,13 +1,13 @@
-"""Durable frames: what is acknowledged survives a crash, and the next attempt goes on from it.
+"""Durable storage of frames: acknowledged frames survive a crash, and the next attempt resumes after them.
 
 ::
 
     .capture.<attempt>/
       capture.zarr/        (camera, frame, y, x, channel) uint16, one shard per camera and frame
-      journal.jsonl        line 1: what is captured (a fingerprint); then one line per acknowledged frame, with its
+      journal.jsonl        line 1: fingerprint of the capture's inputs; then one line per acknowledged frame, with its
                            FrameRecord and each shard's size and SHA-256
 
-A frame is acknowledged by its journal line: written and fsynced after the shards and their folders were.
+A frame is acknowledged by its journal line, which is written and fsynced after its shards and their folders.
 """
 
 from __future__ import annotations
@@ -36,21 +36,22 @@ DIMENSIONS = ("camera", "frame", "y", "x", "channel")
 
 
 class Acknowledged(Record):
-    """One line of the journal."""
+    """One line of the journal: a frame's record, and name, size in bytes and SHA-256 of each of its shards."""
 
     frame: FrameRecord
     shards: tuple[tuple[str, int, str], ...]
 
 
 class FrameStore:
-    """The capture array being written, with the journal that says which frames count."""
+    """The capture array being written, with the journal of its acknowledged frames."""
 
     def __init__(self, writer: StageWriter, shape: tuple[int, int, int, int, int], fingerprint: str) -> None:
-        """Open the attempt's folder, adopting the acknowledged frames of the newest attempt that captured the same.
+        """Open the attempt's folder and adopt the acknowledged frames of the newest attempt with the same fingerprint.
 
         Args:
-            shape: cameras, frames, height, width, channels; smaller cameras are padded with zeros.
-            fingerprint: equal for two captures exactly when their frames may be mixed.
+            writer: writer of the stage.
+            shape: cameras, frames, height, width, channels; images of smaller cameras are padded with zeros.
+            fingerprint: digest that is equal for two captures exactly when their frames may be mixed.
         """
         self._writer, self._folder = writer, writer.folder
         self._header = json.dumps(
@@ -70,10 +71,14 @@ class FrameStore:
         write_atomic(self._folder / JOURNAL, text.encode())
 
     def store(self, frame: FrameRecord, images: Sequence[NDArray[np.uint16]]) -> None:
-        """Store one frame of all cameras; when this returns it survives a power cut.
+        """Store one frame of all cameras; after the return it survives a power cut.
+
+        Args:
+            frame: record of the frame.
+            images: counts (height, width, channel) of each camera.
 
         Raises:
-            FencedError: a newer attempt owns the stage. StoreError: the disk does not take it.
+            FencedError: a newer attempt owns the stage. StoreError: the disk cannot store the frame.
         """
         self._writer.require_lease()
         try:
@@ -96,7 +101,7 @@ class FrameStore:
         self.acknowledged[frame.index] = frame
 
     def frames(self) -> tuple[FrameRecord, ...]:
-        """Acknowledged frames by index."""
+        """Acknowledged frames in the order of their indices."""
         return tuple(self.acknowledged[index] for index in sorted(self.acknowledged))
 
     def remove_leftovers(self) -> None:
@@ -134,8 +139,9 @@ class FrameStore:
 
 
 def _intact(folder: Path, header: str) -> Iterator[Acknowledged]:
-    """Journal lines whose shards are as acknowledged; torn and damaged lines and frames are left out, to be captured
-    again.
+    """Yield the journal lines whose shards still match them.
+
+    Incomplete lines and damaged frames are left out, so that they are captured again.
     """
     text = (folder / JOURNAL).read_text()
     assert text.startswith(header)
@@ -156,7 +162,7 @@ def _digest(path: Path) -> tuple[int, str] | None:
 
 
 def _digest_durably(array: Path, name: str) -> tuple[int, str]:
-    """Fsync a shard and every folder between it and the array; its size and SHA-256."""
+    """Fsync a file and every folder from it up to the array; return the file's size in bytes and its SHA-256."""
     path = array / name
     for entry in [path, *path.parents[: len(Path(name).parts)]]:
         _fsync(entry)
@@ -173,9 +179,9 @@ def _fsync(path: Path) -> None:
 
 
 def _link_shards(source: Path, target: Path, line: Acknowledged) -> None:
-    """Adopt a frame's shards without copying.
+    """Adopt a frame's shards by hard links, or by copies where links are impossible.
 
-    A stalled older attempt replaces files and never changes them, so links are safe.
+    Links are safe, because an older attempt that is still running replaces files and never modifies them.
     """
     for name, _, _ in line.shards:
         path = target / ARRAY / name
@@ -188,5 +194,5 @@ def _link_shards(source: Path, target: Path, line: Acknowledged) -> None:
 
 
 def fingerprint(*parts: Any) -> str:
-    """SHA-256 over the JSON of what decides a frame's pixels."""
+    """SHA-256 of the JSON of all inputs that determine a frame's pixels."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()

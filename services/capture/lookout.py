@@ -1,4 +1,4 @@
-"""Looks for a cancel while a light is on, so that the light does not last until the exposure is over."""
+"""Check for a cancel while a light is on, so that the light does not stay on until the exposure is over."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 LOOK_EVERY_S = 0.05
-"""A tenth of the half second within which a cancel must have darkened the dome; a look costs one question to the file
-system."""
+"""Interval between checks in seconds: a tenth of the half second within which a cancel must have darkened the dome. A
+check costs one request to the file system."""
 
 
 @contextmanager
 def interrupting(raise_if_cancelled: Callable[[], None], interrupt: Callable[[Exception], None]) -> Iterator[None]:
-    """Ask again and again during the block whether to go on, from a thread of its own.
+    """Check repeatedly for a cancel during the block, in a separate thread.
 
     Args:
-        raise_if_cancelled: raises once the work is not wanted any more, or once that cannot be found out.
-        interrupt: told what was raised, once.
+        raise_if_cancelled: raises if the work is cancelled, or if that cannot be determined.
+        interrupt: called once with the exception that was raised.
     """
     is_over = threading.Event()
 
@@ -29,7 +29,8 @@ def interrupting(raise_if_cancelled: Callable[[], None], interrupt: Callable[[Ex
                 interrupt(why)
                 return
 
-    # A daemon, not joined for long: a disk that hangs may hold it for ever, and must hold nothing else.
+    # Use a daemon thread with a short join, because a disk that hangs may block it for ever and must block nothing
+    # else.
     thread = threading.Thread(target=look, name="capture lookout", daemon=True)
     thread.start()
     try:

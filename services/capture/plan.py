@@ -1,11 +1,11 @@
-"""What will be exposed, decided before anything is lit. Pure: a rig and its lights in, frames out.
+"""Plan of all exposures, made before any light is on by a pure function of the rig and its number of lights.
 
 ::
 
     black ... black | tracking | light 0 ... light k-1 | tracking | light k ... | tracking
 
-A tracking frame has all lights on at 1/lights of the level, so that it is as bright as the mean single light and costs
-no more dose. The subject's motion is measured between tracking frames, whose light does not change.
+A tracking frame has all lights on at 1/lights of the level, so that it is as bright as the mean frame of a single light
+and costs no more dose. The subject's motion is measured between tracking frames, because they all have the same light.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from services.core.geometry import Record
 from services.core.records import MAX_ON_TIME_S, RigSpec
 
 MAX_BLACK_FRAMES = 1000
-"""Their mean then has 3 % of one frame's noise."""
+"""Largest number of black frames; their mean then has 3 % of one frame's noise."""
 GLIMPSE_S = 0.005
-"""How long a preflight lights each light to see that it emits."""
+"""Time for which a preflight switches on each light to check that it emits, seconds."""
 
 
 class PlannedFrame(Record):
@@ -39,14 +39,15 @@ class PlannedFrame(Record):
 
 
 def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
-    """The frames of one capture, in order.
+    """Plan the frames of one capture, in order.
 
     Args:
-        lights: lights to capture, indices 0 to lights - 1 of the dome.
+        rig: description of the rig.
+        lights: number of lights to capture, indices 0 to lights - 1 of the dome.
 
     Raises:
-        SettingsError: the level is below one register step, or an exposure is longer than a light may be on.
-            ExposureLimitError: the plan passes a dose limit.
+        SettingsError: the level is below one register step, an exposure is longer than a light may be on, or there are
+            too many black frames. ExposureLimitError: the plan exceeds a dose limit.
     """
     if rig.black_frames > MAX_BLACK_FRAMES:
         raise SettingsError(
@@ -65,15 +66,16 @@ def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
 
 
 def preflight_frames(plan: Sequence[PlannedFrame]) -> tuple[PlannedFrame, ...]:
-    """What a preflight lights: every light for a glimpse, then one whole frame, with all lights on where the plan has
-    such frames.
+    """Lit frames of a preflight: each light for ``GLIMPSE_S``, then one whole frame.
+
+    The whole frame is a tracking frame, or the plan's last frame if the plan has no tracking frames.
     """
     glimpses = (frame.model_copy(update={"on_s": GLIMPSE_S}) for frame in plan if frame.light is not None)
     return (*glimpses, next((frame for frame in plan if frame.kind == "tracking"), plan[-1]))
 
 
 def require_exposure(frames: Sequence[PlannedFrame], lights: int, rig: RigSpec) -> None:
-    """Raise ExposureLimitError where the planned dose passes a limit of the rig."""
+    """Raise ExposureLimitError if the planned dose exceeds a limit of the rig."""
     budget = ExposureBudget(rig.light_exposure_limit_s, rig.total_exposure_limit_s)
     for frame in frames:
         if frame.kind != "black":

@@ -1,4 +1,4 @@
-"""Checks in seconds, while the subject still sits there."""
+"""Checks that take seconds, made before a capture while the subject sits in the dome."""
 
 from __future__ import annotations
 
@@ -12,21 +12,26 @@ from services.core.errors import RigError
 from services.core.records import RigSpec
 
 BLACK_TOLERANCE = 0.005
+"""Largest deviation of a black frame's mean from the black level, as a fraction of full scale."""
 
 
 def preflight(
     plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec, raise_if_unwanted: Callable[[], None]
 ) -> tuple[str, ...]:
-    """Light every light for a moment, then expose one black and one lit frame.
+    """Switch on every light for a moment, then expose one black and one lit frame.
 
     Args:
-        raise_if_unwanted: called in the dark before every light and at the end; what it raises ends the preflight.
+        plan: planned frames of the capture.
+        dome: the dome. cameras: the cameras.
+        rig: description of the rig.
+        raise_if_unwanted: called in the dark before every light and at the end; an exception from it ends the
+            preflight.
 
     Returns:
-        Sentences about what the operator may want to correct; empty when all is well.
+        Sentences about settings that the operator may want to correct; empty if there are none.
 
     Raises:
-        RigError: a light does not emit what it should, or the black level is wrong by more than 0.5 % of full scale.
+        RigError: a light does not emit as commanded, or the black level is wrong by more than 0.5 % of full scale.
     """
     *glimpses, lit = preflight_frames(plan)
     for glimpse in glimpses:

@@ -1,6 +1,4 @@
-"""A rig ready to be used: what its files say, the frames planned for it, and its dome and cameras while they are
-open.
-"""
+"""A rig with checked input: its description, its planned frames, and access to its dome and cameras."""
 
 from __future__ import annotations
 
@@ -24,12 +22,19 @@ from services.core.records import FolderCapture, RigSpec, SimulatedCameraSpec
 from services.core.store import read_record
 
 MAX_MOTION_PX = 1000.0
-"""Far beyond what the preparation undoes."""
+"""Largest motion of the simulated subject, pixels; far beyond what the preparation can stabilise."""
 
 
 @dataclass(frozen=True)
 class PlannedRig:
-    """A rig whose input was checked; nothing is lit yet."""
+    """A rig with checked input and planned frames; no light is on yet.
+
+    Attributes:
+        spec: the rig's options.
+        description: cameras, lights and channels.
+        plan: frames of the capture, in order.
+        stills: images of the virtual mouth.
+    """
 
     spec: RigSpec
     description: FolderCapture
@@ -41,30 +46,31 @@ class PlannedRig:
         """Read the rig's calibration and plan its frames.
 
         Raises:
-            CaptureInputError: the mouth folder. SettingsError, ExposureLimitError: the plan cannot be.
+            CaptureInputError: the mouth folder is incomplete or contradictory. SettingsError, ExposureLimitError: the
+                frames cannot be planned.
         """
         description = _read_description(spec.mouth / "capture.json")
         _require_sensor(spec.simulation)
         lights = len(description.lights)
         plan = plan_capture(spec, lights)
-        # The preflight takes its part of the dose: without it the plan would end at the limit before its last frames.
+        # Count the preflight's dose too; otherwise a capture could reach the limit before its last frames.
         require_exposure((*preflight_frames(plan), *plan), lights, spec)
         return cls(spec, description, plan, Stills(spec.mouth, description))
 
     @property
     def lights(self) -> tuple[str, ...]:
-        """Names, by the dome's indices."""
+        """Names of the lights, by their indices in the dome."""
         return tuple(light.name for light in self.description.lights)
 
     @contextmanager
     def in_use(self, spent_s: dict[int, float] | None = None) -> Iterator[tuple[ModbusDome, Cameras]]:
-        """Dome and cameras, connected; dark at the end.
+        """Connect to the dome and the cameras for a block; the dome is dark at its end.
 
         Args:
-            spent_s: dose of each light so far, in level-seconds; what is emitted is added to it.
+            spent_s: dose of each light so far, in level-seconds; emitted light is added to it.
 
         Raises:
-            RigError: the dome does not answer, or has too few lights. SettingsError: its address cannot be.
+            RigError: the dome does not answer, or has too few lights. SettingsError: its address is invalid.
         """
         spec = self.spec
         with dome_address(spec.dome, len(self.lights), spec.watchdog_s) as (host, port):
@@ -101,10 +107,10 @@ class PlannedRig:
 
 
 def _require_sensor(sensor: SimulatedCameraSpec) -> None:
-    """Refuse a simulated sensor that no camera has.
+    """Refuse impossible options of a simulated sensor.
 
     Raises:
-        SettingsError: names the option.
+        SettingsError: an option is out of its range; the message names it.
     """
     full_scale = 2**sensor.bits - 1
     if not 0 <= sensor.black_level < full_scale / 2:

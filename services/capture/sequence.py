@@ -1,4 +1,4 @@
-"""Carry a plan out: light, settle, expose, read, dark, store."""
+"""Execution of a plan, frame by frame: light, settle, expose, read, dark, store."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from services.core.records import FrameRecord
 from services.core.stage import StageContext, StageEvent
 
 CLIPPED_FRACTION = 0.01
+"""Largest fraction of clipped pixels of a camera that is not reported."""
 
 
 def capture_frames(
@@ -29,10 +30,18 @@ def capture_frames(
 ) -> None:
     """Expose and store every planned frame that is not acknowledged yet.
 
-    The lights are dark between two frames: while storing, while looking for a cancel, and when anything raises.
+    The lights are dark between two frames: during storage, during the check for a cancel, and after any exception.
+
+    Args:
+        plan: all frames of the capture.
+        lights: names of the lights by index.
+        dome: the dome. cameras: the cameras.
+        settle_s: time between switching on a light and the exposure, seconds.
+        store: storage of the frames.
+        context: context of the stage.
 
     Raises:
-        JobCancelledError, RigError, StoreError: what was acknowledged is kept, and a later attempt goes on from it.
+        JobCancelledError, RigError, StoreError: acknowledged frames are kept, and a later attempt resumes after them.
     """
     missing = [frame for frame in plan if frame.index not in store.acknowledged]
     if len(missing) < len(plan):
@@ -79,7 +88,11 @@ def capture_frames(
 def expose(
     frame: PlannedFrame, dome: Dome, cameras: Cameras, settle_s: float
 ) -> tuple[Rgb, tuple[NDArray[np.uint16], ...]]:
-    """One exposure of all cameras; the dome is dark before and after. Returns the levels read back and the counts."""
+    """Make one exposure of all cameras; the dome is dark before and after.
+
+    Returns:
+        The levels read back, and the counts (height, width, channel) of each camera.
+    """
     try:
         cameras.arm(frame.exposure_s, frame.index)
         if frame.kind != "black":
@@ -87,7 +100,8 @@ def expose(
         dome.pause(settle_s)
         dome.trigger()
         images = cameras.read()
-        # The light must have lasted the exposure: a watchdog or strobe that ended it early makes the frame worthless.
+        # Check that the light lasted through the exposure: if a watchdog or strobe ended it early, the frame is
+        # worthless.
         readback = dome.confirm()
     finally:
         dome.dark()
@@ -104,5 +118,5 @@ def _clipping(images: Sequence[NDArray[np.uint16]], cameras: Cameras) -> str:
 
 
 def clipped_fraction(image: NDArray[np.uint16], bits: int) -> float:
-    """Fraction of pixels (height, width, channel) with a channel at the converter's end."""
+    """Fraction of an image's pixels (height, width, channel) with a channel at the converter's largest count."""
     return float((image >= 2**bits - 1).any(axis=-1).mean())

@@ -13,14 +13,14 @@ from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter
 
 PACKAGES = ("pymodbus",)
-"""What the extra ``capture`` brings."""
+"""Import names of the packages that the extra ``capture`` installs."""
 
 
 def check() -> None:
-    """Import what a capture needs.
+    """Import every module and package that a capture needs.
 
     Raises:
-        PlatformError: something is missing.
+        PlatformError: a package is missing.
     """
     require_packages(PACKAGES, "capture")
     importlib.import_module("services.capture.sequence")
@@ -29,11 +29,12 @@ def check() -> None:
 def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     """Capture with ``spec.rig`` and publish ``capture``; an interrupted capture of the same rig is resumed.
 
-    Everything that can be wrong with the input is found before a light is lit.
+    All checks of the input are made before a light is switched on.
 
     Raises:
-        SettingsError: no rig, or a level or address that cannot be. CaptureInputError, MeshError: the mouth folder.
-        RigError and its kinds: the dome or a camera; lights are dark. StoreError: the disk. JobCancelledError.
+        SettingsError: there is no rig, or a level or address is invalid. CaptureInputError, MeshError: the mouth folder
+            is incomplete or contradictory. RigError and its kinds: the dome or a camera failed; lights are dark.
+            StoreError: a frame cannot be stored. JobCancelledError: the job was cancelled.
     """
     from services.capture.frames import FrameStore, fingerprint
     from services.capture.lookout import interrupting
@@ -58,15 +59,15 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     )
     widths, heights = zip(*(camera.size for camera in description.cameras), strict=True)
     shape = (len(description.cameras), len(plan), max(heights), max(widths), len(description.channels))
-    # Where the dome is and how far it may go do not change a frame; everything else does.
+    # Leave the dome's address and limits out of the fingerprint, because they do not change a frame; all else does.
     pixels = spec.rig.model_dump(mode="json", exclude=set(LIMITS_OF_A_RIG))
     store = FrameStore(
         writer, shape, fingerprint(pixels, description.model_dump(mode="json"), rig.stills.peak_radiance)
     )
 
     with rig.in_use() as (dome, cameras), interrupting(context.raise_if_cancelled, dome.interrupt):
-        # The watchdog is armed from here on: an ALL OFF before it has left its cancel, one after it is refused light by
-        # the dome.
+        # Check for a cancel after the watchdog is armed. An ALL OFF before that moment has left a cancel; after a later
+        # ALL OFF the dome itself refuses light.
         context.raise_if_cancelled()
         for finding in preflight(plan, dome, cameras, spec.rig, context.raise_if_cancelled):
             context.report(StageEvent(stage="capture", kind="log", message=finding))

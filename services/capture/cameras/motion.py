@@ -1,4 +1,4 @@
-"""How the simulated subject moves: a slow drift with a little smooth warp, known exactly."""
+"""Motion of the simulated subject: a slow drift with a little smooth warp, known exactly."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 WARP_SHARE = 0.2
+"""Fraction of the largest displacement that the warp contributes; the drift contributes the rest."""
 SWAY_SHARE = 0.3
+"""Amplitude of the sway across the drift, as a fraction of the drift."""
 
 
 @dataclass(frozen=True)
 class SubjectMotion:
     """Displacement fields over the frames of one capture.
 
-    A frame shows the still at ``p + flow_px(p)``; the field is zero up to the reference frame, changes smoothly with
-    the frame's number, and never exceeds ``motion_px`` anywhere.
+    Pixel p of a frame shows the still image at ``p + flow_px(p)``. The field is zero up to the reference frame, changes
+    smoothly with the frame's number, and never exceeds ``motion_px`` anywhere.
 
     Attributes:
-        motion_px: bound of the displacement, pixels.
+        motion_px: upper bound of the displacement, pixels.
         reference: number of the first lit frame.
         last: number of the last frame.
-        seed: chooses directions.
+        seed: seed of the random directions and phases.
     """
 
     motion_px: float
@@ -32,14 +34,14 @@ class SubjectMotion:
     seed: int
 
     def flow_px(self, frame: int, camera: int, height: int, width: int) -> NDArray[np.float64]:
-        """Ground truth (height, width, 2): x and y displacement of each pixel against the still."""
+        """Ground truth (height, width, 2): x and y displacement of each pixel relative to the still image, pixels."""
         field = np.zeros((height, width, 2))
         if self.motion_px == 0 or frame <= self.reference:
             return field
         progress = (frame - self.reference) / max(self.last - self.reference, 1)
         direction, phase_x, phase_y = np.random.default_rng([self.seed, camera, 1]).uniform(0, 2 * math.pi, 3)
 
-        # Drift along one direction with a sway across it; the norm is at most 1.
+        # Drift along one direction with a sway across it; scale the norm to at most 1.
         along, across = math.sin(math.pi / 2 * progress), SWAY_SHARE * math.sin(2 * math.pi * progress)
         drift = np.array(
             [
@@ -49,7 +51,7 @@ class SubjectMotion:
         )
         drift /= math.hypot(1, SWAY_SHARE)
 
-        # One wave across the image bends it; the norm of (cos, cos)/√2 is at most 1.
+        # Warp by one wave across the image; the norm of (cos, cos)/√2 is at most 1.
         y, x = (np.arange(height)[:, None] + 0.5) / height, (np.arange(width)[None, :] + 0.5) / width
         warp = (
             along

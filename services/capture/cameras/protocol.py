@@ -1,4 +1,4 @@
-"""What the capture asks of its cameras."""
+"""Protocol of the cameras that a capture uses."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Cameras(Protocol):
         """Scene radiance of one count above black at level 1 and 1 s exposure."""
 
     def arm(self, exposure_s: float, frame: int) -> None:
-        """Make ready for one trigger; ``frame`` numbers the exposure in the plan."""
+        """Prepare for one trigger; ``frame`` is the exposure's number in the plan."""
 
     def read(self) -> tuple[NDArray[np.uint16], ...]:
-        """Wait for the exposure to end; counts (height, width, channel) of each camera.
+        """Wait for the exposure to end and return the counts (height, width, channel) of each camera.
 
         Raises:
             RigError: no trigger arrived, or a camera does not answer.

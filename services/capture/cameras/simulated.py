@@ -1,4 +1,4 @@
-"""Cameras that look at a virtual mouth, lit by what the dome really emits; and cameras that play images back."""
+"""Cameras that see a virtual mouth under the light that the dome really emits, and cameras that play back images."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from services.core.errors import RigError
 from services.core.records import RigSpec, SimulatedCameraSpec
 
 PEAK_FRACTION = 0.7
+"""Fraction of the range above black that the peak radiance reaches."""
 RGB_OF_CHANNEL = {"red": 0, "green": 1, "blue": 2, "r": 0, "g": 1, "b": 2}
+"""Index of the LED for each name of a channel."""
 
 
 class SensorModel:
-    """From radiance and light to counts.
+    """Sensor that converts radiance and light to counts.
 
     ``count = black + level * exposure_s * radiance / radiance_per_count + noise``, rounded and clipped to 0 ..
     2**bits - 1, with noise of variance ``(noise_relative * signal)² + (noise_floor * full scale)²``. The gain puts
@@ -37,7 +39,7 @@ class SensorModel:
         )
 
     def expose(self, radiance_s: NDArray[np.float32], noise_seed: Sequence[int] | None) -> NDArray[np.uint16]:
-        """Counts of an image of level x radiance x seconds; without a seed the sensor is free of noise."""
+        """Counts of an image of level × radiance × seconds; without a seed they have no noise."""
         signal = radiance_s / self.radiance_per_count
         if noise_seed is not None:
             deviation = np.hypot(self.spec.noise_relative * signal, self.spec.noise_floor * self.full_scale)
@@ -51,7 +53,7 @@ class SensorModel:
 
 
 class SimulatedCameras:
-    """``Cameras`` that see only what the dome's output registers say, over a read-only connection of their own.
+    """``Cameras`` that see only the light in the dome's output registers, over a read-only connection of their own.
 
     The subject's motion and the noise depend on the frame's number and not on the clock, so that a resumed capture
     equals an undisturbed one.
@@ -104,7 +106,7 @@ class SimulatedCameras:
         self._exposure_s, self._frame, self._triggers_before = exposure_s, frame, self._observer.trigger_count()
 
     def read(self) -> tuple[NDArray[np.uint16], ...]:
-        """See ``Cameras``: the light is observed at both ends of the exposure, and their mean is what was caught."""
+        """See ``Cameras``. The exposure's light is the mean of the levels observed at its start and at its end."""
         assert self._observer is not None
         if self._observer.trigger_count() == self._triggers_before:
             raise RigError(f"The cameras got no trigger for frame {self._frame}; check the trigger line.")
@@ -116,7 +118,7 @@ class SimulatedCameras:
     def _see(self, camera: int, levels: NDArray[np.float64]) -> NDArray[np.uint16]:
         height, width, channels = self._stills.shape(camera)
         radiance = np.zeros((height, width, channels), dtype=np.float32)
-        # A channel that is no primary sees the mean of the three LEDs.
+        # Give a channel that is not red, green or blue the mean of the three LEDs.
         weights = np.stack([levels.mean(axis=1) if rgb is None else levels[:, rgb] for rgb in self._rgb], axis=-1)
         for light in np.flatnonzero(weights[: len(self._stills.description.lights)].any(axis=1)):
             radiance += weights[light].astype(np.float32) * self._stills.still(camera, int(light))
@@ -125,7 +127,10 @@ class SimulatedCameras:
 
 
 class PlaybackCameras:
-    """``Cameras`` that play a folder's images for the planned lights, whatever the dome does: no motion, no noise."""
+    """``Cameras`` that play back a folder's images for the planned lights, without motion and noise.
+
+    They do not observe the dome.
+    """
 
     def __init__(
         self,

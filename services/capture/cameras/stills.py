@@ -1,4 +1,4 @@
-"""The images of a folder capture, as what a simulated or playback camera looks at."""
+"""The images of a folder capture, as the scene of simulated and playback cameras."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from services.core.records import FolderCapture
 
 
 class Stills:
-    """Linear images (height, width, channel) per camera and light of a folder capture; checked once, read when asked
-    for.
+    """Linear images (height, width, channel) of a folder capture, by camera and light; checked once, read on demand.
+
+    Attributes:
+        peak_radiance: largest radiance of all images, without the brightest thousandth of each one's pixels.
     """
 
     def __init__(self, folder: Path, description: FolderCapture) -> None:
@@ -44,7 +46,7 @@ class Stills:
         return height, width, len(self.description.channels)
 
     def _peak(self, camera: int, light: int) -> float:
-        # Of each image the brightest thousandth may saturate, as highlights do.
+        # Let the brightest thousandth of each image saturate, as highlights do.
         return float(np.quantile(self.still(camera, light).max(axis=-1), 0.999))
 
 

@@ -1,4 +1,4 @@
-"""Where a dome is."""
+"""Network address of a dome."""
 
 from __future__ import annotations
 
@@ -11,10 +11,15 @@ from services.core.records import SIMULATED_DOME
 
 @contextmanager
 def dome_address(address: str, lights: int, watchdog_s: float) -> Iterator[tuple[str, int]]:
-    """Host and port of a dome; 'simulated' starts one for the time of the block.
+    """Yield host and port of a dome; the address 'simulated' starts a simulated dome for the time of the block.
+
+    Args:
+        address: 'simulated' or host:port.
+        lights: number of lights of a simulated dome.
+        watchdog_s: watchdog period of a simulated dome at power-on, seconds.
 
     Raises:
-        SettingsError: neither 'simulated' nor host:port.
+        SettingsError: the address is neither 'simulated' nor host:port.
     """
     if address == SIMULATED_DOME:
         from services.capture.dome.simulator import simulated_dome

@@ -1,4 +1,4 @@
-"""ALL OFF: darkens a dome whoever drives it, without a driver."""
+"""ALL OFF: darkens a dome independently of the process that drives it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from services.capture.dome.modbus_link import LinkError, ModbusLink, NoReplyErro
 from services.core.dome import DomeStatus
 
 IDENTITY_TIMEOUT_S = 0.1
-"""How long ALL OFF waits to hear whether the device is a dome: one on a network of its own answers in milliseconds, and
-one that is late may be lit."""
+"""Time in seconds that ALL OFF waits for the answer whether the device is a dome. A dome on a network of its own
+answers in milliseconds, and one that is late may be lit."""
 
 
 def all_off(host: str, port: int) -> DomeStatus:
-    """Switch every light off, whoever drives the dome, and keep the supply open until a driver arms the watchdog anew.
+    """Switch off every light of a dome, and keep its supply relay open until a driver arms the watchdog anew.
+
+    It acts over a connection of its own, so no matter which process drives the dome.
 
     Raises:
         RigError: darkness could not be confirmed.

@@ -1,4 +1,4 @@
-"""What anybody may ask of a dome's controller without driving it: its state, and what it emits."""
+"""Read access to a dome's controller without driving the dome: its state and the light it emits."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from services.core.errors import RigError, RigUnreachableError
 
 REPLY_TIMEOUT_S = 0.5
 DARK_ATTEMPTS = 3
-"""How often a dome is told to go dark before a person is asked to cut its power."""
+"""Number of times that a dome is ordered to go dark before a person is asked to cut its power."""
 
 
 class OtherDeviceError(LinkError):
-    """What answers is no dome controller, and gets no write."""
+    """The device that answers is not a dome controller; nothing is written to it."""
 
 
 class DomeObserver:
-    """Read-only eyes on the dome's light, over a connection of their own; never feeds the watchdog."""
+    """Read-only observer of the dome's light, over a connection of its own; it never feeds the watchdog."""
 
     def __init__(self, host: str, port: int) -> None:
         self._link = ModbusLink(host, port, REPLY_TIMEOUT_S)
         self._lights = self._read(reg.LIGHT_COUNT)[0]
 
     def outputs(self) -> NDArray[np.float64]:
-        """What each LED emits now, (light, 3) as fraction of full scale."""
+        """Present output (light, 3) of each LED as a fraction of full scale."""
         return np.asarray(self._read(reg.OUTPUTS, 3 * self._lights), dtype=np.float64).reshape(-1, 3) / reg.FULL_SCALE
 
     def trigger_count(self) -> int:
@@ -35,7 +35,7 @@ class DomeObserver:
         return self._read(reg.TRIGGER_COUNT)[0]
 
     def faults(self) -> reg.FaultBit:
-        """Latched faults."""
+        """Faults that are latched in the controller."""
         return reg.FaultBit(self._read(reg.FAULTS)[0])
 
     def status(self) -> DomeStatus:
@@ -61,20 +61,20 @@ class DomeObserver:
 
 
 def require_dome(link: ModbusLink, *, repeated: bool = True) -> None:
-    """Ask a device whether it is a dome's controller; ``repeated`` asks again where it does not reply.
+    """Check that a device is a dome's controller; ``repeated`` asks again if it does not reply.
 
     Raises:
-        OtherDeviceError: it is something else. LinkError: it does not say.
+        OtherDeviceError: it is another device. LinkError: it does not answer the question.
     """
     if link.read(reg.IDENTITY, repeated=repeated)[0] != reg.IDENTITY_VALUE:
         raise OtherDeviceError(f"the device at {link.address} is no dome controller")
 
 
 def read_status(link: ModbusLink) -> DomeStatus:
-    """The controller's state, register by register.
+    """Read the controller's state, register by register.
 
     Raises:
-        LinkError: it cannot be read, or the device is no dome.
+        LinkError: the state cannot be read, or the device is not a dome.
     """
     require_dome(link)
     firmware, lights = link.read(reg.FIRMWARE)[0], min(link.read(reg.LIGHT_COUNT)[0], reg.MAX_LIGHTS)
@@ -96,10 +96,13 @@ def read_status(link: ModbusLink) -> DomeStatus:
 
 
 def error_kind(problem: Exception | None) -> type[RigError]:
-    """What a failure of the link is to whoever uses the dome: a controller that gives no reply may still be lit."""
+    """Class of the error that reports a failure of the link.
+
+    A missing reply has a class of its own, because such a dome may still be lit.
+    """
     return RigUnreachableError if isinstance(problem, NoReplyError) else RigError
 
 
 def fault_names(faults: reg.FaultBit) -> tuple[str, ...]:
-    """The latched faults in words."""
+    """Names of the latched faults in words."""
     return tuple(bit.name.lower().replace("_", " ") for bit in reg.FaultBit if bit in faults and bit.name)

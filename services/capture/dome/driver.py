@@ -1,16 +1,16 @@
-"""The dome over Modbus TCP. Safety first: there is a face in the dome.
+"""Driver of the dome over Modbus TCP. Safety comes first, because there is a face in the dome.
 
 * A light is on only between ``light`` and ``dark``; every exception, signal, cancel and process end goes through
   ``dark``.
 * The controller goes dark by itself when the keep-alive thread stops feeding its watchdog (a killed process), and when
-  a light has been on for its strobe time (a hung one).
-* Nothing is believed before it is read back, from the commanded levels and from the emitted ones.
-* ``interrupt`` darkens in mid-exposure, from another thread and over the keep-alive's connection; the driver lights
-  nothing after it.
-* ``all_off`` needs no driver and stops whichever there is: the controller then refuses light until a driver arms the
-  watchdog anew.
-* A device that says it is no dome gets no write. One that does not say what it is may be a dome under light, and is
-  switched off.
+  a light has been on for its strobe time (a process that hangs).
+* Every commanded light is read back and compared, both the commanded levels and the emitted ones.
+* ``interrupt`` darkens the dome during an exposure, from another thread and over the keep-alive's connection; the
+  driver switches on no light after it.
+* ``all_off`` needs no driver and stops any driver: the controller then refuses light until a driver arms the watchdog
+  anew.
+* Nothing is written to a device that identifies itself as another one. A device that does not identify itself may be a
+  dome with a light on, and is switched off.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ from services.core.dome import DomeStatus
 from services.core.errors import InterlockError, ReadbackError, RigError, RigStoppedError
 
 HANG_MARGIN_S = 2.0
+"""Time in seconds by which the controller's strobe exceeds the planned on-time of a light."""
 
 
 class ModbusDome:
-    """A ``Dome`` behind a Modbus TCP controller. Use as a context manager; see the module for what it guarantees."""
+    """A ``Dome`` behind a Modbus TCP controller. Use it as a context manager; the module lists its guarantees."""
 
     def __init__(self, host: str, port: int, budget: ExposureBudget, watchdog_s: float = 2.0) -> None:
         self.address = f"{host}:{port}"
@@ -85,14 +86,15 @@ class ModbusDome:
         self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            # An exception may have struck between a request and its answer: start from a clean connection.
+            # Start from a new connection, because an exception may have come between a request and its answer.
             if kind is not None:
                 self._link.close()
             self.dark()
             if self._why_interrupted is not None and isinstance(problem, RigError):
                 raise self._why_interrupted from problem
         except RigError:
-            # A light that may still burn matters more than a cancel; another rig error has said it already.
+            # Report that a light may still be on rather than a cancel; if another rig error is on its way, that one has
+            # reported it already.
             if not isinstance(problem, RigError):
                 raise
         finally:
@@ -103,7 +105,7 @@ class ModbusDome:
 
     @property
     def light_count(self) -> int:
-        """Lights fitted."""
+        """Number of lights fitted."""
         return self._light_count
 
     def light(self, index: int | None, level: float, on_s: float) -> Rgb:
@@ -123,10 +125,10 @@ class ModbusDome:
             strobe_ms = min(math.ceil(1000 * (on_s + HANG_MARGIN_S)), reg.FULL_SCALE)
             active = reg.ALL_LIGHTS if index is None else index
             self._lit = (lights, level, time.monotonic())
-            # Feeding here as well makes a light independent of when the thread last ran.
+            # Feed the watchdog here too, so that a light does not depend on when the thread last ran.
             with suppress(NoReplyError, WrongReplyError):
                 self._link.write(reg.KEEPALIVE, [1])
-            # Where the answer is lost or odd, the read-back decides whether the light was set; it is not sent again.
+            # Send the order once. If its answer is lost or wrong, the read-back decides whether the light was set.
             with suppress(NoReplyError, WrongReplyError):
                 self._link.write(reg.STROBE_MS, [strobe_ms, active, *[reg.level_word(level)] * 3])
             self._require_wanted()
@@ -149,7 +151,7 @@ class ModbusDome:
                 )
 
     def dark(self) -> None:
-        """Switch every light off and check it. All-off alone is repeated: it can only make things safer."""
+        """Switch off every light and check it. Only this order is repeated, because it can only make the dome safer."""
         problem: Exception | None = None
         for _ in range(DARK_ATTEMPTS):
             try:
@@ -163,7 +165,7 @@ class ModbusDome:
                 self._account()
                 return
             problem = LinkError(f"light {int(emitting[0])} still emits after all-off")
-        # Starving the watchdog opens the supply relay, the last thing this side can do.
+        # Stop feeding the watchdog as a last resort, which makes the controller open the supply relay.
         self._keepalive.stop()
         self._account()
         raise ReadbackError(
@@ -179,19 +181,20 @@ class ModbusDome:
 
     def interrupt(self, why: Exception) -> None:
         """Go dark at once, from any thread; see ``Dome.interrupt``."""
-        # The reason comes before the order, so that a light that the driver sends meanwhile is found unwanted after it
-        # was sent.
+        # Set the reason before the order, so that a light that the driver sends meanwhile is found unwanted afterwards.
         self._why_interrupted = why
         self._interrupted.set()
         with suppress(LinkError):
             self._keepalive.darken()
-        # Confirmed here too, as the driver's own thread may be held by a camera. Where it fails, the watchdog is
-        # starved.
+        # Confirm darkness here too, because the driver's own thread may be waiting for a camera. If this fails, the
+        # watchdog is no longer fed.
         with suppress(RigError):
             self.dark()
 
     def give_up(self) -> None:
-        """Go dark if that can be, and stop feeding the watchdog, from any thread: whoever drives gets no more light."""
+        """Go dark if possible and stop feeding the watchdog, so that the driver gets no further light; any thread may
+        call it.
+        """
         try:
             with suppress(RigError):
                 self.dark()
@@ -213,10 +216,10 @@ class ModbusDome:
                 self.dark()
                 is_dark = True
             if is_dark and self._why_interrupted is not None and isinstance(problem, (LinkError, RigError)):
-                # An interrupted light is dark, which is no fault of the dome.
+                # Report the interruption: a light that is dark because of it is not a fault of the dome.
                 raise self._why_interrupted from problem
             if isinstance(problem, LinkError):
-                # ALL OFF or an open interlock is why a controller refuses; say that rather than the code.
+                # Report ALL OFF or an open interlock as the cause of a refusal rather than the exception code.
                 if isinstance(problem, RefusedError):
                     with suppress(LinkError):
                         self._require_armed()
@@ -337,5 +340,5 @@ class ModbusDome:
 
 
 def _unwind(number: int, _frame: FrameType | None) -> None:
-    """Turn a deadly signal into an exception, so that every context manager between here and the top runs."""
+    """Turn a terminating signal into an exception, so that every context manager on the stack runs."""
     raise SystemExit(128 + number)

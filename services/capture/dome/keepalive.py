@@ -1,4 +1,4 @@
-"""The thread that tells the controller that the host is alive."""
+"""Thread that feeds the controller's watchdog while the host is alive."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from services.capture.dome.registers import ALL_OFF, KEEPALIVE
 from services.core.errors import RigError
 
 FEEDS_PER_WATCHDOG = 5
+"""Number of feeds in one watchdog period."""
 
 
 class KeepAlive:
-    """Feeds the watchdog from a thread, over its own connection, so that a slow transaction elsewhere does not starve
-    it.
-    """
+    """Thread that feeds the watchdog over its own connection, so that a slow transaction elsewhere cannot delay it."""
 
     def __init__(self, link: ModbusLink, watchdog_s: float) -> None:
         self._link = link
@@ -43,12 +42,12 @@ class KeepAlive:
         """Order all off over this connection, which no slow transaction of the driver holds.
 
         Raises:
-            LinkError: it may or may not have happened.
+            LinkError: the order may or may not have been carried out.
         """
         self._link.write(ALL_OFF, [1])
 
     def require_alive(self) -> None:
-        """Raise RigError when no feed has succeeded for a watchdog period."""
+        """Raise RigError if no feed has succeeded for a watchdog period."""
         if self._stop.is_set() or time.monotonic() > self._fed_at_s + self._watchdog_s:
             raise RigError(
                 f"The dome's watchdog is no longer fed ({self._problem or 'stopped'}); check the network and run again."

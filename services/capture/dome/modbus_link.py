@@ -1,8 +1,8 @@
-"""One Modbus TCP connection that is honest about what it does not know.
+"""Modbus TCP connection whose errors state whether a write may have been carried out.
 
-Facts about the library that shape it: a timeout leaves the connection open and a late answer in its buffer; its retries
-send a write again; it checks neither the request's length nor the echoed address. So every timeout closes the
-connection, reads alone are repeated, and lengths and echoes are checked here.
+Three properties of the library require this: a timeout leaves the connection open and a late answer in its buffer; its
+retries send a write again; and it checks neither the length of an answer nor the echoed address. So here every timeout
+closes the connection, only reads are repeated, and lengths and echoes are checked.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ UNIT = 1
 
 
 class LinkError(Exception):
-    """A transaction did not end as it should; the driver turns it into a RigError once the lights are dark."""
+    """A transaction failed; the driver turns it into a RigError once the lights are dark."""
 
 
 class NoReplyError(LinkError):
-    """Nothing came back in time: a write may or may not have happened."""
+    """No answer came in time: a write may or may not have been carried out."""
 
 
 class RefusedError(LinkError):
-    """The controller answered with an exception code: a write has not happened."""
+    """The controller answered with an exception code: a write has not been carried out."""
 
 
 class WrongReplyError(LinkError):
-    """The answer does not belong to the question: a write may or may not have happened."""
+    """The answer does not match the request: a write may or may not have been carried out."""
 
 
 class ModbusLink:
-    """Registers of one controller, one transaction at a time, from any thread."""
+    """Access to one controller's registers, one transaction at a time, from any thread."""
 
     def __init__(self, host: str, port: int, timeout_s: float) -> None:
         self.address = f"{host}:{port}"
@@ -51,8 +51,12 @@ class ModbusLink:
         self._lock = threading.RLock()
 
     def read(self, register: Register, count: int | None = None, *, repeated: bool = True) -> list[int]:
-        """First ``count`` values of a register, in requests of at most 125; unless told not to, repeated once over a
-        new connection.
+        """Read the first ``count`` values of a register, in requests of at most 125 values.
+
+        With ``repeated`` a request without a valid answer is repeated once over a new connection.
+
+        Raises:
+            NoReplyError, RefusedError, WrongReplyError.
         """
         total = register.count if count is None else count
         values: list[int] = []
@@ -67,7 +71,9 @@ class ModbusLink:
         return values
 
     def write(self, register: Register, values: list[int]) -> None:
-        """Write from the register's first address on, running into the registers behind it; sent once, never repeated.
+        """Write values from the register's first address on; more values than it holds go to the registers after it.
+
+        Each request is sent once and never repeated.
 
         Raises:
             NoReplyError, RefusedError, WrongReplyError.

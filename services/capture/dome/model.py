@@ -1,12 +1,12 @@
-"""How the simulated controller behaves: registers in, light out, time given from outside, no I/O.
+"""Behaviour of the simulated controller: registers in, light out; time is given from outside, and there is no I/O.
 
 ::
 
     supply on  =  watchdog fed in time  and  no latched fault  and  interlock closed  and  emergency stop released
     output     =  level if supply on else 0
 
-A level that would light something while the supply is off is refused. When the watchdog runs out under light, every
-level becomes 0 and the fault is latched; in the dark it only opens the supply until the next feed.
+A level above 0 is refused while the supply is off. If the watchdog expires while a light is on, every level becomes 0
+and the fault is latched; if it expires in the dark, it only opens the supply until the next feed.
 """
 
 from __future__ import annotations
@@ -18,9 +18,13 @@ from services.capture.dome import registers as reg
 from services.capture.dome.registers import FaultBit, FaultKind, Register, Space
 
 ILLEGAL_VALUE = 3
+"""Modbus exception code of a value that is out of range."""
 DEVICE_FAILURE = 4
+"""Modbus exception code of a write that the device cannot carry out."""
 AMBIENT_DEGC = 24.0
+"""Temperature of a bank without current, degrees Celsius."""
 FULL_LED_MA = 350.0
+"""Current of one LED at full scale, mA."""
 
 
 @dataclass
@@ -34,7 +38,7 @@ class FaultOrder:
     address: int = 0
 
     def take(self, space: Space, address: int, count: int) -> FaultKind:
-        """The fault this request meets, if any, and one time less."""
+        """Return the fault for this request, NONE if there is none, and count it."""
         meant = self.space == reg.ANY_SPACE or (
             self.space == reg.SPACE_CODE[space] and address <= self.address < address + count
         )
@@ -71,7 +75,7 @@ class DomeModel:
         return self._now_s < self._fed_until_s and not self._latched
 
     def advance(self, now_s: float) -> None:
-        """Let time pass: strobe, watchdog, interlock."""
+        """Advance the time and update strobe, watchdog and interlock."""
         self._now_s = now_s
         if now_s >= self._strobe_until_s:
             self._go_dark()
@@ -93,7 +97,7 @@ class DomeModel:
         return emitted
 
     def values(self, register: Register) -> list[int]:
-        """What a read of the register returns now."""
+        """Present values of a register."""
         if register.space == "holding":
             return self._held[register.name]
         if register.space == "coil":
@@ -114,7 +118,7 @@ class DomeModel:
         return sensors[register]()
 
     def write(self, space: str, address: int, values: list[int]) -> int:
-        """Carry out a write; returns a Modbus exception code, 0 for none. A refused write changes nothing."""
+        """Carry out a write and return a Modbus exception code, 0 for none. A refused write changes nothing."""
         held = {name: list(old) for name, old in self._held.items()}
         touched: set[str] = set()
         for register in (r for r in reg.TABLE if r.space == space):

@@ -1,4 +1,4 @@
-"""What the capture asks of a dome, and the exposure budget every dome keeps."""
+"""Protocol of the dome that a capture uses, and the exposure budget that every dome enforces."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ Rgb = tuple[int, int, int]
 
 
 class Dome(Protocol):
-    """A dome of lights around a face. Whatever raises, the lights are dark when the caller sees it."""
+    """A dome of lights around a face. When an exception reaches the caller, the lights are dark."""
 
     @property
     def light_count(self) -> int:
-        """Lights fitted."""
+        """Number of lights fitted."""
 
     def light(self, index: int | None, level: float, on_s: float) -> Rgb:
-        """Switch one light on, or all for None, every other off; returns the levels read back.
+        """Switch on one light, or all for None, and every other off; return the levels read back.
 
         Args:
+            index: index of the light; None for all lights.
             level: fraction of full scale, the same for R, G and B.
             on_s: planned on-time in seconds, counted against the exposure limits before anything is sent.
 
@@ -31,19 +32,22 @@ class Dome(Protocol):
         """
 
     def confirm(self) -> Rgb:
-        """Check that exactly the commanded light is emitting; returns the levels read back."""
+        """Check that exactly the commanded light is emitting; return the levels read back."""
 
     def trigger(self) -> None:
         """Pulse the cameras' trigger line."""
 
     def dark(self) -> None:
-        """Switch every light off and check it."""
+        """Switch off every light and check it."""
 
     def pause(self, seconds: float) -> None:
-        """Let time pass with the light as it is; raises what ``interrupt`` was given as soon as it is called."""
+        """Wait with the light unchanged; when ``interrupt`` is called meanwhile, raise its exception at once."""
 
     def interrupt(self, why: Exception) -> None:
-        """Go dark at once, called from any thread; whoever drives the dome gets no further light and meets ``why``."""
+        """Go dark at once; any thread may call it.
+
+        The thread that drives the dome gets no further light; its next call raises ``why``.
+        """
 
     def status(self) -> DomeStatus:
         """Read the controller's state."""
@@ -62,6 +66,11 @@ class ExposureBudget:
     """Light dose so far and its limits, in level-seconds: level (fraction of full scale) times on-time in seconds.
 
     Both limits follow from the rig's photobiological assessment (IEC 62471): radiance dose of one source, and of all.
+
+    Attributes:
+        light_limit_s: largest dose of one light.
+        total_limit_s: largest dose of all lights together.
+        spent_s: dose of each light so far, by its index.
     """
 
     light_limit_s: float
@@ -69,10 +78,10 @@ class ExposureBudget:
     spent_s: dict[int, float] = field(default_factory=dict)
 
     def require(self, lights: range, level: float, on_s: float) -> None:
-        """Refuse what would pass a limit.
+        """Refuse a dose that would exceed a limit.
 
         Raises:
-            ExposureLimitError: names the light, the dose and the limit.
+            ExposureLimitError: a limit would be exceeded; the message names the dose, the limit and the light.
         """
         dose_s = level * on_s
         worst = max(lights, key=lambda light: self.spent_s.get(light, 0.0))

@@ -1,7 +1,7 @@
-"""The dome controller's Modbus map: one typed table for driver, simulator and documentation.
+"""Modbus register map of the dome controller: one typed table for driver, simulator and documentation.
 
-Every level is 16 bit, 65535 being full scale. ``LEVELS`` is what was commanded, ``OUTPUTS`` what the LEDs emit once the
-supply relay, faults and watchdog have had their say; a light is confirmed only when both agree.
+Every level has 16 bits, and 65535 is full scale. ``LEVELS`` holds the commanded levels. ``OUTPUTS`` holds the levels
+that the LEDs emit after supply relay, faults and watchdog. A light is confirmed only when both agree.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class FaultBit(IntFlag):
 
 
 class FaultKind(IntEnum):
-    """What ``FAULT_ORDER`` makes the simulator do; a real controller has no such register."""
+    """Kinds of faults that ``FAULT_ORDER`` triggers in the simulator; a real controller has no such register."""
 
     NONE = 0
     DROP_REPLY = 1
@@ -57,10 +57,12 @@ class Register:
     """One named range of the map.
 
     Attributes:
+        name: of the register.
         space: Modbus data block; coil and holding can be written.
         address: first address, counted from zero as in the request.
-        count: addresses in the range.
-        unit: of each value; '1' for plain numbers.
+        count: number of addresses in the range.
+        unit: unit of each value; '1' for plain numbers.
+        meaning: text for the documentation.
     """
 
     name: str
@@ -72,7 +74,7 @@ class Register:
 
     @property
     def end(self) -> int:
-        """One past the last address."""
+        """Address after the last one."""
         return self.address + self.count
 
 
@@ -168,7 +170,7 @@ def level_word(level: float) -> int:
 
 
 def markdown_table() -> str:
-    """The map as docs/use/registers.md prints it."""
+    """The map as a Markdown table, as printed in docs/use/registers.md."""
     rows = ["| register | space | address | count | unit | meaning |", "|---|---|---|---|---|---|"]
     rows += [f"| {r.name} | {r.space} | {r.address} | {r.count} | {r.unit} | {r.meaning} |" for r in TABLE]
     return "\n".join(rows)

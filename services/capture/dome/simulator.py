@@ -1,7 +1,8 @@
-"""The simulated dome: a real Modbus TCP server around ``DomeModel``, with faults to order.
+"""The simulated dome: a real Modbus TCP server around ``DomeModel``, with faults on request.
 
-Faults are ordered through the register ``fault_order``, so that any process can, and nothing below the registers is
-faked. Run alone (``serve_dome``), or as a process of its own that ends with its parent (``simulated_dome``).
+Faults are requested through the register ``fault_order``, so that any process can do it, and everything below the
+registers is real. The server runs alone (``serve_dome``), or as a child process that ends with its parent
+(``simulated_dome``).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from services.capture.dome.registers import FaultKind, Space
 from services.core.errors import RigError
 
 START_TIMEOUT_S = 30.0
+"""Time that a simulated dome may take to start or to end, seconds."""
 _SPACES: dict[int, Space] = {
     **dict.fromkeys((1, 5, 15), "coil"),
     2: "discrete",
@@ -40,13 +42,14 @@ def serve_dome(
     """Serve one simulated dome until SIGINT or SIGTERM.
 
     Args:
-        port: 0 picks a free one.
-        lights: RGB lights fitted, 1 to 155.
-        watchdog_s: watchdog period at power-on; a driver sets its own.
-        announce: told the address once requests are answered.
+        host: address to listen on.
+        port: port to listen on; 0 picks a free one.
+        lights: number of RGB lights fitted, 1 to 155.
+        watchdog_s: watchdog period at power-on, seconds; a driver sets its own.
+        announce: called with host and port once requests are answered.
 
     Raises:
-        RigError: the port cannot be opened, or no dome has so many lights.
+        RigError: the port cannot be opened, or the number of lights is out of range.
     """
     if not 1 <= lights <= reg.MAX_LIGHTS:
         raise RigError(
@@ -58,14 +61,14 @@ def serve_dome(
 
 @contextmanager
 def simulated_dome(lights: int, watchdog_s: float = 2.0, host: str = "127.0.0.1") -> Iterator[tuple[str, int]]:
-    """A simulated dome in a process of its own on a free port; yields its address. It ends when this process does."""
+    """Run a simulated dome in a child process on a free port and yield its address. It ends with this process."""
     command = [
         sys.executable,
         "-m",
         "services.capture.dome.simulator",
         json.dumps({"host": host, "lights": lights, "watchdog_s": watchdog_s}),
     ]
-    # A session of its own: Ctrl-C must reach the driver, which still needs the dome to go dark.
+    # Start a session of its own, so that Ctrl-C reaches only the driver, which still needs the dome to go dark.
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True) as process:  # noqa: S603
         assert process.stdin is not None
         assert process.stdout is not None
@@ -90,12 +93,17 @@ def simulated_dome(lights: int, watchdog_s: float = 2.0, host: str = "127.0.0.1"
 def order_fault(
     host: str, port: int, kind: FaultKind, argument: int = 0, times: int = 1, on: reg.Register | None = None
 ) -> None:
-    """Make the simulator at this address fail.
+    """Request a fault from the simulator at this address.
 
     Args:
-        argument: a light's index, milliseconds of a delay, or a Modbus exception code, by kind.
-        times: requests that meet it; faults of the machine itself stay until ``FaultKind.NONE``.
-        on: only requests that touch this register's first address.
+        host, port: address of the simulator.
+        kind: kind of the fault.
+        argument: a light's index, a delay in milliseconds, or a Modbus exception code, depending on the kind.
+        times: number of requests that are affected; faults of the dome itself stay until ``FaultKind.NONE``.
+        on: affect only requests that touch this register's first address; None for all requests.
+
+    Raises:
+        RigError: the simulator does not accept the order.
     """
     link = ModbusLink(host, port, timeout_s=2.0)
     place = [reg.ANY_SPACE, 0] if on is None else [reg.SPACE_CODE[on.space], on.address]
@@ -108,7 +116,9 @@ def order_fault(
 
 
 class _Shell:
-    """Puts the model behind pymodbus: refreshes the registers before every request, and spoils requests as ordered."""
+    """Adapter between the model and pymodbus: updates the registers before every request, and applies the ordered
+    faults.
+    """
 
     def __init__(self, model: DomeModel) -> None:
         self._model = model
@@ -123,7 +133,7 @@ class _Shell:
         registers: list[int],
         values: list[int] | list[bool] | None,
     ) -> ExcCodes | None:
-        """Called by pymodbus before each read and write."""
+        """Handle one read or write; pymodbus calls this first."""
         space, span = _SPACES[function], count if values is None else len(values)
         is_order = space == "holding" and address == reg.FAULT_ORDER.address
         fault = FaultKind.NONE if is_order else self._model.order.take(space, address, span)
@@ -144,7 +154,7 @@ class _Shell:
         return None
 
     def packet(self, sending: bool, data: bytes) -> bytes:
-        """Called by pymodbus with every packet on the wire."""
+        """Return a packet as it is or spoiled; pymodbus calls this with every packet on the wire."""
         if not sending or self._spoil_reply is FaultKind.NONE:
             return data
         spoil, self._spoil_reply = self._spoil_reply, FaultKind.NONE
@@ -194,13 +204,13 @@ async def _serve(
 
 
 class _Parent(asyncio.Protocol):
-    """Notices the parent's death: the pipe on standard input closes."""
+    """Watches for the parent's end, at which the pipe on standard input closes."""
 
     def __init__(self, stop: asyncio.Event) -> None:
         self._stop = stop
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
-        """End with the pipe."""
+        """Stop the server when the pipe closes."""
         self._stop.set()
 
 

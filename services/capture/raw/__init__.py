@@ -1,1 +1,1 @@
-"""Raw folders as captures: a description made from the names of the files."""
+"""Import of photographs as a raw folder, with a description made from the names of the files."""

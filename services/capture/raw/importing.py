@@ -1,6 +1,4 @@
-"""A folder of named files as a raw folder: ``raw.toml`` from their names and what the first file of each camera
-holds.
-"""
+"""Import of a folder of named files: ``raw.toml`` is written from their names and from some files of each camera."""
 
 from __future__ import annotations
 
@@ -26,13 +24,15 @@ from services.core.store import read_record, write_atomic
 
 IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
 DEPTHS = (8, 10, 12, 14, 16)
-"""Bits that analogue-to-digital converters of cameras have."""
+"""Numbers of bits of cameras' analogue-to-digital converters."""
 LOOKED_AT = 8
-"""Frames of a camera that are read to tell its bits."""
+"""Largest number of a camera's frames that are read to find its number of bits."""
 MIN_TRACKING = 4
-"""A smooth motion is followed from four frames on."""
+"""Smallest number of tracking frames from which a smooth motion can be followed."""
 MAX_NAMED = 5
+"""Largest number of lights that a sentence lists by name."""
 Entry = dict[str, Any]
+"""Keys and values of one table of ``raw.toml``."""
 _THINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "board": (
@@ -55,16 +55,16 @@ _THINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "chart": ("[[chart]]", 'name = "chart"', 'type = "colorchecker-24"', 'reference = "?.csv"'),
     }
 )
-"""What a person has to measure of each thing, as ``raw.toml`` asks for it."""
+"""Lines of ``raw.toml`` for each calibration target, with question marks for the values that a person must measure."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """What was made of a folder.
+    """Result of an import.
 
     Attributes:
-        folder: what ``raw.toml`` says now. missing: what a preparation lacks, or would be better with, one sentence
-            each.
+        folder: content of the ``raw.toml`` that was written.
+        missing: one sentence for each thing that a preparation lacks or would profit from.
     """
 
     folder: RawFolder
@@ -72,16 +72,17 @@ class Imported:
 
 
 def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, calibration: Path | None) -> Imported:
-    """Write ``root/raw.toml``.
+    """Write ``root/raw.toml`` from the names of the files in the folder.
 
     Args:
-        exposure_s: of files whose names say none.
-        mosaic: of cameras whose files hold one number a pixel, and do not tell themselves.
-        calibration: of the rig.
+        root: folder of the photographs.
+        exposure_s: exposure of files whose names do not give one.
+        mosaic: pattern of cameras whose files hold one number a pixel and do not state their pattern.
+        calibration: calibration of the rig.
 
     Raises:
-        CaptureInputError: there is a description already, no file can be understood, files of a camera differ, or the
-            calibration cannot be read; names the file.
+        CaptureInputError: a description exists already, no file's name can be interpreted, or a file or the calibration
+            cannot be read; the message names the file.
     """
     if (root / DESCRIPTION).exists():
         raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")
@@ -153,8 +154,8 @@ def _frame(one: NamedFrame, exposure_s: float | None) -> Entry:
 
 
 def _camera(root: Path, name: str, frames: Sequence[NamedFrame], mosaic: str | None) -> Entry:
-    """Size, bits, mosaic and channels of a camera, from some of its files."""
-    # Frames with the most light tell best how many bits there are.
+    """Entry of a camera with its size, bits, mosaic and channels, from some of its files."""
+    # Read the frames with the most light, because they use the most bits.
     bright = sorted(frames, key=lambda one: (one.kind == "black", -(one.exposure_s or 0) * one.gain))[:LOOKED_AT]
     decoded = [_decoded(root, one) for one in bright]
     first = decoded[0]
@@ -178,7 +179,7 @@ def _decoded(root: Path, frame: NamedFrame) -> Decoded:
 
 
 def _bits(images: Iterable[np.ndarray]) -> Entry:
-    """Bits and shift of whole numbers: low bits that are never set carry nothing."""
+    """Number of bits and shift of integer images; low bits that are never set are taken for padding."""
     used, most = 0, 0
     for values in images:
         used |= int(np.bitwise_or.reduce(values.ravel().astype(np.uint16)))
@@ -232,14 +233,14 @@ def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[st
 
 
 def _is_out_of_order(folder: RawFolder, camera: str) -> bool:
-    """Whether tracking frames stand in one block beside the lights, and no times say otherwise."""
+    """Whether all tracking frames come before or after all light frames, and a frame lacks its time."""
     own = [frame for frame in folder.frame if frame.camera == camera and frame.kind in {"light", "tracking"}]
     changes = sum(one.kind != other.kind for one, other in pairwise(own))
     return changes == 1 and any(frame.time_s is None for frame in own)
 
 
 def _of_a_scan(file: str, camera: str) -> bytes:
-    """Comments: a scan's entry and one landmark, to fill in."""
+    """Comment lines with the entry of a scan and of one landmark, to be filled in."""
     lines = ["", "[scan]", f'file = "{file}"', 'units = "mm"', 'jaw = "upper"', ""]
     lines += ["[[landmark]]", "tooth = ?", 'point = "edge"', "xyz_mm = [?, ?, ?]"]
     lines += [f'pixels = [{{camera = "{camera}", xy_px = [?, ?]}}]']
@@ -247,7 +248,7 @@ def _of_a_scan(file: str, camera: str) -> bytes:
 
 
 def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> bytes:
-    """Comments: things that frames show, with measures to fill in, and those frames."""
+    """Comment lines with the calibration targets that frames show, to be filled in, and with those frames."""
     shown = [one for one in frames if one.kind in THING_OF]
     templates = {kind: _THINGS[kind] for kind in dict.fromkeys(one.kind for one in shown)}
     lines = [line for template in templates.values() for line in ("", *template)]

@@ -1,7 +1,7 @@
-"""What the name of a photograph says: camera, kind or light, exposure, gain.
+"""Interpretation of a photograph's file name: camera, kind or light, exposure and gain.
 
-The parts of a path are parted by slashes, underscores and blanks. Parts that nothing else explains are the camera, then
-the light; numbers that follow are repetitions::
+The parts of a path are separated by slashes, underscores and blanks. The first part without another meaning is the
+camera, the second one the light; numbers that follow count repetitions::
 
     left_L07_0.05s.tif    left/black_50ms_2.png    right_tracking_003_1-20s.dng    left_flat_0.1s_gain4.npy
 """
@@ -38,9 +38,9 @@ KINDS: Mapping[str, FrameKind] = MappingProxyType(
         "colorchecker": "chart",
     }
 )
-"""Words by which laboratories call a kind of photograph, with an optional number behind."""
+"""Words that laboratories use for the kinds of photographs; a number may follow the word."""
 PLACED: frozenset[FrameKind] = frozenset({"board", "mirror-sphere", "white-sphere"})
-"""Kinds of photographs of a thing that is moved from place to place."""
+"""Kinds of photographs of a target that is moved from place to place."""
 _SECONDS = re.compile(r"(?:(\d+)-(\d+)|(\d+(?:\.\d+)?))(s|ms|us)")
 _GAIN = re.compile(r"gain(\d+(?:\.\d+)?)")
 _NUMBER = re.compile(r"\d+")
@@ -50,7 +50,7 @@ _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 @dataclass(frozen=True)
 class NamedFrame:
-    """A photograph by its name; what the name does not say is None."""
+    """A photograph as its name describes it; a value that the name does not give is None, and the gain 1."""
 
     file: str
     camera: str
@@ -59,11 +59,11 @@ class NamedFrame:
     exposure_s: float | None
     gain: float
     place: str | None = None
-    """Of a board or sphere: where it lay, as its word and number say."""
+    """Place of a board or sphere: the word and number in the name."""
 
 
 def named_frame(file: str) -> NamedFrame | str:
-    """What a name says, or the part of a sentence that says what it lacks."""
+    """Interpret a file name; if it lacks something, return a part of a sentence that says what."""
     pure = PurePosixPath(file)
     parts = [part for whole in (*pure.parent.parts, pure.stem) for part in re.split(r"[_ ]+", whole) if part]
     exposure_s, gain, kind, place = None, 1.0, None, None
