@@ -1,1 +1,1 @@
-"""Virtual mouths, subjects and rigs: what simulated cameras look at."""
+"""Virtual mouths, subjects and rigs: the scenes of simulated cameras."""

@@ -1,6 +1,4 @@
-"""The mouth of the demonstration: a virtual incisor, rendered once in a process of its own and kept for the jobs
-after.
-"""
+"""The mouth of the demonstration: a virtual incisor, rendered once in a child process and kept for later jobs."""
 
 from __future__ import annotations
 
@@ -17,24 +15,26 @@ from services.core.errors import CrashError
 from services.core.store import write_atomic
 
 OPTIONS: Mapping[str, str] = MappingProxyType({"pixel-mm": "0.5", "cameras": "3", "lights": "8", "samples": "8192"})
-"""Of ``dentine phantom``. With so many samples the images' own noise is 3 %, which is what the held-out error comes to;
-a quarter of them gives 6 %."""
+"""Options of ``dentine phantom``. With this number of samples the noise of the images is 3 %, and the held-out error is
+the same; a quarter of the samples gives 6 %."""
 NAME = "incisor-" + "-".join(f"{value}-{name}" for name, value in OPTIONS.items())
-"""Folder of this mouth among those that are kept: another one where the options change."""
+"""Name of this mouth's folder among the kept ones; it contains the options, so other options give another folder."""
 WATCH_S = 0.25
+"""Interval at which the rendering process is checked, seconds."""
 DESCRIPTION = "capture.json"
-"""Written last, so a folder that has it is whole."""
+"""Name of the file that is written last, so a folder that contains it is complete."""
 
 
 def make_demo_mouth(folder: Path, kept_in: Path | None, look: Callable[[float], None]) -> bool:
-    """Fill a folder with the mouth; returns whether it had to be rendered.
+    """Fill a folder with the mouth, and return whether it had to be rendered.
 
     Args:
-        kept_in: folder with mouths made earlier; None where none are kept.
-        look: called with the fraction done, several times a second; what it raises ends the rendering.
+        folder: folder to fill.
+        kept_in: folder of mouths that were made earlier; None to keep none.
+        look: called several times a second with the fraction done; an exception from it ends the rendering.
 
     Raises:
-        CrashError: the rendering process ended; the message ends with its last words.
+        CrashError: the rendering process failed; the message ends with the last line of its output.
     """
     kept = None if kept_in is None else kept_in / NAME
     if kept is not None and (kept / DESCRIPTION).is_file():
@@ -47,8 +47,8 @@ def make_demo_mouth(folder: Path, kept_in: Path | None, look: Callable[[float], 
 
 
 def _render(folder: Path, look: Callable[[float], None]) -> None:
-    # As a process: a kernel may hold the interpreter for seconds, in which the worker must answer its scheduler; and it
-    # can be ended in mid-kernel.
+    # Render in a child process, because a kernel may hold the interpreter for seconds, during which the worker must
+    # answer its scheduler, and because a process can be ended during a kernel.
     options = [part for name, value in OPTIONS.items() for part in (f"--{name}", value)]
     command = [sys.executable, "-m", "services", "phantom", "--out", str(folder), *options]
     words = folder.with_name(f"{folder.name}.words")
@@ -71,7 +71,8 @@ def _render(folder: Path, look: Callable[[float], None]) -> None:
 
 
 def _keep(folder: Path, kept: Path) -> None:
-    # By a rename, so that another job sees all of it or none; the slower of two jobs that rendered it finds it there.
+    # Publish by a rename, so that other jobs see either the whole mouth or nothing. If two jobs rendered it, the
+    # rename of the slower one fails and is ignored.
     draft = kept.with_name(f".{kept.name}.{folder.parent.name}")
     shutil.rmtree(draft, ignore_errors=True)
     shutil.copytree(folder, draft)

@@ -1,5 +1,5 @@
-"""A dome in front of the mouth: cameras near its rim, point lights over the hemisphere and a little behind the tooth's
-edge.
+"""A dome in front of the mouth: cameras near the front direction, point lights over the hemisphere and a little behind
+the tooth's edge.
 """
 
 from __future__ import annotations
@@ -10,22 +10,27 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Light, Mesh
 
 RADIUS_MM = 1000.0
+"""Distance of cameras and lights from the origin, mm."""
 WIDEST_LIGHT_DEG = 108.0
-"""Angle from the front of the last light: it grazes and reaches the tooth from behind its edge, which is what tells
-enamel's thickness."""
+"""Largest angle between a light and the front direction, degrees. Such a light grazes the tooth and reaches it from
+behind its edge; images under it determine the enamel's thickness."""
 INTENSITY = 1.0e6
-"""Radiant intensity that gives unit irradiance at the dome's radius."""
+"""Radiant intensity that gives unit irradiance at the dome's radius, with mm as the unit of length."""
 LED_WHITE = {"red": 1.0, "green": 1.0, "blue": 0.9}
+"""Relative intensity of each channel."""
 LED_SPREAD = 0.1
-"""Relative spread of single LEDs, which calibration has to know."""
+"""Relative half width of the LEDs' brightness, which a calibration has to measure."""
 MARGIN_PX = 2
+"""Margin around the meshes in an image, pixels."""
 
 
 def dome_cameras(count: int, pixel_mm: float, meshes: tuple[Mesh, ...]) -> tuple[Camera, ...]:
     """Cameras that frame the meshes, which lie at the origin in the canonical tooth frame.
 
     Args:
+        count: number of cameras.
         pixel_mm: size of a pixel at the origin.
+        meshes: surfaces that the images must contain.
     """
     azimuth = np.radians(np.linspace(-35, 35, count) if count > 1 else np.zeros(1))
     elevation = np.radians([(-8, 10, -8, 10)[k % 4] for k in range(count)])
@@ -53,7 +58,7 @@ def dome_lights(count: int, channels: tuple[str, ...], seed: int) -> tuple[Light
 
 
 def _aimed(azimuth: float, elevation: float) -> NDArray[np.float64]:
-    # Upper teeth hang down: the image's down axis is the occlusal one.
+    # Let the image's downward axis be the occlusal one, because upper teeth hang down.
     outward = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
     forward = -outward
     down = np.array([0.0, 0.0, 1.0]) - forward[2] * forward

@@ -1,4 +1,4 @@
-"""What every phantom writes: images with their variance, the capture's description, and media as known truth."""
+"""Files that every phantom writes: images with their variance, the capture's description, and the true media."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from services.core.store import write_atomic, write_record
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium
 
 CHANNELS = {1: ("green",), 3: ("red", "green", "blue")}
+"""Names of the channels by their number."""
 HELD_OUT_EVERY = 4
+"""Every light of this many is held out by default."""
 
 Renderer = Literal["engine", "mitsuba"]
 
@@ -31,10 +33,10 @@ def require_rig(
     boundary: Boundary,
     renderer: Renderer,
 ) -> None:
-    """Refuse what no phantom can be rendered with.
+    """Refuse options with which no phantom can be rendered.
 
     Raises:
-        InputError: names the option.
+        InputError: an option is impossible; the message names it.
     """
     if min(cameras, lights) < 1 or samples < 16 or not pixel_mm > 0:
         raise InputError(
@@ -50,8 +52,10 @@ def require_rig(
 
 
 def held_out_lights(lights: int, held_out: int | None) -> frozenset[int]:
-    """Which lights are kept from the fit: every fourth, or so many at even distances, neither the first nor the last
-    where there is a choice.
+    """Indices of the lights that are held out from the fit.
+
+    These are every fourth light if ``held_out`` is None. Otherwise they are ``held_out`` lights at even distances, if
+    possible without the first and the last one.
     """
     if held_out is None:
         return frozenset(range(HELD_OUT_EVERY - 1, lights, HELD_OUT_EVERY))
@@ -66,7 +70,13 @@ def write_images(
     variance: NDArray[np.float64],
     held_out: frozenset[int],
 ) -> list[ImageEntry]:
-    """Write ``<camera>_<light>.npy`` and its variance for images (L, H, W, C) of one camera."""
+    """Write ``<camera>_<light>.npy`` and its variance for the images (L, H, W, C) of one camera; return their entries.
+
+    Args:
+        out: folder of the capture.
+        mean, variance: (L, H, W, C), radiance and the variance of its estimate.
+        held_out: indices of the lights that are marked as held out.
+    """
     entries = []
     for n, light in enumerate(lights):
         stem = f"{camera.name}_{light.name}"
@@ -98,7 +108,7 @@ def write_description(
     images: list[ImageEntry],
     truth: dict[str, Any],
 ) -> None:
-    """Write ``truth.json``, then ``capture.json``, which makes the folder a capture."""
+    """Write ``truth.json`` and then ``capture.json``, whose presence makes the folder a capture."""
     write_atomic(out / "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
     write_record(
         out / "capture.json",
@@ -107,6 +117,6 @@ def write_description(
 
 
 def medium_truth(medium: Medium) -> dict[str, float]:
-    """A medium's parameters, and what similar media share."""
+    """A medium's parameters, its reduced scattering (1/mm) and its reduced albedo, by name."""
     fields = {field: float(getattr(medium, field)) for field in MEDIUM_FIELDS}
     return fields | {"sigma_s_reduced": medium.sigma_s_reduced, "alpha_reduced": medium.alpha_reduced}

@@ -1,4 +1,4 @@
-"""A virtual jaw: a folder capture of fourteen teeth with gums and the wall of the mouth, whose optics are known."""
+"""A virtual jaw: a folder capture of fourteen teeth with gums and the wall of the mouth, with known optics."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.tooth import IOR
 
 Painter = Callable[[Camera, int, int], Stack]
-"""One channel's images of a camera, given paths per pixel and a seed."""
+"""Function that renders one channel's images of a camera, given the paths per pixel and a seed."""
 SCAN_DENTIN = (0.3, 0.8)
-"""Range of the blend weights of a scanned tooth's dentin, whose true surface nobody has seen."""
+"""Range of the blend weights of a scanned tooth's dentin, whose true surface is unknown."""
 _DENTIN = 3
-"""Stream of random numbers beside those of the optics."""
+"""Stream of random numbers for dentin, different from those of the optics."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class JawSurfaces:
     gums: Mesh
     cavity: Mesh | None = None
     weights: dict[int, tuple[float, ...]] | None = None
-    """Blend weights of each dentin that was made up; None where all are known."""
+    """Blend weights of each tooth's assumed dentin, by FDI number; None if every dentin is known."""
     lips: Mesh | None = None
-    """Lips and a retractor before the teeth, which no scan shows."""
+    """Lips and a retractor in front of the teeth, which no scan shows."""
 
     @property
     def opaque(self) -> Mesh | None:
-        """All that reflects and lets no light in: the wall of the mouth, lips and retractor."""
+        """All opaque surfaces: the wall of the mouth, lips and retractor; None if there are none."""
         parts = [mesh for mesh in (self.cavity, self.lips) if mesh is not None]
         return joined(parts) if parts else None
 
     def recipe(self, lights: tuple[Light, ...], channel: int, boundary: Boundary) -> SceneRecipe:
-        """The scene for the project's engine; dentin stays as it is."""
+        """Scene of one channel for the project's engine, with fixed dentin."""
         surfaces = [
             ToothSurfaces(tooth.outer, None if tooth.dentin is None else DentinShape.known(tooth.dentin))
             for tooth in self.teeth
@@ -87,10 +87,11 @@ class JawSurfaces:
 
 
 def jaw_surfaces(subject: int | None = None, scan: Path | None = None) -> JawSurfaces:
-    """A subject's jaw, or a scanned one with made-up dentin, which has no wall behind it.
+    """Surfaces of a subject's jaw, or of a scanned jaw with assumed dentin and without the wall of the mouth.
 
     Args:
-        subject: None for the average; a number draws sizes and stances, of a scanned jaw the dentin alone.
+        subject: None for the average; a number draws sizes and stances, and for a scanned jaw only the dentin.
+        scan: labelled scan of a jaw; None for an average jaw.
 
     Raises:
         CaptureInputError: the scan cannot be read. MeshError: a part of it cannot be closed.
@@ -113,7 +114,7 @@ def jaw_surfaces(subject: int | None = None, scan: Path | None = None) -> JawSur
         try:
             shape = dentin_blend_shape(tooth.outer, frame, crown=upper_tooth(tooth.fdi % 10))
         except MeshError:
-            # A crown too thin for any dentin is enamel throughout.
+            # Make a crown that is too thin for any dentin of enamel alone.
             teeth.append(tooth)
             continue
         teeth.append(replace(tooth, dentin=Mesh(shape.vertices_mm(c), shape.base.faces)))
@@ -141,20 +142,23 @@ def write_jaw_phantom(
     ``truth.json`` with its optics.
 
     Args:
-        subject: whose sizes, stances and optics are drawn; None for the average.
-        scan: a labelled scan (.vtp or .ply) to take teeth and gums from.
+        out: folder to write.
+        subject: seed of a subject's sizes, stances and optics; None for the average.
+        scan: a labelled scan (.vtp or .ply) from which teeth and gums are taken; None for an average jaw.
         pixel_mm: size of a pixel in the jaw's middle.
-        held_out: how many lights are marked as held out; default every fourth.
+        cameras, lights: numbers of cameras and lights.
+        held_out: number of lights that are marked as held out; default every fourth.
         channels: 1 (green) or 3 (red, green, blue).
-        seed: of the rendering and of the lights' brightness.
+        boundary: model of the teeth's outer boundary.
+        seed: seed of the rendering and of the lights' brightness.
         samples: paths per pixel.
         renderer: the project's engine, or stock Mitsuba for boundary ``matched`` and teeth that do not overlap.
-        lips: put lips and a retractor before the teeth, which throw shadows; their surface, which a capture does not
-            know, is in ``truth_lips.ply``.
+        lips: put lips and a retractor in front of the teeth, which cast shadows. A capture does not contain their
+            surface; it is in ``truth_lips.ply``.
 
     Raises:
-        InputError: impossible combination of options. CaptureInputError: the scan cannot be read. MeshError: a surface
-            cannot bound a medium.
+        InputError: the combination of options is impossible. CaptureInputError: the scan cannot be read. MeshError: a
+            surface cannot bound a medium.
     """
     require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
     jaw, names = jaw_surfaces(subject, scan), CHANNELS[channels]
@@ -201,7 +205,7 @@ def write_jaw_meshes(out: Path, jaw: JawSurfaces) -> None:
 
 
 def jaw_truth(jaw: JawSurfaces, mouths: dict[str, Mouth], boundary: Boundary) -> dict[str, Any]:
-    """What ``truth.json`` says of the optics, by channel and FDI number."""
+    """True optics for ``truth.json``, by channel and FDI number."""
     return {
         "boundary": boundary,
         "ior": IOR if boundary == "thin" else 1.0,
@@ -222,7 +226,7 @@ def _channel_truth(jaw: JawSurfaces, mouth: Mouth) -> dict[str, Any]:
 
 
 def known_mouth(jaw: JawSurfaces, channel: str, subject: int | None) -> Mouth:
-    """A subject's media in one channel, in the order of the jaw's teeth."""
+    """True media of a subject in one channel, in the order of the jaw's teeth."""
     mouth = jaw_mouth([tooth.fdi for tooth in jaw.teeth], channel, subject)
     return mouth if jaw.opaque is not None else replace(mouth, reflectance=None)
 

@@ -1,5 +1,5 @@
-"""Known optics of a phantom jaw: each tooth's own media about the phantom tooth's, its gums, and the colour of the
-mouth's wall.
+"""Known optics of a phantom jaw: each tooth's media, drawn about those of the phantom tooth, the gums, and the
+reflectance of the mouth's wall.
 """
 
 from __future__ import annotations
@@ -14,26 +14,30 @@ from services.phantom.reflection import GUM_REFLECTANCE
 from services.phantom.tooth import TRUE_TISSUE
 
 GUMS_IOR = 1.33
+"""Refractive index of the gums."""
 GUMS_MEAN_COSINE = 0.8
-"""Generic soft tissue's is nearer to 0.9; images fix reduced scattering, and fewer scatters are cheaper."""
+"""Mean cosine of scattering in the gums. That of generic soft tissue is nearer to 0.9, but images determine only the
+reduced scattering, and fewer scattering events are cheaper."""
 GUMS_PER_MM = {"red": (1.39, 0.05), "green": (1.71, 1.2), "blue": (1.99, 0.6)}
-"""Reduced scattering and absorption of gums at 635, 540 and 480 nm: generic soft tissue (Jacques 2013) and a guess at
-its blood."""
+"""Reduced scattering and absorption of gums, 1/mm, at 635, 540 and 480 nm: generic soft tissue (Jacques 2013) with an
+assumed content of blood."""
 
 SIGMA_SPREAD, ABSORPTION_SPREAD, COSINE_SPREAD = 0.15, 0.30, 0.02
-"""Half widths of uniform draws about the phantom tooth: relative, relative, absolute. Reduced scattering stays within
-the literature's spread."""
+"""Half widths of uniform draws about the phantom tooth's media: extinction (relative), absorption (relative), mean
+cosine (absolute). Reduced scattering stays within the literature's spread."""
 REFLECTANCE_SPREAD = 0.2
+"""Relative half width of the uniform draw of the wall's reflectance."""
 _GUMS, _CAVITY = 1, 2
-"""Streams of random numbers beside the teeth's, which are their FDI numbers."""
+"""Streams of random numbers for gums and wall; a tooth's stream is its FDI number."""
 
 
 def jaw_mouth(fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
-    """Media of a subject's teeth, gums and wall in one channel; what differs between subjects is drawn alike for all
-    channels.
+    """Media of a subject's teeth, gums and wall in one channel; the random deviations are the same in all channels.
 
     Args:
-        subject: None for the same average in every tooth.
+        fdi: FDI numbers of the teeth.
+        channel: name of the channel.
+        subject: seed of the subject; None for the average in every tooth.
     """
     average = TRUE_TISSUE[channel]
     teeth = []
@@ -47,7 +51,7 @@ def jaw_mouth(fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
 
 
 def gums_medium(channel: str) -> Medium:
-    """Average gums."""
+    """Medium of average gums in one channel."""
     reduced, absorption = GUMS_PER_MM[channel]
     scattering = reduced / (1 - GUMS_MEAN_COSINE)
     return Medium(scattering + absorption, scattering / (scattering + absorption), g1=GUMS_MEAN_COSINE)

@@ -1,4 +1,4 @@
-"""Lips held open by a retractor, which stand before a virtual jaw: what throws shadows on it that no scan explains."""
+"""Lips held open by a retractor in front of a virtual jaw, which cast shadows that no scan explains."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from services.core.geometry import Mesh
 
 FloatArray = NDArray[np.float64]
 LIP_RADIUS_MM = 5.0
-"""Half the thickness of a lip that is pulled outwards."""
+"""Half the thickness of a lip that is pulled outwards, mm."""
 BOW_RADIUS_MM = 1.5
-"""Half the thickness of a retractor's bow."""
+"""Half the thickness of a retractor's bow, mm."""
 LIP_GAP_MM = 7.0
-"""From the front teeth to a lip's inner side: a retractor holds it about a finger's half width away."""
+"""Distance from the front teeth to a lip's inner side, mm: a retractor holds it about half a finger's width away."""
 OPENING_MM = (31.0, 19.0)
-"""Half width and half height of the opened mouth along the lips' middle, as a retractor of the middle size holds it."""
+"""Half width and half height of the opened mouth along the lips' middle, mm, with a retractor of the middle size."""
 BOW_AT = 0.78
-"""Where the two bows cross the opening, as a fraction of its half width."""
+"""Distance from the middle at which each bow crosses the opening, as a fraction of its half width."""
 _AROUND, _ALONG = 16, 96
+"""Numbers of vertices around a tube and along the ring of the lips."""
 
 
 def lips_and_retractor(teeth: Sequence[Mesh]) -> Mesh:
-    """One surface (V, 3), mm: the ring of both lips and the two bows of a retractor, in the teeth's frame (y forward, z
-    towards the biting edge).
+    """Build the ring of both lips and the two bows of a retractor as one surface.
+
+    It lies in the frame of the teeth: y forward, z towards the biting edge, mm.
     """
     vertices = np.concatenate([tooth.vertices_mm for tooth in teeth])
     front = np.sort(vertices[:, 1])[-20:].mean()
@@ -43,7 +45,7 @@ def lips_and_retractor(teeth: Sequence[Mesh]) -> Mesh:
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """Several surfaces as one."""
+    """Join several surfaces to one mesh without changing their vertices."""
     offsets = np.cumsum([0, *(len(part.vertices_mm) for part in parts)])
     return Mesh(
         np.concatenate([part.vertices_mm for part in parts]),
@@ -52,16 +54,16 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def _lip_y(x: FloatArray, front: float) -> FloatArray:
-    """How far in front the lips' middle lies (mm): they follow the arch backwards towards the corners of the mouth."""
+    """Coordinate y (mm) of the lips' middle line, which follows the arch backwards to the corners of the mouth."""
     return front + LIP_GAP_MM + LIP_RADIUS_MM - 14.0 * (x / OPENING_MM[0]) ** 2
 
 
 def _tube(line: FloatArray, radius_mm: float, *, closed: bool) -> Mesh:
-    """A tube of round section about a line (N, 3) in which neighbours lie closer than its bends."""
+    """Tube of round section about a line (N, 3) whose points lie closer together than its radius of curvature."""
     ahead, behind = (np.roll(line, -1, axis=0), np.roll(line, 1, axis=0)) if closed else (line[1:], line[:-1])
     along = ahead - behind if closed else np.vstack([ahead - behind, (ahead - behind)[-1:]])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    # Both axes of each section are at right angles to the line; the forward axis is never along it here.
+    # Make both axes of each section perpendicular to the line; here the line is never parallel to the forward axis.
     forward = np.array([0.0, 1.0, 0.0]) - along[:, 1:2] * along
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     sideways = np.cross(along, forward)

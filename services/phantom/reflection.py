@@ -1,5 +1,5 @@
-"""Light that never enters the tooth: the enamel's glossy reflection and the gums' diffuse one, per camera and point
-light.
+"""Light that never enters the tooth: glossy reflection by the enamel and diffuse reflection by the gums, for each
+camera and point light.
 """
 
 from __future__ import annotations
@@ -15,28 +15,38 @@ from services.fit.transport.rays import RayScene, pixel_rays
 ROUGHNESS = 0.12
 """GGX roughness of wet enamel at the scale of a pixel."""
 SUBPIXELS = 4
+"""Number of rays along each side of a pixel."""
 GUM_REFLECTANCE = {"red": 0.50, "green": 0.24, "blue": 0.22}
+"""Diffuse reflectance of the gums by channel."""
 SHADOW_OFFSET_MM = 1e-3
+"""Distance along the normal by which shadow rays start above the surface, so that they do not hit it, mm."""
 
 
 @dataclass(frozen=True)
 class Reflection:
-    """Radiance (L, H, W, C) of one camera under each light, averaged over the pixel, and what share of a pixel shows
-    enamel.
-    """
+    """Reflected radiance in one camera under each light, averaged over each pixel, and the share of enamel in it."""
 
     highlight: NDArray[np.float64]
+    """(L, H, W, C): radiance reflected by the enamel's surface."""
     gums: NDArray[np.float64]
+    """(L, H, W, C): radiance reflected by the gums."""
     enamel_share: NDArray[np.float64]
-    """(H, W): of the pixel's rays that meet the tooth, the fraction not hidden by gums; 1 where none meets it."""
+    """(H, W): fraction of the pixel's rays towards the tooth that gums do not hide; 1 where no ray meets the tooth."""
     enamel_pixels: NDArray[np.bool_]
-    """(H, W) whether any ray of the pixel meets the tooth."""
+    """(H, W): whether any ray of the pixel meets the tooth, with gums ignored."""
 
 
 def reflect(
     outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light, ...], channels: tuple[str, ...], ior: float
 ) -> Reflection:
-    """Shade each pixel on a 4 × 4 grid of rays, with shadows by tooth and gums."""
+    """Shade each pixel on a 4 × 4 grid of rays, with shadows of tooth and gums.
+
+    Args:
+        outer: the tooth's outer surface.
+        gums: surface of the gums; None without gums.
+        camera: the camera. lights: point lights. channels: names of the channels.
+        ior: refractive index of enamel.
+    """
     width, height = camera.size
     normals_at = [_SmoothNormals(mesh) for mesh in (outer, gums) if mesh is not None]
     everything = RayScene(outer) if gums is None else RayScene(outer, gums)
@@ -88,8 +98,12 @@ def ggx_reflection(
     roughness: float,
     ior: float,
 ) -> NDArray[np.float64]:
-    """Reflection BRDF D F G / (4 |n·l| |n·v|) of a rough dielectric (Walter et al. 2007), 1/sr; all directions unit and
-    away from the surface.
+    """Reflection BRDF D F G / (4 |n·l| |n·v|) of a rough dielectric (Walter et al. 2007), 1/sr, with values (...).
+
+    Args:
+        normal, towards_light, towards_eye: (..., 3), unit directions that point away from the surface.
+        roughness: GGX roughness.
+        ior: refractive index.
     """
     half = towards_light + towards_eye
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
@@ -103,14 +117,14 @@ def ggx_reflection(
 
 
 def fresnel(cosine: NDArray[np.float64], ior: float) -> NDArray[np.float64]:
-    """Unpolarised reflectance from air onto a dielectric."""
+    """Unpolarised Fresnel reflectance of a dielectric in air at the given cosines of incidence."""
     inside = np.sqrt(1 - (1 - cosine**2) / ior**2)
     s, p = (cosine - ior * inside) / (cosine + ior * inside), (ior * cosine - inside) / (ior * cosine + inside)
     return np.asarray((s**2 + p**2) / 2)
 
 
 class _SmoothNormals:
-    # Area-weighted vertex normals, interpolated: a highlight shows every facet otherwise.
+    # Interpolates area-weighted vertex normals, because a highlight would show every facet otherwise.
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
         a, b, c = (mesh.vertices_mm[mesh.faces[:, k]] for k in range(3))

@@ -16,23 +16,23 @@ if TYPE_CHECKING:
     from services.fit.transport.engine import Engine
 
 Stack = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Radiance (L, H, W) and the variance of its mean."""
+"""Radiance (L, H, W) and the variance (L, H, W) of its estimate."""
 
 
 def render_engine(
     engine: Engine, tissue: Tissue | Mouth, camera: Camera, seen: NDArray[np.bool_], samples: int, seed: int
 ) -> Stack:
-    """All lights in one walk; pixels that are not ``seen`` (H, W) stay dark."""
+    """Render by the project's engine, all lights with the same paths; pixels that are not ``seen`` (H, W) stay dark."""
     pixels = np.argwhere(seen)[:, ::-1].astype(np.int32)
     estimate = engine.images(tissue, View(camera, pixels), samples=samples, seed=seed)
     images = np.zeros((2, len(engine.recipe.light_positions_mm), *seen.shape))
-    # Single estimates of almost no light may come out below zero; a photograph's cannot.
+    # Clip at zero: estimates of very little light may be negative, the values of a photograph cannot.
     images[:, :, pixels[:, 1], pixels[:, 0]] = np.maximum(estimate.mean, 0.0), estimate.variance
     return images[0], images[1]
 
 
 def render_mitsuba(scene: SceneDict, lights: tuple[Light, ...], channel: int, samples: int, seed: int) -> Stack:
-    """One light after the other, in place of the point light ``light`` of a scene with one camera."""
+    """Render a scene with one camera by stock Mitsuba; its point light ``light`` becomes each light in turn."""
     import mitsuba as mi
 
     from services.fit.export.mitsuba_scene import load_scene, render_batches

@@ -1,4 +1,4 @@
-"""The door of the phantoms: the stage that makes a demonstration's mouth."""
+"""The stage that makes the virtual mouth of a demonstration."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from services.phantom.demo import DESCRIPTION, make_demo_mouth
 
 
 def run(spec: JobSpec, context: StageContext) -> FolderCapture:
-    """Publish ``phantom/``, the virtual incisor that a demonstration's simulated rig looks at; ``spec.rig.mouth`` is
-    where such mouths are kept, if anywhere.
+    """Publish ``phantom/``, the virtual incisor that a demonstration's simulated rig photographs.
+
+    Finished mouths are kept in the folder ``spec.rig.mouth``, unless it is only the demonstration's placeholder.
 
     Raises:
-        CrashError: it could not be rendered. JobCancelledError: in mid-kernel.
+        CrashError: the incisor could not be rendered. JobCancelledError: the job was cancelled, also during a kernel.
     """
     done = -1.0
 

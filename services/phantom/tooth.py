@@ -1,4 +1,4 @@
-"""A virtual tooth: a folder capture with known optics, for tests, demonstrations and the simulated cameras."""
+"""A virtual tooth: a folder capture with known optics, for tests, demonstrations and simulated cameras."""
 
 from __future__ import annotations
 
@@ -37,15 +37,18 @@ from services.phantom.stain_paint import painted_stains
 from services.phantom.subjects import subject_tissues
 
 FDI = 11
-"""Of the procedural incisor."""
+"""FDI number of the procedural incisor."""
 FDI_NUMBERS = tuple(10 * quadrant + place for quadrant in range(1, 5) for place in range(1, 9))
+"""FDI numbers of all permanent teeth."""
 IOR = 1.631
+"""Refractive index of enamel."""
 TRUE_TISSUE = {
     "red": Tissue(Medium(4.2, 0.9980, g1=0.80), Medium(11.0, 0.9965, g1=0.75)),
     "green": Tissue(Medium(4.5, 0.9970, g1=0.80), Medium(12.0, 0.9945, g1=0.75)),
     "blue": Tissue(Medium(5.0, 0.9955, g1=0.80), Medium(13.0, 0.9905, g1=0.75)),
 }
-"""Absorption rises towards blue, dentin's faster: the yellow of teeth. Within the literature's spread."""
+"""True media by channel, within the literature's spread. Absorption increases towards blue, in dentin more than in
+enamel, which gives the yellow colour of teeth."""
 
 
 def write_phantom(
@@ -72,24 +75,28 @@ def write_phantom(
     optics.
 
     Args:
+        out: folder to write.
         pixel_mm: size of a pixel at the tooth.
+        cameras, lights: numbers of cameras and lights.
         channels: 1 (green) or 3 (red, green, blue).
+        boundary: model of the tooth's outer boundary.
+        seed: seed of the rendering, of the lights' brightness and of stains.
         samples: paths per pixel.
-        outer: another tooth's enamel surface, in the canonical frame (x mesial, y buccal, z occlusal) or near it;
+        outer: enamel surface of another tooth, in the canonical frame (x mesial, y buccal, z occlusal) or near it;
             default the procedural incisor.
-        dentin: its dentin surface, given with ``outer``.
-        fdi: its number, given with ``outer``; default ``FDI``.
+        dentin: dentin surface of the other tooth, given with ``outer``.
+        fdi: FDI number of the other tooth, given with ``outer``; default ``FDI``.
         renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
-        highlights: add the surface's reflection of each light; also written alone to
+        highlights: add the surface's reflection of each light; it is also written alone to
             ``highlights/<camera>_<light>.npy``.
-        gums: cover the root with gums, drawn as an opaque diffuse surface that exchanges no light with the tooth; also
+        gums: cover the root with gums, an opaque diffuse surface that exchanges no light with the tooth; it is also
             written as ``gums.ply``.
-        stains: paint stains on the enamel; also written as ``stains.npz``.
-        held_out: how many lights are marked as held out; default every fourth.
-        subject: seed of a random subject's optics; None for those of ``TRUE_TISSUE``.
+        stains: paint stains on the enamel; they are also written as ``stains.npz``.
+        held_out: number of lights that are marked as held out; default every fourth.
+        subject: seed of a random subject's optics; None for ``TRUE_TISSUE``.
 
     Raises:
-        InputError: impossible combination of options.
+        InputError: the combination of options is impossible.
     """
     _require_possible(boundary, outer, dentin, fdi, highlights, gums)
     require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
@@ -151,7 +158,7 @@ def _require_possible(
 
 
 def _tooth(outer: Path | None, dentin: Path | None, fdi: int) -> tuple[Tooth, Mesh]:
-    # Other people's meshes are moved to the origin: single precision is best there.
+    # Move foreign meshes to the origin, where single precision is most accurate.
     incisor = build_incisor()
     if outer is None:
         return Tooth(fdi, incisor.outer, incisor.dentin), incisor.gums
@@ -189,7 +196,7 @@ def _render(
     seed: int,
     painted: ToothStains | None = None,
 ) -> Stack:
-    """Light that was inside the tooth."""
+    """Render one channel's light that was inside the tooth, under each light."""
     prepare_device()
     if renderer == "mitsuba":
         from services.fit.export.mitsuba_scene import nested_scene

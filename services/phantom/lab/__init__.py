@@ -1,3 +1,1 @@
-"""A virtual laboratory: the raw frames that a rig would leave of a mouth and of its calibration, and the truth behind
-them.
-"""
+"""A virtual laboratory: the raw frames that a rig would take of a mouth and for its calibration, with their truth."""

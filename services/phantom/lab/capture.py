@@ -1,5 +1,5 @@
-"""The capture of a virtual laboratory's mouth: lights in turn, some frames with all of them, while the subject sways a
-little.
+"""Capture of a virtual laboratory's mouth: one light after the other, some frames with all lights, while the subject
+sways a little.
 """
 
 from __future__ import annotations
@@ -19,31 +19,34 @@ from services.phantom.lab.sensor import Sensor
 
 Floats = NDArray[np.float64]
 EXPOSURES_S = (0.02, 0.06)
-"""Of every light: the long one reaches full scale where a light stands in front, the short one nowhere."""
+"""Exposure times of every light, seconds. Under lights in front the long one reaches full scale, the short one never
+does."""
 TRACKING_S = 0.004
-"""With all lights on."""
+"""Exposure time of a tracking frame, with all lights on, seconds."""
 FRAME_S = 0.15
-"""From one frame to the next."""
+"""Time from one frame to the next, seconds."""
 SWAY_MM = (0.15, 0.1, 0.2)
-"""How far the jaw moves from where it was at first, at most about twice that, along x, y and z."""
+"""Amplitudes of the jaw's sway along x, y and z, mm. It begins at an extreme, so displacements reach twice this."""
 SWAY_S = 7.0
+"""Period of the sway along x, seconds; those along y and z are longer."""
 TRACKING_EVERY = 2
-"""Lights between two frames with all of them."""
+"""Number of lights between two tracking frames."""
 CLICK_PX = 1.0
-"""Standard deviation of an operator's click."""
+"""Standard deviation of an operator's click, pixels."""
 BLACKS, FLATS = 4, 2
+"""Numbers of black frames for each exposure time and of flat frames."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """One camera's images as a pinhole has them, and the way of its lens from them to photographs."""
+    """One camera's images as an ideal pinhole would see them, and their distortion by its lens."""
 
     camera: CalibratedCamera
     images: Floats
-    """(L, H, W, 3)"""
+    """Radiance (L, H, W, 3) under each light."""
 
     def through_lens(self, image: Floats, moved_px: Floats) -> Floats:
-        """An image (H, W, 3) behind the lens, of a mouth that has moved by some pixels (2,)."""
+        """Image (H, W, 3) behind the lens, of a mouth that has moved by ``moved_px`` (2,) pixels."""
         import cv2
 
         width, height = self.camera.size
@@ -56,7 +59,7 @@ class Shown:
 
 
 def sway_mm(time_s: float) -> Floats:
-    """Where the jaw is (3,) at a time of the capture; at its beginning it is at rest in the origin."""
+    """Displacement (3,) of the jaw at a time of the capture; at time 0 it is zero and at rest."""
     phase = 2 * np.pi * time_s / SWAY_S * np.array([1.0, 0.8, 0.6])
     return np.asarray(np.array(SWAY_MM) * (1 - np.cos(phase)))
 
@@ -67,13 +70,13 @@ def write_capture(
     """Write a raw folder of the mouth: its frames, its scan and the operator's clicks.
 
     Args:
-        root: to fill.
-        rig: the true one.
-        sensor: of all cameras.
-        mouth: what is photographed.
-        shown: each camera's images.
-        calibration: where ``raw.toml`` says that the calibration is.
-        seed: of noise and clicks.
+        root: folder to fill.
+        rig: the true rig.
+        sensor: sensor of all cameras.
+        mouth: the mouth that is photographed.
+        shown: images of each camera.
+        calibration: path of the calibration that ``raw.toml`` names.
+        seed: seed of noise and clicks.
     """
     random = np.random.default_rng([seed, 0xCA9])
     writer = RawWriter(root, rig, sensor, random)
@@ -111,8 +114,9 @@ def write_capture(
 
 
 def _seen_move(camera: CalibratedCamera, moved_mm: Floats) -> Floats:
-    """By how many pixels (2,) the middle of the teeth moves in a pinhole's image; at half a metre all of them move
-    alike.
+    """Displacement (2,) in pixels of the middle of the teeth in the pinhole image.
+
+    At half a metre all teeth move by about the same.
     """
     start, end = camera.project(np.stack([np.zeros(3), moved_mm]))[0]
     return np.asarray(end - start)

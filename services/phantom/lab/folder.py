@@ -1,4 +1,4 @@
-"""A raw folder as it is filled: frames one by one, then ``raw.toml``, which makes it whole."""
+"""Writer of a raw folder: frames one by one, and at the end ``raw.toml``, which completes the folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Entry = dict[str, Any]
 
 
 class RawWriter:
-    """Photographs radiance with a rig's cameras and lists the frames."""
+    """Writer that turns radiance into photographs of a rig's cameras and lists the frames."""
 
     def __init__(self, root: Path, rig: Calibration, sensor: Sensor, random: np.random.Generator) -> None:
         root.mkdir(parents=True, exist_ok=True)
@@ -31,10 +31,10 @@ class RawWriter:
         """Photograph an image (H, W, 3) and write it as NAME.npy.
 
         Args:
-            camera: its number.
-            name: of the file, behind the camera's.
-            radiance: as the lens throws it on the sensor.
-            exposure_s: of the frame.
+            camera: index of the camera.
+            name: name of the file, after that of the camera.
+            radiance: image on the sensor, behind the lens.
+            exposure_s: exposure time of the frame, seconds.
             told: further keys of the frame in ``raw.toml``.
         """
         taken = self.rig.cameras[camera]
@@ -43,7 +43,7 @@ class RawWriter:
         self._frames.append({"camera": taken.name, "file": file, "exposure_s": exposure_s, **told})
 
     def black(self, camera: int, exposures_s: Sequence[float], count: int) -> None:
-        """Photograph nothing some times with each exposure."""
+        """Take ``count`` black frames with each exposure time."""
         width, height = self.rig.cameras[camera].size
         for exposure_s in exposures_s:
             for number in range(count):

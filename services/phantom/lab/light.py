@@ -1,8 +1,8 @@
-"""What light comes from the mouth of a virtual laboratory to a camera, under each of its lights.
+"""Radiance from the mouth of a virtual laboratory to a camera, under each of its lights.
 
-The tooth that is measured is walked through by the engine, path by path. What stands around it only has to look like
-teeth, gums and lips, so it is shaded: no light passes between it and that tooth, which is what a fit of one tooth takes
-for granted.
+The tooth that is measured is rendered by the engine with path tracing. The surfaces around it only have to look like
+teeth, gums and lips, so they are shaded locally. No light passes between them and the measured tooth, as a fit of a
+single tooth assumes.
 """
 
 from __future__ import annotations
@@ -22,16 +22,18 @@ from services.phantom.render import render_engine
 
 Floats = NDArray[np.float64]
 SUBPIXELS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
+"""Positions x, y within a pixel at which rays are traced."""
 TOOTH, GUMS, LIP, DARK = (0.75, 0.66, 0.52), (0.50, 0.24, 0.22), (0.45, 0.28, 0.27), (0.01, 0.01, 0.01)
-"""Reflectances in red, green and blue of what is shaded, and of the dark of the mouth."""
+"""Reflectances in red, green and blue of the shaded surfaces, and of the dark interior of the mouth."""
 SMOOTHING_PX = 1.5
-"""Less than light spreads inside a tooth, and than the squares of pixels that a fit reads."""
+"""Standard deviation of the smoothing of rendered images, pixels. It is less than the spread of light inside a tooth,
+and less than the squares of pixels that a fit reads."""
 WRAP = 0.3
-"""By how much light wraps around a shaded tooth: scattering inside softens the border between light and dark."""
+"""Amount by which light wraps around a shaded tooth: scattering inside a tooth softens the edge of its own shadow."""
 
 
 class MouthLight:
-    """Radiance of a mouth in the cameras of a rig, each as a pinhole has it."""
+    """Radiance of a mouth in the cameras of a rig, as ideal pinhole cameras see it."""
 
     def __init__(self, mouth: LabMouth, lights: tuple[CalibratedLight, ...], tissues: dict[str, Tissue]) -> None:
         self._lights, self._tissues = lights, tissues
@@ -42,7 +44,7 @@ class MouthLight:
         self._wrap = np.array([*[WRAP] * len(outers), 0.0, 0.0, 0.0])
         tooth = mouth.fitted
         assert tooth.dentin is not None
-        # Images are linear in each light's intensity, so one scene serves all channels.
+        # Use one scene of unit intensities for all channels, because images are linear in each light's intensity.
         places, unit = np.array([light.position_mm for light in lights]), np.ones(len(lights))
         self._engine = Engine(single_tooth(tooth.outer, DentinShape.known(tooth.dentin), places, unit))
 
@@ -50,9 +52,9 @@ class MouthLight:
         """Radiance (L, H, W, 3) under each light, averaged over the pixels.
 
         Args:
-            camera: whose lens is left out.
-            samples: paths per pixel in green, of the fitted tooth; red and blue have a quarter of them.
-            seed: of the paths.
+            camera: the camera, whose lens distortion is left out.
+            samples: paths per pixel of the fitted tooth in green; red and blue get a quarter of them.
+            seed: seed of the paths.
         """
         drawn, shaded, visible, met = self._around(camera)
         share = np.where(met > 0, visible / np.maximum(met, 1), 0.0)
@@ -61,7 +63,7 @@ class MouthLight:
             own = render_engine(self._engine, self._tissues[name], camera, visible > 0, paths, seed)[0]
             intensity = np.array([light.intensity[channel] for light in self._lights])
             own = _smoothed(own * intensity[:, None, None], visible > 0, share)
-            # Its neighbours are as bright as the tooth itself, over all lights and pixels.
+            # Scale the shaded neighbours so that the tooth, shaded like them, has its rendered mean brightness.
             whole = visible == len(SUBPIXELS)
             like = own[:, whole].sum() / max(float(shaded[:, whole, channel].sum()), 1e-30)
             teeth, others = drawn[0][..., channel], drawn[1][..., channel]
@@ -71,8 +73,12 @@ class MouthLight:
     def _around(
         self, camera: CalibratedCamera
     ) -> tuple[tuple[Floats, Floats], Floats, NDArray[np.int64], NDArray[np.int64]]:
-        """Shaded neighbours and all else, the fitted tooth as if it were shaded (L, H, W, 3), and how many subpixels
-        see it and could.
+        """Shade everything by local illumination, without the engine.
+
+        Returns:
+            Radiance (L, H, W, 3) of the neighbouring teeth and of all other surfaces; that of the fitted tooth if it
+            were shaded too; and for each pixel (H, W) the number of subpixels that see the fitted tooth, and the number
+            that would see it without the surfaces in front of it.
         """
         width, height = camera.size
         neighbours, others, fitted = (np.zeros((len(self._lights), height * width, 3)) for _ in range(3))
@@ -102,10 +108,10 @@ class MouthLight:
 
 
 def _smoothed(images: Floats, seen: NDArray[np.bool_], share: Floats) -> Floats:
-    """Images (L, H, W) of a tooth, as much of each pixel as shows it, with the noise of single paths spread over
-    neighbours.
+    """Smooth the noise in images (L, H, W) of a tooth, and scale each pixel by the share (H, W) that shows the tooth.
 
-    A few hundred paths leave some pixels several times too bright, which would clip in a sensor as no light does.
+    With a few hundred paths some pixels come out several times too bright. A sensor would clip them, which real light
+    would not cause.
     """
     import cv2
 

@@ -1,8 +1,8 @@
-"""Makes a virtual laboratory once: two raw folders that hold all that a real one would have, and the truth in a third.
+"""Make a virtual laboratory: two raw folders as a real laboratory would have them, and a folder with the ground truth.
 
 LAB/session/   raw.toml and frames of boards, spheres, flat field and chart
-LAB/mouth/     raw.toml, frames of the mouth, scan.ply; its calibration is to be in LAB/calibration/
-LAB/truth/     calibration.json, teeth/11, lab.json: what the last comparison alone reads
+LAB/mouth/     raw.toml, frames of the mouth, scan.ply; its calibration is expected in LAB/calibration/
+LAB/truth/     calibration.json, teeth/11, lab.json: read only by the final comparison
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ LAB_RECORD = "lab.json"
 
 @dataclass(frozen=True)
 class LabSize:
-    """How large a laboratory is.
+    """Size of a laboratory.
 
     Attributes:
-        rig: images, cameras and lights.
-        boards, mirror, white: places of the board and of the spheres.
-        samples: paths per pixel of the tooth, in green.
+        rig: size of images, and numbers of cameras and lights.
+        boards, mirror, white: numbers of places of the board, the mirror sphere and the white sphere.
+        samples: paths per pixel of the tooth in green.
     """
 
     rig: RigSize
@@ -48,32 +48,32 @@ class LabSize:
 
 
 DEMO_SIZE = LabSize(RigSize((720, 520), 0.13, 3, 9), boards=10, mirror=5, white=2, samples=256)
-"""Of ``make lab-demo``: rendered once in some minutes on two cores."""
+"""Size for ``make lab-demo``, which is rendered in some minutes on two cores."""
 COARSE_SIZE = LabSize(RigSize((480, 352), 0.19, 3, 6), boards=7, mirror=4, white=1, samples=128)
-"""Shows that the steps fit together, and no more."""
+"""Smallest size, which only shows that all steps work together."""
 
 
 class LabRecord(Record):
-    """What a laboratory was made from; ``truth/lab.json``, written last, so a folder that has it is whole."""
+    """Content of ``truth/lab.json``, which is written last, so a folder that has it is complete."""
 
     recipe: str
-    """All options, by which a laboratory of others is known."""
+    """All options as text, by which a laboratory with other options is recognised."""
     world_from_scan: Matrix4
     world_from_session: Matrix4
-    """The session's frame is that of its first board."""
+    """Rigid transform from the session's frame, which is that of its first board."""
     media: dict[str, dict[str, dict[str, float]]]
-    """By channel, then enamel and dentin."""
+    """True media by channel, then by enamel and dentin."""
 
 
 def make_lab(root: Path, size: LabSize, subject: int, seed: int, tell: Callable[[str], None]) -> bool:
-    """Make a laboratory, unless the folder holds this one already; returns whether it was made.
+    """Make a laboratory, unless the folder contains it already, and return whether it was made.
 
     Args:
-        root: of the laboratory.
-        size: of it.
-        subject: whose teeth and optics.
-        seed: of everything that is drawn.
-        tell: is told each step as it begins.
+        root: folder of the laboratory.
+        size: size of the laboratory.
+        subject: seed of the subject's teeth and optics.
+        seed: seed of all other random numbers.
+        tell: called with the name of each step as it begins.
     """
     recipe = repr((size, subject, seed))
     kept = root / TRUTH / LAB_RECORD

@@ -19,23 +19,24 @@ from services.phantom.lips import lips_and_retractor
 
 Floats = NDArray[np.float64]
 PLACES = 3
-"""Teeth on each side of the midline."""
+"""Number of teeth on each side of the midline."""
 FITTED = 11
 """FDI number of the tooth whose optics are measured."""
 SCAN_NOISE_MM = 0.02
+"""Standard deviation of each coordinate of the scan, mm."""
 SCAN_TURN_RAD, SCAN_SHIFT_MM = 1.0, 30.0
-"""How far the scanner's frame lies from the mouth's, half widths."""
+"""Half widths of the uniform draws of rotation vector and translation between the scan's frame and the mouth's."""
 
 
 @dataclass(frozen=True)
 class LabMouth:
-    """Surfaces as they truly are, in the world of the rig, whose origin is the middle of the crowns.
+    """True surfaces in the world of the rig, whose origin is the middle of the crowns.
 
     Attributes:
-        teeth: from the patient's right to the left, with stubs of their roots, which end in the gums.
-        fitted: the one that is measured, with its dentin and its whole root.
-        gums, lips: what is around them.
-        scan: in the frame of its own.
+        teeth: teeth from the patient's right to the left, with root stubs that end in the gums.
+        fitted: the tooth that is measured, with its dentin and its whole root.
+        gums, lips: surfaces around the teeth.
+        scan: scan of the teeth in a frame of its own.
         world_from_scan: rigid transform (4, 4).
     """
 
@@ -51,8 +52,8 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
     """Build a mouth.
 
     Args:
-        subject: whose teeth; None for the average.
-        seed: of the scan's noise and frame.
+        subject: seed of the subject's teeth; None for the average.
+        seed: seed of the scan's noise and frame.
     """
     from scipy.spatial.transform import Rotation
 
@@ -84,15 +85,16 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
 
 
 def landmarks_mm(mouth: LabMouth) -> dict[tuple[int, str], Floats]:
-    """Points (3,) of the scan that an operator clicks on, by tooth and name: each tooth's lowest point, and the height
-    of its neck.
+    """Points (3,) of the scan that an operator clicks on, by tooth and name.
+
+    They are each tooth's most occlusal point ("edge") and the most apical point of its front at mid-width ("neck").
     """
     found = {}
     world = mouth.scan.mesh.vertices_mm @ mouth.world_from_scan[:3, :3].T + mouth.world_from_scan[:3, 3]
     for tooth in mouth.teeth:
         own = np.unique(mouth.scan.mesh.faces[mouth.scan.fdi == tooth.fdi])
         front = own[world[own, 1] > np.median(world[own, 1])]
-        # Along the tooth's middle, as the neck rises towards the neighbours.
+        # Look for the neck in the tooth's middle only, because it rises towards the neighbouring teeth.
         middle = front[np.abs(world[front, 0] - np.median(world[front, 0])) < 1.0]
         for name, vertex in (("edge", own[world[own, 2].argmax()]), ("neck", middle[world[middle, 2].argmin()])):
             found[tooth.fdi, name] = mouth.scan.mesh.vertices_mm[vertex]
@@ -100,12 +102,12 @@ def landmarks_mm(mouth: LabMouth) -> dict[tuple[int, str], Floats]:
 
 
 def write_scan(path: Path, mouth: LabMouth) -> None:
-    """Write the scan as a scanner's program exports it."""
+    """Write the scan in a format that scanning software exports, a labelled PLY."""
     write_labelled_ply(path, mouth.scan.mesh, mouth.scan.fdi)
 
 
 def _near(gums: Mesh, behind_mm: float) -> Mesh:
-    # Open behind the last teeth, where lips and cheeks would hide it.
+    # Cut off the gums behind the last teeth, where lips and cheeks would hide them.
     kept = gums.vertices_mm[gums.faces].mean(axis=1)[:, 1] > behind_mm
     return Mesh(gums.vertices_mm, gums.faces[kept])
 

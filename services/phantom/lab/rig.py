@@ -1,6 +1,4 @@
-"""The true rig of a virtual laboratory: cameras with their lenses, lights with their brightness, all a little off what
-was planned.
-"""
+"""The true rig of a virtual laboratory: cameras with lenses, and lights, all deviating a little from their plan."""
 
 from __future__ import annotations
 
@@ -17,32 +15,33 @@ from services.phantom.dome_rig import dome_cameras, dome_lights
 Floats = NDArray[np.float64]
 CHANNELS = ("red", "green", "blue")
 CAMERA_MM = 500.0
-"""From the teeth to each camera: near enough that boards tell focal length from distance."""
+"""Distance from the teeth to each camera, mm; short enough that boards distinguish focal length from distance."""
 LENS = (-0.35, 0.3, 0.001, -0.0006)
-"""Radial and tangential distortion as OpenCV has it: one or two pixels in the corners of an image of half a
+"""Radial and tangential distortion in OpenCV's order: one or two pixels in the corners of an image of half a
 megapixel."""
 OFF_CAMERA_MM, OFF_CAMERA_DEG, OFF_FOCAL, OFF_CENTRE_PX = 4.0, 0.5, 0.02, 6.0
-"""Standard deviations of a mounted camera from the plan: its place, its direction, its focal length and its principal
-point."""
+"""Standard deviations of a mounted camera from the plan: position (each coordinate), direction (each axis), focal
+length (relative) and principal point (each coordinate)."""
 OFF_LIGHT_MM, LIGHT_SPREAD = 8.0, 0.2
-"""Of a light's place, and of its brightness in each channel, relative."""
+"""Standard deviation of each coordinate of a light's position, and relative half width of the uniform draw of its
+brightness."""
 WHITE_COUNTS_PER_S = 1.3e5
-"""Of a white diffuser at a metre from a light of intensity 1, in a camera's green: 2600 counts in a fiftieth of a
-second."""
+"""Counts per second of a white diffuser at a metre from a light of intensity 1, in a camera's green channel: 2600
+counts in a fiftieth of a second."""
 RESPONSE = (0.8, 1.0, 0.7)
-"""Of a sensor in red, green and blue."""
+"""Relative response of a sensor in red, green and blue."""
 OFF_RESPONSE = 0.05
-"""Standard deviation between cameras and channels."""
+"""Relative standard deviation of the response between cameras and channels."""
 
 
 @dataclass(frozen=True)
 class RigSize:
-    """How large a rig's images are, and how many lights it has.
+    """Size of a rig's images, and its numbers of cameras and lights.
 
     Attributes:
         pixels: width and height of an image.
-        pixel_mm: edge of a pixel at the teeth.
-        cameras, lights: how many there are.
+        pixel_mm: size of a pixel at the teeth.
+        cameras, lights: numbers of cameras and lights.
     """
 
     pixels: tuple[int, int]
@@ -52,12 +51,12 @@ class RigSize:
 
 
 def true_rig(size: RigSize, sensor_black: float, seed: int) -> Calibration:
-    """Draw a rig about its plan; the world is the mouth's, whose teeth stand about the origin.
+    """Draw a rig that deviates randomly from its plan, in the frame of the mouth, whose teeth are at the origin.
 
     Args:
-        size: of images, and how many cameras and lights there are.
+        size: size of images, and numbers of cameras and lights.
         sensor_black: counts without light.
-        seed: of the draw.
+        seed: seed of the draw.
     """
     random = np.random.default_rng([seed, 0x716])
     planned = dome_cameras(size.cameras, 1.0, (Mesh(np.zeros((1, 3)), np.zeros((0, 3), dtype=np.int32)),))
@@ -65,7 +64,7 @@ def true_rig(size: RigSize, sensor_black: float, seed: int) -> Calibration:
     places = np.array([one.position_mm for one in dome_lights(size.lights, CHANNELS, seed)])
     places += random.normal(0, OFF_LIGHT_MM, places.shape)
     intensity = 1 + LIGHT_SPREAD * random.uniform(-1, 1, (size.lights, 1)) + 0.03 * random.normal(size=(size.lights, 3))
-    # The gauge of all calibrations: the mean of the lights' intensities is 1 in every channel.
+    # Apply the gauge of all calibrations: the mean of the lights' intensities is 1 in every channel.
     intensity /= intensity.mean(axis=0)
     lights = [
         CalibratedLight(name=f"L{n}", position_mm=tuple(place), intensity=tuple(own))
@@ -75,7 +74,7 @@ def true_rig(size: RigSize, sensor_black: float, seed: int) -> Calibration:
 
 
 def in_session_frame(rig: Calibration, world_from_session: Floats) -> Calibration:
-    """The same rig in the frame of a session's first board, as a calibration gives it."""
+    """Transform a rig to the frame of a session's first board, which is the frame of a calibration."""
     session_from_world = np.linalg.inv(world_from_session)
     cameras = tuple(
         one.model_copy(update={"camera_from_world": _rows(np.array(one.camera_from_world) @ world_from_session)})
@@ -99,7 +98,7 @@ def _camera(name: str, planned: Floats, size: RigSize, black: float, random: np.
     rotation = turn @ planned[:3, :3]
     centre = -planned[:3, :3].T @ planned[:3, 3]
     centre = CAMERA_MM * centre / np.linalg.norm(centre) + random.normal(0, OFF_CAMERA_MM, 3)
-    # Whoever mounts it turns it until the teeth are in the middle of the picture.
+    # Aim the camera at the teeth, as a person who mounts it would do.
     rotation = _aimed(rotation, -centre)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
@@ -113,7 +112,7 @@ def _camera(name: str, planned: Floats, size: RigSize, black: float, random: np.
             "K": ((focal, 0.0, middle[0]), (0.0, focal * (1 + 0.001 * random.normal()), middle[1]), (0.0, 0.0, 1.0)),
             "distortion": tuple(np.array(LENS) * random.uniform(0.7, 1.3, 4)),
             "camera_from_world": pose.tolist(),
-            # Radiance of the diffuser over its counts a second.
+            # Radiance of the diffuser divided by its counts per second.
             "radiance_per_count": (1 / (np.pi * 1e6) / response).tolist(),
             "black_counts": black,
         }
@@ -121,7 +120,7 @@ def _camera(name: str, planned: Floats, size: RigSize, black: float, random: np.
 
 
 def _aimed(rotation: Floats, forward: Floats) -> Floats:
-    """A camera's rotation with its line of sight turned along a direction, and about it by as little as can be."""
+    """Turn a camera's rotation (3, 3) so that it looks along a direction, and keep its x axis as near as possible."""
     z = forward / np.linalg.norm(forward)
     x = rotation[0] - (rotation[0] @ z) * z
     x /= np.linalg.norm(x)
@@ -129,26 +128,24 @@ def _aimed(rotation: Floats, forward: Floats) -> Floats:
 
 
 class Lens:
-    """Where a camera's pixels look, and where they lie in the image of a pinhole in its place; by OpenCV's own
-    formulas.
-    """
+    """Distortion of a camera's lens by OpenCV's formulas: pixels to undistorted pixels and rays, points to pixels."""
 
     def __init__(self, camera: CalibratedCamera) -> None:
         self.camera = camera
 
     def undistorted(self, pixels: Floats) -> Floats:
-        """Pixels (N, 2) of the photograph as a pinhole would have them."""
+        """Undistorted positions (N, 2) of pixels (N, 2) of the photograph."""
         import cv2
 
         K = np.array(self.camera.K)
-        K[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers.
+        K[:2, 2] -= 0.5  # because OpenCV's pixel centres are whole numbers
         until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
         points = (np.asarray(pixels, dtype=np.float64) - 0.5).reshape(-1, 1, 2)
         found = cv2.undistortPoints(points, K, np.array(self.camera.distortion), R=np.eye(3), P=K, criteria=until)
         return np.asarray(found.reshape(-1, 2) + 0.5)
 
     def seen(self, points_mm: Floats) -> Floats:
-        """Pixels (N, 2) of the photograph that show points (N, 3)."""
+        """Pixels (N, 2) of the photograph that show world points (N, 3)."""
         import cv2
 
         K, pose = np.array(self.camera.K), np.array(self.camera.camera_from_world)

@@ -1,8 +1,8 @@
-"""The whole root of a virtual laboratory's tooth: a phantom has a stub of it, as its gums hide the rest.
+"""The whole root of a virtual laboratory's tooth, in place of the stub that a phantom has because gums hide the rest.
 
-The engine renders the measured tooth alone, so light reaches what gums would cover. Through the end of a stub 4 mm
-above the neck, lights from above brightened or darkened the lower crown by 5 to 20 % against a root of its kind's
-length, which is what a registered scan's tooth has.
+The engine renders the measured tooth without gums, so light also reaches the root. With the end of a stub 4 mm above
+the neck, lights from above made the lower crown brighter or darker by 5 to 20 % than with a root of average length,
+which the tooth of a registered scan has.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from services.core.geometry import Mesh, Tooth
 
 Floats = NDArray[np.float64]
 TAPER = 0.4
-"""Width of the root's end to that at the cervical line."""
+"""Ratio of the root's width at its end to that at the cervical line."""
 
 
 def with_whole_root(tooth: JawTooth) -> Tooth:
-    """An upper tooth of a phantom, its stub stretched to the average length of its kind's root, enamel and dentin by
-    the same map.
+    """Stretch the root stub of a phantom's upper tooth to the average root length of its kind.
+
+    The same map is applied to enamel and dentin.
     """
     outer, dentin = (Mesh(_stretched(tooth, mesh.vertices_mm), mesh.faces) for mesh in (tooth.outer, tooth.dentin))
     return Tooth(tooth.fdi, outer, dentin)
@@ -33,6 +34,6 @@ def _stretched(tooth: JawTooth, points_mm: Floats) -> Floats:
     depth = np.maximum(tooth.cervix_mm - own[:, 2], 0.0) / ROOT_STUB_MM
     longer = root_length_mm(tooth.fdi % 10, is_upper=True) - ROOT_STUB_MM
     narrower = 1 + (TAPER / ROOT_TAPER - 1) * depth
-    # Evenly from the cervical line on, so that surfaces that lie in one another still do.
+    # Move points in proportion to their depth below the cervical line, so that nested surfaces stay nested.
     moved = np.stack([own[:, 0] * narrower, own[:, 1] * narrower, own[:, 2] - longer * depth], axis=1)
     return tooth.frame.world_from_canonical(moved)

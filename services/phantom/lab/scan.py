@@ -1,6 +1,4 @@
-"""A scan of a phantom jaw as a scanner gives it: one open labelled surface, cut off above the gums' base, with
-noise.
-"""
+"""Scan of a phantom jaw as a scanner gives it: one open labelled surface with noise, cut off above the gums' base."""
 
 from __future__ import annotations
 
@@ -15,17 +13,17 @@ from services.anatomy.templates.jaw import Jaw
 from services.core.geometry import Mesh, Tooth
 
 BELOW_CERVIX_MM = 4.0
-"""How much of the gums a scan shows beside the teeth."""
+"""Distance below the mean cervical line to which the scan shows the gums, mm."""
 
 
 def scan_of(jaw: Jaw, noise_mm: float = 0.02, seed: int = 0, places: int = 7) -> LabelledScan:
-    """In the jaw's frame.
+    """Scan a phantom jaw, in the jaw's frame.
 
     Args:
         jaw: the phantom.
         noise_mm: standard deviation of each coordinate.
-        seed: of the noise.
-        places: teeth from the midline that are scanned; the scan ends behind them.
+        seed: seed of the noise.
+        places: number of teeth on each side of the midline that are scanned; the scan ends behind them.
     """
     surfaces = separate(tuple(Tooth(tooth.fdi, tooth.outer) for tooth in jaw.teeth), jaw.gums)
     cervix = float(
@@ -38,13 +36,13 @@ def scan_of(jaw: Jaw, noise_mm: float = 0.02, seed: int = 0, places: int = 7) ->
     vertices = np.concatenate([mesh.vertices_mm for mesh, _ in parts])
     faces = np.concatenate([mesh.faces + start for (mesh, _), start in zip(parts, first, strict=False)])
     labels = np.repeat([label for _, label in parts], [len(mesh.faces) for mesh, _ in parts])
-    # Surfaces share their cut edges bit by bit, so equal vertices are one.
+    # Join equal vertices; this works because the surfaces share their cut edges bit for bit.
     joined, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces].astype(np.int32)
     kept = joined[faces][..., 2].min(axis=1) > cervix - BELOW_CERVIX_MM
     middles = {tooth.fdi: tooth.outer.vertices_mm.mean(axis=0) for tooth in jaw.teeth}
     if places < 7:
-        # Midway to the next tooth; who is behind is part of the gums no more.
+        # End the scan midway to the next tooth, and leave out all teeth behind.
         behind = np.mean([middles[10 * quadrant + places + k][1] for quadrant in (1, 2) for k in (0, 1)])
         near = joined[faces].mean(axis=1)[:, 1] > behind
         kept &= near & ((labels == 0) | (labels % 10 <= places))

@@ -1,4 +1,4 @@
-"""The sensor of a virtual camera: light becomes electrons behind a mosaic of filters, electrons become counts."""
+"""The sensor of a virtual camera: light becomes electrons behind a mosaic of filters, and electrons become counts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Sensor:
     """A sensor with shot noise, read noise and a black level.
 
     Attributes:
-        bits: of a count.
+        bits: number of bits of a count.
         black: counts without light.
         full_well: electrons at the largest count.
         read_electrons: standard deviation of the noise without light.
@@ -34,29 +34,36 @@ class Sensor:
 
     @property
     def full(self) -> int:
-        """The largest count."""
+        """Largest count."""
         return int(2**self.bits - 1)
 
     @property
     def counts_per_electron(self) -> float:
-        """At gain 1."""
+        """Counts per electron at gain 1."""
         return (self.full - self.black) / self.full_well
 
     def photograph(
         self, camera: CalibratedCamera, radiance: Floats, exposure_s: float, random: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """Counts (H, W) of an image of radiance (H, W, 3), or (H, W, 3) without a mosaic."""
+        """Counts (H, W) of an image of radiance (H, W, 3), or (H, W, 3) without a mosaic.
+
+        Args:
+            camera: camera with its ``radiance_per_count``.
+            radiance: image on the sensor.
+            exposure_s: exposure time, seconds.
+            random: generator of the noise.
+        """
         assert camera.radiance_per_count is not None
         through = self.filtered(radiance / np.array(camera.radiance_per_count))
         electrons = np.maximum(through, 0) * (exposure_s / self.counts_per_electron)
-        # Thousands of electrons scatter as a normal distribution does; in the dark the read noise is larger than the
-        # difference.
+        # Draw shot noise from a normal distribution, which approximates Poisson noise of thousands of electrons; in the
+        # dark the read noise is larger than the difference.
         noise = random.normal(size=electrons.shape) * np.sqrt(electrons + self.read_electrons**2)
         counts = self.black + (electrons + noise) * self.counts_per_electron
         return np.clip(np.rint(counts), 0, self.full).astype(np.uint16)
 
     def filtered(self, image: Floats) -> Floats:
-        """What the mosaic's filters let through (H, W) of an image (H, W, 3); all of it without a mosaic."""
+        """Light (H, W) of an image (H, W, 3) that passes the mosaic's filters; the image itself without a mosaic."""
         if self.mosaic == "none":
             return image
         through = np.empty(image.shape[:2])

@@ -1,8 +1,8 @@
-"""The calibration session of a virtual laboratory: boards, mirror and white spheres, an even source and a chart.
+"""The calibration session of a virtual laboratory: boards, mirror and white spheres, a uniform source and a chart.
 
-Everything is drawn ray by ray from its geometry: planes and spheres are met by the rays of the distorted lens, and a
-mirror's highlight lies where the law of reflection puts it. Nothing of the calibration's own code draws what it is to
-find.
+All images are computed ray by ray from the geometry: the rays of the distorted lens are intersected with planes and
+spheres, and a mirror's highlight follows from the law of reflection. No code of the calibration takes part, so that the
+calibration is tested independently.
 """
 
 from __future__ import annotations
@@ -21,35 +21,40 @@ from services.phantom.lab.sensor import Sensor
 Floats = NDArray[np.float64]
 BOARD = Board(name="plate", type="charuco", squares=(9, 7), square_mm=7, marker_mm=5, dictionary="DICT_5X5_100")
 TEXELS_PER_MM = 20
+"""Resolution of the board's print."""
 BLUR_MM = 0.08
-"""Of the board's print and the lens together, standard deviation."""
+"""Standard deviation of the blur by the board's print and the lens together, mm."""
 TILT_RAD, SHIFT_MM = 0.5, (14.0, 8.0, 15.0)
-"""How far the board is turned and moved from place to place at most."""
+"""Largest components of the board's rotation vector and of its displacement."""
 MIRROR_MM, WHITE_MM = 16.0, 14.0
-"""Radii of the spheres."""
+"""Radii of the mirror sphere and of the white sphere, mm."""
 REFLECTANCE = (0.92, 0.91, 0.90)
+"""Reflectance of the white sphere in red, green and blue."""
 PLACES = np.array(
     [[-1.0, 0.4, -1.0], [1.0, -0.6, -0.9], [-0.9, -0.8, 1.0], [1.0, 0.6, 1.0], [0.0, 1.4, 0.1], [0.0, -1.4, -0.1]]
 )
-"""Of the spheres' centres, in units of how far they may stand from the middle and still be seen whole."""
+"""Places (N, 3) of the spheres' centres, in units of the distance from the middle at which all of a sphere is seen."""
 MARGIN_MM, DEPTH_MM = 4.0, 10.0
-"""Around a sphere in the picture, and the unit along the cameras' line of sight."""
+"""Margin around a sphere in the picture, and largest unit of ``PLACES`` along the cameras' line of sight, mm."""
 WALL, BODY, GLINT = 0.25, 0.02, 1.5
-"""Radiance behind the spheres, of the mirror's own surface, and of its highlights, over that of a white diffuser."""
+"""Radiance of the wall behind the mirror sphere, of the mirror's own surface and of its highlights, relative to a white
+diffuser."""
 GLINT_PX = 1.6
 """Radius of a highlight: the LED's own image and the lens' blur."""
 NEUTRALS = (0.9, 0.59, 0.36, 0.19, 0.09, 0.032)
 """Reflectances of a chart's grey row."""
 XYZ_FROM_SENSOR = np.array([[0.62, 0.22, 0.12], [0.28, 0.70, 0.02], [0.03, 0.12, 0.68]])
+"""True matrix (3, 3) from the sensor's red, green and blue to XYZ."""
 CHART_CORNERS = np.array([[0.14, 0.2], [0.86, 0.2], [0.86, 0.8], [0.14, 0.8]])
 """Centres of the patches 1, 6, 24 and 19, as fractions of the image."""
 WHITE_RADIANCE = 1 / (np.pi * 1e6)
-"""Of a perfect diffuser at a metre from a light of intensity 1."""
+"""Radiance of a perfect diffuser at a metre from a light of intensity 1."""
 EXPOSURE_S = 0.02
+"""Exposure time of all frames, seconds."""
 
 
 class Session:
-    """Draws the frames of one session."""
+    """Renderer of the frames of one session."""
 
     def __init__(self, writer: RawWriter, random: np.random.Generator, n_places: int) -> None:
         self._writer = writer
@@ -60,7 +65,7 @@ class Session:
         self._texture = _board_texture()
 
     def _reach_mm(self) -> Floats:
-        """How far (3,) from the middle a sphere may stand."""
+        """Largest distances (3,) in mm of a sphere's centre from the middle, along x, y and z."""
         halves = [
             np.array(camera.size) / 2 * np.linalg.norm(np.array(camera.camera_from_world)[:3, 3]) / camera.K[0][0]
             for camera in self._writer.rig.cameras
@@ -69,7 +74,7 @@ class Session:
         return np.array([x, min(x, DEPTH_MM), z])
 
     def _place(self, random: np.random.Generator, *, is_first: bool) -> Floats:
-        """Pose (4, 4) world_from_board: the plate faces the cameras, which look along the world's −y."""
+        """Random pose (4, 4) world_from_board; the plate faces the cameras, which look along the world's −y."""
         from scipy.spatial.transform import Rotation
 
         facing = Rotation.from_euler("x", 90, degrees=True)
@@ -83,7 +88,7 @@ class Session:
         return pose
 
     def board(self, camera: int, place: int) -> None:
-        """The board at one place: each ray meets its plane at a point of the print."""
+        """Photograph the board at one place by intersecting each ray with its plane."""
         import cv2
 
         centre, rays = self._rays[camera]
@@ -98,14 +103,14 @@ class Session:
         self._writer.shoot(camera, f"board{place}", image, EXPOSURE_S, kind="board", board="plate", place=f"p{place}")
 
     def sphere(self, camera: int, place: int, light: int, kind: str) -> None:
-        """A mirror or a white sphere before a wall, under one light."""
+        """Photograph a mirror or white sphere in front of a wall, under one light."""
         taken, lamp = self._writer.rig.cameras[camera], self._writer.rig.lights[light]
         centre, rays = self._rays[camera]
         radius = MIRROR_MM if kind == "mirror" else WHITE_MM
         middle_mm = self.centres_mm[place]
         along = rays @ (middle_mm - centre)
         nearest = np.sqrt(np.maximum(((middle_mm - centre) ** 2).sum() - along**2, 0))
-        # A pixel at the edge shows as much of the sphere as a straight edge would cut off.
+        # Compute the fraction of each pixel that the sphere covers, with its outline taken as straight in a pixel.
         covered = np.clip(0.5 - (nearest - radius) / (along / taken.K[0][0]), 0, 1)[:, None]
         if kind == "mirror":
             body = np.full((len(rays), 3), BODY) + self._glint(camera, middle_mm, radius, np.array(lamp.position_mm))
@@ -123,13 +128,13 @@ class Session:
         self._writer.shoot(camera, f"{kind}{place}_{lamp.name}", image, EXPOSURE_S, kind=f"{kind}-sphere", **told)
 
     def _glint(self, camera: int, middle_mm: Floats, radius_mm: float, light_mm: Floats) -> Floats:
-        """Light (N, 1) of a highlight, none where it would lie at the outline."""
+        """Relative radiance (N, 1) of a highlight at all pixels; zero if the highlight would lie at the outline."""
         lens, eye = self._lenses[camera], self._rays[camera][0]
         normal = eye - middle_mm
         for _ in range(50):
             point = middle_mm + radius_mm * normal / np.linalg.norm(normal)
             to_eye, to_light = eye - point, light_mm - point
-            # Law of reflection: the normal halves the angle between eye and light.
+            # Apply the law of reflection: the normal bisects the angle between eye and light.
             normal = to_eye / np.linalg.norm(to_eye) + to_light / np.linalg.norm(to_light)
         normal /= np.linalg.norm(normal)
         width, height = lens.camera.size
@@ -141,14 +146,14 @@ class Session:
         return np.asarray(GLINT * np.exp(-off / (2 * GLINT_PX**2))).reshape(-1, 1)
 
     def flat(self, camera: int) -> None:
-        """An even source that fills the view."""
+        """Photograph a uniform source that fills the view."""
         width, height = self._writer.rig.cameras[camera].size
         for number in range(2):
             even = np.full((height, width, 3), 0.6 * WHITE_RADIANCE)
             self._writer.shoot(camera, f"flat{number}", even, EXPOSURE_S, kind="flat")
 
     def chart(self, camera: int, xyz: Floats) -> None:
-        """A chart of 24 patches that fills the middle."""
+        """Photograph a chart of 24 patches with the colours ``xyz`` (24, 3) that fills the middle of the view."""
         width, height = self._writer.rig.cameras[camera].size
         image = np.full((height, width, 3), 0.03)
         rgb = xyz @ np.linalg.inv(XYZ_FROM_SENSOR).T
@@ -168,8 +173,17 @@ class Session:
 def write_session(
     root: Path, rig: Calibration, sensor: Sensor, seed: int, *, n_boards: int, n_mirror: int, n_white: int
 ) -> Floats:
-    """Write a raw folder with all frames of a session; returns world_from_board (4, 4) of the first board, the
-    calibration's frame.
+    """Write a raw folder with all frames of a session.
+
+    Args:
+        root: folder to fill.
+        rig: the true rig.
+        sensor: sensor of all cameras.
+        seed: seed of noise, places and colours.
+        n_boards, n_mirror, n_white: numbers of places of the board and of the spheres.
+
+    Returns:
+        Pose (4, 4) world_from_board of the first board, whose frame is that of the calibration.
     """
     random = np.random.default_rng([seed, 0x5E5])
     writer = RawWriter(root, rig, sensor, random)
@@ -206,7 +220,7 @@ def write_session(
 
 
 def _board_texture() -> NDArray[np.float32]:
-    """The print, 0 to 1, by OpenCV's own drawing."""
+    """Image of the board's print, 0 to 1, drawn by OpenCV and blurred."""
     import cv2
 
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(BOARD.dictionary)))
