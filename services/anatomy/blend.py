@@ -1,13 +1,19 @@
 """Dentin as a blend shape made from the enamel's outer surface (teeth 2018 Eq. 5, Fig. 4).
 
-V = B0 + Σ c_m (B_m − B0). B0 is the outer surface offset 0.1 mm inward, the most dentin there can be. Enamel grows from
-nothing at the cervical line with about the square root of height (the micro-CT incisor's wall: 1.25 mm √s to 0.1 mm, s
-the height as a part of the crown's), and so do the walls' modes, which at the top thicken it to 1.8 mm. The buccal one
-moves dentin inward along its axis, where the tooth is thin 0.75 of the way to the middle at most, so that opposite
-walls never meet; the proximal one makes it narrower, most at its sides, which cannot fold it. At an edge or a cusp
-dentin ends lower rather than thinner: the third mode moves it down by 2 mm and less below. What a mode would move out
-of the crown, which is hollow behind and narrows downwards, is kept at the base's depth. Each V with 0 <= c <= 1 lies in
-a box whose corners are kept inside the enamel.
+V = B0 + Σ c_m (B_m − B0). The base B0 is the outer surface offset 0.1 mm inward, the largest possible dentin. The modes
+thicken the enamel:
+
+* The thickness of enamel grows from zero at the cervical line about with the square root of height (the wall of the
+  micro-CT incisor: 1.25 mm √s to within 0.1 mm, with s the height as a fraction of the crown's). The two modes of the
+  walls grow in the same way and thicken the enamel to 1.8 mm at the top.
+* The buccal mode moves dentin inward along the buccal axis. Where the tooth is thin it moves it at most 0.75 of the way
+  to the middle, so that opposite walls never meet.
+* The proximal mode makes dentin narrower, most at its sides, so that the surface cannot fold.
+* At an edge or a cusp dentin ends lower rather than becoming thinner: the occlusal mode lowers it to 2 mm below the
+  edge, and moves lower points by less.
+
+A vertex that a mode would move out of the crown, which is hollow at the back and narrows downwards, is kept at the
+base's depth. Every V with 0 <= c <= 1 lies in a box of displacements whose corners are kept inside the enamel.
 """
 
 from __future__ import annotations
@@ -30,38 +36,44 @@ MODES = ("buccal", "proximal", "occlusal")
 MODE_AXES = (1, 0, 2)
 """Axis of the canonical frame that each mode moves along."""
 BASE_DEPTH_MM = 0.1
+"""Depth of the base below the enamel's surface, mm."""
 FULL_DEPTH_MM = 1.8
-"""Of the walls' dentin at full weight and at the height of the edge."""
+"""Depth of the walls' dentin below the surface at full weight and at the height of the edge, mm."""
 FULL_DROP_MM = 2.0
-"""By which dentin ends below the edge or cusps at full weight."""
+"""Distance by which dentin ends below the edge or cusps at full weight, mm."""
 CLEARANCE_MM = 0.05
-"""Enamel that is left everywhere for any c, away from the base's own depth."""
+"""Smallest enamel thickness for any c, away from the base's own depth, mm."""
 CORNER_DEPTH_MM = 0.075
-"""Depth asked of each vertex's box at its corners: the clearance and half as much again for faces between vertices."""
+"""Smallest depth at the corners of each vertex's box, mm: the clearance and half as much again for the faces between
+vertices."""
 CREASE_MM = 0.03
-"""How much nearer to the enamel's surface a face's middle may come than its corners."""
+"""Distance by which a face's middle may come nearer to the enamel's surface than its corners, mm."""
 MIDDLE_FRACTION = 0.75
+"""Largest fraction of the way to the tooth's middle that the buccal mode moves dentin."""
 PROXIMAL_FRACTION = 0.48
-"""Of half the width at that height: below a half, what is further out stays further out."""
+"""Largest displacement of the proximal mode, as a fraction of half the width at the same height. Below one half, points
+keep their order from the middle outwards."""
 STEP_MM = 0.05
+"""Step of the walk towards the tooth's middle, mm."""
 UNFOLDING_ROUNDS = 12
-"""In which vertices of faces that turn over move less and less; what is left then are slivers."""
+"""Number of rounds in which the vertices of turned-over faces are moved less; faces that remain turned over are
+slivers."""
 CORNERS = np.stack(np.meshgrid(*[(0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
-"""Of the weights, but for the base's."""
+"""Corners (7, 3) of the box of weights, without that of the base."""
 SLICES = 20
-"""Of the tooth's height, in which its width is taken."""
+"""Number of slices of the tooth's height in which its width is measured."""
 
 
 def dentin_blend_shape(
     outer: Mesh, frame: ToothFrame | None = None, *, crown: ToothDimensions | None = None, faces: int = 4000
 ) -> DentinShape:
-    """Base 0.1 mm below the enamel's surface and three modes that thicken the enamel, in the coordinates of ``outer``.
+    """Build a base 0.1 mm below the enamel's surface and three modes that thicken the enamel, in ``outer``'s frame.
 
     Args:
         outer: watertight enamel surface, mm.
-        frame: the tooth's canonical frame; None when ``outer`` is in it.
-        crown: where its cervical line runs, by the average of its kind; None for a mesh that is all crown.
-        faces: about so many triangles for the dentin surface, whatever the enamel has.
+        frame: the tooth's canonical frame; None if ``outer`` is in it.
+        crown: average dimensions of the tooth's kind, which place the cervical line; None for a mesh that is all crown.
+        faces: approximate number of triangles of the dentin surface.
 
     Raises:
         MeshError: the mesh cannot bound a medium, or is too thin for any dentin.
@@ -104,8 +116,8 @@ def _kept_inside(points_mm: NDArray[np.float64], grid: SignedDistanceGrid) -> ND
 
 
 def _height(points_mm: NDArray[np.float64], crown: ToothDimensions | None) -> NDArray[np.float64]:
-    # Of points in the canonical frame's axes: 0 at the cervical line and on the root, 1 at the edge. The line rises on
-    # the proximal sides.
+    # Relative height (N,) of points in the canonical frame's axes: 0 at the cervical line and on the root, 1 at the
+    # edge. The line rises on the proximal sides.
     across, up = points_mm[:, 0], points_mm[:, 2]
     top, bottom = up.max(), np.full(len(up), up.min())
     if crown is not None:
@@ -116,8 +128,8 @@ def _height(points_mm: NDArray[np.float64], crown: ToothDimensions | None) -> ND
 
 
 def _side(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    # How far the proximal mode moves points in the canonical frame's axes: as the square of their place between the
-    # middle and the side.
+    # Displacement (N,) in mm of points in the canonical frame's axes by the proximal mode. It grows with the square of
+    # a point's relative distance from the middle.
     up, middle = points_mm[:, 2], np.median(points_mm[:, 0])
     across = points_mm[:, 0] - middle
     edges = np.linspace(up.min(), up.max(), SLICES + 1)
@@ -129,8 +141,8 @@ def _side(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces: int) -> Mesh:
-    # A surface net at the base's depth: closed by construction and evenly spaced, unlike the scan's own triangles moved
-    # inward.
+    # Extract a surface net at the base's depth, which is closed by construction and evenly spaced, unlike the scan's
+    # own triangles moved inward.
     corners = outer.vertices_mm[outer.faces]
     area = float(
         np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
@@ -146,7 +158,7 @@ def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces
             "The enamel mesh has no closed surface 0.1 mm below it; check its scale and that it is one solid tooth."
         )
 
-    # Exact projection to the depth; faces that cut through a concave crease of the enamel take their corners deeper.
+    # Project vertices exactly to the depth, and move the corners of faces that cut through a concave crease deeper.
     vertices = _smooth(base, base.vertices_mm, 2)
     depth = np.full(len(vertices), BASE_DEPTH_MM)
     for _ in range(5):
@@ -162,7 +174,8 @@ def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces
 
 
 def _room_mm(start: NDArray[np.float64], inward: NDArray[np.float64], grid: SignedDistanceGrid) -> NDArray[np.float64]:
-    # Walk straight inward while depth still rises; the walk ends at the middle of the tooth.
+    # Distance (N,) that the buccal mode may move each point: walk straight inward while the depth increases; the walk
+    # ends at the middle of the tooth.
     full = FULL_DEPTH_MM - BASE_DEPTH_MM
     travelled, rising = np.zeros(len(start)), np.ones(len(start), dtype=bool)
     for step in range(1, int(np.ceil(full / MIDDLE_FRACTION / STEP_MM)) + 1):
@@ -175,14 +188,14 @@ def _room_mm(start: NDArray[np.float64], inward: NDArray[np.float64], grid: Sign
 def _shallowest_corner_mm(
     start: NDArray[np.float64], modes: NDArray[np.float64], grid: SignedDistanceGrid
 ) -> NDArray[np.float64]:
-    # Depth is concave where the surface is convex, so a box's corners bound its inside; the edges' middles guard the
-    # lingual hollow.
+    # Smallest depth (V,) over each vertex's box. Depth is concave where the surface is convex, so the box's corners
+    # bound its inside; the middles of its edges cover the lingual hollow.
     weights = np.stack(np.meshgrid(*[(0.0, 0.5, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
     return np.asarray(np.min([grid.depth_mm(start + np.tensordot(c, modes, axes=1)) for c in weights], axis=0))
 
 
 def _turned_over(base: Mesh, modes: NDArray[np.float64]) -> NDArray[np.bool_]:
-    # Faces that some corner of the weights' box turns over.
+    # Faces (F,) that turn over at one of the corners of the box of weights.
     before = _normals(base.vertices_mm, base.faces)
     turned = np.zeros(len(before), dtype=bool)
     for c in CORNERS:
@@ -212,7 +225,7 @@ def _smooth(mesh: Mesh, values: NDArray[np.float64], rounds: int) -> NDArray[np.
 
 
 def _smooth_below(mesh: Mesh, limit: NDArray[np.float64], rounds: int = 15) -> NDArray[np.float64]:
-    # A smooth field that never exceeds its limit.
+    # Smooth a field so that it never exceeds its limit.
     mean = _neighbour_mean(mesh)
     values = limit
     for _ in range(rounds):

@@ -1,4 +1,4 @@
-"""Distance from points to a closed triangle mesh: exact at the surface, and signed on a grid."""
+"""Distance from points to a closed triangle mesh: unsigned by closest points, and signed on a grid."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from services.core.geometry import Mesh
 
 CANDIDATES = 6
+"""Number of nearest surface samples whose triangles are tested for the closest point."""
 
 
 class SurfaceDistance:
@@ -54,8 +55,8 @@ class SignedDistanceGrid:
         axes = [low[k] + pitch_mm * np.arange(shape[k]) for k in range(3)]
         inside = _inside_columns(mesh, axes)
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        # Exact closest points in a shell around the surface; deeper points inherit the closest point of the nearest
-        # shell point (about pitch² / depth too far).
+        # Find exact closest points in a shell around the surface; points farther away inherit the closest point of the
+        # nearest shell point (about pitch² / depth too far).
         from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
         shell = binary_dilation(inside, iterations=2) & ~binary_erosion(inside, iterations=2)
@@ -84,12 +85,12 @@ class SignedDistanceGrid:
         return self._interpolate(self.depth, points_mm)
 
     def inward(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Gradient of the depth (N, 3); of length 1 off the medial axis, shorter on it."""
+        """Gradient (N, 3) of the depth; its length is 1 off the medial axis and less on it."""
         return np.stack([self._interpolate(slope, points_mm) for slope in self._slopes], axis=-1)
 
 
 def _sample_triangles(corners: NDArray[np.float64], spacing_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    # Points of a regular barycentric lattice per triangle, as fine as its longest edge asks for.
+    # Points of a regular barycentric lattice in each triangle, fine enough for its longest edge, and their triangles.
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
     order = np.maximum(1, np.ceil(longest / spacing_mm)).astype(int)
     points, owners = [], []
@@ -105,8 +106,8 @@ def _sample_triangles(corners: NDArray[np.float64], spacing_mm: float) -> tuple[
 
 
 def _inside_columns(mesh: Mesh, axes: list[NDArray[np.float64]]) -> NDArray[np.bool_]:
-    # Parity of surface crossings below each grid point along z. Columns are shifted by an irrational part of a cell so
-    # that none hits an edge or a vertex.
+    # Grid points inside the mesh, by the parity of surface crossings below each along z. Columns are shifted by an
+    # irrational fraction of a cell, so that none hits an edge or a vertex.
     xs, ys, zs = axes
     pitch = xs[1] - xs[0]
     xs, ys = xs + pitch * 1e-4 * np.sqrt(2), ys + pitch * 1e-4 * np.sqrt(3)
@@ -120,7 +121,7 @@ def _inside_columns(mesh: Mesh, axes: list[NDArray[np.float64]]) -> NDArray[np.b
     local = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
     i, j = first[face, 0] + local // np.maximum(span[face, 1], 1), first[face, 1] + local % np.maximum(span[face, 1], 1)
 
-    # Barycentric coordinates in the xy plane; vertical triangles have no area there and are never crossed.
+    # Compute barycentric coordinates in the xy plane; vertical triangles have no area there and are never crossed.
     ab, ac, ap = (b - a)[face, :2], (c - a)[face, :2], np.stack([xs[i], ys[j]], axis=-1) - a[face, :2]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):

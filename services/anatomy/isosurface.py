@@ -15,15 +15,20 @@ Field = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 def surface_net(
     field: Field, low_mm: NDArray[np.float64], high_mm: NDArray[np.float64], pitch_mm: float, level: float
 ) -> Mesh:
-    """Surface where ``field`` equals ``level``, oriented outward from the larger values; they must not touch the
-    bounds.
+    """Extract the surface where ``field`` equals ``level``, oriented outward from the larger values.
+
+    Args:
+        field: function of points (N, 3) in mm; values above ``level`` must not touch the bounds.
+        low_mm, high_mm: bounds (3,) of the grid.
+        pitch_mm: distance between grid points.
+        level: value on the surface.
     """
     shape = np.ceil((high_mm - low_mm) / pitch_mm).astype(int) + 1
     index = np.stack(np.meshgrid(*[np.arange(n) for n in shape], indexing="ij"), axis=-1)
     value = (field((low_mm + pitch_mm * index).reshape(-1, 3)) - level).reshape(tuple(shape))
     above = value > 0
 
-    # One vertex per mixed cell: the mean of the crossings on its twelve edges.
+    # Place one vertex in each cell that the surface crosses: the mean of the crossings on its twelve edges.
     cells = tuple(shape - 1)
     total, count = np.zeros((*cells, 3)), np.zeros(cells)
     for axis in range(3):
@@ -48,7 +53,8 @@ def surface_net(
     number[mixed] = np.arange(np.count_nonzero(mixed))
     vertices = low_mm + pitch_mm * (index[:-1, :-1, :-1][mixed] + total[mixed] / count[mixed][:, None])
 
-    # One quad per crossed grid edge, joining the four cells around it, split along its shorter diagonal.
+    # Make one quad for each crossed grid edge, which joins the four cells around it, and split it along its shorter
+    # diagonal.
     quads = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3

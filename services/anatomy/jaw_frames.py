@@ -1,9 +1,10 @@
-"""Canonical frames of teeth whose FDI numbers are known: of one from its shape, of several from the arch that they form
-and from each one's shape.
+"""Canonical frames of teeth with known FDI numbers: of a single tooth from its shape, of several teeth from the arch
+that they form and from their shapes.
 
-The shape is compared with the average tooth of its kind (``matching``). It tells the occlusal direction of a crown with
-some root to a few degrees, but hardly buccal from lingual where cusps are alike; there a single tooth turns towards the
-cameras and the tooth of a jaw out of the arch.
+A tooth's shape is compared with the average tooth of its kind (``matching``). The shape determines the occlusal
+direction of a crown with some root to a few degrees, but hardly distinguishes buccal from lingual where cusps are
+alike. In that case the buccal side of a single tooth is turned towards the cameras, and that of a tooth in a jaw out of
+the arch.
 """
 
 from __future__ import annotations
@@ -23,44 +24,49 @@ from services.core.geometry import Tooth
 Array = NDArray[np.float64]
 
 TURNS = 576
-"""From which a tooth alone is matched: about 20 degrees apart."""
+"""Number of rotations from which a single tooth is matched; they are about 20 degrees apart."""
 KEPT = 40
-"""Of these, that are matched closely."""
+"""Number of the best rotations after the coarse match that are matched closely."""
 COARSE, MEDIUM, CLOSE = (80, 4), (80, 6), (300, 20)
-"""Points of the average crown and rounds of closest points: from every turn, for the turns of an arch, and to the
-end."""
+"""Number of points of the average crown and of rounds of closest points: for the match from every rotation, for the
+rotations of an arch, and for the final match."""
 VIEW_MM = 0.4
-"""Misfit that a tooth is given for turning its back to the cameras. Misfits come to 1.0 to 1.4 mm on real crowns with
-roots; the same crown with its front for its back adds -0.05 to 0.35, one upside down 0.4 to 0.7."""
+"""Misfit in mm that is added to a tooth with its back to the cameras. The misfit of real crowns with roots is 1.0 to
+1.4 mm; exchanging front and back adds -0.05 to 0.35 mm, and turning upside down 0.4 to 0.7 mm."""
 ARCH_TURNS = 24
-"""About the line of the teeth's middles: four front teeth, or those of one side, hardly leave it."""
+"""Number of rotations of the arch about the line through the teeth's middles. Four front teeth, or those of one side,
+hardly leave this line, so their middles do not determine the rotation about it."""
 WORST_ARCH_MM = 6.0
-"""How much more than the best of these turns may bring the teeth's middles off an average arch's."""
+"""Largest excess, mm, of a rotation's misfit of the teeth's middles over that of the best rotation."""
 ARCH_SHARE = 0.25
-"""Misfit of shape that the same misfit of middles counts as: real arches are some millimetres wider or narrower."""
+"""Weight of the misfit of the middles relative to that of the shapes: real arches are some millimetres wider or
+narrower."""
 FREE_DRIFT_DEG = 15.0
-"""By which a tooth's match may turn away from the arch's at no cost: half a step between turns, and how teeth stand in
-an arch."""
+"""Angle by which a tooth's match may deviate from the arch at no cost: half a step between rotations, and the variation
+of teeth in an arch."""
 DRIFT_MM_PER_DEG = 1 / 30
+"""Misfit added for each degree beyond ``FREE_DRIFT_DEG``, mm."""
 DOUBTFUL_MM, MUCH_LESS = 0.8, 0.5
-"""Misfit, both ways, from which a tooth's number is doubted, and the share of it that another kind must come to.
-Phantom teeth come to 0.3 by their own kind and to 1.1 to 1.5 by another family's; real bare crowns to 1.6 whichever
-kind they are compared with, and nothing can be said of them."""
+"""Misfit in mm, summed over both directions, above which a tooth's number is doubted; and the largest ratio to it of
+the misfit of another kind that is reported. Phantom teeth have 0.3 mm with their own kind and 1.1 to 1.5 mm with
+another family. Real bare crowns have 1.6 mm with any kind, so nothing can be said about them."""
 KINDS = (1, 3, 4, 6)
-"""Places from the midline that stand for their families."""
+"""Places from the midline of the teeth that represent their families."""
 KEPT_OF_KIND = 8
+"""Number of the best rotations that are matched closely for the test of a tooth's number."""
 LARGEST_OWN_TURN_DEG = 40.0
-"""Of a tooth's own match against the arch: upper incisors lean by 20 degrees, last molars by 30; beyond, the arch is
-believed."""
+"""Largest angle between a tooth's own match and the arch. Upper incisors lean by 20 degrees and last molars by 30; a
+match that deviates more is replaced by the arch's axes."""
 
 
 def tooth_frame(tooth: Tooth, viewpoints_mm: Array) -> ToothFrame:
-    """Canonical frame of a single tooth.
+    """Find the canonical frame of a single tooth.
 
-    With some root its axes are found to within 10 degrees or so; a bare crown of a premolar or molar, which is as wide
-    as it is high, may be taken for one that lies on its side.
+    With some root the axes are accurate to about 10 degrees. The axes of a premolar's or molar's bare crown, which is
+    as wide as it is high, may be found as if the crown lay on its side.
 
     Args:
+        tooth: the tooth with its FDI number.
         viewpoints_mm: camera centres (N, 3).
     """
     match = CrownMatch(tooth.fdi, tooth.outer)
@@ -73,7 +79,7 @@ def tooth_frame(tooth: Tooth, viewpoints_mm: Array) -> ToothFrame:
 
 
 def number_told(tooth: Tooth) -> str:
-    """A sentence where a tooth clearly has the shape of another kind than its FDI number says; else nothing."""
+    """A sentence if a tooth clearly has the shape of another kind than its FDI number says; else an empty text."""
     own_mm = _misfit_mm(tooth, tooth.fdi)
     if own_mm < DOUBTFUL_MM:
         return ""
@@ -97,10 +103,11 @@ def _misfit_mm(tooth: Tooth, fdi: int) -> float:
 
 
 def jaw_frames(teeth: Sequence[Tooth], viewpoints_mm: Array) -> tuple[ToothFrame, ...]:
-    """Canonical frames of a jaw's teeth: some or all, of the upper jaw, the lower one or both.
+    """Find the canonical frames of some or all teeth of the upper jaw, the lower jaw or both.
 
     Args:
-        viewpoints_mm: camera centres (N, 3); they count for the only tooth of its jaw.
+        teeth: teeth with their FDI numbers.
+        viewpoints_mm: camera centres (N, 3); they are used only for a tooth that is the only one of its jaw.
     """
     frames: dict[int, ToothFrame] = {}
     for upper in (True, False):
@@ -113,8 +120,8 @@ def jaw_frames(teeth: Sequence[Tooth], viewpoints_mm: Array) -> tuple[ToothFrame
 
 
 def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
-    # The arch's pose first: of the turns about the line of middles, the one in which middles and shapes are nearest to
-    # the average's.
+    # Find the arch's rotation first: of the rotations about the line of middles, the one in which middles and shapes
+    # are nearest to those of the average.
     numbers, matches = tuple(tooth.fdi for tooth in teeth), [CrownMatch(tooth.fdi, tooth.outer) for tooth in teeth]
     middles = np.array([middle_mm(tooth.outer) for tooth in teeth])
     nominal, nominal_axes = nominal_places(numbers)
@@ -130,7 +137,7 @@ def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
         )
     arch = turns[misfits.argmin()]
 
-    # From there each tooth turns to where its own shape is nearest to the average's.
+    # Then turn each tooth to where its own shape is nearest to that of the average.
     frames = []
     for tooth, match, axes in zip(teeth, matches, nominal_axes, strict=True):
         own = match.settled((axes @ arch)[None], *CLOSE).axes[0]
@@ -140,8 +147,8 @@ def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
 
 
 def _arch_turns(best: Array, middles_mm: Array, nominal_mm: Array) -> tuple[Array, Array]:
-    # Rotations (K, 3, 3) into the arch's frame, and how far each leaves the middles off the average's, root mean
-    # square, mm.
+    # Rotations (K, 3, 3) into the arch's frame, and for each the root mean square distance (K,) in mm of the middles
+    # from those of the average.
     from scipy.spatial.transform import Rotation
 
     line = np.linalg.svd(middles_mm, full_matrices=False)[2][0]
@@ -154,7 +161,7 @@ def _arch_turns(best: Array, middles_mm: Array, nominal_mm: Array) -> tuple[Arra
 
 
 def _even_turns(count: int) -> Array:
-    # Super-Fibonacci spiral of unit quaternions (Alexa 2022).
+    # Rotations (count, 3, 3) on a super-Fibonacci spiral of unit quaternions (Alexa 2022).
     from scipy.spatial.transform import Rotation
 
     at = np.arange(count) + 0.5
@@ -167,7 +174,7 @@ def _even_turns(count: int) -> Array:
 
 
 def _angles_deg(one: Array, two: Array) -> Array:
-    # Of the rotations between axes (N, 3, 3) and (N, 3, 3).
+    # Angles (N,) of the rotations between axes (N, 3, 3) and (N, 3, 3).
     cosine = (np.einsum("nij,nij->n", one, two) - 1) / 2
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 

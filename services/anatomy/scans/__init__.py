@@ -1,1 +1,1 @@
-"""Scans: reading them, parting them into teeth, and closing teeth by roots."""
+"""Scans: reading, segmentation into teeth, and closing of teeth by roots."""

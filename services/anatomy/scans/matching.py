@@ -1,8 +1,8 @@
-"""Where an average crown lies in the mesh of a tooth: closest points iterated from many turns at once (Besl and McKay
-1992), with normals.
+"""Registration of an average crown to the mesh of a tooth: iterative closest points (Besl and McKay 1992) with normals,
+from many rotations at once.
 
-Only the average's crown is looked for, so that it does not matter how much root the mesh has. Its size is free within
-limits.
+Only the crown of the average tooth is registered, so that it does not matter how much root the mesh has. Its size is
+free within limits.
 """
 
 from __future__ import annotations
@@ -20,66 +20,66 @@ from services.core.geometry import Mesh
 Array = NDArray[np.float64]
 
 NORMAL_MM = 2.0
-"""What a difference of one radian between normals counts as: it keeps a crown's walls apart, which are some millimetres
-from each other."""
+"""Distance in mm that a difference of one radian between normals counts as. It prevents matches between opposite walls
+of a crown, which are some millimetres apart."""
 FARTHEST_MM = 3.0
-"""A point that is farther than this from the other surface counts as this far: it is of something that the other does
-not have."""
+"""Largest distance that a point counts with, mm. A point farther away is on a part that the other surface lacks."""
 SOFT_MM = 1.0
-"""Distance at which a point has half its weight in the next step."""
+"""Distance at which a point has half its weight in the next step, mm."""
 SCALES = (0.8, 1.25)
-"""Of a tooth's size to the average's: real teeth differ by 10 to 20 %; an upper average stands for the smaller lower
-incisors too."""
+"""Smallest and largest ratio of a tooth's size to the average's. Real teeth differ by 10 to 20 %, and an upper average
+also represents the smaller lower incisors."""
 NECK = 0.12
-"""Share of the crown's length above its neck in which the mesh is not compared: its cervical line, or where it was cut
-and closed, is elsewhere."""
+"""Fraction of the crown's length above its neck in which the mesh is not compared, because its cervical line, or the
+place where it was cut and closed, differs from the average's."""
 MESH_POINTS, CROWN_POINTS = 3000, 2500
-"""Of the mesh and of the average, in which closest points are looked for: 0.3 mm apart."""
+"""Numbers of points of the mesh and of the average among which closest points are searched; they are 0.3 mm apart."""
 REVERSE_STEP = 4
-"""Every so many of the mesh's points are compared with the average."""
+"""Step between those of the mesh's points that are compared with the average."""
 MIN_REVERSE_POINTS = 20
+"""Smallest number of the mesh's points above the neck for which a misfit is computed."""
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points on a surface with its outward normals, (N, 3) each."""
+    """Points on a surface with their outward normals, (N, 3) each."""
 
     points_mm: Array
     normals: Array
 
     @property
     def features(self) -> Array:
-        """(N, 6): places and normals as lengths."""
+        """Features (N, 6) in mm: positions, and normals scaled by ``NORMAL_MM``."""
         return np.concatenate([self.points_mm, NORMAL_MM * self.normals], axis=1)
 
 
 @dataclass(frozen=True)
 class Placements:
-    """Similarities of the average crown to a mesh, G of them."""
+    """G similarity transforms from the average crown to a mesh."""
 
     axes: Array
     """(G, 3, 3): rows are the canonical axes in world coordinates."""
     centres_mm: Array
-    """(G, 3): of the average crown's box."""
+    """(G, 3): world position of the middle of the average crown's bounding box."""
     scales: Array
-    """(G,)"""
+    """(G,): ratio of the mesh's size to that of the average."""
     misfits_mm: Array
-    """(G,): mean distance, with normals, of the crown's points from the mesh."""
+    """(G,): mean distance, normals included, of the crown's points from the mesh."""
 
     def of(self, chosen: NDArray[np.int64]) -> Placements:
-        """Some of them."""
+        """Select the placements with the given indices."""
         return Placements(self.axes[chosen], self.centres_mm[chosen], self.scales[chosen], self.misfits_mm[chosen])
 
 
 class CrownMatch:
-    """An average crown of the tooth's kind and side beside its mesh."""
+    """Average crown of a tooth's kind and side, for registration to the tooth's mesh."""
 
     def __init__(self, fdi: int, outer: Mesh) -> None:
         """Sample both surfaces.
 
         Args:
-            fdi: a lower tooth is compared with the upper one of its kind.
-            outer: closed enamel surface, with any part of the root or none.
+            fdi: FDI number of the tooth; a lower tooth is compared with the upper one of its kind.
+            outer: closed enamel surface, with or without a part of the root.
         """
         from scipy.spatial import cKDTree
 
@@ -87,8 +87,7 @@ class CrownMatch:
         crown = average.outer.faces[
             average.outer.vertices_mm[average.outer.faces].mean(axis=1)[:, 2] > average.cervix_mm
         ]
-        # x is mesial on the patient's right above and on the left below; on the other sides the average is a mirror
-        # image.
+        # Mirror the average for the patient's left above and right below, where x is not mesial.
         self._mirror = np.array([-float(side_of_front(fdi)), 1.0, 1.0])
         self._crown = Mesh(average.outer.vertices_mm, crown)
         self._middle = (
@@ -103,12 +102,13 @@ class CrownMatch:
         return np.asarray(np.ptp(self._crown_points(CROWN_POINTS).points_mm, axis=0) / 2)
 
     def settled(self, axes: Array, points: int, rounds: int, top_mm: Array | None = None) -> Placements:
-        """Turned, moved and scaled onto the mesh from canonical axes (G, 3, 3), the crown's top at the mesh's.
+        """Register the crown to the mesh from given axes; at first the crown's top lies at the mesh's top.
 
         Args:
-            points: of the crown, that are compared.
-            rounds: of closest points.
-            top_mm: where the crown's top is to begin (3,), in place of the mesh's.
+            axes: (G, 3, 3), initial canonical axes.
+            points: number of the crown's points that are compared.
+            rounds: number of iterations.
+            top_mm: (3,), initial position of the crown's top in place of the mesh's top.
         """
         crown = self._crown_points(points)
         placed = self._begun(axes, crown.points_mm) if top_mm is None else self._hung(axes, crown.points_mm, top_mm)
@@ -118,7 +118,7 @@ class CrownMatch:
         return Placements(placed.axes, placed.centres_mm, placed.scales, np.minimum(distance, FARTHEST_MM).mean(axis=1))
 
     def reverse_misfits_mm(self, placed: Placements) -> Array:
-        """Mean distance (G,), with normals, of the mesh's points from the average crown, above its neck."""
+        """Mean distance (G,), normals included, of the mesh's points from the average crown, above its neck."""
         points, normals = self._mesh.points_mm[::REVERSE_STEP], self._mesh.normals[::REVERSE_STEP]
         low, high = self._average.points_mm[:, 2].min(), self._average.points_mm[:, 2].max()
         misfits = np.full(len(placed.axes), FARTHEST_MM)
@@ -148,7 +148,7 @@ class CrownMatch:
         return Placements(axes, np.einsum("gkj,gk->gj", axes, middle), ones, ones)
 
     def _closest(self, placed: Placements, crown: SurfacePoints) -> tuple[Array, Array]:
-        # The mesh's point closest to each of the crown's (G, N, 3), and its distance (G, N).
+        # Point of the mesh closest to each point of the crown (G, N, 3), and its distance (G, N).
         points = (
             placed.scales[:, None, None] * np.einsum("gkj,nk->gnj", placed.axes, crown.points_mm)
             + placed.centres_mm[:, None]
@@ -158,7 +158,8 @@ class CrownMatch:
         return self._mesh.points_mm[nearest].reshape(points.shape), np.asarray(distance.reshape(points.shape[:2]))
 
     def _step(self, placed: Placements, crown: SurfacePoints) -> Placements:
-        # The similarity that brings the crown's points nearest to the mesh's (Umeyama 1991), far ones counting less.
+        # Find the similarity that brings the crown's points nearest to the mesh's (Umeyama 1991), with less weight for
+        # distant points.
         target, distance = self._closest(placed, crown)
         weight = 1 / (1 + (distance / SOFT_MM) ** 2)[..., None]
         total = weight.sum(axis=1)
@@ -175,7 +176,7 @@ class CrownMatch:
 
 
 def _sampled(mesh: Mesh, count: int) -> SurfacePoints:
-    # Evenly by area, the same for the same mesh.
+    # Sample points evenly by area; the same mesh always gives the same points.
     random = np.random.default_rng(0)
     corners = mesh.vertices_mm[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

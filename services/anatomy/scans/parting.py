@@ -1,9 +1,10 @@
-"""Teeth of a scan without labels: the operator points at each, an average crown is fitted there, and creases part the
-surface.
+"""Segmentation of a scan without labels: the operator clicks on each tooth, an average crown is fitted there, and the
+surface is cut along its creases.
 
-A fitted crown only tells what is surely its tooth and what is surely not; between the two a minimal cut follows the
-creases of the surface (Boykov and Jolly, "Interactive graph cuts", ICCV 2001). Teeth are told from each other by fronts
-that run from what is surely theirs and that creases hold up (Dijkstra's distances).
+A fitted crown only determines triangles that surely belong to its tooth and triangles that surely do not. Between the
+two, a minimal cut follows the creases of the surface (Boykov and Jolly, "Interactive graph cuts", ICCV 2001). Teeth are
+separated from each other by fronts that start from the sure triangles of each tooth and are slowed down by creases
+(Dijkstra's distances).
 """
 
 from __future__ import annotations
@@ -32,75 +33,81 @@ from services.core.geometry import Mesh
 Array = NDArray[np.float64]
 
 GINGIVA = 0
+"""Label of triangles of the gums."""
 PERMANENT_QUADRANTS, TEETH_A_QUADRANT = (1, 2, 3, 4), 8
 FARTHEST_MM = 2.0
-"""Of a point from the scan: clicks lie on the surface, and vertices some tenths of a millimetre apart."""
+"""Largest distance of a point from the scan's vertices, mm: clicks lie on the surface, and vertices are some tenths of
+a millimetre apart."""
 NEAREST_MM = 2.0
-"""Between points of two teeth: the narrowest teeth are 5 mm wide."""
+"""Smallest distance between the points of two teeth, mm: the narrowest teeth are 5 mm wide."""
 PATCH_MM, PATCH_DEPTH_MM = 8.0, 6.0
-"""Around a point, and below it, that a crown is fitted to: half a molar's width with room, and the least height of a
-crown."""
+"""Radius around a point and depth below it of the patch to which a crown is fitted, mm: half a molar's width with some
+margin, and the smallest height of a crown."""
 CROWN_POINTS, CROWN_ROUNDS = 300, 12
-"""Of a fit, which need not be closer than a millimetre."""
+"""Numbers of points and iterations of a fit, which need not be more accurate than a millimetre."""
 SHIFTS_MM = (-2.5, 0.0, 2.5)
-"""Towards the cheek, of where fits begin: people click the cusp, a premolar's or molar's being so far beside its
-middle."""
+"""Displacements towards the cheek from which fits start, mm: people click on a cusp, which in a premolar or molar is
+this far from the middle."""
 CORE = 0.7
-"""Share of the fitted crown's half width within which its upper half is surely the tooth's."""
+"""Fraction of the fitted crown's half width within which its upper half surely belongs to the tooth."""
 CLICKED_MM = 1.0
-"""Around a point, what is surely its tooth's."""
+"""Radius around a point within which triangles surely belong to its tooth, mm."""
 CORE_ABOVE_MM = 2.0
-"""Above the fitted crown's top, as far as the core reaches."""
+"""Height above the fitted crown's top up to which triangles surely belong to the tooth, mm."""
 GUMS_MM = (1.0, 3.5)
-"""Away from the boxes around all fitted crowns: where the surface begins to be likelier gums than tooth, and where it
-surely is."""
+"""Distances from the boxes around all fitted crowns, mm: where gums begin to be likelier than teeth, and beyond which
+the surface surely is gums."""
 GUMS_PER_MM = 0.3
-"""Cost of a square millimetre that is taken for tooth just before it is surely gums, against a millimetre of border on
-a flat surface."""
+"""Cost of assigning a square millimetre of likely gums to the teeth, just before it is surely gums, in units of the
+cost of a millimetre of border on a flat surface."""
 FLAT = 0.2
-"""Spread of the points across their line, relative to that along it, above which they span the occlusal plane."""
+"""Ratio of the spread of the points across their line to that along it, above which they span the occlusal plane."""
 SMOOTH_MM = 0.33
-"""Over which normals are averaged before the surface's bend is taken: a scan's noise is shorter, a crease at a neck as
-wide."""
+"""Distance over which normals are averaged before the curvature is computed, mm: the noise of a scan has shorter waves,
+and a crease at a neck is as wide."""
 MAX_ROUNDS = 30
+"""Largest number of rounds of averaging."""
 CREASE_PER_MM = 0.4
-"""Bend inwards, radians a millimetre, at which a border costs 1/e of one on a flat surface."""
+"""Concave curvature, radians per mm, at which a border costs 1/e of one on a flat surface."""
 FLOOR = 0.02
-"""Least cost of a border, per length of one on a flat surface: what keeps it short along a crease."""
+"""Smallest cost of a border relative to one of the same length on a flat surface; it keeps borders along creases
+short."""
 HOLD_MM2 = 20.0
-"""How a crease holds up a front: a way over a bend of b per mm counts 1 + HOLD b² times as long."""
+"""Strength by which a crease slows down a front: a path across a concave curvature of b per mm counts 1 + HOLD b² times
+its length."""
 NEAREST_FACES_MM = 0.03
-"""Two triangles' centres count as at least so far apart: slivers have no bend that means anything."""
+"""Smallest distance that the centres of two triangles count with, mm, because the curvature at slivers is
+meaningless."""
 UNITS_PER_MM = 1000.0
-"""Cost of a border in whole numbers, which the flow takes."""
+"""Cost units per mm of border: the flow algorithm needs integers."""
 
 
 @dataclass(frozen=True)
 class _Bends:
-    """Pairs of neighbouring faces, each pair twice."""
+    """Pairs (P,) of neighbouring faces; each pair occurs twice, once in each order."""
 
     one: NDArray[np.int64]
     other: NDArray[np.int64]
     apart_mm: Array
-    """Between the faces' centres."""
+    """Distance between the faces' centres."""
     inwards_per_mm: Array
-    """How the surface bends inwards there; 0 where it is flat or bends outwards."""
+    """Concave curvature between the faces, radians per mm; 0 where the surface is flat or convex."""
     border_mm: Array
-    """Length of the edge between the two."""
+    """Length of the edge between the faces."""
 
 
 def part_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) -> NDArray[np.int64]:
-    """FDI number (F,) of each triangle of a scan, 0 for gingiva.
+    """Find the FDI number (F,) of each triangle of a scan, 0 for gingiva.
 
     Args:
         mesh: open surface of one jaw, counter-clockwise seen from outside.
-        points_mm: by FDI number, points (N, 3) in the middle of the tooth's edge or chewing surface, or on a cusp; a
-            tooth without any is left to the gums.
+        points_mm: by FDI number, points (N, 3) in the middle of the tooth's edge or chewing surface, or on a cusp. A
+            tooth without points is treated as gums.
         what: the scan's name for messages.
 
     Raises:
-        CaptureInputError: fewer than two teeth have points, a point is not on the scan, two teeth's are at one place,
-            they point into the gums, or no crown is found about one.
+        CaptureInputError: fewer than two teeth have points, a point is not on the scan, points of two teeth coincide,
+            the teeth point into the gums, or no crown is found at a tooth's points.
     """
     teeth = tuple(sorted(points_mm))
     tops = np.array([points_mm[fdi].mean(axis=0) for fdi in teeth]).reshape(-1, 3)
@@ -164,7 +171,7 @@ def _require_points(mesh: Mesh, points_mm: Mapping[int, Array], teeth: tuple[int
 def _fitted_crowns(
     surface: Mesh, middles: Array, teeth: tuple[int, ...], tops: Array
 ) -> tuple[NDArray[np.bool_], Array]:
-    # Faces that are surely of each tooth (F, T), and how far (F,) each lies outside the boxes of all teeth.
+    # Faces (F, T) that surely belong to each tooth, and distance (F,) of each face from the boxes of all teeth.
     from scipy.spatial import cKDTree
 
     is_core = np.zeros((len(middles), len(teeth)), dtype=bool)
@@ -183,7 +190,8 @@ def _fitted_crowns(
             & (place[:, 2] > 0)
             & (place[:, 2] < half[2] + CORE_ABOVE_MM)
         ) | (np.linalg.norm(off, axis=1) < CLICKED_MM)
-        # A fit may slip to the next tooth, so the average crown below the point is spared as well.
+        # Keep the box of an average crown below the point out of the gums too, because a fit may slip to the next
+        # tooth.
         hung = off @ axes.T + [0, 0, match.half_size_mm[2]]
         for offset, size in ((place, half), (hung, match.half_size_mm)):
             beside_mm = np.linalg.norm(np.maximum(np.abs(offset) - size, 0), axis=1)
@@ -192,8 +200,8 @@ def _fitted_crowns(
 
 
 def _axes(surface: Mesh, teeth: tuple[int, ...], tops: Array) -> Array:
-    # Canonical axes (T, 3, 3): z across the plane of the points, or of the scan's rim where they lie in a line; x along
-    # the arch.
+    # Approximate canonical axes (T, 3, 3): z is normal to the plane of the points, or to the scan's rim if they lie in
+    # a line; x runs along the arch.
     opening = vector_area_mm2(surface)
     _, spread, principal = np.linalg.svd(tops - tops.mean(axis=0), full_matrices=False)
     plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
@@ -209,7 +217,8 @@ def _axes(surface: Mesh, teeth: tuple[int, ...], tops: Array) -> Array:
 
 
 def _fitted(match: CrownMatch, axes: Array, top_mm: Array) -> Placements:
-    # The best of several starts. A crown shrunk onto one cusp is close to the scan, but the scan is not close to it.
+    # Choose the best of several starts by the misfit in both directions: a crown shrunk onto one cusp is close to the
+    # scan, but the scan is not close to it.
     found = [match.settled(axes[None], CROWN_POINTS, CROWN_ROUNDS, top_mm + shift * axes[1]) for shift in SHIFTS_MM]
     misfits = [float(one.misfits_mm[0] + match.reverse_misfits_mm(one)[0]) for one in found]
     return found[int(np.argmin(misfits))]
@@ -222,8 +231,8 @@ def _bends(surface: Mesh, middles: Array) -> _Bends:
     away = middles[other] - middles[one]
     apart = np.maximum(np.linalg.norm(away, axis=1), NEAREST_FACES_MM)
 
-    # Means over a face and its neighbours, again and again, spread over the root of the rounds times the faces'
-    # distance.
+    # Average normals repeatedly over a face and its neighbours; the width of this smoothing is the square root of the
+    # number of rounds times the distance between faces.
     rounds = int(np.clip(round((SMOOTH_MM / float(np.median(apart))) ** 2), 1, MAX_ROUNDS))
     a, b, c = (surface.vertices_mm[surface.faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a) / np.maximum(2 * area, np.finfo(float).tiny)[:, None]
@@ -238,7 +247,7 @@ def _bends(surface: Mesh, middles: Array) -> _Bends:
 
 
 def _cut(bends: _Bends, is_tooth: NDArray[np.bool_], likely_gums: Array, gums_cost: Array) -> NDArray[np.bool_]:
-    # Faces (F,) on the teeth's side of the cheapest border, with what it costs to take likely gums for tooth.
+    # Faces (F,) on the teeth's side of the cheapest border (minimal cut), with a cost for likely gums on that side.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
@@ -260,7 +269,8 @@ def _cut(bends: _Bends, is_tooth: NDArray[np.bool_], likely_gums: Array, gums_co
 
 
 def _reached(bends: _Bends, is_core: NDArray[np.bool_], is_tooth: NDArray[np.bool_]) -> NDArray[np.int64]:
-    # For each face 1 + the number of the tooth whose front is there first, 0 for gums and what no front reaches.
+    # For each face (F,) 1 + the index of the tooth whose front arrives first; 0 for gums and faces that no front
+    # reaches.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 

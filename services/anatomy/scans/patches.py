@@ -1,4 +1,4 @@
-"""Parts of a triangle surface by label: neighbours, connected pieces, boundary loops, and what makes them manifold."""
+"""Operations on parts of a triangle surface: neighbours, connected pieces, boundary loops, repair to a manifold."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from services.core.geometry import Mesh
 
 Faces = NDArray[np.int32]
 TINY_MM2 = 1e-30
-"""Added to areas that are weights, so that a part of vanishing triangles still has a middle."""
+"""Area added to areas that are weights, so that a part with only degenerate triangles still has a middle."""
 
 
 def neighbours(faces: Faces) -> NDArray[np.int64]:
-    """Face (F, 3) across each edge, which runs from corner k to corner k + 1; -1 at a boundary.
+    """Neighbouring face (F, 3) across each edge from corner k to corner k + 1; -1 at a boundary.
 
-    Each edge has at most two faces.
+    Each edge must have at most two faces.
     """
     count = int(faces.max()) + 1
     start, end = faces.astype(np.int64).reshape(-1), np.roll(faces, -1, axis=1).astype(np.int64).reshape(-1)
@@ -26,13 +26,13 @@ def neighbours(faces: Faces) -> NDArray[np.int64]:
 
 
 def pieces(faces: Faces) -> NDArray[np.int64]:
-    """Number (F,) of the connected piece that each face belongs to; pieces that touch at a vertex alone are two."""
+    """Number (F,) of the connected piece of each face; faces that share only a vertex are not connected."""
     across = neighbours(faces)
     return _components(np.repeat(np.arange(len(faces)), 3)[across.reshape(-1) >= 0], across[across >= 0], len(faces))
 
 
 def touching_pieces(faces: Faces) -> NDArray[np.int64]:
-    """The same where a vertex in common connects, and edges may have any number of faces."""
+    """Number (F,) of the piece of each face, where a common vertex connects and edges may have any number of faces."""
     vertices = np.unique(faces, return_inverse=True)[1].reshape(-1, 3)
     number = _components(vertices.reshape(-1), np.roll(vertices, 1, axis=1).reshape(-1), int(vertices.max()) + 1)
     return np.unique(number[vertices[:, 0]], return_inverse=True)[1]
@@ -44,19 +44,17 @@ def areas_mm2(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def vector_area_mm2(mesh: Mesh) -> NDArray[np.float64]:
-    """Sum of the faces' normals times their areas (3,): for a cap, the normal of its boundary loop."""
+    """Vector area (3,): sum of the faces' normals times their areas, which depends only on the boundary loop."""
     return np.asarray(_crosses(mesh).sum(axis=0) / 2)
 
 
 def middle_mm(mesh: Mesh) -> NDArray[np.float64]:
-    """Centre of a surface's area (3,)."""
+    """Centroid (3,) of a surface, weighted by area."""
     return np.asarray(np.average(mesh.vertices_mm[mesh.faces].mean(axis=1), axis=0, weights=areas_mm2(mesh) + TINY_MM2))
 
 
 def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:
-    """Faces (F,) of the largest piece without edges of three faces and without pieces that hang together at a vertex
-    alone.
-    """
+    """Mask (F,) of the faces of the largest manifold piece: no edge has three faces, no vertex alone connects parts."""
     area = areas_mm2(mesh)
     kept = (area > 0) & _first_of_equals(mesh.faces)
     while True:
@@ -72,8 +70,9 @@ def manifold_piece(mesh: Mesh) -> NDArray[np.bool_]:
 
 
 def boundary_loops(faces: Faces) -> list[NDArray[np.int64]]:
-    """Vertices of each boundary loop of a manifold piece in the direction of its faces' edges, the loop of most
-    vertices first.
+    """Vertices of each boundary loop of a manifold piece, in the direction of its faces' edges.
+
+    The loop with the most vertices comes first.
     """
     open_edge = (neighbours(faces) < 0).reshape(-1)
     following = dict(
@@ -95,8 +94,10 @@ def boundary_loops(faces: Faces) -> list[NDArray[np.int64]]:
 
 
 def fill_holes(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
-    """Close every boundary loop but the longest by a fan about its middle; for the new faces, the old face (N,) across
-    their outer edge.
+    """Close every boundary loop but the one with the most vertices by a fan about its middle.
+
+    Returns:
+        The mesh, and for each new face the old face (N,) across its outer edge.
     """
     across, owner = neighbours(mesh.faces), {}
     for face, corner in np.argwhere(across < 0):
@@ -111,17 +112,17 @@ def fill_holes(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
 
 
 def compact(mesh: Mesh) -> Mesh:
-    """The same faces without vertices that none of them uses."""
+    """Remove vertices that no face uses."""
     used, index = np.unique(mesh.faces, return_inverse=True)
     return Mesh(mesh.vertices_mm[used], index.reshape(-1, 3).astype(np.int32))
 
 
 def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
-    """Rings (steps, N, 3) that lead from one ring of points (N, 3), left out, to another, each point the mean of its
-    four neighbours.
+    """Rings (steps, N, 3) between a first ring (N, 3), which is not included, and a last one, which is.
 
-    Around the ring that is a Fourier series, whose wave k falls off over the rows as a hyperbolic sine of the rate with
-    cosh(rate) = 2 - cos(2 pi k / N): what is ragged in a ring ends within a few rows.
+    Each point is the mean of its four neighbours. Around the ring the solution is a Fourier series. Its wave k changes
+    over the rows as a hyperbolic sine with the rate from cosh(rate) = 2 - cos(2 pi k / N), so that ragged details of a
+    ring vanish within a few rows.
     """
     count = len(first_mm)
     rate = np.arccosh(2 - np.cos(2 * np.pi * np.arange(1, count) / count))
@@ -130,7 +131,7 @@ def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], s
         1 - np.broadcast_to(row, (steps, count)) / steps,
         np.broadcast_to(row, (steps, count)) / steps,
     )
-    # sinh(rate n) / sinh(rate steps) without overflow.
+    # Compute sinh(rate n) / sinh(rate steps) without overflow.
     from_first[:, 1:] = np.exp(-rate * row) * np.expm1(-2 * rate * (steps - row)) / np.expm1(-2 * rate * steps)
     from_last[:, 1:] = np.exp(rate * (row - steps)) * np.expm1(-2 * rate * row) / np.expm1(-2 * rate * steps)
     waves = from_first[..., None] * np.fft.fft(first_mm, axis=0) + from_last[..., None] * np.fft.fft(last_mm, axis=0)
@@ -138,8 +139,9 @@ def harmonic_rows(first_mm: NDArray[np.float64], last_mm: NDArray[np.float64], s
 
 
 def ring_faces(rings: NDArray[np.int64], vertices_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Triangles between rings of vertices (R, N), the first a boundary loop of the faces that they continue; quads
-    split along their shorter diagonal.
+    """Triangles between rings of vertices (R, N); quads are split along their shorter diagonal.
+
+    The first ring is a boundary loop of the surface that the triangles continue.
     """
     a, b = rings[:-1], np.roll(rings[:-1], -1, axis=1)
     c, d = rings[1:], np.roll(rings[1:], -1, axis=1)
@@ -153,7 +155,7 @@ def ring_faces(rings: NDArray[np.int64], vertices_mm: NDArray[np.float64]) -> ND
 
 
 def smooth_labels(faces: Faces, labels: NDArray[np.int64], rounds: int = 10) -> NDArray[np.int64]:
-    """Labels (F,) after faces with two neighbours of one other label have taken it, again and again."""
+    """Smooth labels (F,): repeatedly, a face with two neighbours of the same other label takes that label."""
     across = neighbours(faces)
     for _ in range(rounds):
         around = np.where(across >= 0, labels[across], labels[:, None])
@@ -164,7 +166,7 @@ def smooth_labels(faces: Faces, labels: NDArray[np.int64], rounds: int = 10) -> 
 
 
 def without_specks(mesh: Mesh, labels: NDArray[np.int64], share: float = 0.05) -> NDArray[np.int64]:
-    """Labels (F,) after pieces that hold less than ``share`` of their label's area have taken a neighbour's."""
+    """Remove specks from labels (F,): pieces below ``share`` of their label's area take a neighbour's label."""
     across, area = neighbours(mesh.faces), areas_mm2(mesh)
     speck = np.zeros(len(labels), dtype=bool)
     for label in np.unique(labels):
@@ -184,13 +186,14 @@ def without_specks(mesh: Mesh, labels: NDArray[np.int64], share: float = 0.05) -
 
 
 def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Mesh:
-    """Straighten the lines between labels along the surface; a vertex stays where a face about it would fold or nearly
-    vanish.
+    """Straighten the lines between labels along the surface.
+
+    A vertex is not moved if a face about it would fold or nearly vanish.
     """
     from services.anatomy.distance import SurfaceDistance
 
-    # Edges between labels: each of their vertices moves towards the mean of its neighbours along them, but where a line
-    # ends at the scan's rim.
+    # Move each vertex on an edge between labels towards the mean of its neighbours along these edges, except where a
+    # line ends at the scan's rim.
     across = neighbours(mesh.faces)
     border = (across >= 0) & (labels[across] != labels[:, None])
     start, end = mesh.faces[border], np.roll(mesh.faces, -1, axis=1)[border]
@@ -244,7 +247,7 @@ def _first_of_equals(faces: Faces) -> NDArray[np.bool_]:
 
 
 def _simple_edges(faces: Faces) -> NDArray[np.bool_]:
-    # Not three faces at an edge, and not two that run along it in the same direction.
+    # Faces whose edges have at most two faces, and not two faces that run along an edge in the same direction.
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
     count = int(faces.max()) + 1
 
@@ -257,8 +260,8 @@ def _simple_edges(faces: Faces) -> NDArray[np.bool_]:
 
 
 def _largest_fans(faces: Faces) -> NDArray[np.bool_]:
-    # Corners of one vertex are joined across the edges that end there; of several fans about a vertex, the one of most
-    # faces stays.
+    # Faces that belong to the largest fan at each of their vertices. Corners of a vertex belong to one fan if they are
+    # joined across edges that end there.
     across = neighbours(faces)
     face, k = np.nonzero(across >= 0)
     other = across[face, k]

@@ -1,4 +1,4 @@
-"""Roots for scanned crowns: an open crown becomes a solid by a tapering root, or a stub of one, from its cervical
+"""Roots for scanned crowns: an open crown is closed to a solid by a tapering root, or a stub of one, at its cervical
 line.
 """
 
@@ -25,61 +25,62 @@ from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
 STUB_MM = 4.0
-"""How far the root reaches beyond the cervical line's most apical point; what lies deeper in the gums is not seen."""
+"""Length of a root stub beyond the cervical line's most apical point, mm; deeper parts in the gums are not seen."""
 TAPER = 0.72
-"""Width of the root's end to that of the cervical line."""
+"""Ratio of the stub's width at its end to that of the cervical line."""
 ROUNDING_MM = 1.2
-"""Height of the root's rounded end, part of ``STUB_MM``."""
+"""Height of the root's rounded end, which is part of its length, mm."""
 WHOLE_TAPER, MOLAR_TAPER = 0.35, 0.5
-"""The same of a root as long as those of its kind: a single root ends in a blunt point, the roots of a molar stand
-apart."""
+"""Ratio of a whole root's width at its end to that of the cervical line, for single roots and for molars: a single root
+ends in a blunt point, the roots of a molar stand apart."""
 WHOLE_NARROWING = 1.5
-"""Roots stay nearly as wide as the neck for some millimetres, and are conical further on: half way down they have 0.77
-of its width."""
+"""Exponent by which a whole root narrows with depth. Roots stay nearly as wide as the neck for some millimetres and are
+conical further on: half way down they have 0.77 of its width."""
 FIRST_MOLAR = 6
+"""Place of the first molar from the midline."""
 ROW_MM = 0.45
+"""Distance between rows of vertices, mm."""
 WIDEST_BRIDGE_MM = 3.5
-"""Between the two sides of a contact; wider, they are a tooth's front and back."""
+"""Largest distance between the two sides of a contact, mm; sides farther apart are a tooth's front and back."""
 STEEP_NOTCH = 0.5
-"""Depth to width above which the cervical line's rise between two teeth is taken for a contact."""
+"""Ratio of depth to width above which the rise of the cervical line between two teeth is taken for a contact."""
 HARMONICS = 3
-"""Of the closed curve that the root's cross-section ends in."""
+"""Number of harmonics of the closed curve that is the root's last cross-section."""
 
 
 @dataclass(frozen=True)
 class Root:
-    """Form of a made-up root; its cross-section narrows from the cervical line to the end."""
+    """Form of an assumed root; its cross-section narrows from the cervical line to the end."""
 
     length_mm: float = STUB_MM
-    """Beyond the cervical line's most apical point."""
+    """Length beyond the cervical line's most apical point."""
     taper: float = TAPER
-    """Width at the end, before it is rounded, to that of the cervical line."""
+    """Ratio of the width at the end, before rounding, to that of the cervical line."""
     rounding_mm: float = ROUNDING_MM
-    """Height of the rounded end, part of the length."""
+    """Height of the rounded end, which is part of the length."""
     narrowing: float = 1.0
-    """Power of the depth by which it narrows: above 1, slowly below the neck and more towards the end."""
+    """Exponent of the narrowing with depth; above 1 the root narrows slowly below the neck and more towards the end."""
 
 
 STUB = Root()
 
 
 def whole_root(fdi: int) -> Root:
-    """The root of a tooth of average length for its kind; molars' several roots are one, as wide as they are
-    together.
-    """
+    """Root of average length for the tooth's kind; the roots of a molar are replaced by one of their common width."""
     place = fdi % 10
     taper = MOLAR_TAPER if place >= FIRST_MOLAR else WHOLE_TAPER
     return Root(root_length_mm(place, is_upper=is_upper(fdi)), taper, narrowing=WHOLE_NARROWING)
 
 
 def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, root: Root = STUB) -> Mesh:
-    """A watertight solid whose surface outside the gums is the crown's own triangles.
+    """Close a crown by a root to a watertight solid, whose surface outside the gums is the crown's own triangles.
 
     Args:
-        crown: open surface, one piece but for what is thrown away: specks, and faces at edges of more than two.
-        occlusal: unit vector along the tooth's axis, out of the mouth's gums.
-        name: of the tooth, for errors.
-        root: what continues it.
+        crown: open surface. All but its largest manifold piece is dropped: specks, and faces at edges with more than
+            two faces.
+        occlusal: unit vector (3,) along the tooth's axis, out of the gums.
+        name: name of the tooth for errors.
+        root: form of the root.
 
     Raises:
         MeshError: the crown is closed, or not cut off by its cervical line across the axis.
@@ -110,7 +111,7 @@ def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, root: Roo
 
 
 def _without_spikes(crown: Mesh, rounds: int = 4) -> Mesh:
-    # Triangles that hang on by one edge, and the steps that are left in the boundary by them.
+    # Remove triangles that are connected by one edge only, and smooth the steps that they leave in the boundary.
     for _ in range(rounds):
         spiked = np.count_nonzero(neighbours(crown.faces) < 0, axis=1) > 1
         crown = Mesh(crown.vertices_mm, crown.faces[~spiked])
@@ -123,8 +124,8 @@ def _without_spikes(crown: Mesh, rounds: int = 4) -> Mesh:
 
 
 def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
-    # Where teeth touch, the scan sees neither's wall and the cervical line climbs to the contact. A strip joins the two
-    # sides of each such notch.
+    # Join the two sides of each notch by a strip. Where teeth touch, the scan shows the wall of neither, and the
+    # cervical line rises to the contact.
     for apex in _notches(crown, occlusal):
         loop = boundary_loops(crown.faces)[0]
         loop = np.roll(loop, -int(np.linalg.norm(crown.vertices_mm[loop] - apex, axis=1).argmin()))
@@ -133,7 +134,7 @@ def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
         edges = set(map(tuple, np.sort(crown.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).tolist()))
         before, after, strip, whole = 0, 0, [], 0
         while after - before < len(loop) // 2:
-            # The shorter of the two next chords.
+            # Choose the shorter of the two next chords.
             steps = [(before - 1, after), (before, after + 1)] if before or after else [(-1, 1)]
             steps = [(i, j) for i, j in steps if tuple(sorted((int(loop[i]), int(loop[j])))) not in edges]
             chord, i, j = min(
@@ -151,7 +152,7 @@ def _bridge_contacts(crown: Mesh, occlusal: NDArray[np.float64]) -> Mesh:
 
 
 def _notches(crown: Mesh, occlusal: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    # The cervical line's highest points on either side of the tooth.
+    # Highest points (3,) of the cervical line on both sides of the tooth.
     loop = crown.vertices_mm[boundary_loops(crown.faces)[0]]
     height = loop @ occlusal
     first = int(height.argmax())
@@ -161,7 +162,7 @@ def _notches(crown: Mesh, occlusal: NDArray[np.float64]) -> list[NDArray[np.floa
 
 
 def _with_strip(crown: Mesh, strip: NDArray[np.int64]) -> Mesh:
-    # The last chord gets vertices as dense as the cervical line's.
+    # Add the strip; its last chord gets vertices as dense as those of the cervical line.
     j, k, i = strip[-1]
     start, end = crown.vertices_mm[i], crown.vertices_mm[j]
     pieces = max(1, round(float(np.linalg.norm(end - start)) / ROW_MM))
@@ -176,7 +177,8 @@ def _with_strip(crown: Mesh, strip: NDArray[np.int64]) -> Mesh:
 def _stub_rows(
     loop_mm: NDArray[np.float64], occlusal: NDArray[np.float64], root: Root
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    # Columns run from the cervical line to a smooth ring across the axis, and on over a rounded end to a pole.
+    # Rows (R, N, 3) of the root and its pole (3,): columns run from the cervical line to a smooth ring across the axis,
+    # and then over a rounded end to the pole.
     height = loop_mm @ occlusal
     flat = loop_mm - np.outer(height, occlusal)
     centre = flat.mean(axis=0)
@@ -200,7 +202,7 @@ def _stub_rows(
 
 
 def _smooth_ring(offsets_mm: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    # The curve's lowest Fourier descriptors; an ellipse where more of them cross over themselves.
+    # Ring (N, 3) of the curve's lowest Fourier descriptors; an ellipse if a ring with more descriptors is not convex.
     across = np.linalg.svd(axis[None])[2][1:]
     across[1] = np.cross(axis, across[0])
     spectrum = np.fft.fft(offsets_mm @ across[0] + 1j * (offsets_mm @ across[1]))
@@ -209,7 +211,7 @@ def _smooth_ring(offsets_mm: NDArray[np.float64], axis: NDArray[np.float64]) -> 
         ring = np.fft.ifft(np.where((order <= harmonics) & (order > 0), spectrum, 0))
         edge = np.roll(ring, -1) - ring
         turn = np.angle(np.roll(edge, -1) / edge)
-        # Convex, once around.
+        # Accept a ring that is convex and turns once around.
         if (turn * np.sign(turn.sum()) > 0).all() and abs(abs(turn.sum()) - 2 * np.pi) < 1e-6:
             break
     return np.outer(ring.real, across[0]) + np.outer(ring.imag, across[1])

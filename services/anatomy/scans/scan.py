@@ -1,5 +1,5 @@
-"""An intra-oral scan: one open surface of one jaw, whose every triangle is of a tooth or of the gingiva by labels or
-landmarks.
+"""An intra-oral scan: one open surface of one jaw, in which labels or landmarks assign each triangle to a tooth or to
+the gingiva.
 """
 
 from __future__ import annotations
@@ -21,34 +21,36 @@ from services.core.files.scans import SIDECARS, ScanFile, read_scan_file, read_s
 from services.core.geometry import Mesh
 
 Numbering = Literal["universal", "fdi", "either"]
-"""How labels name teeth; ``either`` takes FDI numbers where the labels can be these and name one jaw, else Universal
-ones."""
+"""Numbering of the labels. ``either`` means FDI numbers if all labels are FDI numbers, and either all name one jaw or
+one exceeds the Universal numbers; else Universal numbers."""
 Jaw = Literal["upper", "lower"]
 
 GINGIVA = 0
+"""Label of the gingiva."""
 LABEL = "Label"
-"""Name of the array that is looked for where none is named."""
+"""Default name of the array of labels."""
 HIGHEST_UNIVERSAL = 32
+"""Largest number of a permanent tooth in Universal Numbering."""
 EXTENT_MM = (8.0, 200.0)
-"""Of a scan with two teeth at least."""
+"""Smallest and largest extent of a scan with at least two teeth, mm."""
 
 
 @dataclass(frozen=True)
 class LabelledScan:
-    """An open surface, counter-clockwise seen from outside the tissue, and the FDI number of each face (F,), 0 for
-    gingiva.
-    """
+    """An open surface with an FDI number for each face."""
 
     mesh: Mesh
+    """Surface whose triangles are counter-clockwise seen from outside the tissue."""
     fdi: NDArray[np.int64]
+    """FDI number (F,) of each face; 0 for gingiva."""
     doubled_vertices: int = 0
-    """How many vertices of the file were copies of others and were joined with them."""
+    """Number of vertices of the file that were copies of others and were joined with them."""
     is_labelled: bool = True
-    """Whether the file says what each triangle is; otherwise that follows from points on the teeth."""
+    """Whether the numbers are labels of the file; otherwise they follow from points on the teeth."""
 
     @property
     def teeth(self) -> tuple[int, ...]:
-        """FDI numbers that occur, ascending."""
+        """FDI numbers of the scan's teeth, ascending."""
         return tuple(int(number) for number in np.unique(self.fdi) if number != GINGIVA)
 
 
@@ -77,18 +79,18 @@ def read_scan(
     teeth.
 
     Args:
-        path: of the scan.
-        numbering: how labels name teeth; 0 is gingiva in either.
-        labels: name of the file's array or property; or of a file beside the scan (.json, .npy, .txt, .csv), which a
-            format without properties needs. None: the array named Label where the file has one, else none.
-        units: of the file's coordinates.
-        jaw: which jaw the scan is said to be of; None where nothing is said.
-        points_mm: by FDI number, points (N, 3) on the tooth, by which a scan without labels is parted; in mm.
+        path: file of the scan.
+        numbering: numbering of the labels; 0 is gingiva in all of them.
+        labels: name of the file's array or property, or of a file beside the scan (.json, .npy, .txt, .csv), which
+            formats without properties need. None: the array named Label if the file has one, else no labels.
+        units: unit of the file's coordinates.
+        jaw: jaw that the scan is expected to show; None for either.
+        points_mm: by FDI number, points (N, 3) in mm on the tooth, by which a scan without labels is segmented.
 
     Raises:
-        CaptureInputError: unreadable, without labels, with labels that name no tooth, without gingiva, or not of one
-            jaw.
-        MeshError: of a size that no jaw has in this unit.
+        CaptureInputError: the scan is unreadable, lacks labels or gingiva, has labels that name no tooth, or is not of
+            one jaw or of the expected one.
+        MeshError: the scan has a size that no jaw has in this unit.
     """
     file = read_scan_file(path)
     is_labelled = labels is not None or _array(file, LABEL) is not None
@@ -132,7 +134,7 @@ def _require_one_jaw(scan: LabelledScan, path: Path, jaw: Jaw | None) -> None:
 
 
 def _triangle_labels(file: ScanFile, path: Path, labels: str) -> NDArray[np.float64]:
-    # One label a triangle, from the file itself or from one beside it.
+    # Labels (F,) of the triangles, from the scan's file or from a file beside it.
     if Path(labels).suffix.lower() in SIDECARS:
         beside = path.parent / labels
         return _per_triangle(read_sidecar(beside), file, f"Label file {beside}")
@@ -147,7 +149,7 @@ def _triangle_labels(file: ScanFile, path: Path, labels: str) -> NDArray[np.floa
 
 
 def _array(file: ScanFile, name: str) -> NDArray[Any] | None:
-    # That of triangles counts over that of vertices; capitals do not.
+    # Array with a name, in upper or lower case; arrays of triangles take precedence over those of vertices.
     for arrays in (file.triangle_arrays, file.vertex_arrays):
         for own, values in arrays.items():
             if own.lower() == name.lower():
@@ -160,7 +162,7 @@ def _per_triangle(values: NDArray[np.float64], file: ScanFile, what: str) -> NDA
     if values.shape == (triangles,):
         return values
     if values.shape == (vertices,):
-        # The label that two of the corners share; of three different ones the first.
+        # Take the label that two of the corners share; of three different labels take the first.
         one, two, three = (values[file.mesh.faces[:, k]] for k in range(3))
         return np.asarray(np.where(two == three, two, one))
     raise CaptureInputError(
@@ -170,15 +172,15 @@ def _per_triangle(values: NDArray[np.float64], file: ScanFile, what: str) -> NDA
 
 
 def _welded(mesh: Mesh) -> tuple[Mesh, int]:
-    # Vertices at one place are one; an STL file writes each of them some six times. Single precision is what scanners
-    # write.
+    # Join vertices at the same place, which an STL file repeats about six times. Compare them in single precision, in
+    # which scanners write.
     joined, first, index = np.unique(
         mesh.vertices_mm.astype(np.float32), axis=0, return_index=True, return_inverse=True
     )
     doubled = len(mesh.vertices_mm) - len(joined)
     if doubled == 0:
         return mesh, 0
-    # The order of the file is kept.
+    # Keep the order of the file.
     order = np.argsort(first)
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
@@ -204,7 +206,7 @@ def _fdi_numbers(values: NDArray[np.float64], numbering: Numbering, path: Path) 
 
 
 def _are_fdi(labels: NDArray[np.float64], fdi: frozenset[int]) -> bool:
-    # They name teeth of one jaw in it, or such as Universal Numbering does not have.
+    # Whether all labels are FDI numbers, and name teeth of one jaw or a tooth that Universal Numbering does not have.
     teeth = [float(label) for label in labels if label != GINGIVA]
     return all(label in fdi for label in teeth) and (
         len({is_upper(int(label)) for label in teeth}) <= 1 or max(teeth) > HIGHEST_UNIVERSAL

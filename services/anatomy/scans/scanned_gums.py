@@ -1,4 +1,4 @@
-"""Gums from a scanned jaw: the gingiva's own triangles, a membrane where the teeth were, and a base that encloses the
+"""Gums of a scanned jaw: the gingiva's own triangles, a membrane in place of each crown, and a base that encloses the
 roots.
 """
 
@@ -12,27 +12,28 @@ from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
 COVER_MM = 1.5
-"""Depth of gums beyond the deepest root and beyond the scan's rim."""
+"""Depth of the gums below the deepest root and below the scan's rim, mm."""
 ROW_MM = 0.8
+"""Distance between rows of vertices from the rim to the base, mm."""
 RIM_ROUNDS = 200
-"""Of smoothing the rim's outline, on its way to the base."""
+"""Number of rounds of smoothing that turn the rim's outline into that of the base."""
 
 
 def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.float64], deepest_mm: float) -> Mesh:
-    """A watertight solid; on the gingiva it is the scan itself.
+    """Build a watertight solid of the gums, which on the gingiva is the scan itself.
 
-    The crowns' triangles stay, but shrink to a membrane that each cervical line spans: every vertex off the gingiva
-    moves to the mean of its neighbours. The scan's rim is drawn away from the teeth to a flat base. Teeth stand in the
-    solid and overlap it.
+    The crowns' triangles are kept, but shrink to a membrane across each cervical line: every vertex off the gingiva
+    moves to the mean of its neighbours. The scan's rim is extended away from the teeth to a flat base. Teeth stand in
+    the solid and overlap it.
 
     Args:
         surface: the scan, manifold, with one boundary loop.
-        gingiva: which faces (F,) are gingiva.
-        occlusal: unit vector.
-        deepest_mm: coordinate along ``occlusal`` of the deepest root.
+        gingiva: faces (F,) of the gingiva.
+        occlusal: unit vector (3,).
+        deepest_mm: coordinate of the deepest root along ``occlusal``.
 
     Raises:
-        MeshError: there is no outer rim, or its outline crosses itself.
+        MeshError: there is not exactly one rim, or its outline crosses itself.
     """
     loops = boundary_loops(surface.faces)
     if len(loops) != 1:
@@ -42,7 +43,7 @@ def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.f
     height = vertices @ occlusal
     base = min(deepest_mm, float(height.min())) - COVER_MM
 
-    # Rows from the rim to the base, whose outline is the rim's without its steps.
+    # Make rows from the rim to the base, whose outline is that of the rim without its steps.
     rim = vertices[loop] - np.outer(height[loop], occlusal)
     outline = rim
     for _ in range(RIM_ROUNDS):
@@ -61,11 +62,12 @@ def gums_solid(surface: Mesh, gingiva: NDArray[np.bool_], occlusal: NDArray[np.f
 
 
 def fill_outline(outline: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Delaunay triangles (N - 2, 3), counter-clockwise, of a closed outline (N, 2) whose vertices are dense for its
-    bends and for its width.
+    """Delaunay triangles (N - 2, 3), counter-clockwise, inside a closed outline (N, 2).
+
+    The vertices must be dense in comparison with the outline's bends and its width.
 
     Raises:
-        MeshError: the outline crosses itself, or is not that dense.
+        MeshError: the outline crosses itself, or its vertices are not dense enough.
     """
     from scipy.spatial import Delaunay
 
@@ -74,7 +76,7 @@ def fill_outline(outline: NDArray[np.float64]) -> NDArray[np.int64]:
     turned = (b - a)[:, 0] * (c - a)[:, 1] < (b - a)[:, 1] * (c - a)[:, 0]
     triangles = np.where(turned[:, None], triangles[:, ::-1], triangles)
 
-    # Inside where a ray towards +x crosses the outline an odd number of times.
+    # Keep triangles inside the outline, from whose middles a ray towards +x crosses it an odd number of times.
     (x, y), start, end = ((a + b + c) / 3).T, outline, np.roll(outline, -1, axis=0)
     spans = (start[:, 1] > y[:, None]) != (end[:, 1] > y[:, None])
     rise = np.where(start[:, 1] == end[:, 1], 1.0, end[:, 1] - start[:, 1])
@@ -88,7 +90,7 @@ def fill_outline(outline: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _membrane(surface: Mesh, gingiva: NDArray[np.bool_]) -> NDArray[np.float64]:
-    # The harmonic map of uniform weights: each free vertex lies at the mean of its neighbours.
+    # Vertices (V, 3) of the harmonic map with uniform weights: each free vertex lies at the mean of its neighbours.
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import spsolve
 

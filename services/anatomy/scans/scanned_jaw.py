@@ -1,5 +1,5 @@
-"""A jaw of solids from a labelled scan, in arch coordinates: x along the front teeth, y to the front, z occlusal, the
-origin in the arch's middle.
+"""A jaw of solids from a labelled scan, in arch coordinates: x along the front teeth, y to the front, z occlusal, with
+the origin in the arch's middle.
 """
 
 from __future__ import annotations
@@ -32,29 +32,30 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Mesh, Tooth
 
 LARGEST_SHARE = 0.8
-"""Of a tooth's area that has to be in one piece; the rest is taken for specks."""
+"""Smallest fraction of a tooth's area that must be in one piece; the rest is taken for specks."""
 SMALLEST_CROWN_MM2 = 15.0
-"""Area of a crown that is taken for one; a lower incisor shows some 100, one that breaks through some 20."""
+"""Smallest area of a crown, mm²; a lower incisor shows about 100, an erupting one about 20."""
 STEEPEST_TILT_DEG = 25.0
-"""Of a tooth's axis off the arch's normal: upper front teeth lean about so far to the front."""
+"""Largest angle between a tooth's axis and the arch's normal; upper front teeth lean to the front by about this
+angle."""
 FLAT = 0.2
-"""Spread of the crowns across their line, relative to that along it, above which their middles span the occlusal
+"""Ratio of the spread of the crowns across their line to that along it, above which their middles span the occlusal
 plane."""
 
 
 @dataclass(frozen=True)
 class Repairs:
-    """What was wrong with a scan's surface and is mended."""
+    """Repairs of a scan's surface."""
 
     doubled_vertices: int
-    """Joined with others at the same place."""
+    """Number of vertices that were joined with others at the same place."""
     removed_triangles: int
-    """Without area, twice there, at edges of more than two, or apart from the jaw."""
+    """Number of removed triangles: degenerate, duplicate, at an edge with more than two, or apart from the jaw."""
     holes_mm: tuple[float, ...]
-    """Lengths around the holes that were closed, the longest first."""
+    """Circumferences of the holes that were closed, the longest first."""
 
     def sentence(self) -> str:
-        """For a report."""
+        """Describe the repairs in one sentence for a report."""
         holes = f"{len(self.holes_mm)} holes closed" + (
             f" (the longest {self.holes_mm[0]:.1f} mm around)" if self.holes_mm else ""
         )
@@ -68,16 +69,16 @@ class Repairs:
 class ScannedJaw:
     """Solids in arch coordinates, mm.
 
-    Teeth overlap the gums, which hold their roots; roots are made up, and so is the gums' base.
+    Teeth overlap the gums, which contain their roots. The roots and the base of the gums are assumed, not scanned.
     """
 
     teeth: tuple[Tooth, ...]
     frames: tuple[ToothFrame, ...]
-    """Of each tooth: x = y × z, which is mesial in the quadrants 1 and 3 and distal in 2 and 4; y buccal, z
-    occlusal."""
+    """Canonical frame of each tooth: y buccal, z occlusal and x = y × z, which is mesial in the quadrants 1 and 3 and
+    distal in 2 and 4."""
     gums: Mesh
     arch_from_scan: NDArray[np.float64]
-    """Rigid transform (4, 4)."""
+    """Rigid transform (4, 4) from the scan's coordinates to arch coordinates."""
     repairs: Repairs
 
 
@@ -85,12 +86,13 @@ def jaw_from_scan(scan: LabelledScan, roots: Literal["stub", "whole"] = "stub") 
     """Close every crown and the gums of a scan.
 
     Args:
-        scan: of one jaw.
-        roots: a stub of 4 mm, all that a camera's light reaches, or as long as the average of the tooth's kind.
+        scan: labelled scan of one jaw.
+        roots: a stub of 4 mm, beyond which light that a camera sees does not reach, or a root of average length for the
+            tooth's kind.
 
     Raises:
-        CaptureInputError: a label is in several pieces, or left and right are exchanged. MeshError: a part cannot be
-            closed.
+        CaptureInputError: a label is too small or in several pieces, left and right are exchanged, or the scan is
+            inside out. MeshError: a part cannot be closed.
     """
     _require_whole_teeth(scan)
     surface, labels, repairs = _clean(scan)
@@ -101,7 +103,7 @@ def jaw_from_scan(scan: LabelledScan, roots: Literal["stub", "whole"] = "stub") 
     turned = surface.vertices_mm @ rotation.T
     shift = -(turned.min(axis=0) + turned.max(axis=0)) / 2
 
-    # From here on in arch coordinates.
+    # Continue in arch coordinates.
     surface = Mesh(turned + shift, surface.faces)
     crowns = {number: Mesh(crown.vertices_mm @ rotation.T + shift, crown.faces) for number, crown in crowns.items()}
     axes = _tooth_axes(scan.teeth, crowns, middles @ rotation.T + shift)
@@ -121,7 +123,8 @@ def _root(fdi: int, roots: Literal["stub", "whole"]) -> Root:
 
 
 def _require_outward(surface: Mesh, labels: NDArray[np.int64]) -> None:
-    # Crowns stand above the gingiva at their necks, seen along the surface's mean normal; in a mirror they hang below.
+    # Check that crowns rise above the gingiva at their necks along the surface's mean normal; in a mirror image they
+    # would lie below.
     crowns, gingiva = (Mesh(surface.vertices_mm, surface.faces[keep]) for keep in (labels > 0, labels == GINGIVA))
     neck = np.intersect1d(crowns.faces, gingiva.faces)
     rise = (middle_mm(crowns) - surface.vertices_mm[neck].mean(axis=0)) @ _unit(vector_area_mm2(surface))
@@ -150,7 +153,7 @@ def _require_whole_teeth(scan: LabelledScan) -> None:
 
 
 def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64], Repairs]:
-    # One manifold surface with one rim, labels without specks and with smooth borders.
+    # Manifold surface with one rim, its labels without specks and with smooth borders, and the repairs.
     kept = manifold_piece(scan.mesh)
     labels = scan.fdi[kept]
     lost = set(scan.teeth) - set(labels.tolist())
@@ -175,16 +178,16 @@ def _length_mm(loop_mm: NDArray[np.float64]) -> float:
 
 
 def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float64]) -> NDArray[np.float64]:
-    # The occlusal normal is that of the plane through the crowns' middles; few crowns in a line leave the turn about it
-    # to the normal of the scan's rim.
+    # Take the normal of the plane through the crowns' middles as the occlusal axis. If the crowns lie in a line, the
+    # normal of the scan's rim determines the rotation about that line.
     opening = vector_area_mm2(surface)
     _, spread, principal = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)
     plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
     occlusal = principal[2] if plane else opening - (opening @ principal[0]) * principal[0]
     occlusal = _unit(occlusal * np.sign(occlusal @ opening))
 
-    # The turn about it that brings the crowns nearest to an average arch's; to a mirrored one they must not be nearer
-    # by far.
+    # Find the rotation about this axis that brings the crowns nearest to an average arch. They must not be clearly
+    # nearer to a mirrored arch.
     side = np.linalg.svd(occlusal[None])[2][1]
     across = np.stack([side, np.cross(occlusal, side)])
     seen = (middles - middles.mean(axis=0)) @ across.T
@@ -209,8 +212,8 @@ def _tooth_axes(
     tangents = np.gradient(middles[order], axis=0)
     upward, axes = np.array([0.0, 0.0, 1.0]), {}
     for k, tangent in zip(order, tangents, strict=True):
-        # A cervical line rises between teeth and lies deepest in front, so its normal leans about twice as far as the
-        # tooth does.
+        # Halve the tilt of the crown's opening: a cervical line rises between teeth and lies deepest in front, so its
+        # normal leans about twice as far as the tooth.
         occlusal = _unit(_unit(vector_area_mm2(crowns[teeth[k]])) + upward)
         tilt = np.arccos(occlusal @ upward)
         if tilt > np.radians(STEEPEST_TILT_DEG):

@@ -1,9 +1,9 @@
-"""Surfaces that bound the media of a mouth without overlapping, for renderers in which a surface knows its two sides
-and nothing else.
+"""Surfaces that bound the media of a mouth without overlapping, for renderers in which a surface only defines the media
+on its two sides.
 
-Teeth and gums are solids that overlap: a tooth counts over gums, and of two teeth the one listed first. Here each
-surface is cut along the others. Two surfaces share their cut edge bit by bit, so that no ray slips through; at the
-points where three meet they do to rounding.
+Teeth and gums are solids that overlap. A tooth takes precedence over gums, and of two teeth the one listed first. Here
+each surface is cut along the others. Two surfaces share their cut edge bit for bit, so that no ray slips through; at
+points where three surfaces meet, they agree up to rounding.
 """
 
 from __future__ import annotations
@@ -22,23 +22,28 @@ from services.core.geometry import Mesh, Tooth
 
 @dataclass(frozen=True)
 class SeparateSurfaces:
-    """Open surfaces, outward as those of the solids; of what there is nothing the mesh has no face."""
+    """Open surfaces, oriented outward like those of the solids; a surface that does not occur has no faces."""
 
     crowns: tuple[Mesh, ...]
-    """Of each tooth, where air is outside."""
+    """For each tooth, the part of its surface with air outside."""
     roots: tuple[Mesh, ...]
-    """Of each tooth, where gums are outside."""
+    """For each tooth, the part of its surface with gums outside."""
     gums: Mesh
-    """Where air is outside."""
+    """Part of the gums' surface with air outside."""
     contacts: dict[tuple[int, int], Mesh]
-    """Of a tooth, where another one is outside; by their places, the one listed first before the other."""
+    """Part of a tooth's surface with another tooth outside, by the indices of both, the one listed first before the
+    other."""
 
 
 def separate(teeth: tuple[Tooth, ...], gums: Mesh | None) -> SeparateSurfaces:
     """Cut the outer surfaces of teeth and the gums along each other.
 
+    Args:
+        teeth: teeth in order of precedence.
+        gums: solid of the gums; None without gums.
+
     Raises:
-        MeshError: a surface is no solid that can be cut, or a tooth reaches into another one's dentin.
+        MeshError: a surface is not a solid that can be cut, or a tooth reaches into another one's dentin.
     """
     from manifold3d import Manifold, OpType
 
@@ -65,7 +70,7 @@ _EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
 
 
 class _Solid:
-    """A closed surface whose faces are known again after it was cut."""
+    """A closed surface whose faces can be identified after it was cut."""
 
     def __init__(self, mesh: Mesh, name: str) -> None:
         from manifold3d import Error, Manifold, Mesh64
@@ -84,11 +89,11 @@ class _Solid:
         self._low, self._high = mesh.vertices_mm.min(axis=0), mesh.vertices_mm.max(axis=0)
 
     def near(self, other: _Solid) -> bool:
-        """Whether the boxes around both overlap."""
+        """Whether the bounding boxes of both overlap."""
         return bool((self._low <= other._high).all() and (other._low <= self._high).all())
 
     def faces_in(self, body: Any) -> Mesh:
-        """What is left of this surface in a combination of solids."""
+        """Part of this surface that belongs to the surface of a combination of solids."""
         cut = body.to_mesh64()
         ends = np.asarray(cut.run_index, dtype=np.int64) // 3
         own: list[NDArray[Any]] = [

@@ -1,4 +1,4 @@
-"""In which unit a scan was written, judged by how far apart its teeth stand."""
+"""Check of a scan's unit of length by the distances between its teeth."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Unit = Literal["mm", "cm", "m", "um", "inch"]
 
 MM_PER_UNIT = MappingProxyType({"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4})
 LIKELY = (0.6, 1.6)
-"""Distance between neighbouring teeth to that of average upper ones, as a median over a jaw: lower incisors are
-narrower by a third, teeth of one person differ from the average by up to 20 %, and crowded or gapped arches by as much
-again."""
+"""Smallest and largest plausible ratio of the distance between neighbouring teeth to that of average upper teeth, as a
+median over a jaw. Lower incisors are narrower by a third, a person's teeth differ from the average by up to 20 %, and
+crowded or gapped arches by as much again."""
 
 
 def neighbour_ratio(teeth: tuple[int, ...], middles: NDArray[np.float64]) -> float | None:
-    """Median distance between the middles (N, 3) of teeth that stand side by side, relative to average widths in mm.
+    """Median distance between the middles (N, 3) of neighbouring teeth, relative to average widths in mm.
 
-    None where no two of the teeth are neighbours.
+    It is None if no two of the teeth are neighbours.
     """
     along = {side_of_front(fdi) * (fdi % 10) - (side_of_front(fdi) > 0): k for k, fdi in enumerate(teeth)}
     ratios = [
@@ -36,14 +36,16 @@ def neighbour_ratio(teeth: tuple[int, ...], middles: NDArray[np.float64]) -> flo
 
 
 def require_anatomical_scale(teeth: tuple[int, ...], middles_mm: NDArray[np.float64], unit: Unit, what: str) -> None:
-    """Refuse a scan whose teeth are as far apart as nobody's, and name the unit in which they would be somebody's.
+    """Refuse a scan whose teeth are implausibly far apart or close together, and name the unit that would fit.
 
     Args:
-        middles_mm: of the crowns (N, 3), after conversion from ``unit``.
+        teeth: FDI numbers of the teeth.
+        middles_mm: middles (N, 3) of the crowns, after conversion from ``unit``.
+        unit: assumed unit of the scan.
         what: the scan's name for the message.
 
     Raises:
-        MeshError: names the unit that fits.
+        MeshError: the distances are implausible; the message names a unit that fits, if there is one.
     """
     ratio = neighbour_ratio(teeth, middles_mm)
     if ratio is None or LIKELY[0] <= ratio <= LIKELY[1]:

@@ -1,4 +1,4 @@
-"""The dental arch: a superellipse on which teeth stand, measured by its arc length from the midline.
+"""The dental arch: a superellipse on which teeth stand, parametrised by its arc length from the midline.
 
 Jaw frame: x to the patient's left, y forward, z occlusal (an upper jaw's teeth point along +z, down), mm; the occlusal
 plane is z = 0, the midline x = 0.
@@ -10,20 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 HALF_WIDTH_MM = 25.5
+"""Half axis of the superellipse along x, mm."""
 DEPTH_MM = 47.0
-"""With the half width, gives second molars 49 mm apart at their middles, and the arc length that an average upper jaw's
-teeth need."""
+"""Half axis of the superellipse along y, mm. With the half width it places second molars 49 mm apart at their middles,
+and gives the arc length that an average upper jaw's teeth need."""
 EXPONENT = 2.2
-"""Above 2 the front is flatter than an ellipse's."""
+"""Exponent of the superellipse; above 2 its front is flatter than that of an ellipse."""
 STRAIGHT_MM = 20.0
-"""By which the arch runs on straight back behind its widest place."""
+"""Length by which the arch continues straight back behind its widest place, mm."""
 FORWARD_MM = 22.0
-"""y of the arch at the midline: the jaw's middle is the origin."""
+"""Coordinate y of the arch at the midline, mm; the jaw's middle is the origin."""
 STEPS = 8000
+"""Number of points of a half arch."""
 
 
 class Arch:
-    """The curve through the middles of the teeth; arc length is positive on the patient's left."""
+    """Curve through the middles of the teeth; the arc length is positive on the patient's left."""
 
     def __init__(self) -> None:
         angle = np.linspace(0, np.pi / 2, STEPS)
@@ -39,7 +41,7 @@ class Arch:
         self._heading = heading
 
     def points_mm(self, length_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (N, 2), x and y, at signed arc lengths (N,)."""
+        """Points (N, 2), x and y in mm, at signed arc lengths (N,)."""
         away = np.abs(length_mm)
         return np.stack(
             [np.sign(length_mm) * np.interp(away, self._length, self._x), np.interp(away, self._length, self._y)],
@@ -47,7 +49,7 @@ class Arch:
         )
 
     def tangents(self, length_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Unit directions (N, 2) of growing arc length; turned left by a right angle they point out of the mouth."""
+        """Unit tangents (N, 2) in the direction of growing arc length; 90 degrees to their left is out of the mouth."""
         heading = np.sign(length_mm) * np.interp(np.abs(length_mm), self._middle, self._heading)
         return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
 

@@ -1,8 +1,8 @@
 """Upper teeth of every kind from their dimensions: superellipse cross-sections along the axis, then cusps.
 
 Enamel and dentin are stacks of cross-sections, one inside the other. Two maps shape both alike: the cross-section
-narrows towards the tongue, and the occlusal part sinks between the cusps. A map that keeps the order of points along x
-and along z keeps what is inside inside. Frame: x mesial (of a right tooth), y buccal, z occlusal, mm, centred at the
+narrows towards the tongue, and the occlusal part sinks between the cusps. Both maps keep the order of points along x
+and along z, so dentin stays inside enamel. Frame: x mesial (of a right tooth), y buccal, z occlusal, mm, centred at the
 origin.
 """
 
@@ -22,50 +22,61 @@ Profile = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.
 """Half axes along x and y and the centre's y at heights above the cervical line, mm."""
 
 ROOT_STUB_MM = 4.0
+"""Length of the root stub below the cervical line, mm."""
 ROOT_ENAMEL_MM = 0.08
-"""Cover of the root stub: enough to keep the two surfaces apart."""
+"""Thickness of the cover of the root stub, mm: enough to keep the two surfaces apart."""
 ROOT_ROUNDING_MM = 0.8
+"""Radius of the rim at the stub's end, mm."""
 ROOT_TAPER = 0.92
 """Diameter of the stub's end relative to the cervix."""
 DENTIN_EDGE_MM = 0.3
-"""Half the labiolingual thickness at which dentin ends below a thin incisal edge."""
+"""Half the labiolingual thickness at which dentin ends below a thin incisal edge, mm."""
 DENTIN_ROUNDING = 0.35
-"""Of the dentin's upper rim, relative to the enamel's."""
+"""Radius of the dentin's upper rim relative to that of the enamel."""
 CROWN_STEP_MM, ROOT_STEP_MM = 0.36, 0.8
+"""Distances between cross-sections of the crown and of the root, mm."""
 LID_STEP_MM, ROOT_LID_STEP_MM = 0.45, 1.0
+"""Distances between the rings of the flat lids at the crown's and at the root's end, mm."""
 THIN_LID_MM = 0.8
-"""Half width of a flat lid below which it is bridged in one step."""
+"""Half width of a flat lid below which it is bridged in one step, mm."""
 CUSP_RADIUS_MM = 0.6
+"""Radius of the rounding of a cusp's tip, mm."""
 CUSP_BLEND_MM = 0.25
+"""Height scale of the soft maximum over cusps and fossa, mm."""
 CUSP_START = 0.35
-"""Share of the crown's length above which cusps shape it."""
+"""Fraction of the crown's length above which cusps shape it."""
 
 
 @dataclass(frozen=True)
 class CrownForm:
-    """How a kind of crown is shaped, relative to its dimensions."""
+    """Form of a kind of crown, relative to its dimensions."""
 
     heights: tuple[float, ...]
-    """Of the cross-sections above the cervix, relative to the crown's length."""
+    """Heights of the cross-sections above the cervix, relative to the crown's length."""
     mesiodistal: tuple[float, ...]
-    """Their diameters relative to the crown's."""
+    """Mesiodistal diameters of the cross-sections, relative to the crown's."""
     labiolingual: tuple[float, ...]
+    """Labiolingual diameters of the cross-sections, relative to the crown's."""
     labial: tuple[float, ...]
-    """Their labial wall's distance from the axis, relative to the crown's labiolingual diameter."""
+    """Distances of the labial wall from the axis, relative to the crown's labiolingual diameter."""
     cusps: tuple[tuple[float, float, float], ...]
-    """x and y relative to the crown's half diameters, and how much lower than the highest, mm."""
+    """For each cusp x and y relative to the crown's half diameters, and its height below the highest cusp, mm."""
     cusp_slope: float
+    """Slope of a cusp's sides, height over distance."""
     cusp_roundness: float
-    """1 for a cusp that falls off all around, 0 for a ridge that falls off mesially and distally only."""
+    """Shape of a cusp: 1 if it slopes to all sides, 0 for a ridge that slopes mesially and distally only."""
     fossa_mm: float
-    """How far below the highest cusp the occlusal table sinks at most."""
+    """Largest depth of the occlusal table below the highest cusp, mm."""
     exponent: float
+    """Exponent of the cross-sections' superellipse."""
     lingual_taper: float
     """Relative change of width from the axis to the labial or lingual end."""
     rounding_mm: float
+    """Radius of the enamel's upper rim, mm."""
     enamel_mm: tuple[float, float]
-    """At the cervix and at the tip."""
+    """Enamel thickness at the cervix and at the tip, mm."""
     columns: int
+    """Number of vertices around a cross-section."""
 
 
 INCISOR = CrownForm(
@@ -129,23 +140,24 @@ MOLAR = CrownForm(
     columns=72,
 )
 FORMS = (INCISOR, INCISOR, CANINE, PREMOLAR, PREMOLAR, MOLAR, MOLAR, MOLAR)
-"""By position from the midline."""
+"""Forms of the teeth at the places 1 to 8 from the midline."""
 
 
 @dataclass(frozen=True)
 class ToothSolid:
-    """One tooth in its canonical frame: enamel's outer surface with a stub of root, dentin inside."""
+    """One tooth in its canonical frame: outer surface of the enamel with a root stub, and dentin inside."""
 
     outer: Mesh
     dentin: Mesh
     cervix_mm: float
-    """Height of the cervical line."""
+    """Coordinate z of the cervical line, mm."""
 
 
 def build_tooth(dimensions: ToothDimensions, enamel_scale: float = 1.0) -> ToothSolid:
     """Build a right upper tooth.
 
     Args:
+        dimensions: of the tooth.
         enamel_scale: thickness of the enamel relative to the average.
     """
     form, length = FORMS[dimensions.position - 1], dimensions.crown_length_mm
@@ -156,7 +168,7 @@ def build_tooth(dimensions: ToothDimensions, enamel_scale: float = 1.0) -> Tooth
     rounding = max(DENTIN_EDGE_MM / 2, DENTIN_ROUNDING * form.rounding_mm)
     dentin = _stack(dentin_profile, (-ROOT_STUB_MM + ROOT_ENAMEL_MM, top), (ROOT_ROUNDING_MM, rounding), form)
 
-    # The same maps for both, then exactly the crown's diameter and length.
+    # Shape both by the same maps, then scale them exactly to the crown's diameter and length.
     outer, dentin = (Mesh(_shaped(mesh.vertices_mm, form, dimensions), mesh.faces) for mesh in (outer, dentin))
     stretch = np.array(
         [dimensions.md_crown_mm / np.ptp(outer.vertices_mm[:, 0]), 1.0, length / outer.vertices_mm[:, 2].max()]
@@ -173,7 +185,7 @@ def build_tooth(dimensions: ToothDimensions, enamel_scale: float = 1.0) -> Tooth
 def enamel_thickness_mm(
     form: CrownForm, crown_length_mm: float, height_mm: NDArray[np.float64], scale: float
 ) -> NDArray[np.float64]:
-    """Enamel along the normal at a height above the cervical line; fades to the root's cover below it."""
+    """Enamel thickness along the normal at heights above the cervical line, mm; it fades to the root's cover below."""
     cervix, tip = form.enamel_mm
     crown = scale * (cervix + (tip - cervix) * np.clip(height_mm / crown_length_mm, 0.0, 1.0))
     fade = np.clip(1.0 + height_mm / 1.0, 0.0, 1.0)
@@ -181,7 +193,7 @@ def enamel_thickness_mm(
 
 
 def _outer_profile(form: CrownForm, d: ToothDimensions) -> Profile:
-    # Monotone between the stated heights so that no waist appears.
+    # Interpolate monotonically between the given heights, so that no waist appears.
     from scipy.interpolate import PchipInterpolator
 
     heights = (-ROOT_STUB_MM, 0.0, *(share * d.crown_length_mm for share in form.heights))
@@ -218,7 +230,7 @@ def _dentin_profile(form: CrownForm, crown_length_mm: float, outer: Profile, sca
 
 
 def _dentin_top_mm(form: CrownForm, crown_length_mm: float, dentin: Profile, scale: float) -> float:
-    # Below the tip by the enamel's thickness, and where the walls leave room for it.
+    # Height of the dentin's top: below the tip by the enamel's thickness, and where the walls leave enough room.
     heights = np.linspace(0.0, crown_length_mm, 1000)
     room = (dentin(heights)[1] >= DENTIN_EDGE_MM) & (
         heights + enamel_thickness_mm(form, crown_length_mm, heights, scale) <= crown_length_mm
@@ -227,8 +239,8 @@ def _dentin_top_mm(form: CrownForm, crown_length_mm: float, dentin: Profile, sca
 
 
 def _stack(profile: Profile, ends_mm: tuple[float, float], rounding_mm: tuple[float, float], form: CrownForm) -> Mesh:
-    # Rows (height, inset, scale): a rounded rim, the wall, and the other rim. Either end has a flat lid; a wide one has
-    # rings of its own.
+    # List the rows (height, inset, scale): a rounded rim, the wall, and the other rim. Each end has a flat lid; a wide
+    # lid has rings of its own.
     rims, thin = [], []
     for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
         half_x, half_y, _ = (float(value[0]) for value in profile(np.array([end])))
@@ -257,7 +269,8 @@ def _stack(profile: Profile, ends_mm: tuple[float, float], rounding_mm: tuple[fl
 
 
 def _shaped(vertices_mm: NDArray[np.float64], form: CrownForm, d: ToothDimensions) -> NDArray[np.float64]:
-    # Width by distance from the tongue; heights by the cusps, fully at the tip and not at all near the cervix.
+    # Scale the width with the distance from the tongue, and change heights by the cusps, fully at the tip and not at
+    # all near the cervix.
     x, y, z = vertices_mm.T
     x = x * (1 + form.lingual_taper * 2 * y / d.ll_crown_mm)
     share = np.clip((z / d.crown_length_mm - CUSP_START) / (1 - CUSP_START), 0.0, 1.0)
@@ -267,7 +280,8 @@ def _shaped(vertices_mm: NDArray[np.float64], form: CrownForm, d: ToothDimension
 def _relief_mm(
     x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], form: CrownForm, d: ToothDimensions
 ) -> NDArray[np.float64]:
-    # Soft maximum of cones with rounded tips and of the fossa's floor; 0 at the highest cusp.
+    # Height (N,) of the occlusal relief: soft maximum of cones with rounded tips and of the fossa's floor; 0 at the
+    # highest cusp.
     cusps = np.array(form.cusps)
     tips = cusps[:, :2] * [d.md_crown_mm / 2, d.ll_crown_mm / 2]
     x, y = np.append(x_mm, tips[:, 0]), np.append(y_mm, tips[:, 1])

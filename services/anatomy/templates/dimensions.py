@@ -1,5 +1,5 @@
-"""Average dimensions of the upper teeth, and roots of both jaws: Wheeler's averages, some recalled, all recorded in
-steps of 0.5 mm.
+"""Average dimensions of the upper teeth and root lengths of both jaws: Wheeler's averages, some recalled from memory,
+all in steps of 0.5 mm.
 """
 
 from __future__ import annotations
@@ -16,23 +16,27 @@ same table, recalled."""
 
 @dataclass(frozen=True)
 class ToothDimensions:
-    """One kind of upper tooth."""
+    """Average dimensions of one kind of upper tooth."""
 
     name: str
     position: int
-    """From the midline: the second digit of its FDI number."""
+    """Place from the midline: the second digit of the FDI number."""
     crown_length_mm: float
-    """Cervical line to incisal edge or highest cusp."""
+    """Length from the cervical line to the incisal edge or highest cusp."""
     md_crown_mm: float
     """Mesiodistal diameter of the crown, at its widest."""
     md_cervix_mm: float
+    """Mesiodistal diameter at the cervix."""
     ll_crown_mm: float
     """Labio- or buccolingual diameter of the crown, at its widest."""
     ll_cervix_mm: float
+    """Labio- or buccolingual diameter at the cervix."""
     curvature_mesial_mm: float
-    """How far the cervical line rises towards the edge on the mesial side."""
+    """Rise of the cervical line towards the edge on the mesial side."""
     curvature_distal_mm: float
+    """Rise of the cervical line towards the edge on the distal side."""
     status: Status
+    """Source of the values."""
 
 
 UPPER_TEETH = (
@@ -49,12 +53,12 @@ UPPER_TEETH = (
 
 UPPER_ROOTS_MM = (13.0, 13.0, 17.0, 14.0, 14.0, 13.0, 12.0, 11.0)
 LOWER_ROOTS_MM = (12.5, 14.0, 16.0, 14.0, 14.5, 14.0, 13.0, 11.0)
-"""Cervical line to apex by place from the midline, recalled from Wheeler's table of averages; of molars the longest
-root."""
+"""Lengths from cervical line to apex, mm, of the teeth at the places 1 to 8 from the midline, recalled from Wheeler's
+table of averages; for molars that of the longest root."""
 
 
 def root_length_mm(position: int, *, is_upper: bool) -> float:
-    """Average length of the root of the tooth at a place 1 to 8 from the midline."""
+    """Average root length of the tooth at a place 1 to 8 from the midline."""
     return (UPPER_ROOTS_MM if is_upper else LOWER_ROOTS_MM)[position - 1]
 
 

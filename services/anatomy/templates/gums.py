@@ -1,4 +1,4 @@
-"""What surrounds the teeth of an upper jaw: the gums, a solid along the arch, and the wall of the mouth behind it."""
+"""Surroundings of the teeth of an upper jaw: the gums, a solid along the arch, and the wall of the mouth behind it."""
 
 from __future__ import annotations
 
@@ -14,48 +14,58 @@ from services.anatomy.templates.sections import close_rings, superellipse
 from services.core.geometry import Mesh
 
 MARGIN_MM = 0.7
-"""Height of the gums' crest above the cervical line at a tooth's middle; the margin on the tooth is lower, where the
-crest rounds off."""
+"""Height of the gums' crest above the cervical line at a tooth's middle, mm. The margin on the tooth is lower, because
+the crest is rounded there."""
 PAPILLA_MM = 0.8
-"""Height of the crest between teeth above what the cervical lines' curvature gives."""
+"""Height of the crest between teeth in addition to the rise of the cervical lines, mm."""
 BELOW_ROOT_MM = 3.5
+"""Depth of the gums below the ends of the root stubs, mm."""
 COVER_MM = 1.4
-"""Thickness of gums over the root, labially and towards the tongue."""
+"""Thickness of the gums over the root on the labial and lingual sides, mm."""
 EMBRASURE_MM = 0.5
-"""By how much that is less between two teeth."""
+"""Amount by which this thickness is less between two teeth, mm."""
 BEHIND_MM = 3.5
+"""Length of the gums behind the last tooth, mm."""
 END_ROUNDING_MM = 4.0
+"""Length of the rounded ends of the gums, mm."""
 EXPONENT = 3.6
+"""Exponent of the cross-sections' superellipse."""
 STEP_MM = 0.6
+"""Distance between cross-sections along the arch, mm."""
 COLUMNS = 44
+"""Number of vertices around a cross-section."""
 FINE_MM = 0.05
+"""Step of arc length at which crest and ridge are smoothed, mm."""
 CREST_ROUNDING_MM, RIDGE_ROUNDING_MM = 0.8, 1.6
-"""Standard deviations of the smoothing of the crest's height and of the ridge's depth along the arch."""
+"""Standard deviations of the smoothing of the crest's height and of the ridge's depth along the arch, mm."""
 VAULT_MM = 10.0
-"""Height of the palate over its rim."""
+"""Height of the palate over its rim, mm."""
 WALL_BELOW_MM = 5.0
-"""How far the back wall reaches beyond the occlusal plane."""
+"""Distance by which the back wall reaches beyond the occlusal plane, mm."""
 
 
 @dataclass(frozen=True)
 class Socket:
-    """Where a tooth leaves the gums."""
+    """Place at which a tooth leaves the gums."""
 
     arc_mm: float
-    """Signed arc length of its middle."""
+    """Signed arc length of the tooth's middle."""
     width_mm: float
+    """Mesiodistal width of the tooth."""
     cervix_z_mm: float
+    """Coordinate z of the cervical line."""
     half_depth_mm: float
-    """Half its labiolingual diameter at the cervix."""
+    """Half the tooth's labiolingual diameter at the cervix."""
     curvature_mm: float
-    """Rise of its cervical line between the teeth, mean of both sides."""
+    """Rise of the cervical line between the teeth, mean of both sides."""
 
 
 def build_gums(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
-    """One solid around all root stubs whose crest rises between the teeth.
+    """Build one solid around all root stubs, whose crest rises between the teeth.
 
     Args:
-        sockets: in order of arc length.
+        arch: the dental arch.
+        sockets: places of the teeth, in order of arc length.
     """
     first, last = (
         sockets[0].arc_mm - sockets[0].width_mm / 2 - BEHIND_MM,
@@ -73,7 +83,7 @@ def build_gums(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
     scale = np.concatenate([np.sin(cap), np.ones_like(middle), np.cos(cap)])
     crest, floor, half_depth = _outline(sockets, stations)
 
-    # Sections stand across the arch, counter-clockwise seen from the last: first axis up, second outward.
+    # Place the cross-sections across the arch, counter-clockwise seen from the last: first axis up, second outward.
     points, outward = arch.points_mm(stations), arch.outward(stations)
     rings = []
     for k in range(len(stations)):
@@ -86,8 +96,8 @@ def build_gums(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
 
 
 def build_cavity(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
-    """An open wall: the palate's vault between the gums and, behind the last teeth, a wall down past the occlusal
-    plane.
+    """Build the open wall of the mouth: the palate's vault between the gums, and behind the last teeth a wall that
+    reaches beyond the occlusal plane.
     """
     ends = (
         np.array([sockets[-1].arc_mm, -sockets[0].arc_mm])
@@ -98,7 +108,7 @@ def build_cavity(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
     half_width, y = arch.points_mm(lengths).T
     rim = float(np.mean([socket.cervix_z_mm for socket in sockets])) - ROOT_STUB_MM
     across = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 57))
-    # The vault rises behind the incisors and stays; its sides are steep, its middle is flat.
+    # Let the vault rise behind the incisors and then stay at its height, with steep sides and a flat middle.
     rise = VAULT_MM * np.clip((y[0] - y) / 20.0, 0.0, 1.0) ** 0.7
     vault = np.stack(
         np.broadcast_arrays(half_width[:, None] * across, y[:, None], rim - rise[:, None] * (1 - across**4)), axis=-1
@@ -114,8 +124,8 @@ def build_cavity(arch: Arch, sockets: tuple[Socket, ...]) -> Mesh:
 def _outline(
     sockets: tuple[Socket, ...], stations_mm: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    # Crest, floor and half depth at arc lengths: nodes at each tooth's middle and shoulders and between neighbours,
-    # monotone in between, then rounded off.
+    # Heights of crest and floor and half depth (N,) at arc lengths. Nodes lie at each tooth's middle and shoulders and
+    # between neighbours; the curves are monotone between nodes and then smoothed.
     from scipy.interpolate import PchipInterpolator
     from scipy.ndimage import gaussian_filter1d
 
@@ -151,7 +161,7 @@ def _outline(
 
 
 def _sheet(points_mm: NDArray[np.float64]) -> Mesh:
-    # Triangles of a grid of points (rows, columns, 3).
+    # Triangle mesh of a grid of points (rows, columns, 3).
     rows, columns, _ = points_mm.shape
     a = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     b, c, d = a + 1, a + columns, a + columns + 1

@@ -1,8 +1,9 @@
-"""A procedural upper central incisor after Wheeler's averages, with the enamel-thickness model of its labial face.
+"""A procedural upper central incisor after Wheeler's averages, with a model of its labial enamel thickness.
 
-Superellipse cross-sections, stacked along the tooth's axis: labiolingual diameter 6.0 mm at the cervix, 7.0 mm at 2.5
-mm above it and 1.5 mm at the incisal edge, 10.5 mm above it; mesiodistal 7.0 mm at the cervix and 8.5 mm at the widest.
-Labial enamel is 0.35 mm + 0.75 z / 10.5 thick. Frame: x mesial, y buccal, z occlusal, mm, centred at the origin.
+Superellipse cross-sections are stacked along the tooth's axis. The labiolingual diameter is 6.0 mm at the cervix, 7.0
+mm at 2.5 mm above it and 1.5 mm at the incisal edge, 10.5 mm above it; the mesiodistal one is 7.0 mm at the cervix and
+8.5 mm at the widest. At a height of z mm above the cervix, labial enamel is 0.35 mm + 0.75 mm · z / 10.5 thick. Frame:
+x mesial, y buccal, z occlusal, mm, centred at the origin.
 """
 
 from __future__ import annotations
@@ -19,19 +20,28 @@ from services.core.geometry import Mesh
 Profile = tuple[NDArray[np.float64], ...]
 
 CROWN_MM = 10.5
+"""Length of the crown from cervical line to incisal edge."""
 ROOT_STUB_MM = 3.0
+"""Length of the root stub below the cervical line."""
 ROOT_ENAMEL_MM = 0.08
-"""Cover of the root stub: enough to keep the two surfaces apart."""
+"""Thickness of the cover of the root stub: enough to keep the two surfaces apart."""
 EDGE_ROUNDING_MM = 0.45
+"""Radius of the rim at the incisal edge."""
 ROOT_ROUNDING_MM = 0.8
+"""Radius of the rim at the stub's end."""
 DENTIN_EDGE_MM = 0.2
 """Half the labiolingual thickness at which dentin ends below the incisal edge."""
 EXPONENT = 2.4
+"""Exponent of the cross-sections' superellipse."""
 
 HEIGHT_MM = (-ROOT_STUB_MM, 0.0, 2.5, 6.0, 9.0, CROWN_MM)
+"""Heights above the cervical line at which the following three dimensions are given."""
 LABIAL_MM = (2.75, 3.0, 3.40, 2.95, 1.75, 0.95)
+"""Distance of the labial wall from the axis."""
 LABIOLINGUAL_MM = (5.5, 6.0, 7.0, 4.6, 2.35, 1.5)
+"""Labiolingual diameter."""
 MESIODISTAL_MM = (6.5, 7.0, 7.6, 8.3, 8.5, 8.1)
+"""Mesiodistal diameter."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +54,7 @@ class Incisor:
 
 
 def enamel_thickness_mm(height_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Labial enamel thickness at a height above the cervical line; fades to the root's cover below it."""
+    """Labial enamel thickness in mm at heights above the cervical line; it fades to the root's cover below it."""
     crown = 0.35 + 0.75 * np.clip(height_mm, 0.0, CROWN_MM) / CROWN_MM
     fade = np.clip(1.0 + height_mm / 1.0, 0.0, 1.0)
     smooth = fade * fade * (3 - 2 * fade)
@@ -52,7 +62,7 @@ def enamel_thickness_mm(height_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def build_incisor(columns: int = 40) -> Incisor:
-    """Build the tooth.
+    """Build the incisor with its gums.
 
     Args:
         columns: vertices around a cross-section; 40 gives about 4,300 triangles for the enamel surface.
@@ -71,13 +81,13 @@ def build_incisor(columns: int = 40) -> Incisor:
 
 
 def cervix_height_mm() -> float:
-    """Height of the cervical line in the centred frame: add it to a height above the cervix."""
+    """Height of the cervical line in the centred frame; add it to a height above the cervix to get z."""
     return -(CROWN_MM - ROOT_STUB_MM) / 2
 
 
 def _outer_profile(height_mm: NDArray[np.float64]) -> Profile:
-    # Half axes and the labial offset of the centre line, monotone between the measured heights so that no waist
-    # appears.
+    # Half axes along x and y, and labial offset of the centre line, interpolated monotonically between the measured
+    # heights, so that no waist appears.
     from scipy.interpolate import PchipInterpolator
 
     labial, diameter, width = (
@@ -107,7 +117,7 @@ def _stack(
     rounding_mm: tuple[float, float],
     columns: int,
 ) -> Mesh:
-    # Rows: a flat lid that grows from a pole, a rounded rim, the wall, and the same at the other end.
+    # List the rows: a flat lid that grows from a pole, a rounded rim, the wall, and the same at the other end.
     wall_rows, rim_rows = max(8, columns), max(4, columns // 8)
     rows = []
     for end, rounding, sign in ((ends_mm[0], rounding_mm[0], -1.0), (ends_mm[1], rounding_mm[1], 1.0)):
@@ -131,8 +141,7 @@ def _stack(
 
 
 def _gum_collar(columns: int) -> Mesh:
-    # A block around the root whose top rises to papillae between the teeth; inside the tooth it is hidden by the
-    # enamel.
+    # Block around the root whose top rises to papillae between the teeth; the enamel hides the part inside the tooth.
     def profile(height_mm: NDArray[np.float64]) -> Profile:
         return np.full_like(height_mm, 6.5), np.full_like(height_mm, 5.0), np.full_like(height_mm, 0.2)
 

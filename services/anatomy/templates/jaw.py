@@ -22,23 +22,32 @@ from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
 RIGHT, LEFT = 10, 20
-"""FDI numbers of the upper quadrants, before the place."""
+"""Numbers of the upper quadrants, to which the place is added to give the FDI number."""
 PLACES = range(1, 8)
+"""Places of the teeth from the midline; there are no third molars."""
 GAP_MM = 0.07
-"""Between neighbours, at their nearest."""
+"""Smallest distance between neighbours, mm."""
 MAX_MOVES = 60
+"""Largest number of moves of a tooth along the arch."""
 GAP_ERROR_MM = 0.005
+"""Largest accepted error of the gap, mm."""
 SEPARATION_MM = 1.0
-"""By how much more than their half widths two teeth are apart before they are moved together."""
+"""Distance between two teeth, in addition to their half widths, before they are moved together, mm."""
 SHORT_OF_PLANE_MM = {2: 0.6, 7: 0.3}
-"""Teeth that end above the occlusal plane."""
+"""Distance in mm by which teeth end above the occlusal plane, by place from the midline."""
 MIRROR = np.diag([-1.0, 1.0, 1.0])
+"""Reflection (3, 3) that exchanges left and right."""
 
 SIZE_SPREAD = 0.05
+"""Relative half width of the uniform draw of a subject's size."""
 ENAMEL_SPREAD = 0.10
+"""Relative half width of the uniform draw of a tooth's enamel thickness."""
 TURN_SPREAD_DEG = 4.0
+"""Half width of the uniform draw of a tooth's rotation about its axis, degrees."""
 TILT_SPREAD_DEG = 2.5
+"""Half width of the uniform draws of a tooth's torque and tip, degrees."""
 SHIFT_SPREAD_MM = 0.25
+"""Half width of the uniform draws of a tooth's forward displacement and of its height, mm."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +56,16 @@ class JawTooth:
 
     fdi: int
     outer: Mesh
-    """Enamel with a stub of root."""
+    """Outer surface of the enamel, with a root stub."""
     dentin: Mesh
     frame: ToothFrame
-    """Its canonical frame; the world is the jaw's."""
+    """Canonical frame of the tooth; its world is the jaw frame."""
     cervix_mm: float
     """Height of the cervical line in the canonical frame."""
 
     @property
     def jaw_from_tooth(self) -> NDArray[np.float64]:
-        """Rigid transform (4, 4) from the canonical frame."""
+        """Rigid transform (4, 4) from the canonical frame to the jaw frame."""
         pose = np.eye(4)
         pose[:3, :3] = self.frame.rotation.T
         pose[:3, 3] = -self.frame.rotation.T @ self.frame.translation_mm
@@ -65,27 +74,30 @@ class JawTooth:
 
 @dataclass(frozen=True)
 class Jaw:
-    """Teeth from 17 to 27 as they stand, from the patient's right to the left, and what surrounds them."""
+    """Teeth from 17 to 27 in their order from the patient's right to the left, gums, and the wall of the mouth."""
 
     teeth: tuple[JawTooth, ...]
     gums: Mesh
     cavity: Mesh
-    """Open."""
+    """Wall of the mouth, an open surface."""
 
     def tooth(self, fdi: int) -> JawTooth:
-        """The tooth of an FDI number."""
+        """Tooth with the given FDI number."""
         return next(tooth for tooth in self.teeth if tooth.fdi == fdi)
 
 
 @dataclass(frozen=True)
 class Stance:
-    """How one tooth differs from the average."""
+    """Deviation of one tooth from the average."""
 
     enamel_scale: float = 1.0
+    """Thickness of the enamel relative to the average."""
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """About x (torque), y (tip) and z, canonical axes."""
+    """Rotations about the canonical axes x (torque), y (tip) and z."""
     forward_mm: float = 0.0
+    """Displacement out of the arch, towards lips and cheeks."""
     longer_mm: float = 0.0
+    """Displacement in the occlusal direction."""
 
 
 def build_jaw(seed: int | None = None) -> Jaw:
@@ -99,7 +111,7 @@ def build_jaw(seed: int | None = None) -> Jaw:
     random = None if seed is None else np.random.default_rng(seed)
     size = 1.0 if random is None else 1 + SIZE_SPREAD * float(random.uniform(-1, 1))
     right = _quadrant(arch, _stances(random), None)
-    # The left is built as a right one, in the mirror, where it meets the right central incisor.
+    # Build the left quadrant as a mirrored right one, in contact with the mirrored right central incisor.
     left = right if random is None else _quadrant(arch, _stances(random), _mirrored(right[0][0]))
 
     sockets = tuple(socket for _, socket in reversed(right)) + tuple(
@@ -126,8 +138,8 @@ def _stances(random: np.random.Generator | None) -> tuple[Stance, ...]:
 
 
 def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -> list[tuple[JawTooth, Socket]]:
-    # From the midline back, each tooth is moved along the arch until it all but touches the one before; the first,
-    # where there is none, the midline's plane.
+    # Starting at the midline, move each tooth along the arch until it almost touches the tooth before it. The first
+    # tooth is moved to the midline's plane if it has no neighbour.
     placed: list[tuple[JawTooth, Socket]] = []
     neighbour = None if first is None else SurfaceDistance(_far_half(first))
     arc_mm = 0.0
@@ -144,7 +156,7 @@ def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -
             spare_mm = float(
                 -points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM
             )
-            # Turning with the arch may bring a corner nearer than the move itself: so a little less at a time.
+            # Move by a little less than the gap, because turning with the arch may bring a corner nearer than the move.
             arc_mm += 0.85 * spare_mm
             frame = _standing(arch, arc_mm, solid, d, stance)
         else:
@@ -162,7 +174,7 @@ def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -
 
 
 def _standing(arch: Arch, arc_mm: float, solid: ToothSolid, d: ToothDimensions, stance: Stance) -> ToothFrame:
-    # Upright on the arch with its tip on the occlusal plane, then turned about its own middle.
+    # Frame of a tooth that stands upright on the arch with its tip on the occlusal plane, then turned about its middle.
     from scipy.spatial.transform import Rotation
 
     at = np.array([arc_mm])
@@ -183,15 +195,16 @@ def _stood(solid: ToothSolid, frame: ToothFrame, fdi: int) -> JawTooth:
 
 
 def _far_half(tooth: JawTooth) -> Mesh:
-    # Of the crown, the side that the next tooth of the right meets: a right tooth's distal side, or the mesial one
-    # across the midline.
+    # Side of the crown that the next tooth on the right touches: a right tooth's distal side, or across the midline the
+    # mesial side.
     canonical = tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
     kept = (canonical[:, 0] < 0) & (canonical[:, 2] > tooth.cervix_mm)
     return Mesh(tooth.outer.vertices_mm, tooth.outer.faces[kept[tooth.outer.faces].all(axis=1)])
 
 
 def _mirrored(tooth: JawTooth) -> JawTooth:
-    # The patient's other side; the frame's x axis turns from mesial to distal, so that it stays right-handed.
+    # Mirror a tooth to the patient's other side. The frame's x axis changes from mesial to distal, so that the frame
+    # stays right-handed.
     outer, dentin = (
         Mesh(mesh.vertices_mm @ MIRROR, mesh.faces[:, ::-1].copy()) for mesh in (tooth.outer, tooth.dentin)
     )

@@ -13,7 +13,8 @@ def superellipse(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vertices x, y (columns,) of |x / half_x|^n + |y / half_y|^n = 1, counter-clockwise from +x.
 
-    They lie at equal steps of arc length plus turning: neighbouring rows stay aligned and tight bends stay round.
+    They lie at equal steps of a sum of arc length and turning angle, so that neighbouring rows stay aligned and tight
+    bends stay round.
     """
     angle = np.linspace(0, 2 * np.pi, 64 * columns + 1)
     radius = (np.abs(np.cos(angle) / half_x_mm) ** exponent + np.abs(np.sin(angle) / half_y_mm) ** exponent) ** (
@@ -28,10 +29,13 @@ def superellipse(
 
 
 def close_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int) -> Mesh:
-    """Join rings (rows x columns vertices, then the first and the last pole) to a closed surface, with fans at the
-    poles.
+    """Join rings to a closed surface with fans at the poles.
 
-    It faces outward where rings run counter-clockwise seen from the last pole.
+    It faces outward if the rings run counter-clockwise seen from the last pole.
+
+    Args:
+        vertices_mm: (rows · columns + 2, 3): the rings row by row, then the first and the last pole.
+        rows, columns: number of rings, and of vertices in a ring.
     """
     first, last = np.arange(columns), (rows - 1) * columns + np.arange(columns)
     lids = _fan(first, rows * columns)[:, [0, 2, 1]], _fan(last, rows * columns + 1)
@@ -39,14 +43,17 @@ def close_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int) -> Me
 
 
 def cover_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int, thin: tuple[bool, bool]) -> Mesh:
-    """Join rings (rows x columns vertices) to a closed surface whose first and last ring are flat.
+    """Join rings to a closed surface whose first and last ring are flat.
 
-    A thin ring is bridged straight across, where a fan's long triangles would make its edge rough; others get a fan at
-    their middle.
+    A thin ring is bridged straight across, because the long triangles of a fan would make its edge rough; other rings
+    get a fan at their middle.
 
     Args:
-        columns: even; vertices k and columns - k lie opposite each other, as ``superellipse`` puts them.
-        thin: whether the first and the last ring are.
+        vertices_mm: (rows · columns, 3), the rings row by row.
+        rows: number of rings.
+        columns: number of vertices in a ring, even; vertices k and columns - k lie opposite each other, as
+            ``superellipse`` places them.
+        thin: whether the first and the last ring are thin.
     """
     faces, poles = [_wall(rows, columns)], [np.empty((0, 3))]
     for start, bridged, upward in ((0, thin[0], False), ((rows - 1) * columns, thin[1], True)):
@@ -76,7 +83,7 @@ def _wall(rows: int, columns: int) -> NDArray[np.int64]:
 def _split_quads(
     a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64], d: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    # Quads with corners a b below c d, split alternately.
+    # Triangles of quads with corners a, b below c, d, split along alternating diagonals.
     row, column = np.indices(a.shape)
     even = ((row + column) % 2 == 0)[..., None]
     first = np.where(even, np.stack([a, b, d], -1), np.stack([a, b, c], -1)).reshape(-1, 3)

@@ -103,7 +103,7 @@ def require_like_exposures(
 
 
 def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
-    """Logarithm, by channel, of a longer exposure's mean over the mean expected from a shorter one.
+    """Logarithm (C,) of the ratio of a longer exposure's mean to the mean expected from a shorter one, by channel.
 
     It is None if the frames are too dark or full scale is unknown. Both exposures are clipped below full scale, so that
     pixels which are saturated in the longer one, or would be, agree.
