@@ -21,7 +21,7 @@ END = 0.1
 
 @dataclass(frozen=True)
 class ToothFrame:
-    """Rigid pose of a tooth: ``canonical = rotation @ world + translation_mm``."""
+    """Rigid pose of a tooth: ``canonical = rotation @ world + translation_mm``, with shapes (3, 3) and (3,)."""
 
     rotation: NDArray[np.float64]
     translation_mm: NDArray[np.float64]

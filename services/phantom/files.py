@@ -18,7 +18,7 @@ from services.fit.optics.parameters import MEDIUM_FIELDS, Medium
 CHANNELS = {1: ("green",), 3: ("red", "green", "blue")}
 """Names of the channels by their number."""
 HELD_OUT_EVERY = 4
-"""Every light of this many is held out by default."""
+"""Period of the lights that are held out by default."""
 
 Renderer = Literal["engine", "mitsuba"]
 

@@ -87,7 +87,7 @@ def assess(
         stops: result of ``by_stop``.
     """
     pixels = int(np.count_nonzero(covered))
-    # How many pixels have each combination of bits
+    # Count the pixels with each combination of bits
     counts = np.bincount(bits[covered], minlength=1)
     combinations = np.arange(len(counts))
     masked = {

@@ -40,6 +40,7 @@ class Radiometry:
         m = self.manifest
         full_scale = 2**m.bits - 1
         gain = np.float32(m.radiance_per_count / (frame.level * frame.exposure_s))
+        # Rounding has the variance 1/12; the mean of n black frames has 1/n of the variance of one frame
         floor = ((m.sensor_noise_floor * full_scale) ** 2 + 1 / 12) * (1 + 1 / self.black_frames)
         radiance = np.subtract(counts, self.black, dtype=np.float32)
         radiance *= gain

@@ -113,7 +113,7 @@ class RigSource:
         return motion.seen_flow(picture, motions)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
-        """See ``Source``. The frames of one light are read, aligned and merged at a time."""
+        """See ``Source``. The frames of each light are read, aligned and merged, one light after the other."""
         motion = self._motion(view)
         array = StoredArray(self.root / "capture.zarr")
         black = self._black_image(view, array, motion.window)

@@ -35,7 +35,7 @@ place where it was cut and closed, differs from the average's."""
 MESH_POINTS, CROWN_POINTS = 3000, 2500
 """Numbers of points of the mesh and of the average among which closest points are searched; they are 0.3 mm apart."""
 REVERSE_STEP = 4
-"""Step between those of the mesh's points that are compared with the average."""
+"""Step with which the mesh's points are chosen for the comparison with the average."""
 MIN_REVERSE_POINTS = 20
 """Smallest number of the mesh's points above the neck for which a misfit is computed."""
 

@@ -48,6 +48,7 @@ def separate(teeth: tuple[Tooth, ...], gums: Mesh | None) -> SeparateSurfaces:
     from manifold3d import Manifold, OpType
 
     outers = [_Solid(tooth.outer, f"teeth/{tooth.fdi}/outer.ply") for tooth in teeth]
+    # Find the contact surface of each pair of teeth, and cut the later tooth back by the earlier one
     contacts, remaining = {}, [outer.body for outer in outers]
     for (i, first), (j, second) in combinations(enumerate(outers), 2):
         if first.near(second) and len((shared := first.faces_in(remaining[i] ^ second.body)).faces):

@@ -195,7 +195,7 @@ class _Shading:
     misfit: float
 
     def at(self, normal: Image) -> Image:
-        """Shading (h, w) of normals (h, w, 3)."""
+        """Shading (h, w) of surfaces with unit normals (h, w, 3)."""
         flat = normal.reshape(-1, 3)
         product = flat @ self.quadratic
         product += self.linear

@@ -37,7 +37,7 @@ FRAMES_MEASURED = 8
 BRIGHT_BLACK = 0.25
 """Largest median of a black frame, as a fraction of full scale."""
 PIXELS_MEASURED = 1_000_000
-"""Largest number of a frame's pixels from which noise is measured; so many determine a variance to 0.14 %."""
+"""Largest number of a frame's pixels from which noise is measured; this number determines a variance to 0.14 %."""
 
 
 class Measures(Record):

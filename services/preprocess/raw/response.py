@@ -119,6 +119,7 @@ def _curve(x: FloatArray, y: FloatArray, observed: FloatArray) -> tuple[float, f
         a, b, offset = a + step[0], b + step[1], offset + step[2]
         if np.abs(step).max() < 1e-6:
             break
+    # Reject a curve that explains too little of the deviations, or whose own largest deviation is small or uncertain
     if np.median(np.abs(residual)) > (1 - MUST_EXPLAIN) * np.median(np.abs(observed)):
         return 0.0, 0.0
     covariance = scale**2 * np.linalg.inv(normal)[:2, :2]

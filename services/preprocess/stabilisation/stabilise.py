@@ -131,6 +131,15 @@ def _relief(depth_mm: Image, seen: BoolArray) -> Image:
 
 @dataclass(frozen=True)
 class _Level:
+    """One level of the reference frame's pyramid.
+
+    Attributes:
+        feature: (h, w) features of the reference.
+        matched: flat indices (N,) of the pixels that are matched.
+        terms: (h, w, TERMS) basis values.
+        pixel_px: size of the level's pixels, pixels of the frame.
+    """
+
     feature: Image
     matched: NDArray[np.intp]
     terms: Image

@@ -1,6 +1,7 @@
 """Blocks of work of a preparation.
 
-Each block is one Dask task. A block skips results that exist already, so it can safely run again. ::
+Each block is one Dask task and may safely run again: ``develop`` skips images that are stored already, the other steps
+make the same results anew. ::
 
     look (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows
     are asked for
@@ -61,7 +62,7 @@ class Block:
     items: tuple[int, ...] = ()
 
     def __call__(self) -> None:
-        """Run the step for those items that have no result yet.
+        """Run the step; ``develop`` skips images that are stored already.
 
         Raises:
             CaptureInputError, StoreError: as ``Source`` and ``require_seen`` document. JobCancelledError: the job was
