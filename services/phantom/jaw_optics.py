@@ -23,7 +23,7 @@ GUMS_PER_MM = {"red": (1.39, 0.05), "green": (1.71, 1.2), "blue": (1.99, 0.6)}
 assumed content of blood."""
 
 SIGMA_SPREAD, ABSORPTION_SPREAD, COSINE_SPREAD = 0.15, 0.30, 0.02
-"""Half widths of uniform draws about the phantom tooth's media: extinction (relative), absorption (relative), mean
+"""Half widths of uniform draws about the phantom tooth's media: extinction (relative), 1 − albedo (relative), mean
 cosine (absolute). Reduced scattering stays within the literature's spread."""
 REFLECTANCE_SPREAD = 0.2
 """Relative half width of the uniform draw of the wall's reflectance."""

@@ -81,8 +81,8 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         calibration: calibration of the rig.
 
     Raises:
-        CaptureInputError: a description exists already, no file's name can be interpreted, or a file or the calibration
-            cannot be read; the message names the file.
+        CaptureInputError: a description exists already, no file's name can be interpreted, an exposure is not given, or
+            a file or the calibration cannot be read; the message names the file.
     """
     if (root / DESCRIPTION).exists():
         raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")

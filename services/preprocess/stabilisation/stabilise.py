@@ -37,7 +37,7 @@ CORRELATED_PX = 50.0
 # Ridge of each term between frames under different lights, relative to the mean curvature of the cost. Only edges of
 # the lit side remain then, so all terms but the shift are held near zero
 EDGE_RIDGE = (0, 10, 10, 100, 100, 100, 100)
-# Largest number of pixels of a frame reduced for matching: the fit's 1/5 of the resolution of 20 megapixels
+# Largest number of pixels of a frame that is reduced for matching: those of 20 megapixels at the fit's 1/5 resolution
 SOLVE_PIXELS = 800_000
 # Largest number of evenly strided pixels that are matched at each level: a few coefficients need no more
 MATCHED_PIXELS = 200_000

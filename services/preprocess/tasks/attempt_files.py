@@ -220,7 +220,7 @@ class AttemptFiles:
         write_record(self.arrays, RemoteFolder(url=remote.url, objects=there))
 
     def _forget_what_is_gone(self) -> None:
-        """Remove the records of images of which the server lacks an object, so that these images are made again."""
+        """Remove the records of images with a missing or changed object on the server, so that they are made again."""
         remote = remote_folder(self.arrays)
         there = {} if remote is None else remote.listed()
         for path in self.work.glob("*/image-*.json"):

@@ -85,9 +85,7 @@ class OnWorkers:
 
 
 def threads_here() -> int:
-    """Number of blocks that this process may run at once and that share its memory: its Dask worker's threads, else
-    1.
-    """
+    """Number of blocks that may run in this process at once and share its memory: its Dask worker's threads, or 1."""
     from distributed import get_worker
 
     try:
