@@ -4,10 +4,10 @@
 
     python -m services.capture.console '{"address": "host:port", ...}'    DomeCommand lines in, DomeAnswer lines out
 
-Commands run concurrently, so that ALL OFF and the status never wait; only one command at a time drives the dome. The
-process ends when its standard input closes, so also when its parent is killed, and leaves the dome dark. A light that
-is on goes dark when its time is over, by this process and also by the controller's strobe. If this process is killed,
-it goes dark within the watchdog period.
+Commands run concurrently, so that ALL OFF and the status wait for no other command; only one command at a time drives
+the dome. The process ends when its standard input closes, so also when its parent is killed, and leaves the dome dark.
+A light that is on goes dark when its time is over, by this process and also by the controller's strobe. If this process
+is killed, the light goes dark within the watchdog period.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class CameraPage:
     """Content of the page for one camera.
 
     Attributes:
-        name: of the camera.
+        name: name of the camera.
         images: quality of the camera's images.
         motion: for each image the light, the displacement removed and its estimated error, pixels; None where unknown.
         coverage: for each tooth the FDI number and, for each image, its valid pixels as a share of those in the image

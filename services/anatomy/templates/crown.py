@@ -157,7 +157,7 @@ def build_tooth(dimensions: ToothDimensions, enamel_scale: float = 1.0) -> Tooth
     """Build a right upper tooth.
 
     Args:
-        dimensions: of the tooth.
+        dimensions: dimensions of the tooth.
         enamel_scale: thickness of the enamel relative to the average.
     """
     form, length = FORMS[dimensions.position - 1], dimensions.crown_length_mm

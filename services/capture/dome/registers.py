@@ -57,7 +57,7 @@ class Register:
     """One named range of the map.
 
     Attributes:
-        name: of the register.
+        name: name of the register.
         space: Modbus data block; coil and holding can be written.
         address: first address, counted from zero as in the request.
         count: number of addresses in the range.

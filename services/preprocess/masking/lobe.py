@@ -37,7 +37,7 @@ class _Lobe:
     """Distribution fitted to the profile.
 
     Attributes:
-        roughness: of the distribution.
+        roughness: roughness of the distribution.
         by_angle: amplitude times distribution, at the profile's angles.
         error: relative standard error of the amplitude; negative if the amplitude is negative.
         bias: fraction of all light by which the reflection is underestimated, because diffuse light was learned from

@@ -58,8 +58,9 @@ class Progress:
         self._context.report(StageEvent(stage="prepare", kind="finished", message=message, done=1.0))
 
     def _left_s(self) -> tuple[float, float] | None:
-        """Range of the remaining time in seconds: all images taken to be as fast, or as slow, as the ``LIKELY``
-        quantiles so far.
+        """Lower and upper estimate of the remaining time in seconds; None while too few images are finished.
+
+        They assume that each remaining image takes as long as the lower or upper ``LIKELY`` quantile so far.
         """
         if len(self._seconds) < ENOUGH or not self._left:
             return None
