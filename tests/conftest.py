@@ -1,4 +1,6 @@
-"""For all tests: the device on which paths are traced, how long a slow one may take, and that databases are closed."""
+"""Configuration of all tests: the device on which paths are traced, the time limit of slow tests, and the check that
+databases are closed.
+"""
 
 from __future__ import annotations
 

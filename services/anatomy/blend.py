@@ -85,7 +85,7 @@ def dentin_blend_shape(
     inward = _unit(_smooth(base, grid.inward(base.vertices_mm), 6))
 
     height = _height(base.vertices_mm @ axes.T, crown)
-    buccal = _smooth(base, _room_mm(base.vertices_mm, inward, grid), 6) * np.sqrt(height)
+    buccal = _smooth(base, _free_depth_mm(base.vertices_mm, inward, grid), 6) * np.sqrt(height)
     proximal = _side(base.vertices_mm @ axes.T) * np.sqrt(height)
     drop = (FULL_DROP_MM - BASE_DEPTH_MM) * height**2
     share = np.ones(len(height))
@@ -173,7 +173,9 @@ def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces
     return Mesh(vertices, base.faces)
 
 
-def _room_mm(start: NDArray[np.float64], inward: NDArray[np.float64], grid: SignedDistanceGrid) -> NDArray[np.float64]:
+def _free_depth_mm(
+    start: NDArray[np.float64], inward: NDArray[np.float64], grid: SignedDistanceGrid
+) -> NDArray[np.float64]:
     # Distance (N,) that the buccal mode may move each point: walk straight inward while the depth increases; the walk
     # ends at the middle of the tooth.
     full = FULL_DEPTH_MM - BASE_DEPTH_MM

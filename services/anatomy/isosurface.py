@@ -44,9 +44,9 @@ def surface_net(
             crossed = (a > 0) != (b > 0)
             with np.errstate(divide="ignore", invalid="ignore"):
                 fraction = np.where(crossed, a / (a - b), 0.0)
-            place = np.broadcast_to(start.astype(float), (*cells, 3)).copy()
-            place[..., axis] += fraction
-            total += np.where(crossed[..., None], place, 0.0)
+            crossing = np.broadcast_to(start.astype(float), (*cells, 3)).copy()
+            crossing[..., axis] += fraction
+            total += np.where(crossed[..., None], crossing, 0.0)
             count += crossed
     mixed = count > 0
     number = np.full(cells, -1)

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from services.anatomy.frame import ToothFrame
 from services.anatomy.scans.matching import CrownMatch
 from services.anatomy.scans.patches import middle_mm
-from services.anatomy.templates.average_arch import arch_from_middles, is_upper, nominal_places
+from services.anatomy.templates.average_arch import arch_from_middles, is_upper, nominal_positions
 from services.anatomy.templates.dimensions import upper_tooth
 from services.core.geometry import Tooth
 
 Array = NDArray[np.float64]
 
-TURNS = 576
+START_ROTATIONS = 576
 """Number of rotations from which a single tooth is matched; they are about 20 degrees apart."""
-KEPT = 40
+REFINED_ROTATIONS = 40
 """Number of the best rotations after the coarse match that are matched closely."""
 COARSE, MEDIUM, CLOSE = (80, 4), (80, 6), (300, 20)
 """Number of points of the average crown and of rounds of closest points: for the match from every rotation, for the
@@ -33,7 +33,7 @@ rotations of an arch, and for the final match."""
 VIEW_MM = 0.4
 """Misfit in mm that is added to a tooth with its back to the cameras. The misfit of real crowns with roots is 1.0 to
 1.4 mm; exchanging front and back adds -0.05 to 0.35 mm, and turning upside down 0.4 to 0.7 mm."""
-ARCH_TURNS = 24
+ARCH_ROTATIONS = 24
 """Number of rotations of the arch about the line through the teeth's middles. Four front teeth, or those of one side,
 hardly leave this line, so their middles do not determine the rotation about it."""
 WORST_ARCH_MM = 6.0
@@ -46,15 +46,15 @@ FREE_DRIFT_DEG = 15.0
 of teeth in an arch."""
 DRIFT_MM_PER_DEG = 1 / 30
 """Misfit added for each degree beyond ``FREE_DRIFT_DEG``, mm."""
-DOUBTFUL_MM, MUCH_LESS = 0.8, 0.5
+SUSPICIOUS_MISFIT_MM, MAX_MISFIT_RATIO = 0.8, 0.5
 """Misfit in mm, summed over both directions, above which a tooth's number is doubted; and the largest ratio to it of
 the misfit of another kind that is reported. Phantom teeth have 0.3 mm with their own kind and 1.1 to 1.5 mm with
 another family. Real bare crowns have 1.6 mm with any kind, so nothing can be said about them."""
 KINDS = (1, 3, 4, 6)
-"""Places from the midline of the teeth that represent their families."""
-KEPT_OF_KIND = 8
+"""Positions from the midline of the teeth that represent their families."""
+REFINED_ROTATIONS_OF_KIND = 8
 """Number of the best rotations that are matched closely for the test of a tooth's number."""
-LARGEST_OWN_TURN_DEG = 40.0
+MAX_DEVIATION_FROM_ARCH_DEG = 40.0
 """Largest angle between a tooth's own match and the arch. Upper incisors lean by 20 degrees and last molars by 30; a
 match that deviates more is replaced by the arch's axes."""
 
@@ -72,23 +72,23 @@ def tooth_frame(tooth: Tooth, viewpoints_mm: Array) -> ToothFrame:
     match = CrownMatch(tooth.fdi, tooth.outer)
     view = (viewpoints_mm - _box_middle_mm(tooth)).mean(axis=0)
     view /= np.linalg.norm(view)
-    coarse = match.settled(_even_turns(TURNS), *COARSE)
-    close = match.settled(coarse.axes[np.argsort(coarse.misfits_mm)[:KEPT]], *CLOSE)
+    coarse = match.register(_even_rotations(START_ROTATIONS), *COARSE)
+    close = match.register(coarse.axes[np.argsort(coarse.misfits_mm)[:REFINED_ROTATIONS]], *CLOSE)
     misfits = close.misfits_mm + match.reverse_misfits_mm(close) + VIEW_MM * (1 - close.axes[:, 1] @ view) / 2
     return ToothFrame.centred(close.axes[misfits.argmin()], tooth.outer)
 
 
-def number_told(tooth: Tooth) -> str:
+def fdi_mismatch_note(tooth: Tooth) -> str:
     """A sentence if a tooth clearly has the shape of another kind than its FDI number says; else an empty text."""
     own_mm = _misfit_mm(tooth, tooth.fdi)
-    if own_mm < DOUBTFUL_MM:
+    if own_mm < SUSPICIOUS_MISFIT_MM:
         return ""
-    place = tooth.fdi % 10
-    misfits_mm = {other: _misfit_mm(tooth, tooth.fdi - place + other) for other in KINDS if other != place}
-    likest = min(misfits_mm, key=lambda other: misfits_mm[other])
-    if misfits_mm[likest] > MUCH_LESS * own_mm:
+    position = tooth.fdi % 10
+    misfits_mm = {other: _misfit_mm(tooth, tooth.fdi - position + other) for other in KINDS if other != position}
+    best_kind = min(misfits_mm, key=lambda other: misfits_mm[other])
+    if misfits_mm[best_kind] > MAX_MISFIT_RATIO * own_mm:
         return ""
-    shape, named = upper_tooth(likest).name, upper_tooth(place).name
+    shape, named = upper_tooth(best_kind).name, upper_tooth(position).name
     return (
         f"Tooth {tooth.fdi} is shaped like a {shape} and not like a {named}; give its right FDI number, as dentin's"
         " shape follows from it."
@@ -97,8 +97,8 @@ def number_told(tooth: Tooth) -> str:
 
 def _misfit_mm(tooth: Tooth, fdi: int) -> float:
     match = CrownMatch(fdi, tooth.outer)
-    coarse = match.settled(_even_turns(TURNS), *COARSE)
-    close = match.settled(coarse.axes[np.argsort(coarse.misfits_mm)[:KEPT_OF_KIND]], *CLOSE)
+    coarse = match.register(_even_rotations(START_ROTATIONS), *COARSE)
+    close = match.register(coarse.axes[np.argsort(coarse.misfits_mm)[:REFINED_ROTATIONS_OF_KIND]], *CLOSE)
     return float((close.misfits_mm + match.reverse_misfits_mm(close)).min())
 
 
@@ -124,43 +124,44 @@ def _arch_frames(teeth: Sequence[Tooth]) -> list[ToothFrame]:
     # are nearest to those of the average.
     numbers, matches = tuple(tooth.fdi for tooth in teeth), [CrownMatch(tooth.fdi, tooth.outer) for tooth in teeth]
     middles = np.array([middle_mm(tooth.outer) for tooth in teeth])
-    nominal, nominal_axes = nominal_places(numbers)
-    turns, misfits = _arch_turns(
+    nominal, nominal_axes = nominal_positions(numbers)
+    rotations, misfits = _arch_rotations(
         arch_from_middles(numbers, middles), middles - middles.mean(axis=0), nominal - nominal.mean(axis=0)
     )
     misfits = ARCH_SHARE * misfits
     for match, axes in zip(matches, nominal_axes, strict=True):
-        placed = match.settled(axes @ turns, *MEDIUM)
-        drift = np.maximum(_angles_deg(placed.axes, axes @ turns) - FREE_DRIFT_DEG, 0.0)
+        placed = match.register(axes @ rotations, *MEDIUM)
+        drift = np.maximum(_angles_deg(placed.axes, axes @ rotations) - FREE_DRIFT_DEG, 0.0)
         misfits = misfits + (placed.misfits_mm + match.reverse_misfits_mm(placed) + DRIFT_MM_PER_DEG * drift) / len(
             teeth
         )
-    arch = turns[misfits.argmin()]
+    arch = rotations[misfits.argmin()]
 
     # Then turn each tooth to where its own shape is nearest to that of the average.
     frames = []
     for tooth, match, axes in zip(teeth, matches, nominal_axes, strict=True):
-        own = match.settled((axes @ arch)[None], *CLOSE).axes[0]
-        near = _angles_deg(own[None], (axes @ arch)[None])[0] <= LARGEST_OWN_TURN_DEG
+        own = match.register((axes @ arch)[None], *CLOSE).axes[0]
+        near = _angles_deg(own[None], (axes @ arch)[None])[0] <= MAX_DEVIATION_FROM_ARCH_DEG
         frames.append(ToothFrame.centred(own if near else axes @ arch, tooth.outer))
     return frames
 
 
-def _arch_turns(best: Array, middles_mm: Array, nominal_mm: Array) -> tuple[Array, Array]:
+def _arch_rotations(best: Array, middles_mm: Array, nominal_mm: Array) -> tuple[Array, Array]:
     # Rotations (K, 3, 3) into the arch's frame, and for each the root mean square distance (K,) in mm of the middles
     # from those of the average.
     from scipy.spatial.transform import Rotation
 
     line = np.linalg.svd(middles_mm, full_matrices=False)[2][0]
-    turns = (
-        best @ Rotation.from_rotvec(np.linspace(0, 2 * np.pi, ARCH_TURNS, endpoint=False)[:, None] * line).as_matrix()
+    rotations = (
+        best
+        @ Rotation.from_rotvec(np.linspace(0, 2 * np.pi, ARCH_ROTATIONS, endpoint=False)[:, None] * line).as_matrix()
     )
-    misfits = np.sqrt(((np.einsum("kij,nj->kni", turns, middles_mm) - nominal_mm) ** 2).sum(axis=2).mean(axis=1))
+    misfits = np.sqrt(((np.einsum("kij,nj->kni", rotations, middles_mm) - nominal_mm) ** 2).sum(axis=2).mean(axis=1))
     near = misfits < misfits.min() + WORST_ARCH_MM
-    return turns[near], misfits[near]
+    return rotations[near], misfits[near]
 
 
-def _even_turns(count: int) -> Array:
+def _even_rotations(count: int) -> Array:
     # Rotations (count, 3, 3) on a super-Fibonacci spiral of unit quaternions (Alexa 2022).
     from scipy.spatial.transform import Rotation
 

@@ -27,13 +27,13 @@ PHANTOMS = "phantoms"
 """Folder below the data folder for the virtual mouths of demonstrations. Each mouth is rendered once, and one that is
 removed is rendered again."""
 STATIC = Path(__file__).parent / "dashboard" / "static"
-DARKENERS = 8
+ALL_OFF_THREADS = 8
 """Number of threads that only carry out ALL OFF, so that no other request that hangs can delay it. As many ALL OFF
 requests can run at once."""
-CANCELLERS = 4
+CANCEL_THREADS = 4
 """Number of threads that cancel jobs. They are separate from the threads of ALL OFF because each may wait for the
 database, which ALL OFF does only once the dome is dark."""
-OPERATORS = 8
+DOME_THREADS = 8
 """Number of threads that read the state of a dome, switch single lights and run preflights. A dome that does not answer
 holds a thread for half a minute, during a preflight for five minutes."""
 UNBUILT = STATIC.with_name("unbuilt")
@@ -71,7 +71,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from services.api.health.worker_routes import build_workers_router
     from services.api.http import problems
     from services.api.http.thread_pools import ThreadPool
-    from services.api.jobs.event_stream import EventFeed
+    from services.api.jobs.event_stream import EventBroadcaster
     from services.api.jobs.routes import build_router
     from services.api.masks.masks import Masks
     from services.api.masks.routes import build_masks_router
@@ -82,7 +82,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     workers = Workers(settings.scheduler, certificates)
 
     def run_on_workers(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-        kept = settings.data.resolve() / PHANTOMS
+        phantoms = settings.data.resolve() / PHANTOMS
         run_job(
             spec,
             folder,
@@ -90,16 +90,16 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             doors=doors,
             cluster=workers,
             is_logged=True,
-            before=lambda: jobs.take_turn(events.job),
-            phantoms=kept,
+            before=lambda: jobs.require_slot(events.job),
+            phantoms=phantoms,
         )
 
     def run_with_dome(spec: JobSpec, folder: Path, events: EventAddress) -> None:
         if first_stage(spec, folder) == "capture":
-            dome.make_way()
+            dome.yield_to_capture()
         (run or run_on_workers)(spec, folder, events)
 
-    jobs = Jobs(settings, run_with_dome, workers.lacking if run is None else lambda _: None)
+    jobs = Jobs(settings, run_with_dome, workers.reason_unavailable if run is None else lambda _: None)
     dome = Dome(settings.dome, jobs)
 
     def darken() -> None:
@@ -108,19 +108,21 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
         finally:
             dome.close()
 
-    readers, openers, lookers, auditors = (
-        ThreadPool.reading(jobs.repository.engine),
+    database_pool, file_pool, capture_pool, audit_pool = (
+        ThreadPool.for_database(jobs.repository.engine),
         ThreadPool(1),
         ThreadPool(1),
         ThreadPool(1),
     )
-    parsers = ThreadPool(1)
+    parser_pool = ThreadPool(1)
     # ALL OFF runs in threads that nothing else uses, and the audit rows of all requests that darken a dome are written
     # by a thread of their own. Reading the state of a dome and switching its lights have their own threads too.
-    darkeners, dark_auditors = ThreadPool(DARKENERS), ThreadPool(1)
-    cancellers, operators = ThreadPool(CANCELLERS), ThreadPool(OPERATORS)
-    feed = EventFeed(jobs.repository, readers.ask)
-    observation = Observation(jobs, settings, readers, openers, certificates, None if run else workers.condition)
+    all_off_pool, dark_audit_pool = ThreadPool(ALL_OFF_THREADS), ThreadPool(1)
+    cancel_pool, dome_pool = ThreadPool(CANCEL_THREADS), ThreadPool(DOME_THREADS)
+    broadcaster = EventBroadcaster(jobs.repository, database_pool.run)
+    observation = Observation(
+        jobs, settings, database_pool, file_pool, certificates, None if run else workers.condition
+    )
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -128,31 +130,41 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
         if run is None and doors is DOORS:  # the check covers the packages of the standard stages alone
             workers.begin_check()
         jobs.start()
-        tasks = [asyncio.create_task(feed.run()), asyncio.create_task(observation.webhook_sender.run())]
+        tasks = [asyncio.create_task(broadcaster.run()), asyncio.create_task(observation.webhook_sender.run())]
         try:
             yield
         finally:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            closing = ThreadPool(1)  # a new thread, as all others may hang; the dome goes dark first
-            everybody = (darkeners, cancellers, readers, openers, lookers, auditors, dark_auditors, operators, parsers)
-            for close in (darken, *(pool.close for pool in everybody), jobs.close, workers.close):
-                await closing.ask(close)
+            closing_pool = ThreadPool(1)  # a new thread, as all others may hang; the dome goes dark first
+            pools = (
+                all_off_pool,
+                cancel_pool,
+                database_pool,
+                file_pool,
+                capture_pool,
+                audit_pool,
+                dark_audit_pool,
+                dome_pool,
+                parser_pool,
+            )
+            for close in (darken, *(pool.close for pool in pools), jobs.close, workers.close):
+                await closing_pool.run(close)
 
     app = FastAPI(
         title="dentine", version=version("dentine"), lifespan=lifespan, docs_url=None, redoc_url=None, openapi_url=None
     )
-    app.state.darken, app.state.parsers = darken, parsers
+    app.state.darken, app.state.parser_pool = darken, parser_pool
     problems.install(app)
-    app.include_router(build_router(jobs, feed, readers, openers, lookers, cancellers))
+    app.include_router(build_router(jobs, broadcaster, database_pool, file_pool, capture_pool, cancel_pool))
     app.include_router(build_captures_router(jobs.captures))
-    app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures, jobs, openers))
+    app.include_router(build_calibrations_router(jobs.calibrations, jobs.captures, jobs, file_pool))
     app.include_router(build_masks_router(jobs, Masks(jobs)))
-    app.include_router(build_dome_router(dome, darkeners, operators))
+    app.include_router(build_dome_router(dome, all_off_pool, dome_pool))
     app.include_router(build_workers_router(workers, jobs.repository))
     observation.include_routes(app)
-    install(app, settings, jobs.repository.engine, auditors, dark_auditors)
+    install(app, settings, jobs.repository.engine, audit_pool, dark_audit_pool)
     app.mount("/", StaticFiles(directory=STATIC if is_dashboard_built() else UNBUILT, html=True), name="dashboard")
     names = {
         "127.0.0.1",

@@ -28,8 +28,8 @@ class Observation:
     """The observable side of one application. ``webhook_sender.run`` is to be run while the application lives.
 
     Args:
-        readers: threads that query the database.
-        openers: threads that read the files of jobs.
+        database_pool: threads that query the database.
+        file_pool: threads that read the files of jobs.
         certificates, workers: as in ``Readiness``.
     """
 
@@ -37,8 +37,8 @@ class Observation:
         self,
         jobs: Jobs,
         settings: ServerSettings,
-        readers: ThreadPool,
-        openers: ThreadPool,
+        database_pool: ThreadPool,
+        file_pool: ThreadPool,
         certificates: Certificates | None = None,
         workers: Callable[[], str] | None = None,
     ) -> None:
@@ -49,7 +49,7 @@ class Observation:
         deliveries = Deliveries(engine)
         self._registry = build_registry(engine, readiness, jobs.free_bytes)
         self._routers = (
-            build_observe_router(jobs, readers, openers),
+            build_observe_router(jobs, database_pool, file_pool),
             build_health_router(readiness, self._registry),
             build_webhook_router(Webhooks(engine, policy), deliveries),
         )

@@ -25,7 +25,7 @@ from services.core.redaction import redacted
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
 from services.pipeline.database import open_database
-from services.pipeline.garbage_collection import leave_alone_what_is_loaded
+from services.pipeline.garbage_collection import freeze_loaded_objects
 from services.pipeline.log_stream import queued
 from services.pipeline.logs import configure_logs
 from services.pipeline.stages import DOORS
@@ -56,7 +56,7 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
     except ModuleNotFoundError as problem:
         raise PlatformError("The server's packages are not installed; install dentine[api].") from problem
 
-    with _sole_server(settings.data), closing(_listen(settings)) as listener, queued(sys.stderr) as log:
+    with _data_folder_lock(settings.data), closing(_listen(settings)) as listener, queued(sys.stderr) as log:
         if not is_dashboard_built():
             print(
                 "The dashboard is not built; run make dashboard and start again. The API works without it.",
@@ -65,10 +65,10 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
         host, port = listener.getsockname()[:2]
         print(f"http://{host}:{port}", flush=True)
         configure_logs(log)
-        with _telling_what_cannot_be_written(settings.data):
+        with _translated_write_errors(settings.data):
             proxies, app = settings.trusted_proxies, create_app(settings, run, doors)
             if settings.access == "tokens":
-                _tell_setup_link(settings, port)
+                _log_setup_link(settings, port)
         config = uvicorn.Config(
             app,
             log_config=None,
@@ -78,14 +78,14 @@ def serve(settings: ServerSettings, run: RunJob | None = None, doors: Mapping[St
             proxy_headers=bool(proxies),
             forwarded_allow_ips=proxies,
         )
-        server = _dark_at_once(BoundedServer(config, settings.connections), app.state.darken)
+        server = _darken_on_signal(BoundedServer(config, settings.connections), app.state.darken)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)  # uvicorn raises the signal again after it has shut down in order
-        leave_alone_what_is_loaded()
+        freeze_loaded_objects()
         server.run(sockets=[listener])
 
 
-def _tell_setup_link(settings: ServerSettings, port: int) -> None:
+def _log_setup_link(settings: ServerSettings, port: int) -> None:
     """Log the link that makes the first token, if there is no token yet."""
     engine = open_database(settings.database_url)
     try:
@@ -100,7 +100,7 @@ def _tell_setup_link(settings: ServerSettings, port: int) -> None:
 
 
 @contextmanager
-def _telling_what_cannot_be_written(data: Path) -> Iterator[None]:
+def _translated_write_errors(data: Path) -> Iterator[None]:
     from sqlalchemy.exc import DBAPIError
 
     try:
@@ -113,7 +113,7 @@ def _telling_what_cannot_be_written(data: Path) -> Iterator[None]:
         ) from problem
 
 
-def _dark_at_once(server: Server, darken: Callable[[], None]) -> Server:
+def _darken_on_signal(server: Server, darken: Callable[[], None]) -> Server:
     """Make the server darken the domes as soon as a signal arrives, before it waits for open requests."""
     leave = server.handle_exit
 
@@ -145,9 +145,9 @@ def _listen(settings: ServerSettings) -> socket.socket:
 
 
 @contextmanager
-def _sole_server(data: Path) -> Iterator[None]:
+def _data_folder_lock(data: Path) -> Iterator[None]:
     """Hold the lock of the data folder. The operating system releases it however this process ends."""
-    with _telling_what_cannot_be_written(data):
+    with _translated_write_errors(data):
         data.mkdir(parents=True, exist_ok=True)
         with suppress(PermissionError):  # the folder of another user, who has chosen its permissions
             data.chmod(stat.S_IMODE(data.stat().st_mode) & ~PRIVATE)

@@ -48,18 +48,18 @@ def solve_reweighted(
         normal, side = slope.T @ (weights[:, None] * slope), slope.T @ (weights * off)
         scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float64).tiny))
         scaled = normal * np.outer(scale, scale)
-        before, gained = _cost(off, huber), 0.0
+        before, decrease = _cost(off, huber), 0.0
         # Raise the damping until a step lowers the cost. If none does even with the largest damping, the unknowns are
         # as good as rounding lets them be.
         while damping <= MAX_DAMPING:
             step = -scale * np.linalg.solve(scaled + damping * np.eye(len(values)), scale * side)
-            tried = residuals(values + step)
-            gained = before - _cost(tried, huber)
-            if gained >= 0:
-                values, off, damping = values + step, tried, max(damping / DAMPING_STEP, MIN_DAMPING)
+            new_off = residuals(values + step)
+            decrease = before - _cost(new_off, huber)
+            if decrease >= 0:
+                values, off, damping = values + step, new_off, max(damping / DAMPING_STEP, MIN_DAMPING)
                 break
             damping *= DAMPING_STEP
-        if gained <= SMALL_DECREASE * before:
+        if decrease <= SMALL_DECREASE * before:
             break
     return values
 

@@ -38,8 +38,8 @@ def run(spec: JobSpec, context: StageContext) -> Registration:
     writer, refused = StageWriter(context.root, REGISTERED, context.attempt), context.root / PICTURES
     record = register_folder(spec.capture, spec.calibration, writer.folder, refused=refused)
     for step in record.steps:
-        for told in step.left_out:
-            context.report(StageEvent(stage="register", kind="log", message=f"Left out by {step.name}: {told}."))
+        for sentence in step.left_out:
+            context.report(StageEvent(stage="register", kind="log", message=f"Left out by {step.name}: {sentence}."))
     context.raise_if_cancelled()
     writer.publish(record)
     shutil.rmtree(refused, ignore_errors=True)
@@ -69,14 +69,14 @@ def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
     assert spec.capture is not None, "only a raw folder is calibrated"
     steps = 0
 
-    def tell(step: str) -> None:
+    def report_step(step: str) -> None:
         nonlocal steps
         context.raise_if_cancelled()
         context.report(StageEvent(stage="export", kind="progress", done=steps / STEPS, message=step))
         steps += 1
 
     context.report(StageEvent(stage="export", kind="started"))
-    session = calibrate_folder(spec.capture, tell)
+    session = calibrate_folder(spec.capture, report_step)
     for sentence in session.judgement.suspicions:
         context.report(StageEvent(stage="export", kind="log", message=sentence))
     writer = StageWriter(context.root, "asset", context.attempt)
@@ -89,6 +89,8 @@ def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
         advice=session.judgement.advice,
     )
     writer.publish(manifest)
-    told = f"{len(broken)} limits are not kept. " if broken else ""
-    context.report(StageEvent(stage="export", kind="finished", done=1.0, message=told + session.judgement.advice))
+    broken_limits = f"{len(broken)} limits are not kept. " if broken else ""
+    context.report(
+        StageEvent(stage="export", kind="finished", done=1.0, message=broken_limits + session.judgement.advice)
+    )
     return manifest

@@ -29,11 +29,11 @@ from services.core.dome import DomeAnswer, DomeCommand, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigError, RigStoppedError, SettingsError
 from services.core.settings import DomeSettings
 
-TICK_S = 0.1
+CHECK_INTERVAL_S = 0.1
 """Interval at which a light that is on is checked, seconds."""
-PATIENCE_S = 1.0
+LOCK_TIMEOUT_S = 1.0
 """Time that a command waits for another one that drives the dome, seconds."""
-DOSE_S = 1e4
+DOSE_WINDOW_S = 1e4
 """Time over which doses of light add up (IEC 62471), seconds. A limit holds for all manual light since the dome was
 last dark for this long."""
 SHARED_LIMITS = ("watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s")
@@ -47,16 +47,16 @@ class Console:
 
     def __init__(self, host: str, port: int, settings: DomeSettings) -> None:
         self._host, self._port, self._settings = host, port, settings
-        self._driving, self._ending = threading.Lock(), threading.Event()
-        self._held = ExitStack()
+        self._driver_lock, self._closing = threading.Lock(), threading.Event()
+        self._resources = ExitStack()
         self._dome: ModbusDome | None = None
         self._budget, self._until_s = (
             ExposureBudget(settings.light_exposure_limit_s, settings.total_exposure_limit_s),
             0.0,
         )
-        self._newest_off, self._ordering = 0, threading.Lock()
-        self._keeper = threading.Thread(target=self._keep, name="light keeper")
-        self._keeper.start()
+        self._newest_off, self._order_lock = 0, threading.Lock()
+        self._light_watch = threading.Thread(target=self._watch_light, name="light watch")
+        self._light_watch.start()
 
     def answer(self, command: DomeCommand) -> DomeAnswer:
         """Carry out a command; errors become part of the answer."""
@@ -73,40 +73,40 @@ class Console:
 
     def close(self) -> None:
         """Make the dome dark and end, also in the middle of a preflight."""
-        self._ending.set()
-        if not self._driving.acquire(timeout=PATIENCE_S):
+        self._closing.set()
+        if not self._driver_lock.acquire(timeout=LOCK_TIMEOUT_S):
             with suppress(RigError):
                 self._all_off()
-            self._driving.acquire()
+            self._driver_lock.acquire()
         with suppress(RigError):
-            self._leave()
-        self._driving.release()
-        self._keeper.join()
+            self._disconnect()
+        self._driver_lock.release()
+        self._light_watch.join()
 
     def _carry_out(self, command: DomeCommand) -> DomeAnswer:
         findings: tuple[str, ...] = ()
         if command.do == "off":
-            with self._ordering:
+            with self._order_lock:
                 self._newest_off = max(self._newest_off, command.number)
             try:
                 status = self._all_off()
             finally:
-                if self._driving.acquire(timeout=PATIENCE_S):
-                    self._let_go()
+                if self._driver_lock.acquire(timeout=LOCK_TIMEOUT_S):
+                    self._disconnect_and_release()
             return DomeAnswer(number=command.number, status=status)
         if command.do != "status":
-            if not self._driving.acquire(timeout=PATIENCE_S):
+            if not self._driver_lock.acquire(timeout=LOCK_TIMEOUT_S):
                 raise DomeBusyError("The dome is busy with a preflight; wait for it, or press ALL OFF.")
             try:
-                self._require_wanted(command)
+                self._require_current(command)
                 if command.do == "light":
                     self._light(command)
                 else:
-                    self._leave()
+                    self._disconnect()
                 if command.do == "preflight":
                     findings = self._preflight(command)
             finally:
-                self._driving.release()
+                self._driver_lock.release()
         return DomeAnswer(number=command.number, status=self._status(), findings=findings)
 
     def _all_off(self) -> DomeStatus:
@@ -118,26 +118,26 @@ class Console:
                 dome.give_up()
             raise
 
-    def _let_go(self) -> None:
+    def _disconnect_and_release(self) -> None:
         try:
             with suppress(RigError):
-                self._leave()
+                self._disconnect()
         finally:
-            self._driving.release()
+            self._driver_lock.release()
 
     def _light(self, command: DomeCommand) -> None:
         try:
             if self._dome is None:
                 self._forget_old_dose()
-                self._dome = self._held.enter_context(
+                self._dome = self._resources.enter_context(
                     ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s)
                 )
-            self._require_wanted(command)
+            self._require_current(command)
             _require_light(command.light, self._dome.light_count)
             self._dome.light(command.light, command.level, command.on_s)
         except BaseException:
             with suppress(RigError):
-                self._leave()
+                self._disconnect()
             raise
         self._until_s = time.monotonic() + command.on_s
 
@@ -147,27 +147,27 @@ class Console:
 
         if command.rig is None:
             raise SettingsError("A preflight needs a rig; give its mouth folder.")
-        safest = {name: min(getattr(command.rig, name), getattr(self._settings, name)) for name in SHARED_LIMITS}
-        planned = PlannedRig.read(command.rig.model_copy(update={"dome": f"{self._host}:{self._port}", **safest}))
+        limits = {name: min(getattr(command.rig, name), getattr(self._settings, name)) for name in SHARED_LIMITS}
+        planned = PlannedRig.read(command.rig.model_copy(update={"dome": f"{self._host}:{self._port}", **limits}))
         self._forget_old_dose()
         try:
             with planned.in_use(self._budget.spent_s) as (self._dome, cameras):
                 return preflight(
-                    planned.plan, self._dome, cameras, planned.spec, partial(self._require_wanted, command)
+                    planned.plan, self._dome, cameras, planned.spec, partial(self._require_current, command)
                 )
         finally:
             self._dome, self._until_s = None, time.monotonic()
 
     def _forget_old_dose(self) -> None:
-        if time.monotonic() > self._until_s + DOSE_S:
+        if time.monotonic() > self._until_s + DOSE_WINDOW_S:
             self._budget.spent_s.clear()
 
-    def _require_wanted(self, command: DomeCommand) -> None:
+    def _require_current(self, command: DomeCommand) -> None:
         # Checked before the watchdog is armed, because arming would undo ALL OFF, and again afterwards. After an ALL
         # OFF that comes later, the controller itself refuses light.
-        with self._ordering:
-            is_overtaken = command.number < self._newest_off
-        if is_overtaken:
+        with self._order_lock:
+            is_outdated = command.number < self._newest_off
+        if is_outdated:
             raise RigStoppedError("ALL OFF was pressed after this was asked for; ask again when the subject is ready.")
 
     def _status(self) -> DomeStatus:
@@ -177,24 +177,24 @@ class Console:
         finally:
             observer.close()
 
-    def _keep(self) -> None:
+    def _watch_light(self) -> None:
         # Darkens a light whose time is over, or that differs from the commanded one.
-        while not self._ending.wait(TICK_S):
-            with self._driving:
+        while not self._closing.wait(CHECK_INTERVAL_S):
+            with self._driver_lock:
                 if self._dome is None:
                     continue
                 try:
                     self._dome.confirm()
                     if time.monotonic() > self._until_s:
-                        self._leave()
+                        self._disconnect()
                 except RigError as problem:
                     print(problem.message, file=sys.stderr)
                     with suppress(RigError):
-                        self._leave()
+                        self._disconnect()
 
-    def _leave(self) -> None:
-        held, self._held, self._dome = self._held, ExitStack(), None
-        held.close()
+    def _disconnect(self) -> None:
+        resources, self._resources, self._dome = self._resources, ExitStack(), None
+        resources.close()
 
 
 def _require_light(light: int, count: int) -> None:
@@ -205,19 +205,19 @@ def _require_light(light: int, count: int) -> None:
 def _main() -> None:
     settings = DomeSettings.model_validate(json.loads(sys.argv[1]))
     signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
-    speaking = threading.Lock()
+    output_lock = threading.Lock()
     with ExitStack() as stack:
         host, port = stack.enter_context(dome_address(settings.address or "", SIMULATED_LIGHTS, settings.watchdog_s))
         console = Console(host, port, settings)
         stack.callback(console.close)
 
-        def obey(line: str) -> None:
-            told = console.answer(DomeCommand.model_validate_json(line)).model_dump_json()
-            with speaking, suppress(BrokenPipeError):
-                print(told, flush=True)
+        def execute(line: str) -> None:
+            answer = console.answer(DomeCommand.model_validate_json(line)).model_dump_json()
+            with output_lock, suppress(BrokenPipeError):
+                print(answer, flush=True)
 
         for line in sys.stdin:
-            threading.Thread(target=obey, args=(line,), daemon=True).start()
+            threading.Thread(target=execute, args=(line,), daemon=True).start()
 
 
 if __name__ == "__main__":

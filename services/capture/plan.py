@@ -23,7 +23,7 @@ from services.core.records import MAX_ON_TIME_S, RigSpec
 
 MAX_BLACK_FRAMES = 1000
 """Largest number of black frames; their mean then has 3 % of one frame's noise."""
-GLIMPSE_S = 0.005
+FLASH_S = 0.005
 """Time for which a preflight switches on each light to check that it emits, seconds."""
 
 
@@ -66,12 +66,12 @@ def plan_capture(rig: RigSpec, lights: int) -> tuple[PlannedFrame, ...]:
 
 
 def preflight_frames(plan: Sequence[PlannedFrame]) -> tuple[PlannedFrame, ...]:
-    """Lit frames of a preflight: each light for ``GLIMPSE_S``, then one whole frame.
+    """Lit frames of a preflight: each light for ``FLASH_S``, then one whole frame.
 
     The whole frame is a tracking frame, or the plan's last frame if the plan has no tracking frames.
     """
-    glimpses = (frame.model_copy(update={"on_s": GLIMPSE_S}) for frame in plan if frame.light is not None)
-    return (*glimpses, next((frame for frame in plan if frame.kind == "tracking"), plan[-1]))
+    flashes = (frame.model_copy(update={"on_s": FLASH_S}) for frame in plan if frame.light is not None)
+    return (*flashes, next((frame for frame in plan if frame.kind == "tracking"), plan[-1]))
 
 
 def require_exposure(frames: Sequence[PlannedFrame], lights: int, rig: RigSpec) -> None:
@@ -97,8 +97,8 @@ def _order(rig: RigSpec, lights: int) -> Iterator[int | Literal["black", "tracki
 
 def _frame(rig: RigSpec, lights: int, index: int, what: int | Literal["black", "tracking"]) -> PlannedFrame:
     kind: Literal["black", "tracking", "light"] = "light" if isinstance(what, int) else what
-    wanted = {"black": 0.0, "tracking": rig.level / lights, "light": rig.level}[kind]
-    word = level_word(wanted)
+    level = {"black": 0.0, "tracking": rig.level / lights, "light": rig.level}[kind]
+    word = level_word(level)
     if kind != "black" and word == 0:
         raise SettingsError(
             f"rig.level {rig.level:g} is below one step of the dome's 16-bit levels in a {kind} frame; raise it."

@@ -16,7 +16,7 @@ BLACK_TOLERANCE = 0.005
 
 
 def preflight(
-    plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec, raise_if_unwanted: Callable[[], None]
+    plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec, raise_if_cancelled: Callable[[], None]
 ) -> tuple[str, ...]:
     """Switch on every light for a moment, then expose one black and one lit frame.
 
@@ -24,7 +24,7 @@ def preflight(
         plan: planned frames of the capture.
         dome: the dome. cameras: the cameras.
         rig: description of the rig.
-        raise_if_unwanted: called in the dark before every light and at the end; an exception from it ends the
+        raise_if_cancelled: called in the dark before every light and at the end; an exception from it ends the
             preflight.
 
     Returns:
@@ -33,10 +33,10 @@ def preflight(
     Raises:
         RigError: a light does not emit as commanded, or the black level is wrong by more than 0.5 % of full scale.
     """
-    *glimpses, lit = preflight_frames(plan)
-    for glimpse in glimpses:
-        raise_if_unwanted()
-        dome.light(glimpse.light, glimpse.level, glimpse.on_s)
+    *flashes, lit = preflight_frames(plan)
+    for flash in flashes:
+        raise_if_cancelled()
+        dome.light(flash.light, flash.level, flash.on_s)
         dome.dark()
 
     black = next(frame for frame in plan if frame.kind == "black")
@@ -49,10 +49,10 @@ def preflight(
                 " the room or correct the black level."
             )
 
-    raise_if_unwanted()
+    raise_if_cancelled()
     findings = []
     images = expose(lit, dome, cameras, rig.settle_s)[1]
-    raise_if_unwanted()
+    raise_if_cancelled()
     for camera, image in enumerate(images):
         fraction = clipped_fraction(image, cameras.bits)
         if fraction > CLIPPED_FRACTION:

@@ -36,8 +36,8 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
             is incomplete or contradictory. RigError and its kinds: the dome or a camera failed; lights are dark.
             StoreError: a frame cannot be stored. JobCancelledError: the job was cancelled.
     """
+    from services.capture.cancel_watch import interrupt_on_cancel
     from services.capture.frames import FrameStore, fingerprint
-    from services.capture.lookout import interrupting
     from services.capture.preflight import preflight
     from services.capture.rig import PlannedRig
     from services.capture.sequence import capture_frames
@@ -65,7 +65,7 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
         writer, shape, fingerprint(pixels, description.model_dump(mode="json"), rig.stills.peak_radiance)
     )
 
-    with rig.in_use() as (dome, cameras), interrupting(context.raise_if_cancelled, dome.interrupt):
+    with rig.in_use() as (dome, cameras), interrupt_on_cancel(context.raise_if_cancelled, dome.interrupt):
         # Check for a cancel after the watchdog is armed. An ALL OFF before that moment has left a cancel; after a later
         # ALL OFF the dome itself refuses light.
         context.raise_if_cancelled()
@@ -93,8 +93,8 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
 
 
 def _copy_meshes(mouth: Path, folder: Path, fdi: tuple[int, ...]) -> None:
-    wanted = [Path("teeth") / str(number) / name for number in fdi for name in ("outer.ply", "dentin.ply")]
-    for relative in [*wanted, Path("gums.ply"), Path("cavity.ply")]:
+    mesh_files = [Path("teeth") / str(number) / name for number in fdi for name in ("outer.ply", "dentin.ply")]
+    for relative in [*mesh_files, Path("gums.ply"), Path("cavity.ply")]:
         if (mouth / relative).is_file():
             (folder / relative).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(mouth / relative, folder / relative)

@@ -28,7 +28,7 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
     @app.command(context_settings=_ALL_TO_DASK)
     def scheduler(context: typer.Context) -> None:
         """Run a Dask scheduler for a server's jobs; takes the options of `dask scheduler`."""
-        _become("scheduler", context.args, tls_folder())
+        _exec_dask("scheduler", context.args, tls_folder())
 
     @app.command(context_settings=_ALL_TO_DASK)
     def worker(
@@ -43,9 +43,11 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
         A worker runs every stage but captures, once it has shown that it can; with `--resources DOME=1` captures too.
         """
         require_scheduler_named(context.args, os.environ)
-        claims = {DOME: 1} if captures_only else {STAGES: UNLIMITED}
-        _become(
-            "worker", [*_claiming(context.args, claims), "--preload", "services.pipeline.worker_setup"], tls_folder()
+        default_resources = {DOME: 1} if captures_only else {STAGES: UNLIMITED}
+        _exec_dask(
+            "worker",
+            [*_with_resources(context.args, default_resources), "--preload", "services.pipeline.worker_setup"],
+            tls_folder(),
         )
 
     @app.command("worker-health")
@@ -56,20 +58,20 @@ def add_dask_commands(app: typer.Typer, tls_folder: Callable[[], Path | None]) -
         raise typer.Exit(main())
 
 
-def _claiming(arguments: Sequence[str], claims: Mapping[str, int]) -> list[str]:
-    """The arguments with the claims added to their own ``--resources``, whose amounts have precedence."""
-    others, named = list[str](), dict[str, str]()
+def _with_resources(arguments: Sequence[str], default_resources: Mapping[str, int]) -> list[str]:
+    """The arguments with the default resources added to their own ``--resources``, whose amounts have precedence."""
+    others, resources = list[str](), dict[str, str]()
     rest = iter(arguments)
     for argument in rest:
         option, is_joined, value = argument.partition("=")
         if option == "--resources":
-            named |= dict(
+            resources |= dict(
                 part.split("=", 1) for part in (value if is_joined else next(rest, "")).split() if "=" in part
             )
         else:
             others.append(argument)
-    named = {name: str(amount) for name, amount in claims.items()} | named
-    return [*others, "--resources", " ".join(f"{name}={amount}" for name, amount in named.items())]
+    resources = {name: str(amount) for name, amount in default_resources.items()} | resources
+    return [*others, "--resources", " ".join(f"{name}={amount}" for name, amount in resources.items())]
 
 
 def require_scheduler_named(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
@@ -85,7 +87,7 @@ def require_scheduler_named(arguments: Sequence[str], environment: Mapping[str, 
         raise SettingsError("No scheduler is named; give its address first, as in: dentine worker tcp://HOST:8786.")
 
 
-def _become(part: Literal["scheduler", "worker"], arguments: Sequence[str], folder: Path | None) -> NoReturn:
+def _exec_dask(part: Literal["scheduler", "worker"], arguments: Sequence[str], folder: Path | None) -> NoReturn:
     from services.pipeline.dask_tls import Certificates, scheduler_address
 
     certificates = Certificates.of(folder) if folder is not None else None

@@ -44,7 +44,7 @@ def lab_demo(
     as_json: Json = False,
 ) -> None:
     """Make a virtual laboratory's raw frames once, measure a tooth from them alone, and compare it with the truth."""
-    from services.bench.lab.chain import forget
+    from services.bench.lab.chain import remove_results
     from services.bench.lab.report import PAGE, lines, write_summary
     from services.bench.lab.run import measured
     from services.core.files.folders import require_folder
@@ -52,17 +52,17 @@ def lab_demo(
 
     require_folder(out, "--out")
     size = COARSE_SIZE if coarse else DEMO_SIZE
-    if make_lab(out, size, subject, seed, _tell):
-        forget(out)
+    if make_lab(out, size, subject, seed, _log):
+        remove_results(out)
     if frames_only:
         print(f"laboratory: {out}")
         return
-    told = measured(
-        out, size.rig.pixel_mm, [one.value for one in compare or [KnownName.PERFECT]], workers, _tell, coarse=coarse
+    summary = measured(
+        out, size.rig.pixel_mm, [one.value for one in compare or [KnownName.PERFECT]], workers, _log, coarse=coarse
     )
-    write_summary(out, told)
-    print(json.dumps(told) if as_json else "\n".join([*lines(told), f"report: {out / PAGE}"]))
+    write_summary(out, summary)
+    print(json.dumps(summary) if as_json else "\n".join([*lines(summary), f"report: {out / PAGE}"]))
 
 
-def _tell(what: str) -> None:
+def _log(what: str) -> None:
     print(what, file=sys.stderr, flush=True)

@@ -36,17 +36,17 @@ def _lines(properties: dict[str, dict[str, Any]]) -> Iterator[str]:
     """One line for each option; options without a default are commented out."""
     from services.core.raw.toml_writing import toml_value
 
-    for name, told in properties.items():
-        default = told.get("default")
+    for name, schema in properties.items():
+        default = schema.get("default")
         is_set = default is not None and not isinstance(default, dict)
         value = toml_value(default) if is_set else "..."
-        about = [text for text in (told.get("description"), *_limits(told)) if text]
+        about = [text for text in (schema.get("description"), *_limits(schema)) if text]
         yield f"{'' if is_set else '# '}{name} = {value}" + (f"  # {'; '.join(about)}" if about else "")
 
 
-def _limits(told: dict[str, Any]) -> Iterator[str]:
+def _limits(schema: dict[str, Any]) -> Iterator[str]:
     """The limits of an option's values, in words."""
-    for kind in (told, *told.get("anyOf", ())):
+    for kind in (schema, *schema.get("anyOf", ())):
         if choices := kind.get("enum"):
             yield f"one of {', '.join(map(str, choices))}"
         for key, words in (

@@ -30,10 +30,10 @@ def run(
     """Run a job to its asset, without a server."""
     from services.core.settings import read_job
 
-    run_and_tell(read_job(job), out, workers, as_json=as_json)
+    run_and_report(read_job(job), out, workers, as_json=as_json)
 
 
-def run_and_tell(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool) -> None:
+def run_and_report(spec: JobSpec, out: Path, workers: int | None, *, as_json: bool) -> None:
     """Run a job and print where its results are and how well it fits; the first Ctrl-C cancels it in order.
 
     Raises:
@@ -97,19 +97,19 @@ def cancelling_on_signals(out: Path) -> Iterator[None]:
     from services.pipeline.stages import request_cancel, withdraw_cancel
 
     require_folder(out, "Folder")
-    asked = False
+    is_requested = False
     withdraw_cancel(out)
 
-    def ask(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
+    def request_once(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal is_requested
+        if is_requested:
             raise KeyboardInterrupt
-        asked = True
+        is_requested = True
         out.mkdir(parents=True, exist_ok=True)
         request_cancel(out)
         print("Stopping after the current frame or step; press Ctrl-C again to stop at once.", file=sys.stderr)
 
-    earlier = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    earlier = {number: signal.signal(number, request_once) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:

@@ -41,17 +41,19 @@ def sphere_command(
     for note in dict.fromkeys(note for fitted in fits for note in fitted.fit.notes):
         print(note)
     if translucency is not None:
-        told = translucency
-        print(f"translucency parameter {told.translucency_parameter:.2f} ± {told.translucency_parameter_se:.2f}")
-        print(f"contrast ratio         {told.contrast_ratio:.3f} ± {told.contrast_ratio_se:.3f}")
+        measured = translucency
+        print(
+            f"translucency parameter {measured.translucency_parameter:.2f} ± {measured.translucency_parameter_se:.2f}"
+        )
+        print(f"contrast ratio         {measured.contrast_ratio:.3f} ± {measured.contrast_ratio_se:.3f}")
 
 
 def _line(fitted: Fitted) -> str:
     fit = fitted.fit
     quantities = [("σa", fit.sigma_a), ("σs′", fit.sigma_s_reduced)] + ([("g", fit.g)] if fit.sigma_t else [])
-    told = [
+    values = [
         f"{label} {one.value:.4f} ±"
         f" {one.se:.4f}{' per mm' if one.unit == '1/mm' else ''}{'' if one.determined else ' (not determined)'}"
         for label, one in quantities
     ]
-    return f"{fit.name}: {', '.join(told)}{'' if fit.converged else ', which does not give the readings'}"
+    return f"{fit.name}: {', '.join(values)}{'' if fit.converged else ', which does not give the readings'}"

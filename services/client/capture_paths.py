@@ -30,7 +30,7 @@ def require_paths(paths: Iterable[str]) -> None:
         UploadError: there is such a path; the message names the first one and what is wrong with it.
     """
     files: set[str] = set()
-    spelled: dict[str, str] = {}
+    spellings: dict[str, str] = {}
     folders: set[str] = set()
     for path in paths:
         if (fault := path_fault(path)) is not None:
@@ -41,7 +41,7 @@ def require_paths(paths: Iterable[str]) -> None:
         above = [str(folder) for folder in PurePosixPath(path).parents][:-1]
         folders.update(above)
         for own in (path, *above):
-            if (other := spelled.setdefault(_folded(own), own)) != own:
+            if (other := spellings.setdefault(_case_folded(own), own)) != own:
                 raise UploadError(
                     f"File {path!r}: {own!r} and {other!r} are the same to some file systems; rename one."
                 )
@@ -83,5 +83,5 @@ def path_fault(path: str) -> str | None:
     return None
 
 
-def _folded(path: str) -> str:
+def _case_folded(path: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFKC", path).casefold())

@@ -43,8 +43,10 @@ class UploadManifest(Record):
     def digest(self, owner: str = DEFAULT_GROUP) -> str:
         """A digest of the files in any order, the subject and the owner."""
         rows = sorted((file.path, file.bytes, file.sha256) for file in self.files)
-        whose = [] if owner == DEFAULT_GROUP else [owner]  # the same digest as in version 0.1, which knew no owners
-        return hashlib.sha256(json.dumps([self.subject, rows, *whose]).encode()).hexdigest()
+        owner_part = (
+            [] if owner == DEFAULT_GROUP else [owner]
+        )  # the same digest as in version 0.1, which knew no owners
+        return hashlib.sha256(json.dumps([self.subject, rows, *owner_part]).encode()).hexdigest()
 
 
 class CaptureFile(ManifestFile):

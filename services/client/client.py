@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from pydantic import SecretStr
 
-from services.client.downloads import telling_lost, whole_file
-from services.client.flows import RECONNECT_S, Ask, EventCursor, Flow, Pause, Work, error_in
+from services.client.downloads import atomic_file, translated_transport_errors
+from services.client.flows import RECONNECT_S, BlockingCall, EventCursor, Flow, HttpRequest, Pause, error_in
 from services.client.requests import Requests
 from services.core.events import JobEvent
 from services.core.records import JobSpec
@@ -59,12 +59,15 @@ class Client:
 
     def download(self, job_id: str, out: Path) -> int:
         """Write all files of a job into one zip; returns its size in bytes. A broken download leaves no file."""
-        ask = self._requests.archive(job_id)
-        with telling_lost(self._requests.server), self._http.stream(ask.method, ask.path) as response:
+        request = self._requests.archive(job_id)
+        with (
+            translated_transport_errors(self._requests.server),
+            self._http.stream(request.method, request.path) as response,
+        ):
             if response.is_error:
                 response.read()
                 raise error_in(response)
-            with whole_file(out) as stream:
+            with atomic_file(out) as stream:
                 for piece in response.iter_bytes():
                     stream.write(piece)
         return out.stat().st_size
@@ -113,18 +116,18 @@ class Client:
         cursor = EventCursor(self._requests.server, job_id, after)
         while True:
             try:
-                ask = cursor.ask()
-                with self._http.stream(ask.method, ask.path, **ask.options) as response:
+                request = cursor.request()
+                with self._http.stream(request.method, request.path, **request.options) as response:
                     if response.is_error:
                         response.read()
                         raise error_in(response)
                     for line in response.iter_lines():
-                        if (event := cursor.take(line)) is not None:
+                        if (event := cursor.read_line(line)) is not None:
                             yield event
                         if cursor.has_ended:
                             return
             except httpx.TransportError as problem:
-                cursor.lose(problem)
+                cursor.count_failure(problem)
             time.sleep(RECONNECT_S)
 
     def run(self, flow: Flow[R]) -> R:
@@ -134,7 +137,7 @@ class Client:
                 step = next(flow)
                 while True:
                     try:
-                        outcome = self._take(step)
+                        outcome = self._perform(step)
                     except Exception as problem:
                         step = flow.throw(problem)
                     else:
@@ -143,13 +146,13 @@ class Client:
                 result: R = end.value
                 return result
 
-    def _take(self, step: Ask | Pause | Work) -> Any:
+    def _perform(self, step: HttpRequest | Pause | BlockingCall) -> Any:
         match step:
-            case Ask(method, path, options):
+            case HttpRequest(method, path, options):
                 return self._http.request(method, path, **options)
             case Pause(seconds):
                 return time.sleep(seconds)
-            case Work(call):
+            case BlockingCall(call):
                 return call()
 
 
@@ -185,13 +188,13 @@ class AsyncClient:
 
     async def download(self, job_id: str, out: Path) -> int:
         """See ``Client``."""
-        ask = self._requests.archive(job_id)
-        with telling_lost(self._requests.server):
-            async with self._http.stream(ask.method, ask.path) as response:
+        request = self._requests.archive(job_id)
+        with translated_transport_errors(self._requests.server):
+            async with self._http.stream(request.method, request.path) as response:
                 if response.is_error:
                     await response.aread()
                     raise error_in(response)
-                with whole_file(out) as stream:
+                with atomic_file(out) as stream:
                     async for piece in response.aiter_bytes():
                         stream.write(piece)
         return out.stat().st_size
@@ -233,18 +236,18 @@ class AsyncClient:
         cursor = EventCursor(self._requests.server, job_id, after)
         while True:
             try:
-                ask = cursor.ask()
-                async with self._http.stream(ask.method, ask.path, **ask.options) as response:
+                request = cursor.request()
+                async with self._http.stream(request.method, request.path, **request.options) as response:
                     if response.is_error:
                         await response.aread()
                         raise error_in(response)
                     async for line in response.aiter_lines():
-                        if (event := cursor.take(line)) is not None:
+                        if (event := cursor.read_line(line)) is not None:
                             yield event
                         if cursor.has_ended:
                             return
             except httpx.TransportError as problem:
-                cursor.lose(problem)
+                cursor.count_failure(problem)
             await asyncio.sleep(RECONNECT_S)
 
     async def run(self, flow: Flow[R]) -> R:
@@ -254,7 +257,7 @@ class AsyncClient:
                 step = next(flow)
                 while True:
                     try:
-                        outcome = await self._take(step)
+                        outcome = await self._perform(step)
                     except Exception as problem:
                         step = flow.throw(problem)
                     else:
@@ -263,11 +266,11 @@ class AsyncClient:
                 result: R = end.value
                 return result
 
-    async def _take(self, step: Ask | Pause | Work) -> Any:
+    async def _perform(self, step: HttpRequest | Pause | BlockingCall) -> Any:
         match step:
-            case Ask(method, path, options):
+            case HttpRequest(method, path, options):
                 return await self._http.request(method, path, **options)
             case Pause(seconds):
                 return await asyncio.sleep(seconds)
-            case Work(call):
+            case BlockingCall(call):
                 return await asyncio.to_thread(call)

@@ -11,7 +11,7 @@ from services.core.errors import InputError, PlatformError
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """A file that appears under its name once the block has ended without an error.
 
     Raises:
@@ -32,7 +32,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def telling_lost(server: str) -> Iterator[None]:
+def translated_transport_errors(server: str) -> Iterator[None]:
     """Replace the error of a broken connection by one sentence.
 
     Raises:

@@ -1,9 +1,9 @@
 """The exchanges between client and server as flows, which have no connection: a client performs each step and sends its
 result back into the flow.
 
-A flow is a generator. It yields an ``Ask``, a ``Pause`` or some ``Work``, is sent the answer or has the error thrown
-into it, and returns the result. So the blocking and the asynchronous client share every request, retry and error, and
-differ only in how they perform a step.
+A flow is a generator. It yields an ``HttpRequest``, a ``Pause`` or a ``BlockingCall``, is sent the answer or has the
+error thrown into it, and returns the result. So the blocking and the asynchronous client share every request, retry
+and error, and differ only in how they perform a step.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RECONNECT_TRIES = 30
 
 
 @dataclass(frozen=True)
-class Ask:
+class HttpRequest:
     """A request to be made; its answer is an ``httpx.Response``, whatever its status."""
 
     method: str
@@ -39,16 +39,16 @@ class Pause:
 
 
 @dataclass(frozen=True)
-class Work:
+class BlockingCall:
     """A call that takes a while, because it reads files."""
 
     call: Callable[[], Any]
 
 
-Flow = Generator[Ask | Pause | Work, Any, R]
+Flow = Generator[HttpRequest | Pause | BlockingCall, Any, R]
 
 
-def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
+def answer(server: str, request: HttpRequest) -> Flow[dict[str, Any]]:
     """Make a request and return the JSON of the answer.
 
     A GET request is repeated once if its connection breaks, because servers close idle connections.
@@ -60,19 +60,19 @@ def answer(server: str, ask: Ask) -> Flow[dict[str, Any]]:
 
     try:
         try:
-            response = yield ask
+            response = yield request
         except (httpx.ReadError, httpx.RemoteProtocolError):
-            if ask.method != "GET":
+            if request.method != "GET":
                 raise
-            response = yield ask
+            response = yield request
     except httpx.HTTPError as problem:
         raise PlatformError(
             f"Server {server} does not answer ({problem}); start it with dentine serve or give --server."
         ) from problem
     if response.is_error:
         raise error_in(response)
-    told: dict[str, Any] = response.json()
-    return told
+    document: dict[str, Any] = response.json()
+    return document
 
 
 class EventCursor:
@@ -83,12 +83,12 @@ class EventCursor:
         self._tries, self._ends = 0, False
         self.has_ended = False
 
-    def ask(self) -> Ask:
+    def request(self) -> HttpRequest:
         """The request for another connection, for the events that were not read yet."""
         self._ends = False
-        return Ask("GET", self._path, {"headers": {"Last-Event-ID": str(self._after)}})
+        return HttpRequest("GET", self._path, {"headers": {"Last-Event-ID": str(self._after)}})
 
-    def take(self, line: str) -> JobEvent | None:
+    def read_line(self, line: str) -> JobEvent | None:
         """Read a line; return an event if the line completes one."""
         name, _, value = line.partition(": ")
         if name == "event":
@@ -101,7 +101,7 @@ class EventCursor:
             return event
         return None
 
-    def lose(self, problem: Exception) -> None:
+    def count_failure(self, problem: Exception) -> None:
         """Count a broken connection.
 
         Raises:

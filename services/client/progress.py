@@ -13,7 +13,7 @@ from services.core.events import JobEvent
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-ASK_AGAIN_S = 5.0
+REMAINING_INTERVAL_S = 5.0
 """Interval, s, at which the range of the remaining time is requested; 12 times as long where lines are printed."""
 
 
@@ -26,7 +26,7 @@ class ProgressView:
 
     def __init__(self, remaining: Callable[[], dict[str, Any] | None] | None = None) -> None:
         self.events = 0
-        self._remaining, self._asked_s, self._told = remaining, 0.0, ""
+        self._remaining, self._requested_s, self._last_text = remaining, 0.0, ""
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._tenths: dict[str, int] = {}
@@ -59,26 +59,26 @@ class ProgressView:
         self.events += 1
         if self._bars is not None:
             self._draw(self._bars, event)
-        elif self._worth_a_line(event):
+        elif self._is_printed(event):
             share = f" {100 * event.done:3.0f} %" if event.done is not None else ""
             print(f"{event.stage or 'job'}{share}: {_note(event) or event.kind}", file=sys.stderr, flush=True)
-        if self._remaining is not None and self._is_time_to_ask(event):
-            self._tell(describe(self._remaining()), event)
+        if self._remaining is not None and self._is_remaining_due(event):
+            self._show_remaining(describe(self._remaining()), event)
 
-    def _is_time_to_ask(self, event: JobEvent) -> bool:
-        now_s, pause_s = time.monotonic(), ASK_AGAIN_S if self._bars is not None else 12 * ASK_AGAIN_S
-        if event.kind not in {"state", "started"} and now_s < self._asked_s + pause_s:
+    def _is_remaining_due(self, event: JobEvent) -> bool:
+        now_s, pause_s = time.monotonic(), REMAINING_INTERVAL_S if self._bars is not None else 12 * REMAINING_INTERVAL_S
+        if event.kind not in {"state", "started"} and now_s < self._requested_s + pause_s:
             return False
-        self._asked_s = now_s
+        self._requested_s = now_s
         return True
 
-    def _tell(self, text: str, event: JobEvent) -> None:
+    def _show_remaining(self, text: str, event: JobEvent) -> None:
         if self._bars is not None:
             for stage, task in self._tasks.items():
                 self._bars.update(task, left=text if stage == event.stage else "")
-        elif text and text != self._told:
+        elif text and text != self._last_text:
             print(f"job: {text}", file=sys.stderr, flush=True)
-        self._told = text
+        self._last_text = text
 
     def _draw(self, bars: Progress, event: JobEvent) -> None:
         if event.stage is None:
@@ -93,14 +93,14 @@ class ProgressView:
             bars.stop_task(task)
             bars.update(task, left="")
 
-    def _worth_a_line(self, event: JobEvent) -> bool:
+    def _is_printed(self, event: JobEvent) -> bool:
         """Whether to print the event: all but previews, and progress only where it enters another tenth."""
         if event.kind != "progress" or event.done is None or event.stage is None:
             return event.kind != "preview"
         tenth = int(10 * event.done)
-        fresh = self._tenths.get(event.stage) != tenth
+        is_new = self._tenths.get(event.stage) != tenth
         self._tenths[event.stage] = tenth
-        return fresh
+        return is_new
 
 
 def _note(event: JobEvent) -> str:

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from pydantic import SecretStr
 
-from services.client.flows import Ask, Flow, answer
+from services.client.flows import Flow, HttpRequest, answer
 from services.client.uploader import Uploader, UploadProgress, UploadResult
 from services.core.records import JobSpec
 
@@ -42,17 +42,17 @@ class Requests:
 
     def jobs(self, limit: int, before: int | None = None, **only: Any) -> Flow[dict[str, Any]]:
         """List at most ``limit`` jobs, newest first; ``only`` are the filters of the list."""
-        asked = {"limit": limit, "before": before} | only
-        return self._answer("GET", "/jobs", params={name: value for name, value in asked.items() if value is not None})
+        query = {"limit": limit, "before": before} | only
+        return self._answer("GET", "/jobs", params={name: value for name, value in query.items() if value is not None})
 
     def delete(self, job_id: str) -> Flow[dict[str, Any]]:
         """Delete the stored data of a job."""
         return self._answer("DELETE", f"/jobs/{quote(job_id, safe='')}")
 
     @staticmethod
-    def archive(job_id: str) -> Ask:
+    def archive(job_id: str) -> HttpRequest:
         """The request for a job's files as one zip; the client streams its answer."""
-        return Ask("GET", f"/jobs/{quote(job_id, safe='')}/artifacts.zip")
+        return HttpRequest("GET", f"/jobs/{quote(job_id, safe='')}/artifacts.zip")
 
     def calibration(self, name: str) -> Flow[dict[str, Any]]:
         """A stored calibration; its 'option' is what a job takes."""
@@ -85,4 +85,4 @@ class Requests:
         return self._answer("GET", "/workers")
 
     def _answer(self, method: str, path: str, **options: Any) -> Flow[dict[str, Any]]:
-        return answer(self.server, Ask(method, path, options))
+        return answer(self.server, HttpRequest(method, path, options))

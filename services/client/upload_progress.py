@@ -18,7 +18,7 @@ class UploadView:
     def __init__(self) -> None:
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
-        self._told: tuple[str, int] | None = None
+        self._last_printed: tuple[str, int] | None = None
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
@@ -57,6 +57,6 @@ class UploadView:
             self._bars.update(self._tasks[progress.phase], completed=progress.done_bytes, path=progress.path)
             return
         share = progress.done_bytes / max(progress.total_bytes, 1)
-        if self._told != (place := (progress.phase, int(10 * share))):
-            self._told = place
+        if self._last_printed != (tenth := (progress.phase, int(10 * share))):
+            self._last_printed = tenth
             print(f"{progress.phase} {100 * share:3.0f} %: {progress.path}", file=sys.stderr, flush=True)

@@ -19,7 +19,7 @@ from pydantic import Field
 from services.client.capture_paths import path_fault, require_paths
 from services.client.capture_records import SUBJECT, CaptureDetail, CaptureFile, ManifestFile, UploadManifest
 from services.client.errors import UploadError
-from services.client.flows import Ask, Flow, Pause, Work, answer, error_in
+from services.client.flows import BlockingCall, Flow, HttpRequest, Pause, answer, error_in
 from services.core.errors import CaptureInputError, PlatformError
 from services.core.files.image_metadata import metadata_fault
 from services.core.geometry import Record
@@ -38,7 +38,7 @@ VERIFYING_S = 900.0
 """Longest time, s, for an answer of the server, which reads the whole file after its last chunk."""
 MIN_WAIT_S, MAX_WAIT_S = 0.2, 5.0
 """Shortest and longest wait between two tries, s; each wait is twice as long as the one before."""
-_PASSING = frozenset({408, 423, 429, 460, 502, 503, 504})
+_TRANSIENT_STATUSES = frozenset({408, 423, 429, 460, 502, 503, 504})
 
 
 class UploadProgress(Record):
@@ -60,7 +60,7 @@ class UploadResult(Record):
     left_out: tuple[str, ...] = Field(description="files of the folder that are no part of a capture")
 
 
-class PassingError(Exception):
+class TransientError(Exception):
     """A fault that may pass after a while."""
 
     def __init__(self, message: str, wait_s: float | None = None) -> None:
@@ -90,18 +90,18 @@ class Uploader:
                 f"Subject {subject!r} is no label; use up to 64 letters, digits, dots, dashes and underscores, and no"
                 " name."
             )
-        files, left_out = yield Work(lambda: _scan(folder))
-        yield Work(lambda: _require_no_metadata(folder, files))
+        files, left_out = yield BlockingCall(lambda: _scan(folder))
+        yield BlockingCall(lambda: _require_no_metadata(folder, files))
         self._total_bytes = sum((folder / path).stat().st_size for path in files)
-        hashed = yield Work(lambda: tuple(self._hashed(folder, path) for path in files))
+        hashed = yield BlockingCall(lambda: tuple(self._hashed(folder, path) for path in files))
         manifest = UploadManifest(files=hashed, subject=subject)
-        told = yield from answer(self._server, Ask("POST", "/captures", {"json": manifest.model_dump()}))
-        capture = CaptureDetail.model_validate(told)
+        document = yield from answer(self._server, HttpRequest("POST", "/captures", {"json": manifest.model_dump()}))
+        capture = CaptureDetail.model_validate(document)
         self._done_bytes = self._total_bytes - capture.missing_bytes
         for file in capture.files:
             if not file.is_known:
                 yield from self._send(folder / file.path, capture.id, file)
-        yield from self._patiently(lambda: self._answer("POST", f"/captures/{capture.id}/commit"))
+        yield from self._retry(lambda: self._answer("POST", f"/captures/{capture.id}/commit"))
         return UploadResult(
             id=capture.id, path=capture.path, bytes=capture.bytes, sent_bytes=self._sent_bytes, left_out=left_out
         )
@@ -113,7 +113,7 @@ class Uploader:
                 content.update(block)
                 size += len(block)
                 self._done_bytes += len(block)
-                self._tell("hashing", path)
+                self._report("hashing", path)
         if size == 0:
             raise CaptureInputError(f"File {folder / path} is empty; leave it out or export it again.")
         return ManifestFile(path=path, bytes=size, sha256=content.hexdigest())
@@ -126,7 +126,7 @@ class Uploader:
             "Upload-Length": str(file.bytes),
             "Upload-Metadata": format_metadata({"capture": capture, "path": file.path}),
         }
-        created = yield from self._patiently(
+        created = yield from self._retry(
             lambda: self._answer("POST", "/uploads", headers={"Tus-Resumable": VERSION} | metadata)
         )
         base, offset = self._done_bytes - file.received_bytes, int(created.headers["Upload-Offset"])
@@ -137,9 +137,9 @@ class Uploader:
                 nonlocal offset
                 start, offset = offset, -1
                 if start < 0:
-                    asked = yield from self._answer("HEAD", url, headers={"Tus-Resumable": VERSION})
-                    start = int(asked.headers["Upload-Offset"])
-                chunk, checksum = yield Work(
+                    response = yield from self._answer("HEAD", url, headers={"Tus-Resumable": VERSION})
+                    start = int(response.headers["Upload-Offset"])
+                chunk, checksum = yield BlockingCall(
                     lambda: _read_chunk(stream, start, min(self._chunk_bytes, file.bytes - start))
                 )
                 if start < file.bytes and not chunk:
@@ -149,11 +149,11 @@ class Uploader:
                 offset = yield from self._append(url, start, chunk, checksum)
                 return offset
 
-            while (yield from self._patiently(step)) < file.bytes:
+            while (yield from self._retry(step)) < file.bytes:
                 self._done_bytes = base + offset
-                self._tell("sending", file.path)
+                self._report("sending", file.path)
         self._done_bytes = base + file.bytes
-        self._tell("sending", file.path)
+        self._report("sending", file.path)
 
     def _append(self, url: str, offset: int, chunk: bytes, checksum: str) -> Flow[int]:
         from services.client.tus import CHUNK_TYPE, VERSION
@@ -167,7 +167,7 @@ class Uploader:
         self._sent_bytes += len(chunk)
         try:
             appended = yield from self._answer("PATCH", url, content=chunk, headers=headers)
-        except PassingError:
+        except TransientError:
             self._chunk_bytes = max(self._chunk_bytes // 2, MIN_CHUNK_BYTES)
             raise
         self._chunk_bytes = min(2 * self._chunk_bytes, CHUNK_BYTES)
@@ -177,27 +177,28 @@ class Uploader:
         """Make one request and return its response.
 
         Raises:
-            PassingError: another try may succeed. DentineError: another try would fail too.
+            TransientError: another try may succeed. DentineError: another try would fail too.
         """
         import httpx
 
         try:
-            response: httpx.Response = yield Ask(
+            response: httpx.Response = yield HttpRequest(
                 method, path, options | {"timeout": httpx.Timeout(10.0, read=VERIFYING_S, write=60.0)}
             )
         except httpx.TransportError as problem:
-            raise PassingError(f"Server {self._server} does not answer ({problem})") from problem
+            raise TransientError(f"Server {self._server} does not answer ({problem})") from problem
         if not response.is_error:
             return response
         problem_code = "" if method == "HEAD" else response.text
-        if response.status_code in _PASSING or '"code":"upload-offset"' in problem_code:
-            wait = response.headers.get("Retry-After", "")
-            raise PassingError(
-                f"Server {self._server} answers {response.status_code}", float(wait) if wait.isdigit() else None
+        if response.status_code in _TRANSIENT_STATUSES or '"code":"upload-offset"' in problem_code:
+            retry_after = response.headers.get("Retry-After", "")
+            raise TransientError(
+                f"Server {self._server} answers {response.status_code}",
+                float(retry_after) if retry_after.isdigit() else None,
             )
         raise error_in(response)
 
-    def _patiently(self, step: Callable[[], Flow[R]]) -> Flow[R]:
+    def _retry(self, step: Callable[[], Flow[R]]) -> Flow[R]:
         """Perform a step, and repeat it at growing intervals while its fault may pass.
 
         Raises:
@@ -207,7 +208,7 @@ class Uploader:
         while True:
             try:
                 return (yield from step())
-            except PassingError as problem:
+            except TransientError as problem:
                 pause_s = problem.wait_s or wait_s * random.uniform(0.8, 1.2)
                 if time.monotonic() + pause_s > give_up_s:
                     raise PlatformError(
@@ -216,7 +217,7 @@ class Uploader:
             yield Pause(pause_s)
             wait_s = min(2 * wait_s, MAX_WAIT_S)
 
-    def _tell(self, phase: Literal["hashing", "sending"], path: str) -> None:
+    def _report(self, phase: Literal["hashing", "sending"], path: str) -> None:
         if self._progress is not None:
             self._progress(
                 UploadProgress(phase=phase, path=path, done_bytes=self._done_bytes, total_bytes=self._total_bytes)

@@ -48,7 +48,7 @@ from services.core.errors import (
     MissingStageError,
     ReadOnlyStoreError,
 )
-from services.core.files.object_store import discard, place_of, remote_folder
+from services.core.files.object_store import array_location, discard, remote_folder
 from services.core.geometry import Record
 
 R = TypeVar("R", bound=Record)
@@ -110,7 +110,7 @@ class StageWriter:
         """
         self.root, self.stage, self.attempt = Path(root), stage, attempt
         self.root.mkdir(parents=True, exist_ok=True)
-        with self._alone():
+        with self._locked():
             self.require_lease(starting=True)
             write_atomic(self._lease, str(attempt).encode())
         self.folder = self.root / f".{stage}.{attempt}"
@@ -121,7 +121,7 @@ class StageWriter:
         return self.root / f"{self.stage}.lease"
 
     @contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _locked(self) -> Iterator[None]:
         """Hold the stage's lock, so that no other attempt starts or publishes the stage meanwhile; the system releases
         the lock however this process ends.
         """
@@ -150,8 +150,8 @@ class StageWriter:
             p for p in self.folder.rglob("*") if p.is_file() and not p.name.endswith(".partial") and p.name != MANIFEST
         ):
             name, size = path.relative_to(self.folder).as_posix(), path.stat().st_size
-            told_size, told = known.get(name, (-1, ""))
-            files[name] = {"bytes": size, "sha256": told if told_size == size else _sha256(path)}
+            known_size, known_sha256 = known.get(name, (-1, ""))
+            files[name] = {"bytes": size, "sha256": known_sha256 if known_size == size else _sha256(path)}
         manifest = {
             "format": FORMAT_VERSION,
             "stage": self.stage,
@@ -161,7 +161,7 @@ class StageWriter:
         }
         write_atomic(self.folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
         final, retired = self.root / self.stage, self.root / f".{self.stage}.retired"
-        with self._alone():
+        with self._locked():
             self.require_lease()
             if final.exists():
                 discard(retired)
@@ -277,7 +277,7 @@ def create_array(
     chunk: tuple[int, ...] | None = None,
     codec: Literal["zstd", "lz4"] = "zstd",
 ) -> zarr.Array[Any]:
-    """Create a zarr v3 array at the place that ``place_of`` gives.
+    """Create a zarr v3 array at the place that ``array_location`` gives.
 
     Each shard may have only one writer. ``shard`` is also the shape of a chunk unless ``chunk`` divides it.
 
@@ -285,7 +285,7 @@ def create_array(
         codec: compression; lz4 takes a third of zstd's time and 5 % more space for noisy single-precision numbers.
     """
     return zarr.create_array(
-        place_of(folder / name),
+        array_location(folder / name),
         shape=shape,
         chunks=chunk or shard,
         shards=shard if chunk else None,
@@ -308,7 +308,7 @@ def image_pieces(height: int, width: int) -> tuple[tuple[int, int], tuple[int, i
 
 def writable_array(path: Path) -> zarr.Array[Any]:
     """Open an array that ``create_array`` has made, for writing."""
-    return zarr.open_array(place_of(path), mode="r+", zarr_format=3)
+    return zarr.open_array(array_location(path), mode="r+", zarr_format=3)
 
 
 class StoredArray:
@@ -320,19 +320,19 @@ class StoredArray:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with self._telling_damage():
-            self._array = zarr.open_array(place_of(path), mode="r", zarr_format=3)
+        with self._translate_read_errors():
+            self._array = zarr.open_array(array_location(path), mode="r", zarr_format=3)
 
     def __getitem__(self, selection: Any) -> NDArray[Any]:
-        with self._telling_damage(asked=(selection,)):
+        with self._translate_read_errors(requested=(selection,)):
             return np.asarray(self._array[selection])
 
     @contextmanager
-    def _telling_damage(self, asked: tuple[Any, ...] = ()) -> Iterator[None]:
+    def _translate_read_errors(self, requested: tuple[Any, ...] = ()) -> Iterator[None]:
         try:
             yield
         except (FileNotFoundError, ValueError, RuntimeError) as problem:
-            for selection in asked:
+            for selection in requested:
                 # A selection that no array of this shape has is the caller's mistake; this statement raises its error.
                 np.broadcast_to(np.empty((), dtype=bool), self._array.shape)[selection]
             raise CorruptStoreError(
@@ -341,7 +341,7 @@ class StoredArray:
 
 
 @contextmanager
-def telling_disk_faults(root: Path) -> Iterator[None]:
+def translate_disk_errors(root: Path) -> Iterator[None]:
     """Replace the error of a full or read-only disk by this project's error for it.
 
     Raises:

@@ -34,10 +34,12 @@ def verdict_of(report: FitReport) -> Verdict:
     worst = max([*report.fit_error.values(), *report.held_out_error.values()], default=0.0)
     error, error_of = mean_figure(errors, ses), _HELD_OUT if is_tested else _FITTED
     converged, is_above_limit = report.converged and worst <= MAX_ERROR, worst > MAX_ERROR
-    told = f"{error_of} error {percent(error)}"
-    how = f"{'Converged' if converged else 'Not converged'} after {report.steps} steps: {told}."
+    error_text = f"{error_of} error {percent(error)}"
+    convergence_text = f"{'Converged' if converged else 'Not converged'} after {report.steps} steps: {error_text}."
     return Verdict(
-        headline=f"Not converged: {told}; no fit above {100 * MAX_ERROR:g} % is believed." if is_above_limit else how,
+        headline=f"Not converged: {error_text}; no fit above {100 * MAX_ERROR:g} % is believed."
+        if is_above_limit
+        else convergence_text,
         converged=converged,
         is_above_limit=is_above_limit,
         limit=MAX_ERROR,

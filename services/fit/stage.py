@@ -100,7 +100,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.fit.export.asset import errors_json, parameters_json, write_asset
     from services.fit.export.previews import read_pictures
     from services.fit.export.report import write_report
-    from services.fit.export.stains import kept_stains
+    from services.fit.export.stains import read_stains
     from services.fit.tooth.driver import fitted_thickness
 
     context.report(StageEvent(stage="export", kind="started"))
@@ -119,7 +119,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         )
         for light in prepared.lights
     )
-    stains = kept_stains(fit_folder)
+    stains = read_stains(fit_folder)
     files = write_asset(
         writer.folder,
         report,
@@ -160,7 +160,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))
     ]
     centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
-    place = float(centre[0]), float(centre[1]), float(centre[2])
+    centre_mm = float(centre[0]), float(centre[1]), float(centre[2])
     verdict = verdict_of(report)
     manifest = AssetManifest(
         files=files,
@@ -168,7 +168,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         converged=verdict.converged,
         advice=report.advice,
         verdict=verdict,
-        centre_mm=place,
+        centre_mm=centre_mm,
     )
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)

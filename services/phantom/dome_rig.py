@@ -42,9 +42,9 @@ def dome_lights(count: int, channels: tuple[str, ...], seed: int) -> tuple[Light
     random = np.random.default_rng(seed)
     k = np.arange(count) + 0.5
     cosine = 1 - (1 - np.cos(np.radians(WIDEST_LIGHT_DEG))) * k / count
-    turn = np.pi * (3 - np.sqrt(5)) * k
+    angle = np.pi * (3 - np.sqrt(5)) * k
     sine = np.sqrt(1 - cosine**2)
-    position = RADIUS_MM * np.stack([sine * np.cos(turn), cosine, sine * np.sin(turn)], axis=-1)
+    position = RADIUS_MM * np.stack([sine * np.cos(angle), cosine, sine * np.sin(angle)], axis=-1)
     brightness = 1 + LED_SPREAD * random.uniform(-1, 1, size=count)
     colours = INTENSITY * brightness[:, None] * np.array([LED_WHITE[channel] for channel in channels])
     return tuple(

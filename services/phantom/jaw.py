@@ -171,7 +171,7 @@ def write_jaw_phantom(
     if jaw.lips is not None:
         write_mesh(out / "truth_lips.ply", jaw.lips)
 
-    entries, kept = [], held_out_lights(lights, held_out)
+    entries, held_out_indices = [], held_out_lights(lights, held_out)
     with TemporaryDirectory() as folder:
         painters = (
             _by_mitsuba(jaw, mouths, rig_lights, Path(folder))
@@ -181,15 +181,15 @@ def write_jaw_phantom(
         for number, camera in enumerate(rig_cameras):
             stacks = [paint(camera, samples, seed + 7919 * number) for paint in painters]
             mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
-            entries += write_images(out, camera, rig_lights, mean, variance, kept)
-    made = {
+            entries += write_images(out, camera, rig_lights, mean, variance, held_out_indices)
+    settings = {
         "subject": subject,
         "scan": None if scan is None else scan.name,
         "renderer": renderer,
         "samples_per_pixel": samples,
         "seed": seed,
     }
-    write_description(out, names, rig_cameras, rig_lights, entries, jaw_truth(jaw, mouths, boundary) | made)
+    write_description(out, names, rig_cameras, rig_lights, entries, jaw_truth(jaw, mouths, boundary) | settings)
 
 
 def write_jaw_meshes(out: Path, jaw: JawSurfaces) -> None:

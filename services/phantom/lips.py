@@ -33,8 +33,8 @@ def lips_and_retractor(teeth: Sequence[Mesh]) -> Mesh:
     front = np.sort(vertices[:, 1])[-20:].mean()
     edge = np.quantile(vertices[vertices[:, 1] > front - 4.0, 2], 0.99)
     centre_z = edge - 4.0  # the middle of the front crowns, half their height above the biting edge
-    turn = np.linspace(0, 2 * np.pi, _ALONG, endpoint=False)
-    x, z = OPENING_MM[0] * np.cos(turn), centre_z + OPENING_MM[1] * np.sin(turn)
+    angle = np.linspace(0, 2 * np.pi, _ALONG, endpoint=False)
+    x, z = OPENING_MM[0] * np.cos(angle), centre_z + OPENING_MM[1] * np.sin(angle)
     ring = np.stack([x, _lip_y(x, front), z], axis=1)
     parts = [_tube(ring, LIP_RADIUS_MM, closed=True)]
     for side in (-1, 1):
@@ -67,8 +67,8 @@ def _tube(line: FloatArray, radius_mm: float, *, closed: bool) -> Mesh:
     forward = np.array([0.0, 1.0, 0.0]) - along[:, 1:2] * along
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     sideways = np.cross(along, forward)
-    turn = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)[:, None, None]
-    points = line + radius_mm * (np.cos(turn) * forward + np.sin(turn) * sideways)  # (around, along, 3)
+    angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)[:, None, None]
+    points = line + radius_mm * (np.cos(angle) * forward + np.sin(angle) * sideways)  # (around, along, 3)
     number = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
     a, b = (number, np.roll(number, -1, axis=1)) if closed else (number[:, :-1], number[:, 1:])
     c, d = (np.roll(part, -1, axis=0) for part in (a, b))

@@ -53,14 +53,14 @@ def reflect(
     tooth_alone = RayScene(outer)
     shape = (len(lights), height * width, len(channels))
     highlight, diffuse = np.zeros(shape), np.zeros(shape)
-    visible, met = np.zeros(height * width), np.zeros(height * width)
+    visible, unoccluded = np.zeros(height * width), np.zeros(height * width)
     gum_colour = np.array([GUM_REFLECTANCE[channel] for channel in channels])
 
     for sub in range(SUBPIXELS**2):
         offset = ((sub % SUBPIXELS + 0.5) / SUBPIXELS, (sub // SUBPIXELS + 0.5) / SUBPIXELS)
         origin, directions = pixel_rays(camera, offset)
         hits = everything.first_hits(origin, directions)
-        met += tooth_alone.first_hits(origin, directions).hit
+        unoccluded += tooth_alone.first_hits(origin, directions).hit
         visible += hits.mesh == 0
         for part in (0, 1):
             rows = np.flatnonzero(hits.mesh == part)
@@ -69,45 +69,45 @@ def reflect(
             points, flat, view = hits.points_mm[rows], hits.normals[rows], -directions[rows]
             normals = normals_at[part](points, hits.face[rows])
             for n, light in enumerate(lights):
-                towards = np.asarray(light.position_mm) - points
-                distance = np.linalg.norm(towards, axis=1)
-                towards /= distance[:, None]
-                cosine = (normals * towards).sum(axis=1)
-                lit = (cosine > 0) & ((flat * towards).sum(axis=1) > 0)
-                lit[lit] = ~everything.first_hits(points[lit] + SHADOW_OFFSET_MM * flat[lit], towards[lit]).hit
+                to_light = np.asarray(light.position_mm) - points
+                distance = np.linalg.norm(to_light, axis=1)
+                to_light /= distance[:, None]
+                cosine = (normals * to_light).sum(axis=1)
+                lit = (cosine > 0) & ((flat * to_light).sum(axis=1) > 0)
+                lit[lit] = ~everything.first_hits(points[lit] + SHADOW_OFFSET_MM * flat[lit], to_light[lit]).hit
                 irradiance = np.where(lit, cosine, 0.0)[:, None] / distance[:, None] ** 2 * np.asarray(light.intensity)
                 if part == 0:
-                    highlight[n, rows] += irradiance * ggx_reflection(normals, towards, view, ROUGHNESS, ior)[:, None]
+                    highlight[n, rows] += irradiance * ggx_reflection(normals, to_light, view, ROUGHNESS, ior)[:, None]
                 else:
                     diffuse[n, rows] += irradiance * gum_colour / np.pi
 
     count, image = SUBPIXELS**2, (len(lights), height, width, len(channels))
-    share = np.where(met > 0, visible / np.maximum(met, 1), 1.0)
+    share = np.where(unoccluded > 0, visible / np.maximum(unoccluded, 1), 1.0)
     return Reflection(
         (highlight / count).reshape(image),
         (diffuse / count).reshape(image),
         share.reshape(height, width),
-        (met > 0).reshape(height, width),
+        (unoccluded > 0).reshape(height, width),
     )
 
 
 def ggx_reflection(
     normal: NDArray[np.float64],
     towards_light: NDArray[np.float64],
-    towards_eye: NDArray[np.float64],
+    towards_camera: NDArray[np.float64],
     roughness: float,
     ior: float,
 ) -> NDArray[np.float64]:
     """Reflection BRDF D F G / (4 |n·l| |n·v|) of a rough dielectric (Walter et al. 2007), 1/sr, with values (...).
 
     Args:
-        normal, towards_light, towards_eye: (..., 3), unit directions that point away from the surface.
+        normal, towards_light, towards_camera: (..., 3), unit directions that point away from the surface.
         roughness: GGX roughness.
         ior: refractive index.
     """
-    half = towards_light + towards_eye
+    half = towards_light + towards_camera
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    n_l, n_v, n_h = (np.clip((normal * d).sum(axis=-1), 1e-6, 1.0) for d in (towards_light, towards_eye, half))
+    n_l, n_v, n_h = (np.clip((normal * d).sum(axis=-1), 1e-6, 1.0) for d in (towards_light, towards_camera, half))
     a2 = roughness**2
     distribution = a2 / (np.pi * (n_h**2 * (a2 - 1) + 1) ** 2)
     shadowing = np.prod([2 * c / (c + np.sqrt(a2 + (1 - a2) * c**2)) for c in (n_l, n_v)], axis=0)

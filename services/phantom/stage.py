@@ -18,7 +18,7 @@ def run(spec: JobSpec, context: StageContext) -> FolderCapture:
     """
     done = -1.0
 
-    def look(fraction: float) -> None:
+    def report_fraction(fraction: float) -> None:
         nonlocal done
         context.raise_if_cancelled()
         if fraction > done:
@@ -30,8 +30,8 @@ def run(spec: JobSpec, context: StageContext) -> FolderCapture:
     context.report(StageEvent(stage="phantom", kind="started"))
     context.raise_if_cancelled()
     writer = StageWriter(context.root, "phantom", context.attempt)
-    kept_in = spec.rig.mouth if spec.rig is not None and not spec.is_demo else None
-    is_new = make_demo_mouth(writer.folder, kept_in, look)
+    cache = spec.rig.mouth if spec.rig is not None and not spec.is_demo else None
+    is_new = make_demo_mouth(writer.folder, cache, report_fraction)
     description = read_record(writer.folder / DESCRIPTION, FolderCapture)
     writer.publish(description)
     how = "rendered" if is_new else "taken from an earlier demonstration"

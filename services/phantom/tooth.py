@@ -15,7 +15,7 @@ from services.core.errors import InputError
 from services.core.files.meshes import read_mesh, write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.records import Boundary
-from services.fit.export.stains import keep_stains, write_textures
+from services.fit.export.stains import store_stains, write_textures
 from services.fit.inputs.stain_uv import ToothStains
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
@@ -109,13 +109,13 @@ def write_phantom(
     _write_meshes(out, tooth, shown_gums)
     painted = painted_stains(tooth.outer, names, seed) if stains else None
     if painted is not None:
-        keep_stains(out, painted)
+        store_stains(out, painted)
     stained = {
         name: tissues[name] if painted is None else replace(tissues[name], stain=painted.textures[name])
         for name in names
     }
 
-    entries, kept = [], held_out_lights(lights, held_out)
+    entries, held_out_indices = [], held_out_lights(lights, held_out)
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
         stacks = [
@@ -128,7 +128,7 @@ def write_phantom(
         mean, variance = mean * share + surface.gums, variance * share**2
         if highlights:
             mean = mean + surface.highlight
-        entries += write_images(out, camera, rig_lights, mean, variance, kept)
+        entries += write_images(out, camera, rig_lights, mean, variance, held_out_indices)
         if highlights:
             for n, light in enumerate(rig_lights):
                 write_image(out / "highlights" / f"{camera.name}_{light.name}.npy", surface.highlight[n])
@@ -202,13 +202,13 @@ def _render(
         from services.fit.export.mitsuba_scene import nested_scene
 
         folder = teeth_folder(out, tooth.fdi)
-        shell, pictures = folder / "outer.ply", {}
+        shell, stain_textures = folder / "outer.ply", {}
         if painted is not None:
             shell = folder / "stained.ply"
             write_mapped_mesh(shell, tooth.outer, painted.corners_uv)
-            pictures = {str(tooth.fdi): tuple(write_textures(folder, painted).values())[channel]}
+            stain_textures = {str(tooth.fdi): tuple(write_textures(folder, painted).values())[channel]}
         files = {str(tooth.fdi): (shell, folder / "dentin.ply" if tooth.dentin is not None else None)}
-        scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0, stains=pictures)
+        scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0, stains=stain_textures)
         return render_mitsuba(scene, lights, channel, samples, seed)
     from services.fit.transport.engine import Engine
 

@@ -24,15 +24,15 @@ class LastingSocket(ssl.SSLSocket):
 
     def read(self, len: int = 1024, buffer: Any = None) -> Any:  # noqa: A002  # the name is the library's
         """See ``ssl.SSLSocket``; ``recv`` and ``recv_into`` call this method."""
-        return _without_others_errors(super().read, len, buffer)
+        return _retry_after_foreign_error(super().read, len, buffer)
 
     def send(self, data: Any, flags: int = 0) -> int:
         """See ``ssl.SSLSocket``."""
-        return _without_others_errors(super().send, data, flags)
+        return _retry_after_foreign_error(super().send, data, flags)
 
     def do_handshake(self, block: bool = False) -> None:
         """See ``ssl.SSLSocket``."""
-        _without_others_errors(super().do_handshake, block)
+        _retry_after_foreign_error(super().do_handshake, block)
 
 
 class LastingSecurity(Security):  # type: ignore[misc]  # distributed has no types
@@ -57,7 +57,7 @@ def _with_lasting_sockets(arguments: dict[str, Any]) -> dict[str, Any]:
     return arguments
 
 
-def _without_others_errors(
+def _retry_after_foreign_error(
     call: Callable[Arguments, Answer], *arguments: Arguments.args, **named: Arguments.kwargs
 ) -> Answer:
     try:
@@ -65,11 +65,11 @@ def _without_others_errors(
     except ssl.SSLError:  # an error of TLS itself, or nothing to read yet; Python has emptied the queue
         raise
     except OSError:
-        _forget_errors()
+        _clear_error_queue()
         return call(*arguments, **named)
 
 
-def _forget_errors() -> None:
+def _clear_error_queue() -> None:
     """Empty this thread's queue of errors. Python does so after unknown ciphers are set, and has no call for it."""
     with suppress(ssl.SSLError):
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).set_ciphers("UNKNOWN")

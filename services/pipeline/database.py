@@ -23,7 +23,7 @@ from services.core.errors import PlatformError, SettingsError
 
 BUSY_MS = 5000
 """Longest time, ms, that a writer waits for a writer of another process."""
-TURN_S = 5.0
+WRITER_WAIT_S = 5.0
 """Longest time, s, that a writer first waits for other writers of its own process."""
 MAX_CONNECTIONS = 64
 """Number of connections that stay open to a file: as many as a server has threads with queries."""
@@ -75,7 +75,7 @@ def open_database(url: str) -> sql.Engine:
             parsed.set(drivername="postgresql+psycopg"),
             pool_pre_ping=True,
             hide_parameters=True,
-            connect_args=_watchful(parsed),
+            connect_args=_keepalive_options(parsed),
         )
     except ModuleNotFoundError as problem:
         raise PlatformError("Postgres' driver is not installed; install dentine[postgres].") from problem
@@ -133,7 +133,7 @@ def _read_password_at_each_connection(engine: sql.Engine, path: Path) -> None:
         options["password"] = read_password(path)
 
 
-def patiently(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
+def retry_while_lost(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
     """Make a call, and repeat it for up to ``seconds`` while the database does not answer."""
     import stamina
 
@@ -191,29 +191,29 @@ def writing(engine: sql.Engine) -> Iterator[sql.Connection]:
     Raises:
         sqlalchemy.exc.OperationalError: others write for too long, or the database does not answer.
     """
-    with _turn(engine), engine.connect() as connection, connection.execution_options(writes=True).begin():
+    with _writer_lock(engine), engine.connect() as connection, connection.execution_options(writes=True).begin():
         if engine.dialect.name == "postgresql":
             connection.execute(sql.select(sql.func.pg_advisory_xact_lock(WRITER_LOCK)))
         yield connection
 
 
 @contextmanager
-def _turn(engine: sql.Engine) -> Iterator[None]:
-    turn: threading.Lock | None = engine.get_execution_options().get("turn")
-    if turn is None:
+def _writer_lock(engine: sql.Engine) -> Iterator[None]:
+    lock: threading.Lock | None = engine.get_execution_options().get("writer_lock")
+    if lock is None:
         yield
         return
-    if not turn.acquire(timeout=TURN_S):
+    if not lock.acquire(timeout=WRITER_WAIT_S):
         raise sql.exc.OperationalError(
             "BEGIN IMMEDIATE", None, TimeoutError("other writers of this process have not ended")
         )
     try:
         yield
     finally:
-        turn.release()
+        lock.release()
 
 
-def _watchful(url: sql.URL) -> dict[str, Any]:
+def _keepalive_options(url: sql.URL) -> dict[str, Any]:
     # By default a connection over a cut network hangs for a quarter of an hour, and the server keeps the locks of its
     # transaction for two hours.
     third_s, silence_ms = POSTGRES_SILENCE_S // 3, 1000 * POSTGRES_SILENCE_S
@@ -230,7 +230,7 @@ def _sqlite(url: sql.URL) -> sql.Engine:
     # take a lock of their own first. Connections stay open, because opening one costs more than most queries. Errors
     # end in logs, so they hide the parameters of queries.
     engine = sql.create_engine(
-        url, hide_parameters=True, pool_size=MAX_CONNECTIONS, execution_options={"turn": threading.Lock()}
+        url, hide_parameters=True, pool_size=MAX_CONNECTIONS, execution_options={"writer_lock": threading.Lock()}
     )
 
     @sql.event.listens_for(engine, "connect")

@@ -61,9 +61,9 @@ _COLUMNS = tuple(JobEvent.model_fields)
 
 
 def latest_of_stages(jobs: sql.Select[Any]) -> sql.Select[Any]:
-    """Query for the last event of each stage of certain jobs, and for the last event that started each; see ``begun``.
+    """Query for the last event of each stage of certain jobs, and for the last event that started each.
 
-    Each event is found by one look-up in an index, however many events there are.
+    ``progress_of_jobs`` reads its rows. Each event is found by one look-up in an index, however many events there are.
 
     Args:
         jobs: query for the ids of the jobs, as column ``id``.
@@ -134,7 +134,7 @@ def _page_of(columns: tuple[str, ...]) -> Query:
     return Query(query.order_by(event_table.c.id).limit(sql.bindparam("most", type_=sql.Integer)))
 
 
-class Begun(NamedTuple):
+class JobProgress(NamedTuple):
     """The progress of a job's stages."""
 
     latest: Sequence[JobEvent] = ()
@@ -244,11 +244,11 @@ class EventLog:
         """The job's events with an id above ``after``, oldest first; ``only`` gives the value that a column must have,
         or None for any value.
         """
-        asked = {name: value for name, value in only.items() if value is not None}
-        values = {f"of_{name}": value for name, value in asked.items()}
+        selected = {name: value for name, value in only.items() if value is not None}
+        values = {f"of_{name}": value for name, value in selected.items()}
         return [
             _event(row)
-            for row in _page_of(tuple(asked)).rows(self._engine, of=self.job, after=after, most=limit, **values)
+            for row in _page_of(tuple(selected)).rows(self._engine, of=self.job, after=after, most=limit, **values)
         ]
 
     def data_of(self, kind: str) -> Iterator[TimedData]:
@@ -278,13 +278,13 @@ class EventLog:
             )
             return first_s
 
-    def begun(self) -> Begun:
+    def progress(self) -> JobProgress:
         """The progress of the job's stages."""
-        return begun(_LATEST.rows(self._engine, of=self.job)).get(self.job, Begun())
+        return progress_of_jobs(_LATEST.rows(self._engine, of=self.job)).get(self.job, JobProgress())
 
     def latest(self) -> Sequence[JobEvent]:
         """The last event of each stage, oldest first."""
-        return self.begun().latest
+        return self.progress().latest
 
     def newest_id(self) -> int:
         """Id of the job's last event, 0 before the first."""
@@ -294,7 +294,7 @@ class EventLog:
         return connection.scalar(_NEWEST_ATTEMPT, {"of": self.job, "of_stage": stage}) or 0
 
 
-def begun(rows: Iterable[Sequence[Any]]) -> dict[str, Begun]:
+def progress_of_jobs(rows: Iterable[Sequence[Any]]) -> dict[str, JobProgress]:
     """The progress of each job, by id, from the rows of ``latest_of_stages``."""
     latest: dict[str, dict[str | None, JobEvent]] = {}
     started: dict[str, JobEvent] = {}
@@ -305,7 +305,7 @@ def begun(rows: Iterable[Sequence[Any]]) -> dict[str, Begun]:
         of_job[event.stage] = event
         if event.kind == "started":
             started[event.job] = event
-    return {job: Begun(tuple(of_job.values()), started.get(job)) for job, of_job in latest.items()}
+    return {job: JobProgress(tuple(of_job.values()), started.get(job)) for job, of_job in latest.items()}
 
 
 def _event(row: Sequence[Any], **changes: Any) -> JobEvent:

@@ -12,7 +12,7 @@ from services.core.errors import JobCancelledError, WorkerLostError
 from services.core.events import JobEvent
 from services.core.placement import DOME, STAGES, rank
 from services.core.stage import CANCEL_FLAG
-from services.pipeline.database import patiently
+from services.pipeline.database import retry_while_lost
 from services.pipeline.event_log import EventLog
 from services.pipeline.stage_task import StageTask
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 Listener = Callable[[JobEvent], None]
 
-ENDS = ("finished", "error")
+FINAL_STATUSES = ("finished", "error")
 """Final statuses of a task; a task with status lost, whose worker died with the result, runs again."""
 POLL_S = 0.25
-KEEP_S = 10.0
+RESTART_INTERVAL_S = 10.0
 """Interval, s, at which workers that Dask has given up are started again."""
 GRACE_S = 5.0
 """Time, s, within which a cancelled stage must stop before its worker is stopped. The end of a capture is always
@@ -37,20 +37,20 @@ class Watch:
     def __init__(self, log: EventLog, listener: Listener | None, after: int) -> None:
         self._log, self._listener, self._after = log, listener, after
 
-    def tell(self) -> None:
+    def pass_on_events(self) -> None:
         """Pass all new events to the listener."""
-        while new := patiently(lambda: self._log.read(self._after)):
+        while new := retry_while_lost(lambda: self._log.read(self._after)):
             for event in new:
                 if self._listener is not None:
                     self._listener(event)
             self._after = new[-1].id
 
 
-def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTask, watch: Watch) -> None:
+def follow_stage(client: Client, restart_lost_workers: Callable[[], None], task: StageTask, watch: Watch) -> None:
     """Submit a stage, pass on its events until it has ended, and raise the error that it raises.
 
     Args:
-        keep_workers: called from time to time; starts workers again that Dask has given up.
+        restart_lost_workers: called from time to time; starts workers again that Dask has given up.
 
     Raises:
         JobCancelledError: the stage was cancelled and did not stop in time. WorkerLostError: every worker that took on
@@ -62,31 +62,31 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
     key = f"{task.stage}-{task.events.job}-{secrets.token_hex(4)}"
     needed = {DOME: 1} if task.stage == "capture" else {STAGES: 1}
     stage: Future = client.submit(task, key=key, resources=needed, priority=-rank(task.spec.priority), pure=False)
-    flag, give_up_at, keep_at = task.root / CANCEL_FLAG, None, time.monotonic() + KEEP_S
+    flag, give_up_at, restart_at = task.root / CANCEL_FLAG, None, time.monotonic() + RESTART_INTERVAL_S
     try:
-        ended_as = None
-        while ended_as is None:
-            ended_as = _ended_as(stage)
-            watch.tell()
-            if time.monotonic() > keep_at:
-                keep_workers()
-                keep_at = time.monotonic() + KEEP_S
+        final_status = None
+        while final_status is None:
+            final_status = _final_status(stage)
+            watch.pass_on_events()
+            if time.monotonic() > restart_at:
+                restart_lost_workers()
+                restart_at = time.monotonic() + RESTART_INTERVAL_S
             if give_up_at is None and flag.exists():
                 give_up_at = time.monotonic() + GRACE_S
             # The task decides and not its last event, because a task that no worker takes on has no events, and the
             # capture before it has ended.
-            is_given_up = give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture"
-            if ended_as is None and is_given_up:
+            is_grace_over = give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture"
+            if final_status is None and is_grace_over:
                 _stop_workers_of(client, key)
                 raise JobCancelledError(
                     "The job was cancelled on request; its workers were stopped, and what it had published is kept."
                 )
         # The status at the task's end decides and not the present one, because a result may be lost with its worker
         # afterwards, and the task then runs again.
-        if ended_as != "finished":
+        if final_status != "finished":
             stage.result()
     except KilledWorker as problem:
-        watch.tell()
+        watch.pass_on_events()
         raise WorkerLostError(
             f"Every worker that took on stage {task.stage} died {problem.allowed_failures + 1} times; free some memory"
             " or set fewer workers, then run again.",
@@ -94,7 +94,7 @@ def follow_stage(client: Client, keep_workers: Callable[[], None], task: StageTa
         ) from problem
 
 
-def _ended_as(stage: Future) -> str | None:
+def _final_status(stage: Future) -> str | None:
     """``finished`` once a task's result has arrived, or ``error``; None while the task may still end otherwise.
 
     Waits twice for ``POLL_S`` at most, for the end and for the result, and raises Dask's error where the scheduler was
@@ -110,7 +110,7 @@ def _ended_as(stage: Future) -> str | None:
             stage.result(timeout=POLL_S)
     except TimeoutError:
         return None
-    return status if status in ENDS else None
+    return status if status in FINAL_STATUSES else None
 
 
 def _stop_workers_of(client: Client, stage: str) -> None:

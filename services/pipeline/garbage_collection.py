@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 
 
-def leave_alone_what_is_loaded() -> None:
+def freeze_loaded_objects() -> None:
     """Exclude the objects of imported modules from all later collections: with Dask's modules, one takes 0.15 s, during
     which the server answers nobody.
     """

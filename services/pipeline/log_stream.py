@@ -28,9 +28,9 @@ class QueuedStream:
         # Queue and lock are re-entrant, because the garbage collector may run in the middle of a write, and an object
         # that it finalises may log.
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        self._counting = threading.RLock()
+        self._count_lock = threading.RLock()
         # The thread is a daemon, because a stalled reader must not keep the process from ending.
-        self._thread = threading.Thread(target=self._hand_on, name="log", daemon=True)
+        self._thread = threading.Thread(target=self._write_lines, name="log", daemon=True)
         self._thread.start()
 
     def isatty(self) -> bool:
@@ -42,7 +42,7 @@ class QueuedStream:
         if self._lines.qsize() < self._max_waiting_lines:
             self._lines.put(text)
         else:
-            with self._counting:
+            with self._count_lock:
                 self._lost_lines += 1
         if not self._thread.is_alive():
             self._write_rest()
@@ -64,15 +64,15 @@ class QueuedStream:
             while True:
                 self._write(self._lines.get_nowait() or "")
 
-    def _hand_on(self) -> None:
+    def _write_lines(self) -> None:
         for line in iter(self._lines.get, None):
             self._write(line)
             if self._lines.empty():  # otherwise there might be no room for the warning itself
-                self._tell_of_lost_lines()
-        self._tell_of_lost_lines()
+                self._report_lost_lines()
+        self._report_lost_lines()
 
-    def _tell_of_lost_lines(self) -> None:
-        with self._counting:
+    def _report_lost_lines(self) -> None:
+        with self._count_lock:
             count, self._lost_lines = self._lost_lines, 0
         if count:
             logging.getLogger(__name__).warning(

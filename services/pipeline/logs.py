@@ -78,14 +78,14 @@ def stage_logs(stage: StageName, attempt: int, address: EventAddress) -> Iterato
     configure_logs(sys.stderr)
     log = logging.getLogger(__name__)
 
-    def tell(event: StageEvent) -> None:
+    def log_event(event: StageEvent) -> None:
         if event.kind == "log":
             log.info(event.message)
 
     with log_context(request_id=address.request_id, job=address.job, stage=stage, attempt=attempt):
         log.info("Stage started.")
         try:
-            yield tell
+            yield log_event
         except DentineError as problem:
             log.warning("Stage stopped: %s", problem.message, extra={"code": problem.code})
             raise

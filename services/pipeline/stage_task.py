@@ -11,8 +11,8 @@ from pathlib import Path
 from services.core.errors import PlatformError
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent, StageName
-from services.core.store import is_published, telling_disk_faults
-from services.pipeline.database import patiently
+from services.core.store import is_published, translate_disk_errors
+from services.pipeline.database import retry_while_lost
 from services.pipeline.event_log import EventAddress
 from services.pipeline.machine_class import machine_class
 
@@ -56,23 +56,23 @@ class StageTask:
         with self.events.open() as log:
             lease = self.root / f"{folder}.lease"
             known, machine = int(lease.read_text()) if lease.exists() else 0, machine_class()
-            attempt = patiently(lambda: log.begin_stage(self.stage, known, machine))
-            told: set[str] = set()
+            attempt = retry_while_lost(lambda: log.begin_stage(self.stage, known, machine))
+            reported_kinds: set[str] = set()
 
-            def tell(event: StageEvent) -> None:
+            def report(event: StageEvent) -> None:
                 if event.kind != "started":  # begin_stage has recorded it
-                    patiently(lambda: log.append(attempt, event))
-                told.add(event.kind)
+                    retry_while_lost(lambda: log.append(attempt, event))
+                reported_kinds.add(event.kind)
                 write_line(event)
 
             with self._logs(attempt) as write_line:
-                context = LocalContext(self.root, attempt, tell)
+                context = LocalContext(self.root, attempt, report)
                 context.raise_if_cancelled()
                 module, function = self.door.split(":")
-                with telling_disk_faults(self.root), _telling_a_missing_package(self.stage):
+                with translate_disk_errors(self.root), _translate_missing_package(self.stage):
                     getattr(importlib.import_module(module), function)(self.spec, context)
-                if "finished" not in told:
-                    tell(StageEvent(stage=self.stage, kind="finished", done=1.0))
+                if "finished" not in reported_kinds:
+                    report(StageEvent(stage=self.stage, kind="finished", done=1.0))
         return self.stage
 
     def _logs(self, attempt: int) -> AbstractContextManager[Callable[[StageEvent], None]]:
@@ -85,7 +85,7 @@ class StageTask:
 
 
 @contextmanager
-def _telling_a_missing_package(stage: StageName) -> Iterator[None]:
+def _translate_missing_package(stage: StageName) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as problem:

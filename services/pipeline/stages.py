@@ -43,7 +43,7 @@ from services.core.store import (
     open_stage,
     read_record,
     require_intact,
-    telling_disk_faults,
+    translate_disk_errors,
     withdraw,
     write_record,
 )
@@ -140,29 +140,35 @@ def run_stages(
 ) -> None:
     """Run some stages of a job in order; see ``run_job``. With ``again``, published stages run too."""
     root = root.resolve()
-    with telling_disk_faults(root), _sole_owner(root):
+    with translate_disk_errors(root), _sole_owner(root):
         _claim_folder(root, spec)
         if (root / DAMAGE_FLAG).exists():
             _withdraw_damaged(root)
         if "prepare" in stages and is_stale(root):
             _withdraw_prepared(root)
         address = events or folder_events(root)
-        todo = tuple(
+        remaining = tuple(
             stage for stage in _with_registration(spec, stages) if again or not is_published(root, PUBLISHED_AS[stage])
         )
         with address.open() as log:
             watch = Watch(log, listener, log.newest_id())
-            if todo:
-                entered = {**job_kinds()[spec.kind].doors, **doors}
+            if remaining:
+                stage_functions = {**job_kinds()[spec.kind].doors, **doors}
                 tasks = [
                     StageTask(
-                        stage, entered[stage], _seen_by(stage, spec, root, phantoms), root, address, again, is_logged
+                        stage,
+                        stage_functions[stage],
+                        _options_for(stage, spec, root, phantoms),
+                        root,
+                        address,
+                        again,
+                        is_logged,
                     )
-                    for stage in todo
+                    for stage in remaining
                 ]
-                with _remembering_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
-                    _run_tasks(processes, workers or spec.workers, tasks, watch, before or _go_on)
-            watch.tell()
+                with _flag_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
+                    _run_tasks(processes, workers or spec.workers, tasks, watch, before or _do_nothing)
+            watch.pass_on_events()
 
 
 def _with_registration(spec: JobSpec, stages: tuple[StageName, ...]) -> tuple[StageName, ...]:
@@ -173,7 +179,7 @@ def _with_registration(spec: JobSpec, stages: tuple[StageName, ...]) -> tuple[St
     return (*stages[:at], "register", *stages[at:]) if lacks_pose(spec.capture) else stages
 
 
-def _seen_by(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None) -> JobSpec:
+def _options_for(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | None) -> JobSpec:
     """The options as a stage receives them. The demonstration's mouth is the folder of kept mouths for the phantom
     stage, and the mouth that was made for this job for all others.
     """
@@ -193,7 +199,7 @@ def withdraw_cancel(root: Path) -> None:
     (root / CANCEL_FLAG).unlink(missing_ok=True)
 
 
-def _go_on() -> None:
+def _do_nothing() -> None:
     """Let the next stage start."""
 
 
@@ -208,7 +214,7 @@ def _run_tasks(
             for task in tasks:
                 if task.stage != "capture":
                     before()
-                follow_stage(client, processes.keep, task, watch)
+                follow_stage(client, processes.restart_lost, task, watch)
     except (CancelledError, CommClosedError) as problem:
         raise SchedulerLostError(
             "The workers' scheduler went away; the job goes on from what it had published once it answers again."
@@ -240,7 +246,7 @@ def _withdraw_prepared(root: Path) -> None:
 
 
 @contextmanager
-def _remembering_damage(root: Path) -> Iterator[None]:
+def _flag_damage(root: Path) -> Iterator[None]:
     # Damaged stages are not removed at once, because a person who has a copy may restore it before a retry.
     try:
         yield
@@ -265,11 +271,11 @@ def _withdraw_damaged(root: Path) -> None:
 
 def _claim_folder(root: Path, spec: JobSpec) -> None:
     """Write the job's options, or refuse a folder that holds the results of other options."""
-    path, indifferent = root / JOB_FILE, {"workers", "priority"}
+    path, ignored = root / JOB_FILE, {"workers", "priority"}
     if path.exists():
         earlier = read_record(path, JobSpec)
         theirs, ours = (_options(one) for one in (earlier, spec))
-        changed = sorted(name for name in ours if name not in indifferent and ours[name] != theirs[name])
+        changed = sorted(name for name in ours if name not in ignored and ours[name] != theirs[name])
         if changed:
             raise InputError(
                 f"Folder {root} holds a job with other options ({', '.join(changed)}); choose another folder or"

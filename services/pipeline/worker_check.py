@@ -56,7 +56,7 @@ class OwnCheck:
 
     def __init__(self) -> None:
         self._fault: str | None = None
-        threading.Thread(target=self._look, name="worker-check", daemon=True).start()
+        threading.Thread(target=self._run, name="worker-check", daemon=True).start()
 
     def condition(self) -> str:
         """A sentence which says that workers can run stages.
@@ -70,7 +70,7 @@ class OwnCheck:
             raise PlatformError(f"This machine cannot run stages: {self._fault}")
         return "This machine can run stages; workers start with the next job."
 
-    def _look(self) -> None:
+    def _run(self) -> None:
         self._fault = fault_of([STAGES])
 
 

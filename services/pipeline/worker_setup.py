@@ -16,7 +16,7 @@ from tornado.ioloop import PeriodicCallback
 
 from services.pipeline.worker_check import CHECKS, fault_of
 from services.pipeline.worker_health import SIGN_S, Sign
-from services.pipeline.workers import TOLD
+from services.pipeline.workers import FAULT_KEY
 
 
 async def dask_setup(worker: Any) -> None:
@@ -43,7 +43,7 @@ class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no typ
                 for resources in (worker.state.total_resources, worker.state.available_resources):
                     del resources[claim]
                 logging.getLogger(__name__).error("This worker takes no task that needs %s: %s", claim, fault)
-        worker.startup_information[TOLD] = lambda _: self.told
+        worker.startup_information[FAULT_KEY] = lambda _: self.fault_sentences
         # The event loop that answers the scheduler also writes the sign, so that a worker that hangs gives none.
         sign = PeriodicCallback(lambda: self._give_sign(worker), 1000 * SIGN_S)
         worker.periodic_callbacks[self.name] = sign
@@ -53,10 +53,10 @@ class WorkerSetup(WorkerPlugin):  # type: ignore[misc]  # distributed has no typ
         self._sign.withdraw()
 
     @property
-    def told(self) -> str:
+    def fault_sentences(self) -> str:
         """The faults of the worker, in sentences; empty where there are none."""
         return " ".join(dict.fromkeys(self._faults.values()))
 
     def _give_sign(self, worker: Any) -> None:
         if worker.status.name == "running":
-            self._sign.give(self.told)
+            self._sign.give(self.fault_sentences)

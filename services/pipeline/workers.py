@@ -15,7 +15,7 @@ from services.core.errors import PlatformError, SchedulerLostError
 from services.core.placement import DOME, STAGES, UNLIMITED
 from services.pipeline.dask_config import DASK_CONFIG
 from services.pipeline.dask_tls import Certificates, scheduler_address
-from services.pipeline.garbage_collection import leave_alone_what_is_loaded
+from services.pipeline.garbage_collection import freeze_loaded_objects
 from services.pipeline.worker_check import OwnCheck
 
 if TYPE_CHECKING:
@@ -27,12 +27,12 @@ SIGINT_IS_THE_PARENTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_
 CLOSE_HTTP = "services.pipeline.close_http"
 CONNECT_S = 10.0
 PROBE_S = 1.0
-LOOK_S = 3.0
+CENSUS_TIMEOUT_S = 3.0
 """Longest time, s, that the scheduler may take to answer about its workers."""
 
 
 NOT_STARTED = "Workers start with the next job."
-TOLD = "dentine"
+FAULT_KEY = "dentine"
 """Name under which a worker reports its faults to the scheduler."""
 RIG = "rig"
 """Name of this process's own worker for captures."""
@@ -52,24 +52,24 @@ class Census(NamedTuple):
     processing: Mapping[str, Sequence[Any]]
     """Keys of the tasks that each worker has been given."""
 
-    def able(self, resource: str) -> int:
+    def count_with(self, resource: str) -> int:
         """Number of workers that have a resource."""
         return sum(bool(worker["resources"].get(resource)) for worker in self.workers.values())
 
     def sentence(self, *, captures: bool = False) -> str:
         """A sentence on how many workers can run stages and can capture, or on why none can."""
-        connected, stages = len(self.workers), self.able(STAGES)
-        if captures and not self.able(DOME):
+        connected, stages = len(self.workers), self.count_with(STAGES)
+        if captures and not self.count_with(DOME):
             return (
                 f"None of the {connected} connected workers reaches a dome; start one with dentine worker"
                 " --captures-only."
             )
         if stages or captures:
-            rigs = self.able(DOME)
+            rigs = self.count_with(DOME)
             return f"{stages} worker{'' if stages == 1 else 's'} can run stages, {rigs} can capture."
         if not connected:
             return "The scheduler has no workers; start some with dentine worker."
-        why = sorted({str(told) for worker in self.workers.values() if (told := worker.get(TOLD))})
+        why = sorted({str(fault) for worker in self.workers.values() if (fault := worker.get(FAULT_KEY))})
         what = f"None of the {connected} connected workers can run stages"
         return f"{what}: {' '.join(why)}" if why else f"{what}; start some with dentine worker."
 
@@ -132,12 +132,12 @@ class Workers:
             self._scale()
             return self._client
 
-    def keep(self) -> None:
+    def restart_lost(self) -> None:
         """Start lost workers again; Dask gives up a worker that does not come back within 15 s."""
         with self._lock:
             self._scale()
 
-    def look(self) -> Census | None:
+    def census(self) -> Census | None:
         """The present workers and their tasks; None where this process has workers of its own that no job has started
         yet.
 
@@ -151,23 +151,25 @@ class Workers:
             require_scheduler(self._scheduler, self._certificates)
             client = self.connect()
         try:
-            census: Census = client.sync(_census, client, callback_timeout=LOOK_S)
+            census: Census = client.sync(_census, client, callback_timeout=CENSUS_TIMEOUT_S)
         except (OSError, TimeoutError) as problem:
             raise SchedulerLostError(
                 f"The scheduler {self._scheduler or 'of this server'} does not answer; jobs wait for it."
             ) from problem
         return census
 
-    def lacking(self, captures: bool) -> str | None:
+    def reason_unavailable(self, captures: bool) -> str | None:
         """Why no worker can capture, or run other stages; None if one can, or if this process starts its own."""
         if self._scheduler is None:
             return None
         try:
-            census = self.look()
+            census = self.census()
         except SchedulerLostError as problem:
             return problem.message
         return (
-            None if census is None or census.able(DOME if captures else STAGES) else census.sentence(captures=captures)
+            None
+            if census is None or census.count_with(DOME if captures else STAGES)
+            else census.sentence(captures=captures)
         )
 
     def condition(self) -> str:
@@ -178,10 +180,10 @@ class Workers:
         """
         if self._own_check is not None:
             return self._own_check.condition()
-        census = self.look()
+        census = self.census()
         if census is None:
             return NOT_STARTED
-        if not census.able(STAGES):
+        if not census.count_with(STAGES):
             raise PlatformError(census.sentence())
         return census.sentence()
 
@@ -198,7 +200,7 @@ class Workers:
     def _scale(self) -> None:
         if self._cluster is None or not self._demands:
             return
-        specs, wanted = self._cluster.worker_spec, max(demand.workers for demand in self._demands)
+        specs, target_count = self._cluster.worker_spec, max(demand.workers for demand in self._demands)
         if RIG not in specs and any(demand.captures for demand in self._demands):
             (fresh,) = self._cluster.new_worker_spec().values()
             rig = fresh | {"options": fresh["options"] | {"resources": {DOME: 1}}}
@@ -207,8 +209,8 @@ class Workers:
             specs.update({RIG: rig} | others)  # first, because scaling down removes the last workers
         extra = int(RIG in specs)
         if len(self._demands) > 1:  # a worker that this job does not need may hold tasks of another
-            wanted = max(wanted, len(specs) - extra)
-        self._cluster.scale(wanted + extra)
+            target_count = max(target_count, len(specs) - extra)
+        self._cluster.scale(target_count + extra)
 
     def _open(self) -> Client:
         import dask
@@ -216,7 +218,7 @@ class Workers:
 
         from services.pipeline.dask_security import LastingSecurity
 
-        _leave_dask_alone()
+        _freeze_loaded_objects_once()
         # The configuration is set for good, and in this process too, because later connections read it.
         preloads = {
             "distributed.worker.preload": [SIGINT_IS_THE_PARENTS, CLOSE_HTTP],
@@ -253,10 +255,10 @@ class Workers:
 
 
 @cache
-def _leave_dask_alone() -> None:
+def _freeze_loaded_objects_once() -> None:
     # This is done once in a process, because anything else that is frozen, such as the remains of a failed connection,
     # is never collected.
-    leave_alone_what_is_loaded()
+    freeze_loaded_objects()
 
 
 async def _census(client: Client) -> Census:

@@ -17,14 +17,14 @@ from services.preprocess.source import LightImage, View
 PLAUSIBLE = (1e-3, 10.0)
 """Smallest and largest plausible ratio of the teeth's radiance to that of a white diffuser in their place. Real teeth
 give 0.1 to 1; a length unit that is wrong by a factor of 1000 changes the ratio by 1e6."""
-ODD_LIGHT = 30.0
+MAX_DEVIATION_FACTOR = 30.0
 """A light is reported if the teeth's brightness ratio under it differs by more than this factor from the median over
 all lights."""
-NAMED = 3
+NAMES_SHOWN = 3
 """Largest number of dark images that a note lists by name."""
 COMPARED_PIXELS = 50_000
 """Approximate number of an image's pixels at which the white diffuser is evaluated."""
-CERTAIN = 4.0
+MIN_SIGMAS = 4.0
 """Number of standard errors by which an image's summed radiance must exceed zero; otherwise the image is dark."""
 
 
@@ -37,7 +37,7 @@ class ImageLight(Record):
     dark: bool = Field(default=False, description="no tooth is above the noise; the sums are then zero")
 
 
-def light_of(image: LightImage, view: View, light: Light, chosen: NDArray[np.bool_]) -> ImageLight | None:
+def measure_light(image: LightImage, view: View, light: Light, chosen: NDArray[np.bool_]) -> ImageLight | None:
     """Sum radiance and incident light over the chosen pixels (H, W) of an image; None if no pixel is chosen."""
     import cv2
 
@@ -49,7 +49,7 @@ def light_of(image: LightImage, view: View, light: Light, chosen: NDArray[np.boo
         count * sum(cv2.mean(values[..., c], mask)[0] for c in range(values.shape[-1]))
         for values in (image.radiance, image.variance)
     )
-    if measured <= CERTAIN * np.sqrt(variance):
+    if measured <= MIN_SIGMAS * np.sqrt(variance):
         return ImageLight(measured=0.0, white=0.0, cosine=0.0, dark=True)
     # Take every n-th pixel in x and y, which is enough for a test of plausibility
     step = max(1, int(np.sqrt(count / COMPARED_PIXELS)))
@@ -81,17 +81,17 @@ class Brightness:
     """(camera, light) of images in which no tooth is above the noise."""
     _lights: dict[str, _Sums] = field(default_factory=lambda: defaultdict(_Sums))
 
-    def add(self, camera: str, light: str, shown: ImageLight | None) -> None:
+    def add(self, camera: str, light: str, image_light: ImageLight | None) -> None:
         """Add the sums of one image, or note that it is dark; None adds nothing."""
-        if shown is None:
+        if image_light is None:
             return
-        if shown.dark:
+        if image_light.dark:
             self.dark.append((camera, light))
             return
         sums = self._lights[light]
-        sums.measured += shown.measured
-        sums.white += shown.white
-        sums.cosine += shown.cosine
+        sums.measured += image_light.measured
+        sums.white += image_light.white
+        sums.cosine += image_light.cosine
 
     def require_plausible(self) -> None:
         """Refuse a capture whose teeth are implausibly bright or dark.
@@ -114,8 +114,8 @@ class Brightness:
         """Sentences about dark images and about lights whose brightness ratio differs from the others'."""
         notes = []
         if self.dark:
-            which = ", ".join(f"camera {camera} under light {light}" for camera, light in self.dark[:NAMED])
-            more = f" and {len(self.dark) - NAMED} more" if len(self.dark) > NAMED else ""
+            which = ", ".join(f"camera {camera} under light {light}" for camera, light in self.dark[:NAMES_SHOWN])
+            more = f" and {len(self.dark) - NAMES_SHOWN} more" if len(self.dark) > NAMES_SHOWN else ""
             notes.append(f"Dark and left out: {which}{more}; check that these lights were on, then capture them again.")
         # Compare only lights from the front, because light that shines through a tooth from behind says little about
         # the brightness of a white surface.
@@ -123,7 +123,7 @@ class Brightness:
         ratios = {light: sums.ratio for light, sums in self._lights.items() if sums.cosine > front}
         typical = float(np.median(list(ratios.values()))) if ratios else 1.0
         for light, ratio in ratios.items():
-            if not 1 / ODD_LIGHT <= ratio / typical <= ODD_LIGHT:
+            if not 1 / MAX_DEVIATION_FACTOR <= ratio / typical <= MAX_DEVIATION_FACTOR:
                 notes.append(
                     f"Teeth under light {light} are {ratio / typical:.2g} times as bright as its position and intensity"
                     " let expect; check both."

@@ -15,7 +15,7 @@ from services.core.files.arrays import as_float32, map_radiance
 from services.core.records import FolderCapture, ImageEntry, MaskBit
 from services.core.store import read_record
 from services.preprocess.source import Image, LightImage, Motions, View
-from services.preprocess.stabilisation.seen import SeenFlow
+from services.preprocess.stabilisation.flow_comparison import FlowComparison
 from services.preprocess.window import bands
 
 # Largest share of the covered pixels that may be non-finite. Dead pixels are only masked, even where they are all of
@@ -95,11 +95,11 @@ class FolderSource:
         lines = [self.description.model_dump_json(), repr(self._noise)]
         for entry in self._entries.values():
             for file in filter(None, (entry.file, entry.variance_file)):
-                told = self._path(file).stat()
-                lines.append(f"{file} {told.st_size} {told.st_mtime_ns}")
+                status = self._path(file).stat()
+                lines.append(f"{file} {status.st_size} {status.st_mtime_ns}")
         return "\n".join(lines)
 
-    def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
+    def matched_frames(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
         """See ``Source``. Empty, because the images of a folder are assumed to show an unmoved subject."""
         return ()
 
@@ -107,7 +107,7 @@ class FolderSource:
         """See ``Source``."""
         return iter(())
 
-    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:  # noqa: ARG002
+    def flow_comparison(self, view: View, motions: Motions) -> FlowComparison | None:  # noqa: ARG002
         """See ``Source``."""
         return None
 
@@ -137,7 +137,7 @@ class FolderSource:
                 f" {broken} tooth pixels; export it again."
             )
         if variance is None:
-            variance = self._assumed(radiance, peak)
+            variance = self._assumed_variance(radiance, peak)
         for rows in bands(covered.shape):
             spread = variance[rows]
             # Flag pixels whose variance is zero or not finite, because their weight 1/variance is undefined
@@ -147,7 +147,7 @@ class FolderSource:
                 spread[~np.isfinite(spread)] = 0
         return LightImage(radiance, variance, bits)
 
-    def _assumed(self, radiance: Image, peak: float) -> Image:
+    def _assumed_variance(self, radiance: Image, peak: float) -> Image:
         """Variance (H, W, C) by the job's noise options; ``peak`` is the image's largest absolute value."""
         relative, floor = self._noise
         variance = np.empty_like(radiance)
@@ -164,15 +164,15 @@ class FolderSource:
         return path
 
     def _read(self, entry: ImageEntry, file: str, view: View) -> NDArray[np.float32]:
-        image, place = self._map(entry, file, view.number)
-        return as_float32(image[view.window.rows, view.window.columns], place)
+        image, label = self._map(entry, file, view.number)
+        return as_float32(image[view.window.rows, view.window.columns], label)
 
     def _map(self, entry: ImageEntry, file: str, camera: int) -> tuple[NDArray[np.floating[Any]], str]:
-        place = f"Image file {self.root / file} (camera {entry.camera}, light {entry.light})"
+        label = f"Image file {self.root / file} (camera {entry.camera}, light {entry.light})"
         if Path(file).suffix.lower() != ".npy":
             raise CaptureInputError(
-                f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as"
+                f"{label} is no .npy file, the only format read here; convert it with numpy.save, linear and as"
                 " float32."
             )
         width, height = self.description.cameras[camera].size
-        return map_radiance(self._path(file), (height, width, len(self.description.channels)), place), place
+        return map_radiance(self._path(file), (height, width, len(self.description.channels)), label), label

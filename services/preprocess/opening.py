@@ -15,11 +15,11 @@ from services.core.raw.registration import teeth_root
 from services.core.records import CaptureManifest, JobSpec
 from services.core.store import open_stage, read_record
 from services.preprocess.folder import FolderSource
-from services.preprocess.raw.room import GIB
+from services.preprocess.raw.memory_budget import GIB
 from services.preprocess.raw.source import RawSource
 from services.preprocess.rig import RigSource
 from services.preprocess.source import Source
-from services.preprocess.tasks.spread import threads_here
+from services.preprocess.tasks.executors import local_threads
 
 
 def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
@@ -40,7 +40,7 @@ def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
             spec.sensor_noise_relative,
             spec.sensor_noise_floor,
             teeth_root(spec.capture, root),
-            spec.memory_gib * GIB / threads_here(),
+            spec.memory_gib * GIB / local_threads(),
         )
         return _calibrated(raw, raw.calibration, "of the raw folder" if spec.calibration is None else "", spec)
     published = (root, "capture") if spec.capture is None else published_capture(spec.capture)

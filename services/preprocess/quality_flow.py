@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.preprocess.quality import PICTURE_PX, CameraFlow
-from services.preprocess.stabilisation.seen import SeenFlow
+from services.preprocess.stabilisation.flow_comparison import FlowComparison
 
 Image = NDArray[np.float32]
 MIN_SCALE_PX = 0.5
@@ -16,7 +16,7 @@ MIN_SCALE_PX = 0.5
 like motion."""
 
 
-def camera_flow(camera: str, flow: SeenFlow) -> CameraFlow | None:
+def camera_flow(camera: str, flow: FlowComparison) -> CameraFlow | None:
     """Median and 95th percentile of a camera's flow over the teeth; None if no pixel shows a tooth."""
     if not flow.teeth.any():
         return None
@@ -27,7 +27,7 @@ def camera_flow(camera: str, flow: SeenFlow) -> CameraFlow | None:
     )
 
 
-def write_flow(folder: Path, flow: SeenFlow, numbers: CameraFlow) -> None:
+def write_flow(folder: Path, flow: FlowComparison, numbers: CameraFlow) -> None:
     """Write the flow as ``<camera>_before.png`` and ``<camera>_after.png``.
 
     Hue shows the direction. Full saturation means a flow of ``scale_px`` or more, white means no flow.

@@ -14,19 +14,16 @@ from services.core.errors import CaptureInputError
 from services.core.records import CaptureManifest, FrameRecord, MaskBit
 from services.core.store import MANIFEST, StoredArray
 from services.preprocess.radiometry import Merge, Radiometry
-from services.preprocess.scratch import kept_array
+from services.preprocess.scratch import cached_array
 from services.preprocess.source import Image, LightImage, Motions, View
+from services.preprocess.stabilisation.flow_comparison import FlowComparison
 from services.preprocess.stabilisation.motion import Displacement, ViewMotion, frames_to_match, jaws
-from services.preprocess.stabilisation.seen import SeenFlow
-from services.preprocess.window import Window, bands
+from services.preprocess.window import BORDER_TOLERANCE_PX, Window, bands
 
 # Largest median displacement, pixels, that is left in a frame, because resampling would blur more than it aligns
 STILL_PX = 0.1
 # Largest estimated error of a frame's interpolated motion, pixels; an image made from a less certain frame is masked
 UNCERTAIN_PX = 0.5
-# Distance beyond the outermost pixel centres, pixels, up to which a sample is accepted. Interpolation mixes in the
-# black border by this fraction
-BEYOND_PX = 1e-3
 # Largest number of black frames that are averaged
 BLACK_FRAMES = 8
 # Smallest number of tracking frames: a cubic in time has four coefficients
@@ -83,7 +80,7 @@ class RigSource:
         """See ``Source``. It includes the capture's manifest, which holds a checksum of every file."""
         return self.description.model_dump_json() + (self.root / MANIFEST).read_text()
 
-    def matched(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
+    def matched_frames(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
         """See ``Source``."""
         return tuple(frame.index for frame in frames_to_match(self._manifest.frames))
 
@@ -93,8 +90,8 @@ class RigSource:
         array = StoredArray(self.root / "capture.zarr")
         # Subtract the median of the black image instead of the image itself, whose noise would be the same in every
         # frame and bias the match towards no motion
-        level = kept_array(
-            view.kept("level"), lambda: np.asarray(np.median(self._black_image(view, array, motion.window)))
+        level = cached_array(
+            view.scratch_file("level"), lambda: np.asarray(np.median(self._black_image(view, array, motion.window)))
         )
 
         def picture(frame: FrameRecord) -> NDArray[np.uint16]:
@@ -102,7 +99,7 @@ class RigSource:
 
         return motion.measure(frames, picture, float(level))
 
-    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
+    def flow_comparison(self, view: View, motions: Motions) -> FlowComparison | None:
         """See ``Source``."""
         motion = self._motion(view)
         array = StoredArray(self.root / "capture.zarr")
@@ -110,7 +107,7 @@ class RigSource:
         def picture(frame: FrameRecord) -> NDArray[np.uint16]:
             return array[view.number, frame.index, motion.window.rows, motion.window.columns]
 
-        return motion.seen_flow(picture, motions)
+        return motion.flow_comparison(picture, motions)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """See ``Source``. The frames of each light are read, aligned and merged, one light after the other."""
@@ -141,7 +138,7 @@ class RigSource:
                     black[rows] += counts[rows] / np.float32(len(self._black))
             return black
 
-        return kept_array(view.kept("black"), mean)
+        return cached_array(view.scratch_file("black"), mean)
 
 
 def _image(
@@ -162,13 +159,13 @@ def _image(
     inner = window.within(motion.window)
     for rows in bands((height, width)):
         merged, beyond = Merge(), None
-        for frame, move, taken, warped in zip(frames, moves, read, is_warped, strict=True):
+        for frame, move, counts_of_frame, warped in zip(frames, moves, read, is_warped, strict=True):
             if warped:
-                one, outside = _resampled(taken, motion.places(move, rows), radiometry, frame)
+                one, outside = _resampled(counts_of_frame, motion.positions(move, rows), radiometry, frame)
                 beyond = outside if beyond is None else beyond | outside
             else:
                 own = slice(inner[0].start + rows.start, inner[0].start + rows.stop), inner[1]
-                one = radiometry.at(*own).radiance(taken[own], frame)
+                one = radiometry.at(*own).radiance(counts_of_frame[own], frame)
             merged.add(*one)
         radiance[rows], variance[rows], lost = merged.result()
         if beyond is not None:
@@ -178,20 +175,20 @@ def _image(
     if max(move.error_px for move in moves) > UNCERTAIN_PX:
         bits |= np.uint16(MaskBit.MOTION)
     farthest = max(moves, key=lambda move: move.median_px)
-    told = [error for move in moves if (error := move.told_error_px) is not None]
+    errors_px = [error for move in moves if (error := move.known_error_px) is not None]
     return LightImage(
         radiance,
         variance,
         bits,
-        motion.stored(farthest),
+        motion.stored_field(farthest),
         farthest.median_px,
         any(is_warped),
-        motion_error_px=max(told, default=None),
+        motion_error_px=max(errors_px, default=None),
     )
 
 
 def _resampled(
-    counts: NDArray[np.uint16], places: Image, radiometry: Radiometry, frame: FrameRecord
+    counts: NDArray[np.uint16], positions: Image, radiometry: Radiometry, frame: FrameRecord
 ) -> tuple[tuple[Image, Image, NDArray[np.bool_]], NDArray[np.bool_]]:
     """Sample radiance, variance and saturation at the displaced pixels.
 
@@ -199,7 +196,7 @@ def _resampled(
     pixels have the right variance.
 
     Args:
-        places: x and y (2, H, W) of the displaced pixels as indices into ``counts``; overwritten.
+        positions: x and y (2, H, W) of the displaced pixels as indices into ``counts``; overwritten.
 
     Returns:
         Radiance and variance (H, W, C), saturated pixels (H, W); and the samples (H, W) that lie beyond the frame.
@@ -207,10 +204,15 @@ def _resampled(
     import cv2
 
     height, width = counts.shape[:2]
-    x, y = places
-    beyond = (x < -BEYOND_PX) | (x > width - 1 + BEYOND_PX) | (y < -BEYOND_PX) | (y > height - 1 + BEYOND_PX)
+    x, y = positions
+    beyond = (
+        (x < -BORDER_TOLERANCE_PX)
+        | (x > width - 1 + BORDER_TOLERANCE_PX)
+        | (y < -BORDER_TOLERANCE_PX)
+        | (y > height - 1 + BORDER_TOLERANCE_PX)
+    )
     # Convert only the part of the frame that is sampled
-    rows, columns = _reached(y, height), _reached(x, width)
+    rows, columns = _sampled_range(y, height), _sampled_range(x, width)
     y -= np.float32(rows.start)
     x -= np.float32(columns.start)
     radiance, variance, saturated = radiometry.at(rows, columns).radiance(counts[rows, columns], frame)
@@ -225,7 +227,7 @@ def _resampled(
     return (sampled(radiance), sampled(variance), lost), beyond
 
 
-def _reached(places: Image, size: int) -> slice:
+def _sampled_range(positions: Image, size: int) -> slice:
     """Range of rows or columns of an image that holds all samples, and one more on each side."""
-    first = int(np.clip(np.floor(places.min()), 1, size) - 1)
-    return slice(first, max(int(np.clip(np.ceil(places.max()), 0, size - 2) + 2), first + 1))
+    first = int(np.clip(np.floor(positions.min()), 1, size) - 1)
+    return slice(first, max(int(np.clip(np.ceil(positions.max()), 0, size - 2) + 2), first + 1))

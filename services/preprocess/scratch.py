@@ -22,7 +22,7 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
     partial.replace(path)
 
 
-def kept_array(path: Path | None, make: Callable[[], NDArray[A]]) -> NDArray[A]:
+def cached_array(path: Path | None, make: Callable[[], NDArray[A]]) -> NDArray[A]:
     """Memory-map the array in a file; if the file does not exist, make the array and write it first.
 
     Args:

@@ -14,7 +14,7 @@ from services.core.geometry import Camera
 from services.core.records import FolderCapture
 from services.preprocess.colours import FrameColour
 from services.preprocess.projection import Footprint
-from services.preprocess.stabilisation.seen import SeenFlow
+from services.preprocess.stabilisation.flow_comparison import FlowComparison
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
@@ -43,7 +43,7 @@ class View:
     footprint: Footprint
     scratch: Path | None = None
 
-    def kept(self, name: str) -> Path | None:
+    def scratch_file(self, name: str) -> Path | None:
         """Path of an array that the camera's images share; None if the view has no scratch folder."""
         return None if self.scratch is None else self.scratch / f"{name}.npy"
 
@@ -103,7 +103,7 @@ class Source(Protocol):
     def identity(self) -> str:
         """A text that changes whenever a file from which the images are made changes."""
 
-    def matched(self, camera: int) -> tuple[int, ...]:
+    def matched_frames(self, camera: int) -> tuple[int, ...]:
         """Numbers of the camera's frames whose motion must be measured; empty where motion is not measured."""
 
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
@@ -113,14 +113,14 @@ class Source(Protocol):
             CaptureInputError: the subject moved too far to be aligned; the message names the frame and the camera.
         """
 
-    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
+    def flow_comparison(self, view: View, motions: Motions) -> FlowComparison | None:
         """Optical flow before and after stabilisation; None where no two frames share their light."""
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """Yield each light's index and image.
 
         Args:
-            motions: coefficients of all frames that ``matched`` returns.
+            motions: coefficients of all frames that ``matched_frames`` returns.
 
         Raises:
             CaptureInputError: an image cannot be read; the message names the file or frame, camera and light.

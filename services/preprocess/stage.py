@@ -21,7 +21,7 @@ def check() -> None:
         PlatformError: a package is missing.
     """
     require_packages(PACKAGES, "preprocess")
-    for module in ("opening", "tasks.blocks", "tasks.plan", "tasks.progress", "tasks.spread", "tasks.summary"):
+    for module in ("opening", "tasks.blocks", "tasks.plan", "tasks.progress", "tasks.executors", "tasks.summary"):
         importlib.import_module(f"services.preprocess.{module}")
 
 
@@ -43,9 +43,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     from services.preprocess.subject import read_subject
     from services.preprocess.tasks.attempt_files import STAGE, AttemptFiles
     from services.preprocess.tasks.blocks import Block, blocks_of, images_of
+    from services.preprocess.tasks.executors import open_executor
     from services.preprocess.tasks.plan import create_arrays, digest_of_inputs, held_out_images
     from services.preprocess.tasks.progress import Progress
-    from services.preprocess.tasks.spread import spread
     from services.preprocess.tasks.summary import summarise
 
     # Check everything that needs no pixel
@@ -66,35 +66,35 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     digest = digest_of_inputs(spec, source, masks)
     if not files.begin(digest, spec.store):
         create_arrays(files.arrays, source, with_shadows=spec.shadows)
-        files.announce(digest)
+        files.mark_resumable(digest)
 
     lights = [source.lights_of(k) for k in range(len(cameras))]
     progress = Progress(context, sum(len(own) for own in lights), len(cameras))
-    with spread(spec.priority) as workers:
-        unseen = [k for k, camera in enumerate(cameras) if files.view(k, camera) is None]
-        for _ in workers.run([Block(spec, files, "look", k) for k in unseen]):
+    with open_executor(spec.priority) as executor:
+        unlocated = [k for k, camera in enumerate(cameras) if files.view(k, camera) is None]
+        for _ in executor.run([Block(spec, files, "locate", k) for k in unlocated]):
             context.raise_if_cancelled()
         frames = [
-            [one for one in source.matched(k) if one not in files.motions(k, source.matched(k))]
+            [one for one in source.matched_frames(k) if one not in files.motions(k, source.matched_frames(k))]
             for k in range(len(cameras))
         ]
-        for _ in workers.run(blocks_of(spec, files, "match", frames, workers.threads)):
+        for _ in executor.run(blocks_of(spec, files, "match", frames, executor.threads)):
             context.raise_if_cancelled()
         # Run comparing and developing together, as neither needs the other. Comparisons come first, because a camera's
         # whole comparison is one block
         uncompared = [k for k in range(len(cameras)) if source.measures_motion and files.flow(k) is None]
         compare = [Block(spec, files, "compare", k) for k in uncompared]
         missing = [[j for j in own if files.image(k, j) is None] for k, own in enumerate(lights)]
-        progress.begin(sum(len(own) for own in missing), workers.threads)
-        develop = blocks_of(spec, files, "develop", missing, workers.threads)
-        for block in workers.run([*compare, *develop]):
+        progress.begin(sum(len(own) for own in missing), executor.threads)
+        develop = blocks_of(spec, files, "develop", missing, executor.threads)
+        for block in executor.run([*compare, *develop]):
             for done in images_of(block, files):
-                progress.tell(done)
+                progress.report_image(done)
             context.raise_if_cancelled()
         if spec.shadows:
             unshaded = [k for k, own in enumerate(lights) if not all(files.is_shaded(k, j) for j in own)]
-            progress.shade(len(unshaded))
-            for _ in workers.run([Block(spec, files, "shade", k) for k in unshaded]):
+            progress.begin_shading(len(unshaded))
+            for _ in executor.run([Block(spec, files, "shade", k) for k in unshaded]):
                 context.raise_if_cancelled()
 
     manifest, known = summarise(files, source, subject, held_out, masks.digest, context)

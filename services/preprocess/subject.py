@@ -17,7 +17,7 @@ from services.preprocess.projection import Footprint, project
 from services.preprocess.source import View
 from services.preprocess.window import window_of
 
-NOTHING = -1
+NO_SURFACE = -1
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Subject:
         return len(self.teeth) + 1
 
     @property
-    def in_the_way(self) -> tuple[Mesh, ...]:
+    def occluders(self) -> tuple[Mesh, ...]:
         """Occluders: surfaces that hide and shade others and are not fitted."""
         return self.others if self.gums is None or self.whole else (*self.others, self.gums)
 
@@ -60,20 +60,20 @@ class Subject:
         """Window and footprint of the subject in one camera's images."""
         window = window_of(camera, self.fitted_meshes())
         cropped = window.cropped(camera)
-        return View(number, camera, window, cropped, self.seen_by(cropped))
+        return View(number, camera, window, cropped, self.footprint_in(cropped))
 
-    def seen_by(self, camera: Camera) -> Footprint:
+    def footprint_in(self, camera: Camera) -> Footprint:
         """Footprint of all fitted surfaces in a camera, with the occluders taken into account."""
         outers = [tooth.outer for tooth in self.teeth]
         if not self.whole:
-            return project(camera, outers, self.in_the_way)
+            return project(camera, outers, self.occluders)
         shown = dict(enumerate(outers))
         if self.gums is not None:
             shown[self.gums_number] = self.gums
         if self.cavity is not None:
             shown[self.cavity_number] = _two_sided(self.cavity)
         footprint = project(camera, list(shown.values()))
-        numbers = np.array([*shown, NOTHING], dtype=np.int16)
+        numbers = np.array([*shown, NO_SURFACE], dtype=np.int16)
         return replace(footprint, mesh=numbers[footprint.mesh])
 
     def glossy(self, footprint: Footprint) -> tuple[NDArray[np.bool_], ...]:

@@ -13,6 +13,9 @@ MARGIN_PX = 32
 """Smallest margin around the fitted surfaces, pixels: the checks of the pose read pixels outside their outline."""
 MARGIN_SHARE = 0.05
 """Smallest margin as a share of the longer side, for cameras with many pixels."""
+BORDER_TOLERANCE_PX = 1e-3
+"""Distance beyond the outermost pixel centres, pixels, up to which a sample is accepted. Interpolation mixes in the
+black around the image by this fraction."""
 BAND_PIXELS = 1 << 16
 """Approximate number of pixels processed at once: a dozen float32 arrays of this size fit in a processor's cache."""
 

@@ -1,4 +1,4 @@
-"""The import rules hold, and the light rooms load nothing heavy."""
+"""The import rules hold, and the light packages load no heavy ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def modules_below(room: str) -> list[str]:
     paths = (
         path.relative_to(folder).with_suffix("") for path in sorted(folder.rglob("*.py")) if path.stem != "__init__"
     )
-    # Steps of migration are files that Alembic reads, not modules.
+    # Migration steps are files that Alembic reads, not modules.
     return [".".join(("services", room, *path.parts)) for path in paths if path.parts[0] != "migrations"]
 
 

@@ -1,5 +1,5 @@
-"""What the program is made of may be given on: every dependency, of Python and of the page, names a licence that allows
-it.
+"""The program may be redistributed: every dependency, of the Python code and of the dashboard, names a licence that
+allows it.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ PERMISSIVE = re.compile(
     r"\b(MIT(-0|-CMU)?|0?BSD(-[23]-Clause)?|ISCL?|Apache(-2\.0)?|PSF(-2\.0)?|Python Software Foundation"
     r"|Zlib|CC0-1\.0|Unlicense|HPND|MPL(-2\.0)?|Mozilla)\b"
 )
-"""The Mozilla licence binds changes to its own files alone."""
+"""Pattern of licences that allow redistribution. The Mozilla licence is among them, as it binds changes to its own
+files alone."""
 LINKED = {"psycopg": "LGPL-3.0-only", "psycopg-binary": "LGPL-3.0-only"}
-"""Weak copyleft: may be used unchanged as a library, and stays replaceable, which an installed Python package is."""
+"""Packages with a weak copyleft licence: it allows their use as unchanged libraries that users can replace, as they can
+an installed Python package."""
 STRONG = re.compile(r"\bA?GPL|GNU (Affero )?General Public")
 
 
 def licence(of: Distribution) -> str:
-    """As the package's metadata state it."""
+    """Licence that the package's metadata state."""
     told = of.metadata
     classified = [one.rpartition(" :: ")[2] for one in told.get_all("Classifier", []) if one.startswith("License ::")]
     return str(
@@ -36,7 +38,7 @@ def licence(of: Distribution) -> str:
 
 
 def dependencies(name: str, extras: tuple[str, ...], seen: set[str]) -> Iterator[Distribution]:
-    """All that a package with its extras brings along here."""
+    """Yield all direct and indirect dependencies of a package with extras, as installed here."""
     for text in distribution(name).requires or ():
         wanted = Requirement(text)
         applies = wanted.marker is None or any(wanted.marker.evaluate({"extra": extra}) for extra in ("", *extras))
@@ -46,7 +48,7 @@ def dependencies(name: str, extras: tuple[str, ...], seen: set[str]) -> Iterator
         seen.add(key)
         try:
             found = distribution(wanted.name)
-        except PackageNotFoundError:  # for another platform
+        except PackageNotFoundError:  # a dependency of another platform
             continue
         if wanted.name != "dentine":
             yield found

@@ -1,4 +1,4 @@
-"""Every relative link of every Markdown page leads to a file that is there, and every anchor to a heading of it."""
+"""Every relative link of every Markdown page leads to an existing file, and every anchor to one of its headings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ ELSEWHERE = re.compile(r"[a-z][a-z0-9+.-]*:|//", re.IGNORECASE)
 
 
 def pages() -> list[Path]:
-    """Markdown files of the project: those of the root, and of its folders but for what packages bring along."""
+    """Markdown files of the project, in its root and in its folders except those of installed packages."""
     below = (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.md"))
     return sorted([*ROOT.glob("*.md"), *(path for path in below if "node_modules" not in path.parts)])
 
 
 def anchors(text: str) -> set[str]:
-    """Names under which a page's headings are reached, as forges make them: small letters, spaces as hyphens, neither
-    punctuation nor symbols, and a number behind a name that stood before.
+    """Anchors of a page's headings, formed as code hosts do: lower case, hyphens for spaces, no punctuation or symbols,
+    and a number after a name that occurred before.
     """
     seen: Counter[str] = Counter()
     names: set[str] = set()
@@ -39,7 +39,7 @@ def anchors(text: str) -> set[str]:
 
 
 def links(text: str) -> Iterator[str]:
-    """Relative targets of links and pictures, outside of code."""
+    """Relative targets of links and pictures outside code."""
     prose = CODE.sub("", FENCE.sub("", text))
     return (target for target in LINK.findall(prose) if not ELSEWHERE.match(target))
 

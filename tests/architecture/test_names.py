@@ -1,4 +1,6 @@
-"""Every name that is written as text leads somewhere, and modules import each other in one direction."""
+"""Every name of a module or function in a string exists, modules import each other in one direction, and folders and
+files stay small.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def module_of(path: Path) -> str:
 
 
 def named_in_text() -> list[str]:
-    """What strings of the code name: modules to import, functions to call, and attributes that tests replace."""
+    """Names in strings of the code: modules to import, functions to call, and attributes that tests replace."""
     trees = (ast.parse(path.read_text()) for path in sources("services", "tests"))
     texts = (
         node.value
@@ -59,7 +61,7 @@ def test_a_name_in_text_leads_somewhere(name: str) -> None:
 
 
 def test_no_module_reaches_itself_by_its_imports() -> None:
-    """Neither by those inside functions nor by those for type checking."""
+    """Imports inside functions and imports for type checking count too."""
     paths = {module_of(path): path for path in sources("services")}
     graph: dict[str, set[str]] = {}
     for module, path in paths.items():
@@ -91,9 +93,7 @@ def test_no_file_is_too_long_to_be_read_at_once() -> None:
 
 
 def test_every_name_that_is_imported_is_there() -> None:
-    """Benchmarks and fault matrices are imported by no other test, so that a name that has moved would be missed in
-    them alone.
-    """
+    """No other test imports the benchmarks and fault matrices, so only this test finds names that have moved there."""
     defined: dict[str, set[str]] = {}
     asked: list[tuple[Path, str, str]] = []
     for path in sources("services", "tests", "dentine"):
@@ -111,9 +111,7 @@ def test_every_name_that_is_imported_is_there() -> None:
 
 
 def names_bound_in(tree: ast.Module) -> set[str]:
-    """What a module itself defines, assigns or imports; one with ``__getattr__`` may offer what its ``__all__`` lists
-    besides.
-    """
+    """Names that a module defines, assigns or imports; with ``__getattr__``, also the names in its ``__all__``."""
     bound: set[str] = set()
     nodes = list[ast.AST](tree.body)
     while nodes:
@@ -121,7 +119,7 @@ def names_bound_in(tree: ast.Module) -> set[str]:
         match node:
             case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
                 bound.add(name)
-                # What is bound inside is not the module's.
+                # Names bound inside a function or class are not the module's.
                 continue
             case ast.Name(id=name, ctx=ast.Store()):
                 bound.add(name)
@@ -137,14 +135,14 @@ def names_bound_in(tree: ast.Module) -> set[str]:
 
 
 def test_a_name_that_is_only_written_or_bound_inside_is_not_there() -> None:
-    """Nor does a list of names help a module that cannot make them."""
+    """Names in ``__all__`` count only if the module has ``__getattr__``."""
     written = "if True:\n    there = 1\ndef made() -> None:\n    inside = 2\n'lost'\n__all__ = ['listed']\n"
     assert names_bound_in(ast.parse(written)) == {"there", "made", "__all__"}
     assert names_bound_in(ast.parse(written + "def __getattr__(name): ...\n")) >= {"listed"}
 
 
 def test_bounds_are_called_maximum_and_minimum() -> None:
-    """One pair of words for the bounds of the whole house, that of textbooks."""
+    """All code uses the same words for bounds: those of textbooks."""
     others = {
         f"{path.relative_to(ROOT)}: {name}"
         for path in sources("services", "tests", "dentine")

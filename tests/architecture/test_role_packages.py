@@ -1,5 +1,5 @@
-"""Each part of the service finds all that its code imports among the packages that it is installed with;
-``tests/pipeline/test_roles.py`` installs them.
+"""Every import of a role's code is among the packages that the role installs; ``tests/pipeline/test_roles.py`` installs
+them.
 """
 
 from __future__ import annotations

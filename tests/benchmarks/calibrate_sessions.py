@@ -1,12 +1,12 @@
-"""Whole calibration sessions with drawn errors: how far off cameras, lights, intensities and colours come out, and
-whether they know it.
+"""Whole calibration sessions with random errors: the errors of cameras, lights, intensities and colours, and whether
+the stated standard errors match them.
 
-``python -m tests.benchmarks.calibrate_sessions --draws 12 --json FILE`` takes about ten seconds of processor time a
-draw and goes on where a file already holds draws; ``--width 5184`` draws cameras of 20 megapixels in place of 2.
+``python -m tests.benchmarks.calibrate_sessions --draws 12 --json FILE`` takes about ten seconds of processor time per
+draw, and continues where the file already holds draws; ``--width 5184`` draws cameras of 20 megapixels instead of 2.
 
-Boards are drawn by projection with normal errors of 0.1 px, spheres by their formulae (outlines
-0.1 px and shifted alike by up to 0.2 px, highlights 0.05 px, white pixels 1 % shot noise), and every chart patch is off
-by 0.3 %. Each step gets what the step before found, never the truth.
+Boards are drawn by projection with Gaussian errors of 0.1 px, spheres by their formulae (outlines 0.1 px plus a common
+shift of up to 0.2 px per camera, highlights 0.05 px, white pixels 1 % shot noise); chart patches have errors of 0.3 %.
+Each step receives the results of the step before, never the truth.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from services.calibrate.cameras.start import first_lens, first_rig
 from services.calibrate.colour.transform import fit_colour
 from services.calibrate.lights.centres import OutlineView, fit_centres
 from services.calibrate.lights.intensity import IntensityFit, WhitePhoto, WhiteSphere, fit_intensity, shading
-from services.calibrate.lights.mirror import Eye, highlight_points, nearest_point
+from services.calibrate.lights.mirror import PosedCamera, highlight_points, nearest_point
 from services.calibrate.lights.positions import LightsFit, fit_lights
 from services.calibrate.lights.problem import SphereView
 from services.calibrate.reweighted import solve_reweighted
@@ -42,66 +42,66 @@ MIRROR_MM, WHITE_MM = 28.0, 20.0
 MIRROR_PLACES_MM = np.array(
     [*([x, y, z] for x in (-62.0, 62.0) for y in (-38.0, 38.0) for z in (-50.0, 50.0)), [0, 0, 75], [0, 0, -80]]
 )
-"""Of the mirror sphere's centres about the point at which the cameras look: the corners of a box, one place nearer and
-one farther. What decides is how far apart they are, and how many; they are as far apart as the images hold spheres of
-this radius."""
+"""Centres of the mirror sphere relative to the point at which the cameras look: the corners of a box, one place nearer
+and one farther. The precision depends on their distances and their number; they are as far apart as the images can show
+whole spheres of this radius."""
 WHITE_PLACES_MM = np.array([[-32.0, -20, -20], [32, 20, -10], [0, 0, 30]])
 REFLECTANCE = np.array([0.92, 0.9, 0.88])
 SHOT, PATCH_ERROR = 0.01, 0.003
 COUNTS = 1e3
-"""Of a white sphere's photograph, for radiance 1."""
+"""Counts of a white sphere's photograph for radiance 1."""
 MARGIN_PX = 5.0
-"""Between a whole sphere and the image's border, as the search for its edge needs."""
+"""Least distance between a whole sphere and the image's border, which the search for its edge needs."""
 
 
 @dataclass(frozen=True)
 class Spheres:
-    """What the spheres of a session tell."""
+    """Photographs of a session's spheres, and the fits to them."""
 
     views: list[SphereView]
     fit: LightsFit
     photos: list[WhitePhoto]
     white_mm: Floats
-    """Of the white spheres' centres, as found (P, 3)."""
+    """Fitted centres (P, 3) of the white spheres, mm."""
     intensity: IntensityFit
     true_intensity: Floats
 
 
 def one_session(seed: int, width: int = SIZE[0]) -> dict[str, Any]:
-    """Errors of one session: rms, and whitened or normalised scores."""
+    """Errors of one session as rms values, and as whitened or normalised scores."""
     random = np.random.default_rng(1000 + seed)
     size = (width, width * SIZE[1] // SIZE[0])
     rig = true_rig(random, N_PLACES, size)
-    # The teeth are where the boards were turned about: the middle of the board at the first place.
+    # The teeth are at the point about which the boards were turned: the centre of the board at the first place.
     teeth = corners_on_board(CHESSBOARD).mean(axis=0)
     fit, _ = found_rig(random, rig, NAMES)
     layout = fit.layout
     columns = np.concatenate([np.r_[layout.lens_columns(k), layout.camera_columns(k)] for k in range(3)])
     covariance = fit.covariance[np.ix_(columns, columns)]
-    true, found = eyes_of(rig), eyes_of(fit.rig)
+    true, found = posed_cameras_of(rig), posed_cameras_of(fit.rig)
     error = layout.pack(fit.rig) - layout.pack(rig)
     shift_mm, turn_deg = _seen_at_the_teeth(true, found, teeth)
     told: dict[str, Any] = {"seed": seed, "shift_mm": shift_mm, "turn_deg": turn_deg}
     told["z_cameras"] = _whitened(error[columns], covariance)
-    # The dome shines from the cameras' side of the teeth.
+    # The lights are on the cameras' side of the teeth.
     lights = _turned(dome_lights(N_LIGHTS, random), away_from(true, teeth)) + teeth
     told |= _lights_and_intensity(random, true, found, covariance, lights, teeth)
     told["delta_e"] = _colour(random)
     return told
 
 
-def eyes_of(rig: Rig) -> tuple[Eye, ...]:
+def posed_cameras_of(rig: Rig) -> tuple[PosedCamera, ...]:
     """The cameras of a rig."""
-    return tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
+    return tuple(PosedCamera(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
 
 
-def away_from(eyes: tuple[Eye, ...], point_mm: Floats) -> Floats:
-    """From a point to the middle of the cameras (3,)."""
-    return np.asarray(np.mean([eye.centre_mm for eye in eyes], axis=0) - point_mm)
+def away_from(cameras: tuple[PosedCamera, ...], point_mm: Floats) -> Floats:
+    """Vector (3,) in mm from a point to the mean of the cameras' centres."""
+    return np.asarray(np.mean([camera.centre_mm for camera in cameras], axis=0) - point_mm)
 
 
 def found_rig(random: np.random.Generator, rig: Rig, names: list[str]) -> tuple[BundleFit, list[View]]:
-    """What boards of 0.1 px say of a rig."""
+    """Fit a rig to board photographs with errors of 0.1 px; returns the fit and the photographs' corners."""
     views = photographed(rig, 0.1, random)
     lenses = [
         first_lens([view for view in views if view.camera == k], rig.lenses[k].size, "radial-tangential-4", name)
@@ -112,8 +112,8 @@ def found_rig(random: np.random.Generator, rig: Rig, names: list[str]) -> tuple[
 
 def _lights_and_intensity(
     random: np.random.Generator,
-    true: tuple[Eye, ...],
-    found: tuple[Eye, ...],
+    true: tuple[PosedCamera, ...],
+    found: tuple[PosedCamera, ...],
     covariance: Floats,
     lights: Floats,
     teeth: Floats,
@@ -133,8 +133,8 @@ def _lights_and_intensity(
 
 def photographed_spheres(
     random: np.random.Generator,
-    true: tuple[Eye, ...],
-    found: tuple[Eye, ...],
+    true: tuple[PosedCamera, ...],
+    found: tuple[PosedCamera, ...],
     covariance: Floats,
     lights: Floats,
     teeth: Floats,
@@ -142,16 +142,21 @@ def photographed_spheres(
     intensity: Floats | None = None,
     reflectance_off: float = 0.0,
 ) -> Spheres:
-    """Mirror and white spheres about the teeth by true cameras, and what found ones make of them.
+    """Draw photographs of mirror and white spheres by the true cameras, and fit lights and intensities to them with the
+    fitted cameras.
 
     Args:
-        covariance: of the found cameras.
-        lights: true positions (L, 3), mm.
-        teeth: about where the cameras look (3,), mm.
-        intensity: true, mean 1 (L, C); drawn where it is not given.
-        reflectance_off: by how much the white spheres reflect more than they are said to, relative.
+        true: true cameras.
+        found: fitted cameras.
+        covariance: covariance of the fitted cameras.
+        lights: true positions of the lights (L, 3), mm.
+        teeth: point near which the cameras look (3,), mm.
+        intensity: true intensities (L, C) of mean 1; drawn where not given.
+        reflectance_off: relative excess of the white spheres' reflectance over the stated one.
     """
-    looked_at = nearest_point(np.array([eye.centre_mm for eye in true]), np.array([eye.rotation[2] for eye in true]))
+    looked_at = nearest_point(
+        np.array([camera.centre_mm for camera in true]), np.array([camera.rotation[2] for camera in true])
+    )
     away = away_from(true, teeth)
     mirror, white = (
         _turned(places, away) + looked_at + random.normal(0, 2, places.shape)
@@ -161,95 +166,101 @@ def photographed_spheres(
     views = _mirror_views(random, true, shifts, lights, mirror)
     fit = fit_lights(views, found, names, covariance)
     count = 3 * len(fit.lights)
-    # White spheres are seen through the cameras that boards and mirror spheres gave.
+    # Fit the white spheres with the cameras that boards and mirror spheres gave.
     if intensity is None:
         intensity = random.uniform(0.6, 1.4, (len(lights), 3))
         intensity /= intensity.mean(axis=0)
     said = REFLECTANCE[: intensity.shape[1]]
     outlines, photos = [], []
     for place, centre in enumerate(white):
-        for camera, eye in enumerate(true):
-            edge = _outline(random, eye, centre, WHITE_MM, shifts[camera])
+        for number, camera in enumerate(true):
+            edge = _outline(random, camera, centre, WHITE_MM, shifts[number])
             if edge is None:
                 continue
-            outlines.append(OutlineView(camera, place, WHITE_MM, edge))
+            outlines.append(OutlineView(number, place, WHITE_MM, edge))
             photos += [
-                _photo(random, eye, centre, camera, place, light, lights[light], (1 + reflectance_off) * said * own)
+                _photo(random, camera, centre, number, place, light, lights[light], (1 + reflectance_off) * said * own)
                 for light, own in enumerate(intensity)
             ]
-    centres = fit_centres(outlines, fit.eyes)
+    centres = fit_centres(outlines, fit.cameras)
     spheres = [WhiteSphere(centre, WHITE_MM, said) for centre in centres]
-    answer = fit_intensity(photos, fit.eyes, spheres, fit.positions_mm, names, fit.covariance[:count, :count])
+    answer = fit_intensity(photos, fit.cameras, spheres, fit.positions_mm, names, fit.covariance[:count, :count])
     return Spheres(views, fit, photos, centres, answer, intensity)
 
 
 def _mirror_views(
-    random: np.random.Generator, eyes: tuple[Eye, ...], shifts: Floats, lights: Floats, centres: Floats
+    random: np.random.Generator, cameras: tuple[PosedCamera, ...], shifts: Floats, lights: Floats, centres: Floats
 ) -> list[SphereView]:
-    """The mirror sphere where at least one camera holds it whole, and its highlights there."""
+    """Outlines and highlights of the mirror sphere, at the places where at least one camera shows the whole sphere."""
     views: list[SphereView] = []
     place = 0
     for centre in centres:
         here = []
-        for camera, eye in enumerate(eyes):
-            if (edge := _outline(random, eye, centre, MIRROR_MM, shifts[camera])) is None:
+        for number, camera in enumerate(cameras):
+            if (edge := _outline(random, camera, centre, MIRROR_MM, shifts[number])) is None:
                 continue
-            points = highlight_points(eye.centre_mm, lights, centre, MIRROR_MM)
-            to_eye = (eye.centre_mm - points) / np.linalg.norm(eye.centre_mm - points, axis=1, keepdims=True)
-            seen = np.flatnonzero(((points - centre) / MIRROR_MM * to_eye).sum(axis=1) > STEEPEST)
-            pixels = eye.project(points[seen]) + random.normal(0, 0.05, (len(seen), 2))
-            here.append(SphereView(camera, place, MIRROR_MM, edge, seen, pixels))
+            points = highlight_points(camera.centre_mm, lights, centre, MIRROR_MM)
+            to_camera = (camera.centre_mm - points) / np.linalg.norm(camera.centre_mm - points, axis=1, keepdims=True)
+            seen = np.flatnonzero(((points - centre) / MIRROR_MM * to_camera).sum(axis=1) > STEEPEST)
+            pixels = camera.project(points[seen]) + random.normal(0, 0.05, (len(seen), 2))
+            here.append(SphereView(number, place, MIRROR_MM, edge, seen, pixels))
         views += here
         place += bool(here)
     return views
 
 
-def _outline(random: np.random.Generator, eye: Eye, centre: Floats, radius: float, shift: float) -> Floats | None:
-    """Edge points of a sphere with their errors; None where the image does not hold it whole."""
-    edge, outward = outline_points(eye, centre, radius, 90)
-    if not ((edge > MARGIN_PX) & (edge < np.array(eye.lens.size) - MARGIN_PX)).all():
+def _outline(
+    random: np.random.Generator, camera: PosedCamera, centre: Floats, radius: float, shift: float
+) -> Floats | None:
+    """Edge points (90, 2) of a sphere with their errors; None where the image does not show the whole sphere."""
+    edge, outward = outline_points(camera, centre, radius, 90)
+    if not ((edge > MARGIN_PX) & (edge < np.array(camera.lens.size) - MARGIN_PX)).all():
         return None
     return np.asarray(edge + outward * (shift + random.normal(0, 0.1, (90, 1))))
 
 
 def _photo(
     random: np.random.Generator,
-    eye: Eye,
+    camera: PosedCamera,
     centre: Floats,
-    camera: int,
+    number: int,
     place: int,
     light: int,
     light_mm: Floats,
     radiosity: Floats,
 ) -> WhitePhoto:
-    """Pixels of a white sphere; radiosity is its reflectance times the light's intensity by channel."""
-    aim = eye.project(centre[None])[0]
-    reach = 1.05 * WHITE_MM * eye.lens.values[0] / np.linalg.norm(centre - eye.centre_mm)
+    """Draw pixels of a white sphere; ``radiosity`` (C,) is its reflectance times the light's intensity."""
+    aim = camera.project(centre[None])[0]
+    reach = 1.05 * WHITE_MM * camera.lens.values[0] / np.linalg.norm(centre - camera.centre_mm)
     grid = np.stack(np.meshgrid(*(np.linspace(-reach, reach, 21),) * 2), axis=-1).reshape(-1, 2) + aim
-    factor, usable = shading(eye, WhiteSphere(centre, WHITE_MM, np.ones(1)), light_mm, grid)
+    factor, usable = shading(camera, WhiteSphere(centre, WHITE_MM, np.ones(1)), light_mm, grid)
     clean = COUNTS * factor[:, None] * radiosity
     level = clean[usable].mean() if usable.any() else 0.0
     noise = SHOT * np.sqrt(np.maximum(clean, 0) * level)
-    return WhitePhoto(camera, place, light, grid, clean + random.normal(size=clean.shape) * noise)
+    return WhitePhoto(number, place, light, grid, clean + random.normal(size=clean.shape) * noise)
 
 
 def _colour(random: np.random.Generator) -> float:
-    """Median ΔE2000 of left out patches."""
+    """Median colour difference ΔE2000 of chart patches that are left out of the fit in turn."""
     rgb = random.uniform(0.04, 0.85, (24, 3))
     seen = rgb * (1 + random.normal(0, PATCH_ERROR, rgb.shape))
     return float(np.median(fit_colour(seen, rgb @ XYZ_FROM_SENSOR.T, "camera").held_out))
 
 
-def _seen_at_the_teeth(true: tuple[Eye, ...], found: tuple[Eye, ...], teeth: Floats) -> tuple[float, float]:
-    """By how much teeth of 10 mm would seem moved (mm) and turned (deg), if the found cameras were taken for the true
-    ones.
+def _seen_at_the_teeth(
+    true: tuple[PosedCamera, ...], found: tuple[PosedCamera, ...], teeth: Floats
+) -> tuple[float, float]:
+    """Apparent displacement (mm) and rotation (deg) of teeth of 10 mm when the fitted cameras are used in place of the
+    true ones.
     """
     points = np.array([[x, y, z] for x in (-5.0, 5) for y in (-5.0, 5) for z in (-5.0, 5)])
-    drawn = [eye.project(points + teeth) for eye in true]
+    drawn = [camera.project(points + teeth) for camera in true]
 
     def off(pose: Floats) -> Floats:
         moved = pose_apply(pose, points) + teeth
-        return np.concatenate([(eye.project(moved) - seen).ravel() for eye, seen in zip(found, drawn, strict=True)])
+        return np.concatenate(
+            [(camera.project(moved) - seen).ravel() for camera, seen in zip(found, drawn, strict=True)]
+        )
 
     def slope(pose: Floats) -> Floats:
         steps = 1e-5 * np.eye(6)
@@ -260,7 +271,7 @@ def _seen_at_the_teeth(true: tuple[Eye, ...], found: tuple[Eye, ...], teeth: Flo
 
 
 def _turned(points: Floats, away: Floats) -> Floats:
-    """Points about the origin whose z axis is turned to a direction."""
+    """Rotate points (N, 3) about the origin so that their z axis points along a direction (3,)."""
     z = away / np.linalg.norm(away)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -274,7 +285,7 @@ def _whitened(error: Floats, covariance: Floats) -> list[float]:
 
 
 def summary(draws: list[dict[str, Any]]) -> dict[str, float]:
-    """Rms over the draws, and rms of pooled scores."""
+    """Rms of each error over the draws, and rms of the pooled scores."""
     told = {"draws": float(len(draws))}
     for key in ("shift_mm", "turn_deg", "lights_mm", "lights_se_mm", "mirror_views", "intensity", "delta_e"):
         told[f"rms_{key}"] = float(np.sqrt(np.mean([draw[key] ** 2 for draw in draws])))

@@ -1,11 +1,11 @@
-"""How long a whole calibration session takes, part by part, as JSON.
+"""Duration of a whole calibration session, part by part, as JSON.
 
 python -m tests.benchmarks.calibration_time --width 648 --cameras 3 --boards 30 --lights 54 --json time.json
 
-The virtual laboratory photographs boards, one mirror and one white sphere under every light, and a chart;
-``dentine calibrate``'s own steps are timed as they run, each without those within it. What one photograph takes grows
-with its pixels and what fits take does not, so two sizes of image tell a third, and a session of many large images need
-not be written. Seconds are of this process's processor time.
+The virtual laboratory photographs boards, one mirror and one white sphere under every light, and a chart. The steps of
+``dentine calibrate`` are timed as they run, each without the steps inside it. The time per photograph grows with its
+pixels and that of the fits does not, so the times for a third image size follow from two others, and a session of many
+large images need not be written. Seconds are processor time of this process.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from services.phantom.lab.sensor import Sensor
 from services.phantom.lab.session import write_session
 
 FIELD_MM = 84.0
-"""Across an image at the teeth."""
+"""Width of an image's field of view at the teeth."""
 STEPS = {
     "reading": ("photos.read_counts",),
     "boards found": ("boards._find",),
@@ -37,23 +37,24 @@ STEPS = {
     "lights' fit": ("spheres.place_lights",),
     "white spheres sampled": ("run.measure_intensity",),
     "intensities' fit": ("spheres.fit_centres", "spheres.fit_intensity"),
-    "flat frames": ("run.fall_of_light",),
+    "flat frames": ("run.measure_vignetting",),
     "colours": ("run.calibrate_colours",),
     "record and limits": ("run.record_of", "run.judge"),
 }
-"""Functions of ``services.calibrate.session`` by what they do; what is in none of them is the files' checksums."""
+"""Functions of ``services.calibrate.session`` by part. The time outside all of them is spent on the files'
+checksums."""
 REST = "checksums"
 
 
 class Parts:
-    """Seconds by part, each without what is measured within it."""
+    """Processor seconds by part, each without the parts measured inside it."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
         self._open, self._since = [REST], time.process_time()
 
     def measured(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, with its time counted under a name."""
+        """Wrap a function so that its time counts under a name."""
 
         def call(*arguments: Any, **options: Any) -> Any:
             self.turn()
@@ -67,14 +68,14 @@ class Parts:
         return call
 
     def turn(self) -> None:
-        """Count the time since the last turn under the part that is open."""
+        """Add the time since the last call of this method to the part that is running."""
         now = time.process_time()
         self.seconds[self._open[-1]] += now - self._since
         self._since = now
 
 
 def timed(root: Path) -> dict[str, float]:
-    """Seconds of each part of one calibration."""
+    """Processor seconds of each part of one calibration."""
     with ExitStack() as stack:
         parts = Parts()
         for name, places in STEPS.items():
@@ -90,7 +91,7 @@ def timed(root: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    """Write a session, calibrate it and tell the parts."""
+    """Write a session, calibrate it, and print and store the seconds by part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--width", type=int, default=648, help="of images, pixels; they are three quarters as high")
     parser.add_argument("--cameras", type=int, default=3)

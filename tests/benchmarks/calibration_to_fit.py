@@ -1,18 +1,18 @@
-"""From calibration to fit: a tooth rendered by stock Mitsuba, photographed by an instrument whose calibration is that
-of one drawn session, as JSON.
+"""Effect of a calibration on a fit: a tooth rendered by stock Mitsuba is fitted with the calibration that a random
+session gave, as JSON.
 
 python -m tests.benchmarks.calibration_to_fit --sessions 4 --json calibration_to_fit.json
 
-The stored central incisor's own three cameras and eight lights are calibrated by a virtual session (as in
-``calibrate_sessions``: boards of 0.1 px, a mirror sphere in ten places, a white one in three). The fit gets what the
-session found: its cameras, lights, intensities and radiance per count, and its record's covariance. A session that
-measures neither flare nor where the scan lies, nor the white sphere's reflectance to better than 1 %, leaves those to
-the defaults that a fit assumes, and they are drawn from these. All is told in the frame of the session's first board,
-so mesh, lights and cameras of ``capture.json`` move and no image is rendered again. Session 0 is a perfect calibration
-with a record that says so.
+The three cameras and eight lights of the stored central incisor are calibrated by a virtual session as in
+``calibrate_sessions``: boards of 0.1 px, a mirror sphere in ten places, a white sphere in three. The fit receives the
+session's results: cameras, lights, intensities, radiance per count, and the record's covariance. Such a session
+measures neither flare nor the scan's pose, and the white sphere's reflectance to no better than 1 %. The fit assumes
+defaults for these errors, and they are drawn from the same defaults. All poses are in the frame of the session's first
+board, so mesh, lights and cameras of ``capture.json`` move and no image is rendered again. Session 0 is a perfect
+calibration whose record states almost no errors.
 
-Fits run in this process, on one thread; some minutes of processor time each. ``rows`` has the value's distance from the
-truth over its ±, and the ± over that of the perfect calibration.
+Fits run in this process, on one thread, and take some minutes of processor time each. ``rows`` holds each value's error
+over its ±, and the ± over that of the perfect calibration.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from services.bench.fits.tooth_capture import prepared_tooth
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import pose_matrix, pose_vector
-from services.calibrate.lights.mirror import Eye
+from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.record import REFLECTANCE_SE, uncertainty_of
 from services.calibrate.session.spheres import IntensityStep, LightsStep
@@ -48,7 +48,7 @@ from services.fit.instrument.errors import DEFAULT_MOVE_SE, DEFAULT_SE
 from services.fit.instrument.moves import rigid
 from services.fit.stage import run
 from services.fit.transport.platform import prepare_device
-from tests.benchmarks.calibrate_sessions import COUNTS, N_PLACES, eyes_of, found_rig, photographed_spheres
+from tests.benchmarks.calibrate_sessions import COUNTS, N_PLACES, found_rig, photographed_spheres, posed_cameras_of
 from tests.support.board_sessions import in_first_frame, tilted_places
 from tests.support.truths import SIDE_LIGHTS, Truth, read, write_capture
 
@@ -57,24 +57,24 @@ SUBJECT, CHANNEL = "central-incisor", "green"
 QUANTITIES = ("enamel.sigma_s_reduced", "enamel.sigma_a", "dentin.sigma_s_reduced", "dentin.sigma_a")
 OPTIONS: dict[str, Any] = {"boundary": "matched", "dentin": "known", "advise": False, "held_out_lights": SIDE_LIGHTS}
 FINER = 4
-"""Pixels of the calibrated camera on the edge of one of the stored images: 0.125 mm at a metre."""
+"""Pixels of the calibrated camera along the side of one pixel of the stored images; one is 0.125 mm wide at a metre."""
 SIZE = (1600, 1200)
 PERFECT_SE = 1e-5
-"""Of every error that a perfect calibration states; relative, rad or mm."""
+"""Standard error that the perfect calibration states for every quantity; relative, rad or mm."""
 MAX_Z, MAX_SE_RATIO = 3.0, 2.0
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a session found, in the frame of its first board, and what the fit is told of it.
+    """Results of a calibration session in the frame of its first board, as the fit receives them.
 
     Attributes:
-        board_from_world: where the stored tooth truly lies, (4, 4).
+        board_from_world: true pose of the stored tooth (4, 4).
         cameras: K (3, 3) of the stored images and camera_from_world (4, 4), by camera.
-        lights_mm: (L, 3).
-        intensity: over the mean of the true ones (L,).
-        radiance: by camera, over the true one (K,).
-        uncertainty: of the record.
+        lights_mm: positions of the lights (L, 3).
+        intensity: intensities (L,) over the mean of the true ones.
+        radiance: radiance per count (K,) by camera, over the true one.
+        uncertainty: uncertainty of the calibration record.
     """
 
     board_from_world: Floats
@@ -86,7 +86,7 @@ class Drawn:
 
 
 def perfect(truth: Truth) -> Drawn:
-    """A calibration without errors that says so."""
+    """A calibration without errors whose stated standard errors are ``PERFECT_SE``."""
     cameras = [(np.array(one["K"]), np.array(one["camera_from_world"])) for one in truth.description["cameras"]]
     lights = truth.description["lights"]
     names = [f"gain.{CHANNEL}", *(f"light_gain.{light['name']}" for light in lights)]
@@ -100,12 +100,14 @@ def perfect(truth: Truth) -> Drawn:
 
 
 def session(truth: Truth, seed: int) -> Drawn:
-    """One drawn session of the stored rig."""
+    """Draw one calibration session of the stored rig, and calibrate it."""
     random, description = np.random.default_rng(7000 + seed), truth.description
     names, lamps = [one["name"] for one in description["cameras"]], [one["name"] for one in description["lights"]]
     poses = [pose_vector(np.array(one["camera_from_world"])) for one in description["cameras"]]
     lenses = [_lens(np.array(one["K"]), random) for one in description["cameras"]]
-    towards = _turn_to(np.mean([Eye(lens, pose).centre_mm for lens, pose in zip(lenses, poses, strict=True)], axis=0))
+    towards = _turn_to(
+        np.mean([PosedCamera(lens, pose).centre_mm for lens, pose in zip(lenses, poses, strict=True)], axis=0)
+    )
     places = tilted_places(random, N_PLACES, towards)
     rig, board_from_world = in_first_frame(tuple(lenses), poses, places), np.linalg.inv(places[0])
     teeth = board_from_world[:3, 3]
@@ -113,10 +115,10 @@ def session(truth: Truth, seed: int) -> Drawn:
     cameras = CamerasStep(tuple(names), fit, {}, tuple(views), ())
     lights = _moved(board_from_world, np.array([one["position_mm"] for one in description["lights"]]))
     bright = np.array([one["intensity"] for one in description["lights"]])
-    true, bright = eyes_of(rig), bright / bright.mean()
+    true, bright = posed_cameras_of(rig), bright / bright.mean()
     off = random.normal(0, REFLECTANCE_SE)
     spheres = photographed_spheres(
-        random, true, cameras.eyes, cameras.camera_covariance, lights, teeth, lamps, bright, off
+        random, true, cameras.posed_cameras, cameras.camera_covariance, lights, teeth, lamps, bright, off
     )
     found, white = spheres.fit, spheres.intensity
     folder = RawFolder.model_validate(
@@ -135,8 +137,8 @@ def session(truth: Truth, seed: int) -> Drawn:
     )
     points = _moved(board_from_world, truth.meshes["outer"].vertices_mm)
     seen = [
-        (_pinhole(own, eye, guess, points), pose_matrix(guess.pose))
-        for own, eye, guess in zip(description["cameras"], true, found.eyes, strict=True)
+        (_pinhole(own, camera, guess, points), pose_matrix(guess.pose))
+        for own, camera, guess in zip(description["cameras"], true, found.posed_cameras, strict=True)
     ]
     radiance = white.radiance_per_count[:, 0] * COUNTS
     return Drawn(board_from_world, seen, found.positions_mm, white.intensity[:, 0], radiance, stated)
@@ -155,11 +157,11 @@ def _turn_to(away: Floats) -> Floats:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _pinhole(stored: dict[str, Any], true: Eye, found: Eye, points_mm: Floats) -> Floats:
-    """K (3, 3) by which the found camera takes the stored image's pixels for the rays that its lens takes them for.
+def _pinhole(stored: dict[str, Any], true: PosedCamera, found: PosedCamera, points_mm: Floats) -> Floats:
+    """K (3, 3) that maps the rays of the fitted lens to the pixels of the stored image, without distortion.
 
-    The stored image is what the true camera shows without its distortion. A laboratory takes the distortion out that it
-    found; what is left of it over the tooth is a straight map of pixels to a thousandth of one.
+    The stored image is that of the true camera without its distortion. A laboratory removes the distortion that it
+    fitted; over the tooth, the rest is an affine map of pixels to within a thousandth of a pixel.
     """
     import cv2
 
@@ -180,10 +182,11 @@ def _moved(move: Floats, points_mm: Floats) -> Floats:
 
 
 def write(folder: Path, truth: Truth, drawn: Drawn, random: np.random.Generator | None) -> None:
-    """Change a written capture into that of the drawn instrument, with flare and a scan's pose of their own.
+    """Change a written capture into that of the drawn instrument, with random flare and a random error of the scan's
+    pose.
 
     Args:
-        random: draws them; None for a perfect instrument.
+        random: generator of these two errors; None for a perfect instrument.
     """
     description = json.loads((folder / "capture.json").read_text())
     for camera, (matrix, pose) in zip(description["cameras"], drawn.cameras, strict=True):
@@ -213,7 +216,7 @@ def write(folder: Path, truth: Truth, drawn: Drawn, random: np.random.Generator 
 
 
 def fit(folder: Path, number: int, options: dict[str, Any]) -> dict[str, Any]:
-    """One fit: values, ± and what they are made of, and how far the session was off; session 0 is perfect."""
+    """Run one fit; returns values with their ± and parts of these, and the session's errors. Session 0 is perfect."""
     truth = write_capture(SUBJECT, folder / "capture", seed=max(number, 1))
     drawn = session(truth, number) if number else perfect(truth)
     write(folder / "capture", truth, drawn, np.random.default_rng(8000 + number) if number else None)
@@ -238,7 +241,9 @@ def fit(folder: Path, number: int, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _off(truth: Truth, drawn: Drawn) -> dict[str, float]:
-    """Errors of a session: lights (rms, mm), their intensities (rms) and all radiances together, relative."""
+    """Errors of a session: the lights' positions (rms, mm), their intensities (relative, rms), and the mean relative
+    error of all radiances.
+    """
     lights = truth.description["lights"]
     where = _moved(drawn.board_from_world, np.array([one["position_mm"] for one in lights]))
     bright = np.array([one["intensity"][0] for one in lights])
@@ -250,8 +255,8 @@ def _off(truth: Truth, drawn: Drawn) -> dict[str, float]:
 
 
 def rows(fits: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Distance from the truth over its ±, ± in percent, and over that of the perfect calibration, where that was
-    fitted.
+    """One row per session: each quantity's error over its ±, the ± in per cent of the truth, and the ± over that of the
+    perfect calibration where session 0 was fitted.
     """
     truth = read(SUBJECT)
     media = {part: truth.medium(part) for part in ("enamel", "dentin")}
@@ -277,7 +282,7 @@ def rows(fits: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Run the sessions that are missing, write after each, and print what is asked of them."""
+    """Run the sessions that are missing, write the file after each, and print the largest figures with their limits."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True, help="where results go; sessions in it are not run again")
     parser.add_argument("--sessions", type=int, default=4)

@@ -1,11 +1,11 @@
-"""How long a cancel in the middle of a kernel takes to free the worker, and that the worker is the same process
-afterwards.
+"""Time from a cancel in the middle of a kernel until the worker is free, and a check that the worker is the same
+process afterwards.
 
 python -m tests.benchmarks.cancel_in_kernel --times 10
 
 A job of a live server renders with the real engine an image that would take hours. It is cancelled over REST while the
-kernel runs, and the next job runs on the same worker. Seconds are those from the request to the state CANCELLED, which
-is told once the rendering process is dead and its worker free.
+kernel runs, and the next job runs on the same worker. The time is measured from the request to the state CANCELLED,
+which a job reaches when the rendering process is dead and its worker is free.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Cancelled:
 
     seconds: float
     worker: int
-    """The process whose task waited for the rendering process."""
+    """Id of the worker process, whose task waited for the rendering process."""
 
 
 def cancel_once(client: httpx.Client, capture: Path) -> Cancelled:
     """Cancel a job while its kernel runs.
 
     Raises:
-        RuntimeError: the job ended otherwise, or the rendering process lives on.
+        RuntimeError: the job ended in another state, or the rendering process still runs.
     """
     job = submit(client, capture, "render")
     started = capture / "started"
@@ -61,7 +61,7 @@ def cancel_once(client: httpx.Client, capture: Path) -> Cancelled:
 
 
 def worker_of_next(client: httpx.Client, capture: Path) -> int:
-    """The process in which the next job's fit runs."""
+    """Run another job; returns the id of the process in which its fit ran."""
     told = await_end(client, submit(client, capture, "answer"))
     if told["state"] != "SUCCEEDED":
         raise RuntimeError(f"The next job ended {told['state']}: {told['failure']}")
@@ -76,20 +76,20 @@ def submit(client: httpx.Client, capture: Path, call: str) -> str:
 
 
 def await_end(client: httpx.Client, job: str) -> dict[str, Any]:
-    """What the API says of a job that has ended."""
-    client.get(f"/v1/jobs/{job}/events")  # which end with the job
+    """Wait for a job's end; returns the API's record of it."""
+    client.get(f"/v1/jobs/{job}/events")  # the stream ends with the job
     return dict(client.get(f"/v1/jobs/{job}").json())
 
 
 def _await_work(process: psutil.Process) -> None:
-    # A quarter of a second of computing beyond the compilation: the kernel runs.
+    # Processor time of a quarter of a second after the compilation shows that the kernel runs.
     before = sum(process.cpu_times()[:2])
     while sum(process.cpu_times()[:2]) < before + 0.25:
         time.sleep(POLL_S)
 
 
 def main() -> None:
-    """Cancel so many jobs and print the longest time."""
+    """Cancel ``--times`` jobs and print the shortest and the longest time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=10)
     times = parser.parse_args().times

@@ -1,13 +1,13 @@
-"""How long the dome stays lit after a cancel, an ALL OFF and a signal that strike in mid-exposure.
+"""Time for which the dome stays lit after a cancel, an ALL OFF or a signal in the middle of an exposure.
 
 python -m tests.benchmarks.dark --json dark.json --times 300
 python -m tests.benchmarks.dark --json dark.json --times 300 --under upload half-open
 
-A real capture lights a simulated dome over Modbus while an observer reads the registers of what is emitted, again and
-again, over a connection of its own. Each time is from just before the request or the signal was sent to the answer of
-the first reading that saw no light, with none lit after it. Exposures last 2 s and are struck in their first 0.8 s, so
-that whoever waits for the end of one takes 1.2 s at least. Strikes are added to those in the file, which a killed run
-has kept. A hundred of one way take about ten minutes.
+A real capture lights a simulated dome over Modbus, while an observer reads the registers of the emitted light all the
+time over a connection of its own. A time runs from just before the request or signal is sent until the answer of the
+first reading without light after which no light is seen again. Exposures last 2 s and are interrupted in their first
+0.8 s, so a program that waits for an exposure's end takes at least 1.2 s. New times are added to those in the file, so
+a killed run loses none. A hundred times of one way take about ten minutes.
 
 ==========  =======================================================================================
 cancel      POST /v1/jobs/<id>/cancel
@@ -17,9 +17,8 @@ signal      SIGTERM to ``dentine capture``
 serve       SIGTERM to ``dentine serve``, with an event stream open
 ==========  =======================================================================================
 
-Loads of the server, each from a process of its own (``dark_loads``): ``upload`` sends captures all the time,
-``half-open`` holds 1,500 connections that have not finished their first line's headers. The way ``signal`` has no
-server.
+Loads on the server, each from a process of its own (``dark_loads``): ``upload`` sends captures all the time,
+``half-open`` holds 1,500 connections whose first request never ends its headers. The way ``signal`` has no server.
 """
 
 from __future__ import annotations
@@ -54,18 +53,18 @@ from tests.support.mouth import write_mouth
 LIGHTS, TABS = 6, 8
 EXPOSURE_S = 2.0
 STEADY_S = 0.3
-"""Lit for so long without a break, it is an exposure and none of the preflight's glimpses, on all but a very busy
-machine."""
+"""Time of unbroken light after which it counts as an exposure and not as a flash of the preflight, on all but a very
+busy machine."""
 STRIKE_WITHIN_S = 0.5
 PATIENCE_S = 120.0
 QUIET_S = 0.3
-"""Dark for so long, nobody lights the dome any more."""
+"""Time of darkness after which the dome counts as dark for good."""
 LOOK_EVERY_S = 0.003
-"""Between two readings, so that looking takes little of the machine that is looked at."""
+"""Pause between two readings, which keeps the observer's share of the processor small."""
 
 
 class Observer:
-    """Reads what the dome emits all the time, from a thread of its own."""
+    """Reads the dome's emitted light all the time in a thread of its own."""
 
     def __init__(self, host: str, port: int) -> None:
         self._dome, self._ending = DomeObserver(host, port), threading.Event()
@@ -93,19 +92,19 @@ class Observer:
                 return
 
     def await_dark(self) -> float:
-        """The time at which the dome was seen dark for good."""
+        """Wait until the dome is dark for good; returns the time of the first dark reading."""
         _wait(lambda: self._lit_since_s is None and time.monotonic() > self._dark_since_s + QUIET_S)
         return self._dark_since_s
 
     def close(self) -> None:
-        """Stop looking."""
+        """Stop reading."""
         self._ending.set()
         self._thread.join()
         self._dome.close()
 
 
 class Bench:
-    """A dome, its observer, and a mouth for the cameras."""
+    """A dome with its observer, and a mouth for the simulated cameras."""
 
     def __init__(self, folder: Path, host: str, port: int, observer: Observer, loads: tuple[str, ...]) -> None:
         self.folder, self.observer, self._address, self._loads = folder, observer, f"{host}:{port}", loads
@@ -114,7 +113,7 @@ class Bench:
 
     @property
     def rig(self) -> dict[str, Any]:
-        """A rig that exposes for so long."""
+        """Description of a rig with exposures of ``EXPOSURE_S``."""
         mouth = str(self.folder / "mouth")
         return {
             "mouth": mouth,
@@ -126,13 +125,13 @@ class Bench:
         }
 
     def new_folder(self) -> Path:
-        """A folder that was not used before."""
+        """Path of a folder that was not used before."""
         self._count += 1
         return self.folder / f"run-{self._count}"
 
     @contextmanager
     def server(self) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
-        """``dentine serve`` with this dome, and its loads."""
+        """Run ``dentine serve`` with this dome and the loads on it for the time of the block."""
         environment = os.environ | {"DENTINE__SERVER__DOME__ADDRESS": self._address}
         command = [sys.executable, "-m", "services", "serve", "--port", "0", "--data", str(self.new_folder())]
         with (
@@ -145,12 +144,12 @@ class Bench:
             yield running
 
     def submit(self, client: httpx.Client) -> str:
-        """A job that captures."""
+        """Submit a job that captures; returns its id."""
         job: str = client.post("/v1/jobs", json={"rig": self.rig, "workers": 1}).raise_for_status().json()["id"]
         return job
 
     def strike(self, how: Callable[[], object]) -> float:
-        """Seconds from the strike in mid-exposure until it is dark."""
+        """Call ``how`` in the middle of an exposure; returns the seconds until the dome is dark."""
         self.observer.await_exposure()
         began_s = time.monotonic()
         how()
@@ -158,7 +157,7 @@ class Bench:
 
 
 def strike_by_request(bench: Bench, path: str) -> Iterator[float]:
-    """Cancel, or press ALL OFF, in one capture after the other of one server."""
+    """Post to ``path`` (cancel or ALL OFF) in one capture after the other of one server; yields the seconds."""
     with bench.server() as (client, _):
         while True:
             job = bench.submit(client)
@@ -231,7 +230,7 @@ def _wait(condition: Callable[[], bool]) -> None:
 
 
 def main() -> None:
-    """Strike so many times each way and print the worst."""
+    """Measure ``--times`` times each way and print the longest and the median time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=300)
     parser.add_argument("--json", type=Path, required=True)

@@ -1,7 +1,7 @@
-"""Loads of a server, as processes of their own: ``python -m tests.benchmarks.dark_loads upload http://127.0.0.1:8000``;
+"""Loads on a server as processes of their own: ``python -m tests.benchmarks.dark_loads upload http://127.0.0.1:8000``;
 they end by SIGTERM.
 
-A load prints one line once it is under way.
+A load prints one line when it has begun to work.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import httpx
 
 HALF_OPEN = 1500
 UNFINISHED = b"GET /v1/health/live HTTP/1.1\r\nHost: 127.0.0.1\r\n"
-"""A request whose headers do not end."""
+"""Beginning of a request whose headers do not end."""
 IMAGE_BYTES, CHUNK_BYTES = 16 * 2**20, 4 * 2**20
 TEXT_BYTES = 2**20
-"""Of a ``capture.json``, which is parsed at the commit."""
+"""Size of a ``capture.json``, which the server parses at the commit."""
 FILES = 1600 + 500
-"""Descriptors that the server and whoever holds the connections need."""
+"""File descriptors that the server and the process with the connections each need."""
 
 
 @contextmanager
@@ -46,7 +46,7 @@ def loaded(load: str, address: str, log: IO[str]) -> Iterator[None]:
 
 
 def allow_many_connections() -> None:
-    """For this process and those that it starts."""
+    """Raise the limit of open files for this process and those that it starts."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(
         resource.RLIMIT_NOFILE,
@@ -56,12 +56,12 @@ def allow_many_connections() -> None:
 
 @cache
 def tell_once() -> None:
-    """Say that the load is under way, the first time."""
+    """Print, at the first call only, that the load has begun to work."""
     print("under way", flush=True)
 
 
 def upload(address: str) -> None:
-    """Send one capture after the other, in big pieces, and have it checked."""
+    """Send one capture after the other in large chunks, and commit each, so that the server checks it."""
     with httpx.Client(base_url=address, trust_env=False, timeout=120) as client:
         while True:
             text = json.dumps(
@@ -101,7 +101,7 @@ def _send(client: httpx.Client, capture: str, number: int, path: str, body: byte
 
 
 def half_open(address: str) -> None:
-    """Hold so many connections without ever finishing a request; one that the server ends is opened again."""
+    """Hold ``HALF_OPEN`` connections with unfinished requests; those that the server closes are opened again."""
     host, port = address.removeprefix("http://").split(":")
     held: list[socket.socket] = []
     while True:
@@ -121,7 +121,7 @@ def half_open(address: str) -> None:
 
 def _has_ended(connection: socket.socket) -> bool:
     try:
-        connection.recv(4096)  # an answer, or the end: this request was never finished
+        connection.recv(4096)  # data or an end means that the server gave the unfinished request up
     except BlockingIOError:
         return False
     except OSError:

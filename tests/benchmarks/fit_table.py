@@ -1,13 +1,13 @@
-"""The rows of "what a fit must reach" for single teeth, on captures rendered by stock Mitsuba with sensor noise, as
-JSON.
+"""Table of the accuracy that a fit of a single tooth must reach, on captures rendered by stock Mitsuba with sensor
+noise, as JSON.
 
 python -m tests.benchmarks.fit_table --cases homogeneous,known --json fit_table.json
 python -m tests.benchmarks.fit_table --cases starts --subjects canine --options '{"max_samples_per_pixel": 256}' \\
     --json starts.json
 
-Reduced scattering and 1 - alpha' are relative errors of what the report says; image errors have sensor noise and the
-truth's Monte Carlo noise taken out, and are not below what the photographs' noise resolves. Fits run in this process,
-on one thread; ``seconds`` is its processor time.
+Figures of reduced scattering and 1 - alpha' are relative errors of the report's values. Image errors have sensor noise
+and the truth's Monte Carlo noise subtracted, and are never below the resolution that the photographs' noise allows.
+Fits run in this process, on one thread; ``seconds`` is its processor time.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ HOMOGENEOUS = "homogeneous"
 JUDGE_SAMPLES = 512
 STARTS = 10
 START_SPREAD = {"sigma": 0.7, "alpha": 0.4}
-"""Half width of the perturbation of a start, in the unbounded domain."""
+"""Half width of a start's uniform random perturbation, by parameter: of ln sigma, and of log10(1 - alpha)."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """One number against its limits; it is reached when it is not above them."""
+    """One figure with its limits; a limit is reached when the figure is not above it."""
 
     case: str
     subject: str
@@ -61,7 +61,7 @@ class Figure:
 
     @property
     def reached(self) -> str:
-        """goal, must or missed."""
+        """The strictest limit reached: ``goal``, ``must`` or ``missed``."""
         if self.goal is not None and self.value <= self.goal:
             return "goal"
         return "must" if self.value <= self.must else "missed"
@@ -79,7 +79,7 @@ class Fit:
 
     @property
     def tissue(self) -> Tissue:
-        """As reported."""
+        """Parameters that the report states."""
         return tissue_of({name: estimate.value for name, estimate in self.report.parameters["green"].items()})
 
     def off(self, part: str, quantity: str) -> float:
@@ -90,7 +90,7 @@ class Fit:
         return abs((1 - float(found.alpha_reduced)) / (1 - true["alpha_reduced"]) - 1)
 
     def image_errors(self) -> tuple[float, float]:
-        """On fitted and on held-out images, not below what can be resolved."""
+        """Relative errors of fitted and of held-out images, at least the resolution that noise allows."""
         sums = self.prepared.errors(self.tissue, samples=JUDGE_SAMPLES, seed=23)
         fitted, held_out = (
             max(one.resolved_error or 0.0, self.prepared.resolution(held))
@@ -99,19 +99,19 @@ class Fit:
         return fitted, held_out
 
     def note(self) -> str:
-        """How it ended."""
+        """Number of steps, and whether the fit converged."""
         return f"{self.report.steps} steps, {'converged' if self.report.converged else 'not converged'}"
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Where fits go, and options for all of them."""
+    """The folder of the fits, and options for all of them."""
 
     folder: Path
     options: dict[str, Any]
 
     def fit(self, subject: str, label: str, *, seed: int = 1, tested_camera: str | None = None, **options: Any) -> Fit:
-        """Fit a stored truth with noise of its own."""
+        """Fit a stored truth with sensor noise."""
         folder = self.folder / f"{subject}-{label}"
         truth = write_capture(subject, folder / "capture", seed=1, tested_camera=tested_camera)
         held_out = {} if tested_camera is not None else {"held_out_lights": SIDE_LIGHTS}
@@ -135,7 +135,7 @@ Row = Callable[[Bench, Sequence[str]], Iterator[Figure]]
 
 
 def homogeneous(bench: Bench, _: Sequence[str]) -> Iterator[Figure]:
-    """A tooth without dentin, five lights and three views."""
+    """Fit a tooth without dentin, with five lights and three views."""
     fit = bench.fit(HOMOGENEOUS, "none", dentin="none")
     row = partial(Figure, "homogeneous", HOMOGENEOUS, seconds=fit.seconds, note=fit.note())
     fitted, held_out = fit.image_errors()
@@ -146,7 +146,9 @@ def homogeneous(bench: Bench, _: Sequence[str]) -> Iterator[Figure]:
 
 
 def known(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
-    """Dentin's surface given. Thickness is known, so sigma d of enamel is as far off as its reduced scattering."""
+    """Fit teeth whose dentin surface is given. Enamel's thickness d is then known, so the relative error of sigma' d is
+    that of its reduced scattering.
+    """
     for subject in subjects:
         fit = bench.fit(subject, "known")
         row = partial(Figure, "known", subject, seconds=fit.seconds, note=fit.note())
@@ -156,7 +158,7 @@ def known(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
 
 
 def free(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
-    """Dentin's shape fitted, enamel's density known."""
+    """Fit the dentin's shape with known scattering of enamel."""
     for subject in subjects:
         fit = bench.fit(subject, "free", dentin="fit", held=known_enamel(subject))
         value = float(np.abs(thickness_mm(fit) - true_thickness_mm(fit)).mean())
@@ -165,11 +167,10 @@ def free(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
 
 
 def stages(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
-    """What dentin leaves of the homogeneous tooth's loss, each by a fit of its own, in exact media.
+    """Compare the loss of a fit with dentin to that of a homogeneous tooth, each from a fit of its own.
 
-    The photographs' noise is part of every loss, and the note says how much: no fit goes below it.
-    These truths are clean; what stains leave of it, on a stained truth, is in
-    ``tests/pipeline/test_fit_stained_truth.py``.
+    The photographs' noise is part of every loss, and no fit goes below it; the note says how much it is. These truths
+    have no stains; ``tests/pipeline/test_fit_stained_truth.py`` compares losses on a stained truth.
     """
     for subject in subjects:
         losses = []
@@ -185,7 +186,7 @@ def stages(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
 
 
 def cameras(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
-    """Two cameras fitted under all lights, the third tested."""
+    """Fit two cameras under all lights, and compare the error of the third one to theirs."""
     for subject in subjects:
         fit = bench.fit(subject, "cameras", tested_camera="c1")
         fitted, tested = fit.image_errors()
@@ -196,7 +197,9 @@ def cameras(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
 
 
 def starts(bench: Bench, subjects: Sequence[str]) -> Iterator[Figure]:
-    """Ten seeds, each with the table's best point moved at random; losses are compared with common seeds."""
+    """Fit with ten seeds, each from a random perturbation of the table's best point. All losses are computed with the
+    same seed.
+    """
     for subject in subjects:
         losses, seconds = [], 0.0
         for seed in range(1, STARTS + 1):
@@ -237,7 +240,7 @@ def thickness_mm(fit: Fit) -> NDArray[np.float64]:
 
 
 def true_thickness_mm(fit: Fit) -> NDArray[np.float64]:
-    """The same of the truth."""
+    """Enamel's true thickness (N,) at the same pixels."""
     meshes = fit.truth.meshes
     return np.asarray(
         thickness_image(meshes["outer"], meshes["dentin"], fit.prepared.observations.manifest.cameras[1])[
@@ -247,7 +250,7 @@ def true_thickness_mm(fit: Fit) -> NDArray[np.float64]:
 
 
 def _incisal_half(fit: Fit) -> NDArray[np.bool_]:
-    # Of the crown, which begins where true enamel is thicker than a root's cover; occlusal is down in the image.
+    # The crown begins where true enamel is thicker than 0.15 mm, the cover of a root; occlusal is down in the image.
     meshes, camera = fit.truth.meshes, fit.prepared.observations.manifest.cameras[1]
     thickness = thickness_image(meshes["outer"], meshes["dentin"], camera)
     rows = np.flatnonzero((np.nan_to_num(thickness) > 0.15).any(axis=1))
@@ -256,8 +259,8 @@ def _incisal_half(fit: Fit) -> NDArray[np.bool_]:
 
 
 def known_enamel(subject: str) -> dict[str, float]:
-    """A truth's enamel as one lobe of the same reduced scattering and absorption, similar to its two lobes to the
-    second order; only absorption is fitted.
+    """Values to hold: a truth's enamel with a single lobe of the same reduced scattering and absorption, similar to its
+    two lobes to the second order. Only absorption is then fitted.
     """
     enamel = read(subject).medium("enamel")
     lobes = ((enamel["beta"], enamel["g1"]), (1 - enamel["beta"], enamel["g2"]))
@@ -289,7 +292,7 @@ def _perturbed(seed: int) -> Callable[[ChannelSchedule], Tissue]:
 
 
 def main() -> None:
-    """Run rows, print them as they come and write them."""
+    """Run the rows asked for; print each figure when it is known, and write all of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", default=",".join(CASES), help="rows, separated by commas")
     parser.add_argument("--subjects", default=",".join(LAYERED), help="stored truths with dentin, separated by commas")

@@ -1,14 +1,14 @@
-"""2,000 fuzzed inputs: what the server says of them, its memory meanwhile, and what they cost others who read.
+"""Effect of 2,000 fuzzed inputs on the server: its answers, its memory, and the latency of other readers.
 
 python -m tests.benchmarks.fuzzed_load --json fuzzed.json [--inputs 2000] [--pairs 12] [--seed 1]
 
-Nine in ten are requests generated from the API's description, right and wrong ones, by callers with every right and
-with none (see ``generated_requests``); the others are captures whose description or image was damaged, announced, sent
-and committed, some of them as costly as may be sent. First they are sent one by one and judged: no failure of the
-server but the documented ones, no traceback in its log, memory. Then the requests are sent again beside somebody who
-reads, in pairs of a quiet and a loaded stretch that change their order; latency counts from when a request was due.
-Requests that made a job run are not sent again, as what a job takes of the machine is the matter of
-``tests.benchmarks.load``.
+Nine in ten inputs are requests generated from the API's description, valid and invalid, by callers with every right and
+with none (see ``generated_requests``). The others are captures with a damaged description or image, which are
+announced, sent and committed; some descriptions are the costliest that the server accepts. First all inputs are sent
+one by one and checked: no undocumented failure of the server, no traceback in its log, and its memory. Then the
+requests are sent again while another client reads, in pairs of a quiet and a loaded period in alternating order.
+Latency counts from the time at which a request was due. Requests that started a job are not sent again, because
+``tests.benchmarks.load`` measures the load of jobs.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ from tests.support.uploading import announce, contents_of, send
 MAX_MEMORY_BYTES = 400e6
 MAX_RATIO = 1.5
 CAPTURE_SHARE = 0.1
-"""Of the inputs: captures."""
+"""Share of the inputs that are captures."""
 COSTLY_SHARE = 0.05
-"""Of the captures: descriptions that take as much memory to parse as what may be sent can."""
+"""Share of the captures with a description that takes as much memory to parse as any of the allowed size."""
 READS_PER_S = 50.0
 STRETCH_S = 4.0
-"""Of one half of a pair."""
+"""Duration of one half of a pair."""
 SAMPLE_S = 0.02
 SENDERS = 8
-"""Threads that send the load, in a process of its own."""
+"""Number of threads that send the load, in a process of their own."""
 RESAMPLES = 500
 
 Row = dict[str, Any]
@@ -66,17 +66,17 @@ Recorded = tuple[str, str, dict[str, str], bytes | str | None]
 
 @dataclass
 class Memory:
-    """Highest sizes of a server so far, bytes."""
+    """Highest resident memory of a server so far, bytes."""
 
     server: int = 0
-    """Resident, of its own process."""
+    """Of the server's own process."""
     with_readers: int = 0
-    """Together with the processes in which it reads what uploads hold."""
+    """Of the server together with the processes in which it reads uploaded files."""
 
 
 @contextmanager
 def watched(process: psutil.Process) -> Iterator[Memory]:
-    """The highest sizes while the block runs."""
+    """Record the highest resident memory while the block runs."""
     memory, is_over = Memory(), threading.Event()
 
     def watch() -> None:
@@ -99,7 +99,7 @@ def watched(process: psutil.Process) -> Iterator[Memory]:
 
 
 def main() -> None:
-    """Measure, print and write; the exit status tells whether all limits were kept."""
+    """Measure, print and write; the exit status is 0 if all limits were kept."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--inputs", type=int, default=2000)
@@ -172,7 +172,7 @@ def _record(answer: requests.Response, recorded: list[Recorded]) -> None:
 
 
 def _send_capture(client: httpx.Client, source: Path, dice: random.Random, number: int) -> int:
-    """Announce, send and commit a damaged capture; returns the status of the commit, or of what refused it before."""
+    """Announce, send and commit a damaged capture; returns the status of the commit, or of an earlier refusal."""
     contents = contents_of(source) | {"extra.toml": f"number = {number}\n".encode()}
     name = dice.choice(["capture.json", "c0_l0.npy"])
     if dice.random() < COSTLY_SHARE:
@@ -196,7 +196,7 @@ def _send_capture(client: httpx.Client, source: Path, dice: random.Random, numbe
 
 
 def _damaged(content: bytes, dice: random.Random) -> bytes:
-    """Some bytes of it others, left out or repeated."""
+    """Replace, delete or repeat some bytes of a file's content."""
     start = dice.randrange(len(content))
     end = min(len(content), start + dice.choice([0, 1, 2, 8, 64]))
     between = dice.choice(
@@ -233,7 +233,9 @@ def _reads(witnesses: KeptData) -> list[Ask]:
 def _pairs(
     target: Served, reads: Sequence[Ask], recorded: Sequence[Recorded], pairs: int, dice: random.Random
 ) -> list[tuple[list[Answer], list[Answer]]]:
-    """Answers of quiet and of loaded stretches; every input is sent once more over all loaded ones."""
+    """Measure pairs of a quiet and a loaded period; returns the answers (quiet, loaded) of each pair. Over all loaded
+    periods, every recorded request is sent once.
+    """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     load = context.Process(target=_send_load, args=(there, list(recorded)))
@@ -258,7 +260,7 @@ def _pairs(
 
 
 def _send_load(orders: Connection, recorded: list[Recorded]) -> None:
-    """Send so many of the requests from one on, evenly over a stretch, whenever it is told to."""
+    """For each order (first, count), send these requests evenly over one period; an order of None ends the process."""
     local = threading.local()
 
     def send_one(one: Recorded) -> None:
@@ -286,7 +288,7 @@ def _p99(answers: Sequence[Answer]) -> float:
 def _ratio(
     stretches: Sequence[tuple[list[Answer], list[Answer]]], dice: random.Random
 ) -> tuple[float, tuple[float, float]]:
-    """Of the loaded p99 to the quiet one, and its 95 % interval by resampling pairs."""
+    """Ratio of the loaded p99 latency to the quiet one, and its 95 % interval by bootstrap over pairs."""
 
     def ratio(chosen: Sequence[tuple[list[Answer], list[Answer]]]) -> float:
         quiet, loaded = ([answer for stretch in kind for answer in stretch] for kind in zip(*chosen, strict=True))

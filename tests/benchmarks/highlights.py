@@ -1,15 +1,16 @@
-"""How much reflected light the mask of highlights takes, beside the best threshold on the true reflection.
+"""Share of reflected light that the mask of highlights covers, compared to the best threshold on the true reflection.
 
 python -m tests.benchmarks.highlights --json highlights.json
 python -m tests.benchmarks.highlights --roughness 0.2 --json highlights.json
 
-A glossy tooth by stock Mitsuba (GGX, index 1.631), still, under twelve lights from two sides, with 1 % of noise; what
-it reflects is the difference to the same render without reflection. A row says what share of the reflected light is
-masked, and what share of the dull pixels, whose reflection is below 1 % of their diffuse light, is masked falsely.
-The best threshold knows the reflection of every pixel and masks the strongest until 3 % are false: what no mask of
-pixels can beat. Where no pixel is dull it masks all; so a row also says what the strongest pixels reflect, as many as
-the mask has. The row "matte" is the tooth without its reflection, of which nothing should be masked. Rows that the
-file has already are kept. Some 5 seconds of a core a roughness.
+A glossy tooth at rest is rendered by stock Mitsuba (GGX, index 1.631) under twelve lights from two views, with 1 % of
+noise; its reflected light is the difference to the same render without reflection. A row states the share of the
+reflected light that is masked, and the share of dull pixels (reflection below 1 % of their diffuse light) that are
+masked falsely. The best threshold knows the reflection of every pixel and masks the strongest until 3 % of the dull
+pixels are masked; no mask of pixels can beat it. Where no pixel is dull it masks all; therefore a row also states the
+share of reflected light in the strongest pixels, as many as the mask covers. The row "matte" is the tooth without its
+reflection, where nothing should be masked. Rows that the file holds already are kept. A roughness takes some 5 seconds
+of a core.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ LIGHTS, VIEWS_DEG = 12, ((0, 0), (30, 10))
 SIZE, PIXEL_MM, SAMPLES = (124, 156), 0.09, 16
 NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002
 DULL = 0.01
-"""Of its diffuse light: a pixel that reflects less is better kept."""
+"""Reflected light as a share of diffuse light below which a pixel is dull and should not be masked."""
 FALSE = 0.03
 
 
@@ -62,7 +63,7 @@ def main() -> None:
 
 
 def renders(roughness: float) -> dict[str, NDArray[Any]]:
-    """Images with and without reflection, and what describes them."""
+    """Render images with and without reflection; returns the arrays of ``render_moving_tooth.render``."""
     options = {
         "size": SIZE,
         "pixel_mm": PIXEL_MM,
@@ -82,10 +83,10 @@ def renders(roughness: float) -> dict[str, NDArray[Any]]:
 
 
 def row_of(rendered: dict[str, NDArray[Any]], random: np.random.Generator) -> dict[str, float]:
-    """Shares over all lights and views."""
+    """Shares of masked light and pixels over all lights and views."""
     reflected, share, masked = (np.concatenate(one) for one in zip(*_pixels(rendered, random), strict=True))
     energy, false = _shares(reflected, share, masked)
-    # The strongest first, by their share of the pixel's diffuse light, as a threshold has them
+    # The best threshold masks pixels by the ratio of their reflected to their diffuse light, highest first.
     best_energy, best_false = _shares(*_best(reflected, share))
     return {
         "energy": energy,
@@ -101,7 +102,7 @@ def row_of(rendered: dict[str, NDArray[Any]], random: np.random.Generator) -> di
 
 
 def matte_row(rendered: dict[str, NDArray[Any]], random: np.random.Generator) -> dict[str, float]:
-    """What share of the pixels is masked where nothing reflects."""
+    """Share of the pixels that is masked where nothing reflects."""
     pixels = _pixels(rendered | {"total": rendered["diffuse"]}, random)
     masked = np.concatenate([own for _, _, own in pixels])
     return {"masked": float(masked.mean()), "pixels": len(masked)}
@@ -111,7 +112,9 @@ Column = NDArray[Any]
 
 
 def _pixels(rendered: dict[str, NDArray[Any]], random: np.random.Generator) -> list[tuple[Column, Column, Column]]:
-    """Reflected light, its share of the diffuse light, and whether it is masked, of pixels that show tooth alone."""
+    """Reflected light, its ratio to diffuse light, and whether the pixel is masked (each (N,)), by camera and light.
+    The pixels are those that show only the tooth and are lit.
+    """
     height, width = rendered["total"].shape[2:4]
     mesh, found = Mesh(rendered["vertices_mm"], rendered["faces"]), []
     for k, pose in enumerate(rendered["camera_from_world"]):
@@ -134,19 +137,19 @@ def _pixels(rendered: dict[str, NDArray[Any]], random: np.random.Generator) -> l
 
 
 def _shares(reflected: Column, share: Column, masked: Column) -> tuple[float, float]:
-    """Of the reflected light that is masked, and of the dull pixels that are."""
+    """Share of the reflected light that is masked, and share of the dull pixels that are masked."""
     dull = share < DULL
     return float(reflected[masked].sum() / reflected.sum()), float((masked & dull).sum() / max(dull.sum(), 1))
 
 
 def _best(reflected: Column, share: Column) -> tuple[Column, Column, Column]:
-    """What the threshold masks that lets ``FALSE`` of the dull pixels through."""
+    """Arguments of ``_shares`` for the threshold that masks a share ``FALSE`` of the dull pixels."""
     dull = np.sort(share[share < DULL])
     return reflected, share, share >= (dull[int((1 - FALSE) * len(dull))] if len(dull) else 0)
 
 
 def _strongest(share: Column, count: int) -> Column:
-    """So many of the pixels that reflect most."""
+    """Mask (N,) of the ``count`` pixels with the strongest reflection."""
     chosen = np.zeros(len(share), dtype=bool)
     chosen[np.argsort(share)[len(share) - count :]] = True
     return chosen

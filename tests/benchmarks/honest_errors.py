@@ -1,4 +1,4 @@
-"""Whether a fit's ± is true: many small fits of known teeth, how many of the 95 % intervals hold the truth, and the
+"""Check of a fit's ± by many small fits of known teeth: the number of 95 % intervals that contain the truth, and the
 z-scores.
 
 python -m tests.benchmarks.honest_errors --fits 100 --json honest_errors.json
@@ -6,12 +6,13 @@ python -m tests.benchmarks.honest_errors --fits 100 --truths 20 --json honest_er
 python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --json honest_errors_formula.json
 python -m tests.benchmarks.honest_errors --fits 100 --truths 100 --formula --shape --json honest_errors_shape.json
 
-Each fit is the product's own, from a prepared stage with fresh sensor noise to its report, on an ellipsoid of enamel
+Each fit is that of the product, from a prepared stage with new sensor noise to its report, on an ellipsoid of enamel
 and dentin of some 90 pixels under six lights (one held out). The truth is rendered with ``--paths`` paths per pixel.
-With ``--truths 1`` its mean cosine is the one that fits hold; with more, optical parameters are drawn around the centre
-and mean cosines from the fit's own prior, so that what holding g costs is judged too. ``--formula`` puts a formula in
-place of light transport, in which similar media are not alike either: a second per fit, and the solver's errors alone.
-With ``--shape`` the dentin's blend weights are drawn and fitted too, and enamel's mean thickness is judged.
+With ``--truths 1`` its mean cosine g is the value that fits hold. With more truths, optical parameters are drawn around
+the centre and mean cosines from the fit's own prior, so that the errors from holding g are checked too. ``--formula``
+replaces light transport by a formula in which media of equal reduced quantities give different images too; a fit then
+takes a second, and only the solver's errors are checked. With ``--shape`` the dentin's blend weights are also drawn and
+fitted, and enamel's mean thickness is checked.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ from tests.support.prepared import write_prepared
 from tests.support.rendered_capture import rendered_tooth
 
 CENTRE = {"enamel": (0.9, 0.01), "dentin": (2.4, 0.03)}
-"""Reduced scattering and absorption, per mm."""
+"""Reduced scattering and absorption (per mm) about which truths are drawn, by tissue."""
 FORMULA = "tests.support.fake_engine:DirectFakeEngine"
 LEAVES = ("sigma_s_reduced", "alpha_reduced")
 INTERVAL = 1.959964
 
 
 def tissue_of(reduced: dict[str, tuple[float, float]], g: dict[str, float]) -> Tissue:
-    """Media of given reduced scattering and absorption, per mm, and mean cosine."""
+    """Tissue of given reduced scattering and absorption (per mm) and mean cosine."""
     media = {}
     for part, (scattering, absorption) in reduced.items():
         sigma = scattering / (1 - g[part]) + absorption
@@ -58,8 +59,8 @@ def tissue_of(reduced: dict[str, tuple[float, float]], g: dict[str, float]) -> T
 
 
 def drawn_tissue(rng: np.random.Generator, *, with_shape: bool = False) -> Tissue:
-    """Scattering and absorption up to a factor of 1.3 and 1.6 from the centre, mean cosines from the prior of fits,
-    blend weights where they are wanted.
+    """Draw a tissue: scattering and absorption within factors of 1.3 and 1.6 of the centre, mean cosines from the fit's
+    prior cut at two standard deviations, and blend weights if ``with_shape``.
     """
     cosines = {"enamel": COSINE, "dentin": WEAK["dentin.g1"]}
     reduced = {part: (s * 1.3 ** rng.uniform(-1, 1), a * 1.6 ** rng.uniform(-1, 1)) for part, (s, a) in CENTRE.items()}
@@ -74,15 +75,15 @@ def drawn_tissue(rng: np.random.Generator, *, with_shape: bool = False) -> Tissu
 
 
 class Subject(Protocol):
-    """What can be photographed."""
+    """A tooth that can be photographed."""
 
     def photograph(self, root: Path, seed: int) -> None:
-        """Publish ``prepared`` in ``root`` with the sensor's noise drawn anew."""
+        """Publish ``prepared`` in ``root`` with new sensor noise."""
 
 
 @dataclass(frozen=True)
 class FormulaTooth:
-    """Images by the formula of ``DirectFakeEngine``."""
+    """A tooth whose images follow the formula of ``DirectFakeEngine``."""
 
     truth: Tissue
 
@@ -94,7 +95,7 @@ class FormulaTooth:
 def fit_rows(
     tooth: Subject, truth: Tissue, seed: int, options: dict[str, object], engine: str = ENGINE
 ) -> Iterator[dict[str, object]]:
-    """One fit's quantities with what they should be."""
+    """Run one fit; yields one row per quantity with its estimate and its true value."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         tooth.photograph(root, seed)
@@ -139,7 +140,7 @@ def fit_rows(
 
 
 def summary(rows: list[dict[str, object]]) -> list[dict[str, object]]:
-    """Per quantity: intervals that hold the truth, mean and rms of z, median relative standard error."""
+    """Per quantity: number of intervals that contain the truth, mean and rms of z, median relative standard error."""
     found = []
     for name in dict.fromkeys(str(row["quantity"]) for row in rows):
         mine = [row for row in rows if row["quantity"] == name]

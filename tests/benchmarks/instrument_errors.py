@@ -1,17 +1,17 @@
-"""What errors of the instrument do to a fit, with its errors as coordinates and without: bias of the media over their
-±, as JSON.
+"""Bias of a fit by errors of the instrument, over the media's ±, with the instrument's errors as unknowns of the fit
+and without, as JSON.
 
 python -m tests.benchmarks.instrument_errors --json instrument_errors.json
 python -m tests.benchmarks.instrument_errors --errors none,gain --pixel-step 3 --json gain.json
 python -m tests.benchmarks.instrument_errors --errors none,far_gain,far_light,far_scan,exchanged --seeds 3 \\
     --instrument on --json faults.json
 
-The stored central incisor as stock Mitsuba renders it, with sensor noise, is photographed by an instrument with one
-error: its images are scaled, or light is added to them, or its lights, scan or dome are said to be elsewhere, by two of
-the ± that are assumed, or by far more, where the fit has to name the fault. Bias is that of the fit with the error less
-that of the fit without, so that what the fit itself leaves cancels; with several seeds of the sensor's noise, of the
-same seed. Fits run in this process, on one thread; ``seconds`` is its processor time, ``samples`` the paths of its last
-step.
+The stored central incisor, rendered by stock Mitsuba with sensor noise, is photographed by an instrument with one
+error: its images are scaled, or light is added to them, or the stated positions of its lights, scan or dome are wrong.
+The error is two assumed standard errors, or far more, where the fit has to name the fault. Bias is the difference
+between the fits with and without the error for the same seed of the sensor's noise, so that the fit's own errors
+cancel. Fits run in this process, on one thread; ``seconds`` is its processor time, ``samples`` the number of paths of
+its last step.
 """
 
 from __future__ import annotations
@@ -45,29 +45,30 @@ OPTIONS: dict[str, Any] = {"boundary": "matched", "dentin": "known", "advise": F
 LIGHT = "l0"
 FAR_LIGHT = "l1"
 EXCHANGED = ("l0", "l3")
-"""Lights that are fitted, of which each camera's photographs are exchanged."""
+"""Two fitted lights whose photographs are exchanged in every camera."""
 SCAN_OFF_MM, FAR_SCAN_MM, DOME_OFF_MM, FAR_LIGHT_MM = 0.1, 1.0, 4.0, 30.0
-"""Two of the assumed ± of scan and dome; and what is far from any ±."""
+"""Position errors: twice the assumed standard errors of scan and dome (``*_OFF_MM``), and errors far beyond any assumed
+standard error (``FAR_*``)."""
 FAULTS: Mapping[str, Callable[[FitReport], bool]] = {
     "far_gain": lambda report: "gain.green" in report.instrument_faults.get("green", ()),
     "far_light": lambda report: f"light_gain.{FAR_LIGHT}" in report.instrument_faults.get("green", ()),
     "far_scan": lambda report: "mm apart" in report.advice,
     "exchanged": lambda report: all(name in report.advice for name in ("seem exchanged", *EXCHANGED)),
 }
-"""Whether a report names what is wrong."""
+"""By error: a function that says whether the report names the fault."""
 LIGHTS_OFF_MM = 10.0
-"""Root mean square distance of the stated lights from the true ones, in a direction of its own each."""
+"""Distance of each stated light from its true position, in a random direction."""
 
 
 def perturb(folder: Path, error: str) -> None:
-    """Change a written capture as an instrument with an error would have, ``none`` or one of ``ERRORS``."""
+    """Change a written capture into that of an instrument with an error: ``none`` or one of ``ERRORS``."""
     description = json.loads((folder / "capture.json").read_text())
     if error in ("lights", "dome", "far_light"):
         _move_lights(description["lights"], error)
         (folder / "capture.json").write_text(json.dumps(description))
         return
     if error in ("scan", "far_scan"):
-        # Across the line of sight of the first camera, as the others see it aslant.
+        # Move the scan perpendicular to the first camera's line of sight; the other cameras see it obliquely.
         right = np.array(description["cameras"][0]["camera_from_world"])[0, :3]
         for path in (folder / "teeth").rglob("*.ply"):
             mesh = read_mesh(path)
@@ -109,7 +110,7 @@ def _move_lights(lights: list[dict[str, Any]], error: str) -> None:
         ways = np.random.default_rng(7).standard_normal((len(lights), 3))
         ways *= LIGHTS_OFF_MM / np.linalg.norm(ways, axis=1, keepdims=True)
     else:
-        # The dome to the side; one light towards the tooth, where it is told by its brightness.
+        # Move the dome to the side, or one light towards the tooth, where its brightness shows the error.
         towards = -np.array([light["position_mm"] for light in lights])
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         chosen = np.array([error == "dome" or light["name"] == FAR_LIGHT for light in lights])
@@ -120,10 +121,11 @@ def _move_lights(lights: list[dict[str, Any]], error: str) -> None:
 
 
 def fit(folder: Path, error: str, seed: int = 1, **options: Any) -> dict[str, Any]:
-    """One fit of the perturbed capture: values, ± and what they are made of, the instrument's errors, and what it took.
+    """Fit the perturbed capture; returns values with their ± and parts of these, the estimated errors of the
+    instrument, and the fit's cost.
 
     Args:
-        seed: of the sensor's noise.
+        seed: seed of the sensor's noise.
     """
     write_capture(SUBJECT, folder / "capture", seed=seed)
     perturb(folder / "capture", error)
@@ -154,7 +156,7 @@ def fit(folder: Path, error: str, seed: int = 1, **options: Any) -> dict[str, An
 
 
 def rows(fits: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Bias in percent and over its ± by error, with and without coordinates; off the truth, too."""
+    """One row per fit: each quantity's bias in per cent of the truth and over its ±, and its error over its ±."""
     truth = read(SUBJECT)
     media = {part: truth.medium(part) for part in ("enamel", "dentin")}
     true = {f"{part}.sigma_s_reduced": one["sigma_s_reduced"] for part, one in media.items()}
@@ -183,7 +185,7 @@ def rows(fits: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Run the fits asked for, write after each, and print the rows."""
+    """Run the fits asked for, write the file after each, and print the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--json", type=Path, required=True, help="where results go; fits that are in it are not run again"

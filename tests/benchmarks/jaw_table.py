@@ -1,4 +1,4 @@
-"""The row "jaw of 14" of what a fit must reach, tooth by tooth, on the jaw that stock Mitsuba rendered
+"""Accuracy that the fit of a jaw of 14 teeth must reach, tooth by tooth, on the jaw that stock Mitsuba rendered
 (``tests/support/jaw_truth.py``), as JSON.
 
 python -m tests.benchmarks.jaw_table --json jaw_table.json
@@ -6,10 +6,10 @@ python -m tests.benchmarks.jaw_table --options '{"max_samples_per_pixel": 96, "m
     --json jaw_table.json
 python -m tests.benchmarks.jaw_table --options '{"dentin": "fit"}' --photographs engine --json jaw_table.json
 
-Every visible tooth is held to the limits of a single one with known dentin. The photographs' own noise, that of the
-sensor and of the renderer, is part of every number: a medium's figure comes with its standard error, an image's with
-the error that this noise alone looks like in so few pixels. Photographs by the project's engine have the sensor's noise
-alone: they tell what the fit adds, not whether the engine is right.
+Every visible tooth is compared to the limits of a single tooth with known dentin. The noise of sensor and renderer is
+part of every figure: a medium's figure has its standard error beside it, an image's figure the error that this noise
+alone gives in so few pixels. Photographs by the project's engine have the sensor's noise alone; they show the errors of
+the fit, not those of the engine.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from services.core.records import JobSpec, PreparedManifest
 from services.core.results import FitReport
 from services.core.store import open_stage
 from services.fit.checks.thickness import enamel_thickness_mm
-from services.fit.jaw.views import showing
+from services.fit.jaw.views import views_of_parts
 from services.fit.optics.parameters import Mouth
 from services.fit.stage import fitted_teeth
 from tests.benchmarks.fit_table import Figure
@@ -50,16 +50,16 @@ PHOTOGRAPH_SAMPLES = 2048
 
 @dataclass(frozen=True)
 class JawFigure(Figure):
-    """One tooth's number, with what noise makes of it."""
+    """One tooth's figure, with the part that noise can explain."""
 
     resolution: float = 0.0
-    """Of a medium one standard error of its logarithm, where errors are even; of images the error that noise of
-    photographs and renders looks like."""
+    """For a medium, the relative standard error; for images, the error that the noise of photographs and renders alone
+    gives; for thickness, the standard error in mm."""
 
     @property
     def is_beyond_noise(self) -> bool:
-        """Whether it misses its limit by more than three times what noise does; squares of image errors are what noise
-        adds to.
+        """Whether the figure misses its limit by more than three times the resolution. Noise adds to the squares of
+        image errors, so these are compared as squares.
         """
         if self.figure == IMAGE:
             return self.value**2 > self.must**2 + 3 * self.resolution**2
@@ -68,7 +68,7 @@ class JawFigure(Figure):
 
 @dataclass(frozen=True)
 class Cost:
-    """Of a whole job, preparation and report included."""
+    """Cost of a whole job, including preparation and report."""
 
     processor_s: float
     wall_s: float
@@ -92,7 +92,7 @@ def fit(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int) ->
 
 
 def figures(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int = 1) -> Iterator[JawFigure]:
-    """Every visible tooth's numbers, those of all images together first."""
+    """Yield the figure of all images together, then those of every visible tooth."""
     spec, report, cost = fit(folder, truth, options, workers)
     images = judged(prepared_jaw(folder / "job", spec), reported_mouth(report, truth.mouth), JUDGE_SAMPLES)
     ended = f"{report.steps} steps, {'converged' if report.converged else 'not converged'}; {cost}"
@@ -139,7 +139,7 @@ def figures(folder: Path, truth: JawTruth, options: dict[str, Any], workers: int
 
 
 def thickness_off_mm(folder: Path, truth: JawTruth, spec: JobSpec, report: FitReport, fdi: int) -> float:
-    """Mean error of the enamel's thickness over the occlusal half of a tooth's crown."""
+    """Mean absolute error of enamel's thickness (mm) over the occlusal half of a tooth's crown."""
     prepared, manifest = open_stage(folder / "job", "prepared", PreparedManifest)
     (found,) = (tooth for tooth in fitted_teeth(prepared, manifest, spec, report) if tooth.fdi == fdi)
     (true,) = (tooth for tooth in truth.jaw.teeth if tooth.fdi == fdi)
@@ -152,10 +152,10 @@ def thickness_off_mm(folder: Path, truth: JawTruth, spec: JobSpec, report: FitRe
 
 
 def judged(prepared: PreparedTooth, mouth: Mouth, samples: int) -> Iterator[tuple[float, float]]:
-    """Held-out error of all images and then of each tooth's pixels, with the error that noise of photographs and
-    renders looks like.
+    """Yield the held-out error of all images, then of each tooth's pixels, each with the error that the noise of
+    photographs and renders alone gives.
     """
-    for views in (prepared.views, *(showing(prepared.views, k) for k in range(len(mouth.teeth)))):
+    for views in (prepared.views, *(views_of_parts(prepared.views, k) for k in range(len(mouth.teeth)))):
         own = replace(prepared, views=views)
         held_out = own.errors(mouth, samples=samples, seed=23)[1]
         signal = held_out.reference_squared - held_out.reference_variance
@@ -163,13 +163,13 @@ def judged(prepared: PreparedTooth, mouth: Mouth, samples: int) -> Iterator[tupl
 
 
 def _processor_s() -> float:
-    # Of this process and of children that have ended.
+    # Processor time of this process and of its children that have ended.
     usage = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(one.ru_utime + one.ru_stime for one in usage)
 
 
 def main() -> None:
-    """Print the figures as they come and write them."""
+    """Print each figure when it is known, and write all of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--options", default="{}", help="options of the job, JSON")
     parser.add_argument("--workers", type=int, default=1)

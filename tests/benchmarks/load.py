@@ -1,4 +1,5 @@
-"""The server under load: requests against a bare route, event streams, a long queue, and a day at speed, as JSON.
+"""The server under load: requests compared to a bare route, event streams, a long queue, and a day in quick motion, as
+JSON.
 
 python -m tests.benchmarks.load --json load.json [--quick] [--only mixed,streams,queue,day]
 """
@@ -30,7 +31,7 @@ PARTS: dict[str, tuple[Callable[..., Iterable[dict[str, Any]]], dict[str, Any], 
     "queue": (submissions.measure, {"jobs": 100}, {"jobs": 5}),
     "day": (day.measure, {"quarters": day.QUARTERS_OF_A_DAY}, {"quarters": 8}),
 }
-"""What measures, its size, and its size where it only has to be quick."""
+"""By part: the function that measures, its full size, and its size with ``--quick``."""
 
 
 def main() -> None:
@@ -43,7 +44,7 @@ def main() -> None:
     parser.add_argument("--only", default=",".join(PARTS), help="parts to measure, separated by commas")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # and end the servers
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the servers are ended too
     rows = []
     for name in options.only.split(","):
         measure, full, quick = PARTS[name]

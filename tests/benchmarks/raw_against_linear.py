@@ -1,14 +1,14 @@
-"""What a fit of raw photographs reaches beside one of the linear images that they were taken of.
+"""Comparison of a fit of raw photographs to a fit of the linear images from which they were made.
 
 python -m tests.benchmarks.raw_against_linear --folder raw-against-linear --json raw_against_linear.json
 
-The demonstration's tooth under eight lights, two of them held out, as its first camera sees it. Between its pixels of
-0.5 mm it is interpolated, and photographed at twice as many by a known sensor: a mosaic of 12 bits, three exposures
-four times apart, shot and read noise, black frames, tracking frames, flat fields. Red and blue are shades of the
-green that was rendered. Both captures are prepared and fitted in green with the same options, at means over 2 x 2
-pixels. Neither tells the noise that the images have of their rendering, so it counts in both errors; ``scene_noise``
-is how much it is, and ``ratio_without`` the errors' ratio once it is taken out. Some minutes of a core; what is in
-the folder already is not made again.
+The scene is the demonstration's tooth under eight lights, two of them held out, as its first camera sees it. Its images
+with pixels of 0.5 mm are interpolated and photographed at twice the resolution by a known sensor: a mosaic of 12 bits,
+three exposures with factors of four between them, shot and read noise, black frames, tracking frames, flat fields. Red
+and blue are the rendered green times a constant. Both captures are prepared and fitted in green with the same options,
+with means over 2 x 2 pixels. Neither capture states the noise of the rendering, so it is part of both errors;
+``scene_noise`` is its size, and ``ratio_without`` the ratio of the errors without it. It takes some minutes of a core;
+results that are in the folder already are not computed again.
 """
 
 from __future__ import annotations
@@ -34,23 +34,24 @@ from tests.support.raw_captures import write_raw_capture
 from tests.support.raw_sensor import Sensor
 
 CELL = 2
-"""Pixels of the sensor along a pixel of the demonstration, and what fits average."""
+"""Pixels of the sensor along the side of a pixel of the demonstration; fits average over squares of this side."""
 KEPT_NOISE = (0.75**2 + 2 * 0.125**2) ** 2
-"""Of the images' variance, in means over cells: a cell's mean has weights 1/8, 3/4, 1/8 along each side."""
+"""Factor by which interpolation and the mean over a cell lower the images' variance: a cell's mean has the weights 1/8,
+3/4, 1/8 along each side."""
 CHANNELS, SHADES = ("red", "green", "blue"), (1.1, 1.0, 0.8)
-"""A tooth's colours, relative to green."""
+"""Channels, and the radiance of a tooth in each relative to green."""
 EXPOSURES_S = (0.0125, 0.05, 0.2)
 SENSOR = Sensor(bits=12, read_counts=2.0, counts_per_electron=0.5, mosaic="RGGB")
-"""8,000 electrons at full scale: half of a small-pixel camera's, and 1.1 % of noise there."""
+"""Sensor with 8,000 electrons at full scale, half of those of a camera with small pixels; shot noise there is 1.1 %."""
 CHEAP = MappingProxyType({"image_tolerance": 0.01, "max_samples_per_pixel": 256})
-"""Of the images' noise of 3 %, more is not seen."""
+"""Options of a cheap fit; more precision would not show beside the images' noise of 3 %."""
 JUDGE_PASS = 1024
-"""Paths per pixel of one pass of the judge."""
+"""Paths per pixel of one pass of the renders that judge a fit."""
 CHANNEL, HELD_OUT = "green", ["l3", "l7"]
 
 
 def main() -> None:
-    """Photograph, prepare and fit both, and write the rows."""
+    """Write, prepare and fit both captures, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True, help="kept, and gone on with")
     parser.add_argument("--json", type=Path, required=True)
@@ -81,7 +82,7 @@ def main() -> None:
 
 
 def _judged(rows: dict[str, dict[str, Any]], truth: Path, job: Path) -> dict[str, Any]:
-    """The fits and the ratio of their errors."""
+    """The fits, and the ratio of their errors with and without the rendering's noise."""
     noise = _scene_noise(truth, job)
     errors = {name: row["held_out_error"] for name, row in rows.items()}
     without = {name: float(np.sqrt(max(error**2 - noise**2, 0.0))) for name, error in errors.items()}
@@ -95,7 +96,7 @@ def _judged(rows: dict[str, dict[str, Any]], truth: Path, job: Path) -> dict[str
 
 
 def _write_linear(target: Path, mouth: Path) -> None:
-    """The first camera's images in three channels, at the sensor's pixels, without their variance."""
+    """Write the first camera's images in three channels, at the sensor's pixels, without their variance."""
     found = read_record(mouth / "capture.json", FolderCapture)
     (column, row, last), (width, height) = found.cameras[0].K, found.cameras[0].size
     K = tuple(tuple(CELL * value for value in line) for line in (column, row))
@@ -103,7 +104,8 @@ def _write_linear(target: Path, mouth: Path) -> None:
     images = [one for one in found.images if one.camera == camera.name]
     shutil.copytree(mouth / "teeth", target / "teeth")
     for image in images:
-        # Smooth, as a lens leaves it: steps between cells would move the colours of a mosaic against each other
+        # Interpolate linearly, as a lens blurs; steps between cells would shift the mosaic's colours relative to each
+        # other.
         fine = cv2.resize(np.load(mouth / image.file)[..., 0], camera.size, interpolation=cv2.INTER_LINEAR)
         np.save(target / image.file, (fine[..., None] * SHADES).astype(np.float32))
     changes = {
@@ -129,10 +131,10 @@ def _prepare(spec: JobSpec, job: Path) -> None:
 
 
 def _images_error(jobs: dict[str, Path]) -> dict[str, float]:
-    """How far prepared photographs are from the images, in squares that both have, relative to these.
+    """Relative rms difference between prepared photographs and the images, over squares that are valid in both.
 
-    ``noise`` is what the photographs' stated variance lets expect of that, and ``systematic`` what is left without it:
-    in squares, it adds to a fit's error.
+    ``noise`` is the difference that the photographs' stated variance explains, and ``systematic`` the rest, whose
+    square adds to that of a fit's error.
     """
     (linear, first), (raw, second) = (
         open_stage(jobs[name], "prepared", PreparedManifest) for name in ("linear", "raw")
@@ -165,7 +167,7 @@ def _images_error(jobs: dict[str, Path]) -> dict[str, float]:
 
 
 def _fitted(spec: JobSpec, job: Path) -> dict[str, Any]:
-    """Errors, parameters and time of the fit of what was prepared."""
+    """Fit a prepared capture; returns errors, parameters and time. A result in the job's folder is read instead."""
     from services.fit.stage import run as fit
     from services.fit.transport.platform import prepare_device
 
@@ -192,7 +194,7 @@ def _fitted(spec: JobSpec, job: Path) -> dict[str, Any]:
 
 
 def _errors(spec: JobSpec, job: Path, row: dict[str, Any], samples: int) -> dict[str, float]:
-    """A fit's errors by more paths than it had itself, the same ones for both captures."""
+    """Errors of a fit, from renders with ``samples`` paths per pixel and with the same seeds for both captures."""
     tissue = tissue_of({name: one["value"] for name, one in row["parameters"].items()})
     tooth, fitted, held_out = prepared_tooth(job, spec), ErrorSums(), ErrorSums()
     for seed in range(1, max(samples // JUDGE_PASS, 1) + 1):
@@ -206,7 +208,7 @@ def _errors(spec: JobSpec, job: Path, row: dict[str, Any], samples: int) -> dict
 
 
 def _scene_noise(mouth: Path, job: Path) -> float:
-    """Noise of the held-out images' rendering, relative to them."""
+    """Relative noise of the held-out images from their rendering."""
     stage, prepared = open_stage(job, "prepared", PreparedManifest)
     valid = StoredArray(stage / "prepared.zarr" / "valid")
     names, spread, light = [one.name for one in prepared.lights], 0.0, 0.0
@@ -221,7 +223,7 @@ def _scene_noise(mouth: Path, job: Path) -> float:
 
 
 def _squares(image: np.ndarray) -> np.ndarray:
-    """(h, w, CELL²) values of each whole square."""
+    """Reshape an image (H, W) to the values (H // CELL, W // CELL, CELL²) of each whole square."""
     height, width = (length // CELL for length in image.shape)
     cut = image[: height * CELL, : width * CELL].reshape(height, CELL, width, CELL)
     return np.moveaxis(cut, 2, 1).reshape(height, width, CELL**2)

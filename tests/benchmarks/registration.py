@@ -1,14 +1,14 @@
-"""How often the registration check finds teeth 1 mm beside their mesh, and how often it accuses those in place.
+"""Detection rate of the registration check for teeth 1 mm beside their mesh, and false-alarm rate for teeth in place.
 
 python -m tests.benchmarks.registration --json registration.json      some 4 core-minutes
 
-No fit is run. The 200 photographs in place are 20 phantoms (``tests.support.registered_phantoms``: size, pose, camera,
-pixels of 0.5 to 0.8 mm, optics and gums of their own) x 10 draws of noise; the 200 of teeth 1 mm beside their mesh,
-across the line of sight, are the same phantoms x 2 directions x 5 draws. As after a fit, the check sees a camera's
-brightest image and a held-out one from a grazing light, and renders of 32, 128 or 512 paths per pixel whose media are
-some per cent off. Noise is drawn from 1 to 10 %: of the value or, in every other draw, of the brightest pixel
-everywhere; stated by the capture or, in every other pair of draws, taken for the default of 1 %. A third row of 200
-shows the check the dim image alone, in place.
+No fit is run. The 200 cases in place are 20 phantoms (``tests.support.registered_phantoms``, each with its own size,
+pose, camera, pixels of 0.5 to 0.8 mm, optics and gums) x 10 draws of noise. The 200 cases of teeth 1 mm beside their
+mesh, perpendicular to the line of sight, are the same phantoms x 2 directions x 5 draws. As after a fit, the check
+receives a camera's brightest image and a held-out one from a grazing light, with renders of 32, 128 or 512 paths per
+pixel whose media differ from the truth. Noise is drawn from 1 to 10 %, of the value or, in every second draw, of the
+brightest pixel everywhere. The capture states it or, in every second pair of draws, the check assumes the default of
+1 %. In a third row of 200 cases in place, the check receives the held-out image alone.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from typing import Any
 
 import numpy as np
 
-from services.fit.checks.alignment import LOOKED_AT, Offset, told_offset
+from services.fit.checks.alignment import TESTED_ERROR, Offset, reported_offset
 from services.fit.transport.platform import prepare_device
 from tests.support.registered_phantoms import Noise, Phantom, Place, rendered_phantom
 
 PHANTOMS, IN_PLACE_DRAWS, BESIDE_DRAWS = 20, 10, 5
 SEED = 2027
-"""Another one than those of the phantoms that the check's thresholds were looked at with."""
+"""Seed of the phantoms, which differs from those with which the check's thresholds were chosen."""
 OFFSET_MM = 1.0
 NOISE = (0.01, 0.1)
 
 
 def told(phantom: Phantom, place: Place, draw: int, seed: Sequence[int], *, dim_alone: bool = False) -> Offset | None:
-    """What the check tells of one draw of noise."""
+    """Run the check on one draw of noise; returns the offset that it reports, or None."""
     rng = np.random.default_rng([*seed, draw])
     noise = Noise(rng.uniform(*NOISE), is_constant=draw % 2 == 1, is_stated=draw // 2 % 2 == 0)
     photographed = phantom.photographed(place, noise, rng)
-    if photographed.error <= LOOKED_AT:
+    if photographed.error <= TESTED_ERROR:
         return None
     seen = photographed.comparisons[1:] if dim_alone else photographed.comparisons
-    return told_offset("c0", seen, phantom.pixels, phantom.pixel_mm)
+    return reported_offset("c0", seen, phantom.pixels, phantom.pixel_mm)
 
 
 def row(offsets: Sequence[Offset | None]) -> dict[str, Any]:
-    """How many were told, and how long they are on average."""
+    """Number of reported offsets, with mean and standard deviation of their lengths and median standard error, mm."""
     lengths = np.array([offset.length_mm for offset in offsets if offset is not None])
     errors = np.array([offset.length_se_mm for offset in offsets if offset is not None])
     told = {"n": len(offsets), "told": len(lengths)}
@@ -56,7 +56,7 @@ def row(offsets: Sequence[Offset | None]) -> dict[str, Any]:
 
 
 def rates(drawn: Iterable[Phantom], seed: int) -> dict[str, Any]:
-    """Both rates over some phantoms."""
+    """Counts of detections and false alarms over some phantoms."""
     in_place: list[Offset | None] = []
     dim: list[Offset | None] = []
     beside: list[Offset | None] = []

@@ -1,17 +1,17 @@
-"""What landmarks and outlines each bring to the pose of a scan, and whether their ± are honest.
+"""Errors of a scan's pose after the landmarks and after the outlines, and whether the stated ± match them.
 
 python -m tests.benchmarks.registration_steps --json steps.json [--draws 12] [--places 7]
 
 A draw takes some 6 s of processor time.
 
-Each draw is a phantom subject of its own before three cameras, pixels of 0.2 mm, clicks to 0.3 mm, and a scan with
-noise of 0.02 mm in a frame of its own, cut off behind a place from the midline. The photographs are drawn
-(``tests.support.photographed_mouth``) and share neither outlines nor search with the registration. Draws that the file
-holds already are not made again.
+Each draw is a different phantom subject in front of three cameras with pixels of 0.2 mm, clicks with errors of 0.3 mm,
+and a scan with noise of 0.02 mm in its own frame that ends behind a given place from the midline. The photographs are
+drawn (``tests.support.photographed_mouth``) and share neither outlines nor search with the registration. Draws that the
+file holds already are not computed again.
 
-Errors are twists about the teeth's centre from the found pose to the true one: the length of the turn in degrees and of
-the move in mm, as rms over the draws. Scores are the six components whitened by the step's own covariance, as rms over
-six a draw.
+Errors are twists about the teeth's centre from the estimated pose to the true one: the angle of the rotation in degrees
+and the length of the translation in mm, as rms over the draws. Scores are the six components whitened by the step's own
+covariance, as rms over six values per draw.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.anatomy.templates.jaw import build_jaw
 from services.calibrate.registration.landmarks import pose_from_landmarks
 from services.calibrate.registration.outlines import outline_misfit_mm, pose_from_outlines
-from services.calibrate.registration.photographs import cut_out
+from services.calibrate.registration.photographs import crop_to_points
 from services.calibrate.registration.pose import PoseStep, RigidPose
 from services.calibrate.registration.register import REACH_MM
 from services.core.geometry import Mesh
@@ -37,7 +37,7 @@ from services.phantom.lab.scan import scan_of
 from tests.support.photographed_mouth import Mouth, clicks_on, photographed_mouth
 
 FIRST_SUBJECT = 2600
-"""No threshold or constant was chosen with these subjects."""
+"""Number of the first subject. No threshold or constant was chosen with these subjects."""
 PIXEL_MM = 0.2
 
 
@@ -45,13 +45,13 @@ def draw(number: int, places: int) -> dict[str, Any]:
     """Errors and scores of both steps for one subject."""
     jaw = build_jaw(FIRST_SUBJECT + number)
     mouth = photographed_mouth(None, FIRST_SUBJECT + number, PIXEL_MM, jaw)
-    teeth, gums = _scanned(mouth, scan_of(jaw, seed=number, places=places))
+    teeth, gums = _scanned(mouth, scan_of(jaw, seed=number, teeth_a_side=places))
     rng = np.random.default_rng([FIRST_SUBJECT, number])
     clicks = [one for one in clicks_on(mouth, rng) if int(one.name.split()[0]) % 10 <= places]
     vertices = np.concatenate([mesh.vertices_mm for mesh in teeth])
     centre = vertices.mean(axis=0)
     first = pose_from_landmarks(mouth.cameras, clicks, centre)
-    views = [cut_out(view, first.pose.apply(vertices)) for view in mouth.views]
+    views = [crop_to_points(view, first.pose.apply(vertices)) for view in mouth.views]
     reach_px = REACH_MM / min(view.camera.pixel_mm(first.pose.apply(centre[None])[0]) for view in views)
     second = pose_from_outlines(views, teeth, [gums], first, centre, reach_px)
     told = {step.name: _judged(step, mouth, centre) for step in (first, second)}
@@ -59,7 +59,7 @@ def draw(number: int, places: int) -> dict[str, Any]:
 
 
 def _scanned(mouth: Mouth, scan: LabelledScan) -> tuple[list[Mesh], Mesh]:
-    # The solids that a scan in a frame of its own becomes, in that frame.
+    # Build the solids of a scan in the scan's own frame.
     pose = mouth.rig_from_scan
     vertices = (scan.mesh.vertices_mm - pose.translation_mm) @ pose.rotation
     jaw = jaw_from_scan(LabelledScan(Mesh(vertices, scan.mesh.faces), scan.fdi), "whole")
@@ -83,7 +83,7 @@ def _judged(step: PoseStep, mouth: Mouth, centre: np.ndarray) -> dict[str, Any]:
 
 
 def table(draws: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Rms errors, median ± and rms scores by step."""
+    """Rms errors, median standard errors and rms scores by step."""
     rows = {}
     for name in ("landmarks", "outlines"):
         steps = [one[name] for one in draws]
@@ -104,7 +104,7 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def main() -> None:
-    """Measure what is missing and write JSON after each draw."""
+    """Measure the missing draws and write JSON after each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True, help="where the figures go")
     parser.add_argument("--draws", type=int, default=12)

@@ -1,8 +1,8 @@
-"""Render the jaw of ``tests/data/truths-jaw`` by stock Mitsuba, one pass of all images after another; an interrupted
-run goes on with the next pass.
+"""Render the jaw of ``tests/data/truths-jaw`` by stock Mitsuba in independent passes over all images; an interrupted
+run continues with the next pass.
 
 python -m tests.benchmarks.render_jaw_truth --work FOLDER
-python -m tests.benchmarks.render_jaw_truth --work FOLDER --passes 4     stores what four passes give
+python -m tests.benchmarks.render_jaw_truth --work FOLDER --passes 4     stores the mean of four passes
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from services.phantom.jaw import jaw_surfaces, known_mouth
 from tests.support.jaw_truth import CHANNEL, STORED, SUBJECT, cameras, lights, pack
 
 PASSES, SAMPLES = 100, 64
-"""Independent passes, and paths per pixel in each; a pass of 21 images takes 70 s of processor time."""
+"""Number of independent passes, and paths per pixel in each; a pass of 21 images takes 70 s of processor time."""
 
 
 def load(folder: Path) -> Any:
-    """The scene with all cameras."""
+    """Load the jaw's scene with all cameras in Mitsuba."""
     jaw = jaw_surfaces(SUBJECT)
     files = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.cavity)
     fdi = tuple(tooth.fdi for tooth in jaw.teeth)
@@ -36,7 +36,7 @@ def load(folder: Path) -> Any:
 
 
 def render_pass(scene: Any, number: int) -> list[NDArray[np.float32]]:
-    """Images (L, H, W) of every camera."""
+    """Render one pass; returns the images (L, H, W) of every camera."""
     import mitsuba as mi
 
     params, images = mi.traverse(scene), []

@@ -1,5 +1,5 @@
-"""Render the single teeth of ``tests/data/truths`` by stock Mitsuba: jaws, places and optics of random subjects, 3
-cameras and 8 lights of a dome.
+"""Render the single teeth of ``tests/data/truths`` by stock Mitsuba: teeth and optics of random subjects, 3 cameras and
+8 lights of a dome.
 
 python -m tests.benchmarks.render_truths
 python -m tests.benchmarks.render_truths --names homogeneous --samples 512
@@ -42,7 +42,7 @@ CASES = {
 
 
 def render(case: Case, folder: Path, samples: int) -> Path:
-    """The case as a folder capture."""
+    """Render a case as a folder capture; returns its folder."""
     tooth = build_jaw(case.jaw).tooth(case.fdi)
     files = {"outer": tooth.outer, "dentin": tooth.dentin}
     for name, mesh in files.items():
@@ -57,7 +57,7 @@ def render(case: Case, folder: Path, samples: int) -> Path:
 
 
 def main() -> None:
-    """Render what is asked for."""
+    """Render and store the chosen cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--names", default=",".join(CASES), help="cases, separated by commas")
     parser.add_argument("--samples", type=int, default=SAMPLES, help="paths per pixel and light")

@@ -1,7 +1,8 @@
-"""What a request costs the server's processor, by kind, without a network: the application is called in this process.
+"""Processor time of a request by kind, without a network: the application is called in this process.
 
-Holds on a busy machine too. python -m tests.benchmarks.request_cost --json cost.json [--requests 2000] [--tokens]
-[--profile KIND]
+python -m tests.benchmarks.request_cost --json cost.json [--requests 2000] [--tokens] [--only KIND]
+
+The ratios to a bare route also hold on a busy machine, because requests to both take turns.
 """
 
 from __future__ import annotations
@@ -83,15 +84,15 @@ async def _measure(work: Path, options: argparse.Namespace) -> list[Row]:
 
 
 def _row(peer: str, kind: str, took_s: list[tuple[float, float]]) -> Row:
-    """Mean processor time, and its ratio to what the bare route took in turn with it."""
+    """Mean processor time, and its ratio to that of the bare route's requests sent in turn with them."""
     own_s, bare_s = (sum(one) for one in zip(*took_s, strict=True))
     figures = {"cpu_ms": round(1e3 * own_s / len(took_s), 3), "ratio": round(own_s / bare_s, 2)}
     return {"benchmark": "request-cost", "peer": peer, "kind": kind, "requests": len(took_s)} | figures
 
 
 async def _cost(bare: Asked, ours: Asked) -> list[tuple[str, float, float]]:
-    """Kind of each request of ours, and processor time of this process for one of the bare route's and for it, which
-    take turns: both meet the same machine.
+    """For each request: its kind, the processor seconds of a request to the bare route, and its own. The two take
+    turns, so that both run on the machine in the same state.
     """
     took_s = []
     pairs = list(zip(bare[1], ours[1], strict=True))

@@ -1,12 +1,12 @@
-"""What jobs side by side get of the workers, and how long a capture waits for them.
+"""Shares of the workers' time that concurrent jobs get, and the time that a capture waits beside them.
 
     python -m tests.benchmarks.side_by_side --json side.json [--repeats 5] [--seconds 40]
 
-The server, a scheduler, two workers and one at the rig as processes of their own. Two fits run on the workers; their
-blocks hold a worker for a known time and use no processor, so that a busy machine does not change who gets how much.
-While both run, captures are submitted one after the other. A row states each fit's share of the worker time in which
-both had blocks to run, and how long captures took from their submission to their first frame, alone and beside the
-fits. Takes repeats x 4 cases x about a minute.
+The server, a scheduler, two workers and a worker at the rig run as processes of their own. Two fits run on the workers;
+their blocks occupy a worker for a known time and use no processor, so that a busy machine does not change the shares.
+While both run, captures are submitted one after the other. A row states the first fit's share of the worker time while
+both had blocks to run, and the time from a capture's submission until it began, alone and beside the fits. It takes
+repeats x 4 cases x about a minute.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from tests.support.block_stages import BLOCKS, read_trace
 from tests.support.small_system import small_system
 
 CAPTURES = 4
-"""Captures per repeat, and as many before it with nothing beside them."""
+"""Number of captures per repeat beside the fits, and number of captures before them with no other jobs."""
 TWO_WORKERS = 2
 
 
 @dataclass(frozen=True)
 class Case:
-    """Two fits: seconds per block, priorities, and by how much the second one starts later."""
+    """Two fits: seconds per block, priorities, and the delay of the second fit's start in seconds."""
 
     name: str
     block_s: tuple[float, float]
@@ -55,9 +55,9 @@ class Row:
 
     case: str
     share: float
-    """Of the first fit, in the worker time of both."""
+    """Share of the first fit in the worker time of both."""
     busy: float
-    """Fraction of the two workers' time that was used."""
+    """Share of the two workers' time that the fits used."""
     window_s: float
     capture_alone_s: tuple[float, ...]
     capture_beside_s: tuple[float, ...]
@@ -85,7 +85,7 @@ def main() -> None:
 
 
 def run_case(client: httpx.Client, folder: Path, case: Case, seconds: float) -> Row:
-    """Two fits and captures."""
+    """Run the captures alone, then two fits with captures beside them."""
     alone_s = [capture_wait_s(client, folder / f"alone-{k}") for k in range(CAPTURES)]
     sources = [folder / "first", folder / "second"]
     jobs = []
@@ -117,7 +117,7 @@ def row_of(
     beside_s: list[float],
     client: httpx.Client,
 ) -> Row:
-    """The blocks within the window, cut at its ends."""
+    """Compute a row from the parts of all blocks that lie within the window (start, end), in Unix time."""
     traces = [read_trace(source) for source in sources]
     used_s = [sum(max(min(end, window[1]) - max(start, window[0]), 0.0) for start, end, _ in trace) for trace in traces]
     ran = {worker for trace in traces for _, _, worker in trace}
@@ -134,8 +134,8 @@ def row_of(
 
 
 def capture_wait_s(client: httpx.Client, source: Path) -> float:
-    """From a capture's submission until it has begun, by the server's clock; waits for its job's capture and takes the
-    job away.
+    """Seconds from a capture's submission until it began, by the server's clock. Waits for the capture's end and
+    cancels its job.
     """
     (source / "steering").mkdir(parents=True)
     job = submit(client, {"rig": {"mouth": str(source)}})
@@ -156,7 +156,7 @@ def capture_wait_s(client: httpx.Client, source: Path) -> float:
 
 
 def submit(client: httpx.Client, spec: dict[str, Any]) -> str:
-    """A job's id."""
+    """Submit a job; returns its id."""
     answer = client.post("/v1/jobs", json=spec | {"workers": TWO_WORKERS})
     answer.raise_for_status()
     return str(answer.json()["id"])
@@ -168,7 +168,7 @@ def end(client: httpx.Client, job: str) -> None:
 
 
 def summary(rows: list[Row]) -> dict[str, Any]:
-    """By case, and all rows."""
+    """Summary by case, and all rows."""
     by_case = {case.name: [row for row in rows if row.case == case.name] for case in CASES}
     return {
         "cases": {name: told(mine) for name, mine in by_case.items() if mine},
@@ -177,7 +177,7 @@ def summary(rows: list[Row]) -> dict[str, Any]:
 
 
 def told(rows: list[Row]) -> dict[str, Any]:
-    """One case over its repeats."""
+    """Summary of one case over its repeats."""
     alone = [wait_s for row in rows for wait_s in row.capture_alone_s]
     beside = [wait_s for row in rows for wait_s in row.capture_beside_s]
     return {
@@ -192,7 +192,7 @@ def told(rows: list[Row]) -> dict[str, Any]:
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median and range."""
+    """Median and range of values."""
     return {"least": min(values), "median": statistics.median(values), "most": max(values)}
 
 

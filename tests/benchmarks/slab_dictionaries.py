@@ -1,11 +1,11 @@
-"""What each dictionary finds of the slab truths and of one dispersion of spheres, as JSON rows; about 20 core-seconds a
+"""Results of each dictionary on the slab truths and on one dispersion of spheres, as JSON rows; about 20 core-seconds a
 row.
 
 python -m tests.benchmarks.slab_dictionaries --seeds 2 --json dictionaries.json
 
-The truths of ``slab-truth`` are another program's. The dispersion, polystyrene of 800 nm at 533 nm from the reference
-table at sigma_t w = 2, is rendered by the forward model with other seeds, by spheres of that one size, which is none of
-the dictionary's. Rows that the file holds already are not run again.
+The truths of ``slab-truth`` were rendered by another program. The dispersion (polystyrene spheres of 800 nm at a
+wavelength of 533 nm from the reference table, sigma_t w = 2) is rendered by the forward model with other seeds; its one
+size of spheres is none of the dictionary's. Rows that the file holds already are not computed again.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from tests.support.shared_data import shared_path
 TRUTHS = ("mie-500nm", "two-lobe", "hg-paper-angles", "mie-800nm-dispersion")
 DICTIONARIES = ("tents", "hg", "mie")
 LIKE = "mie-500nm"
-"""The truth whose cell, cameras and lights the dispersion has."""
+"""Name of the truth whose cell, cameras and lights the dispersion has."""
 THICKNESS = 2.0
 TRUTH_SEED, TRUTH_BATCHES, TRUTH_PATHS = 4711, 16, 60_000
 RELATIVE_INDEX = {"mie-500nm": 1.59807 / 1.33499, "mie-800nm-dispersion": 1.59807 / 1.33499}
-"""Polystyrene in water at 533 nm, from the reference table; the other truths are no spheres, and these are tried on
-them."""
+"""Refractive index of polystyrene relative to water at 533 nm, from the reference table. The other truths are not
+spheres; the dictionary of spheres is tried on them with the index of ``LIKE``."""
 
 
 def write_dispersion(out: Path, seed: int) -> dict[str, object]:
-    """The dispersion's folder; returns what is true."""
+    """Write the dispersion's folder; returns its true scattering and phase function."""
     with shared_path("reference/mie_dispersions.csv").open() as stream:
         row = next(row for row in csv.DictReader(stream) if (row["diameter_nm"], row["channel"]) == ("800", "G"))
     intensity, _ = scattered(complex(float(row["n_polystyrene"]) / float(row["n_water"])), float(row["size_parameter"]))
@@ -58,7 +58,7 @@ def write_dispersion(out: Path, seed: int) -> dict[str, object]:
         whole, of_whole = (np.concatenate([half[::-1], half]) for half in halves)
         shot = NOISE**2 * whole * whole.mean()
         np.save(out / entry.file, whole + np.sqrt(shot) * noise.normal(size=whole.shape))
-        # Both halves have the walk's noise in common, and are taken for independent.
+        # Both halves share the walk's noise but are treated as independent, hence the factor 2.
         np.save(out / str(entry.variance_file), shot + 2 * of_whole)
     return {
         "sigma_s": sigma_s,
@@ -69,13 +69,13 @@ def write_dispersion(out: Path, seed: int) -> dict[str, object]:
 
 
 def measure(truth: str, dictionary: str, seed: int, effort: float) -> dict[str, Any]:
-    """One row."""
+    """Fit one truth with one dictionary; returns its row."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         true = write_dispersion(root, seed) if truth.endswith("dispersion") else noisy_truth(truth, root, seed)
         told: dict[str, Any] = {"seed": seed, "effort": effort, "dictionary": dictionary}
         if dictionary == "mie":
-            # The cell's medium has the folder's index, so the particles' is what keeps their ratio.
+            # The medium has the folder's index; the particles' index follows from the ratio.
             index = read_folder(root).cell.index
             told["particle_index"] = RELATIVE_INDEX.get(truth, RELATIVE_INDEX[LIKE]) * float(index or 0)
         (fit,) = fit_slab(root, SlabOptions.model_validate(told))

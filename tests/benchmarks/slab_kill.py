@@ -1,12 +1,12 @@
-"""A slab's job killed at random and run again: is the answer the same to the last digit?
+"""Check that a slab's job that is killed at random and run again gives the same result to the last digit.
 
-About a minute a time on two idle cores. python -m tests.benchmarks.slab_kill --times 20 --json slab_kill.json
+python -m tests.benchmarks.slab_kill --times 20 --json slab_kill.json      about a minute per kill on two idle cores
 
-A small cell of two wavelengths (or, every other time, of one, whose blocks of paths both workers share) is fitted once
-undisturbed. Then each time a new run is struck by kill -9 after a random share of that time, all its processes at once
-or one worker alone, and where it does not end by itself it is run again until it does. Its result files are compared
-byte by byte with the undisturbed run's. A time is not counted whose run ended before the kill. The file keeps the times
-of an earlier run and goes on after them.
+A small cell of two wavelengths (or, every second time, of one, whose blocks of paths both workers share) is fitted once
+undisturbed. Then each new run is killed by SIGKILL after a random share of that duration, either all its processes at
+once or one worker alone. If it does not finish by itself, it is run again until it does. Its result files are compared
+byte by byte with those of the undisturbed run. A run that ended before the kill does not count. The file keeps the
+results of an earlier run, and a new run continues after them.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from tests.pipeline.test_slab_job import TRUTHS, write_cell
 RESULTS = ("parameters.json", "phase.json", "errors.json")
 VICTIMS = ("all", "worker")
 MAX_RUNS = 5
-"""Runs after a kill in which it must have ended."""
+"""Largest number of runs after a kill; the job must finish within them."""
 PATIENCE_S = 1800.0
 
 
 def begin(job: Path, out: Path) -> subprocess.Popen[bytes]:
-    """``dentine run`` with all its workers in a process group of its own."""
+    """Start ``dentine run``, with all its workers in a process group of its own."""
     command = [sys.executable, "-m", "services", "run", str(job), "--out", str(out)]
     with out.with_suffix(".log").open("ab") as log:
         return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
 
 
 def strike(process: subprocess.Popen[bytes], victim: str, draw: random.Random) -> bool:
-    """Kill -9; whether there was something to kill."""
+    """Kill all processes of a run, or one of its workers, by SIGKILL; returns whether there was a process to kill."""
     if victim == "all":
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -65,12 +65,12 @@ def _is_worker(process: psutil.Process) -> bool:
 
 
 def results(out: Path) -> dict[str, bytes]:
-    """Contents of the result files."""
+    """Contents of the result files by name."""
     return {name: (out / name).read_bytes() for name in RESULTS}
 
 
 def one_time(job: Path, out: Path, after_s: float, victim: str, draw: random.Random, expected: dict[str, bytes]) -> Any:
-    """Run, kill, and run again; None where the run ended before the kill."""
+    """Run a job, kill it after ``after_s``, run it again; returns a row, or None if the run ended before the kill."""
     began = time.monotonic()
     process = begin(job, out)
     with suppress(subprocess.TimeoutExpired):
@@ -96,7 +96,7 @@ def one_time(job: Path, out: Path, after_s: float, victim: str, draw: random.Ran
 
 
 def write_job(folder: Path, wavelengths_nm: Sequence[float], effort: float) -> Path:
-    """A cell and its job."""
+    """Write a cell and the job that fits it; returns the job's file."""
     (cell := folder / f"cell-{len(wavelengths_nm)}").mkdir()
     write_cell(cell, *wavelengths_nm)
     job = folder / f"wavelengths-{len(wavelengths_nm)}.toml"
@@ -105,7 +105,7 @@ def write_job(folder: Path, wavelengths_nm: Sequence[float], effort: float) -> P
 
 
 def main() -> None:
-    """Strike so many times, and write what became of each."""
+    """Kill ``--times`` runs, and write the result of each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument(

@@ -20,17 +20,17 @@ from services.fit.slab.simulate import Sums
 from tests.support.slab_tables import SlabCase, derivative_cases, is_costly, named, passes, simulate, total_cases
 
 DEEP_TOLERANCE = 1e-3
-"""Of totals where a path scatters hundreds of times: four digits there take hours."""
+"""Tolerance of totals where a path scatters hundreds of times, because a smaller one takes hours there."""
 
 
 def tolerances(case: SlabCase, of_totals: float) -> NDArray[np.float64]:
-    """Of each value (rows, 2)."""
+    """Tolerance (rows, 2) of each value."""
     totals = np.full((1, 2), of_totals)
     return np.vstack([totals, case.derivative_tolerance()]) if case.names else totals
 
 
 def rule(tolerance: NDArray[np.float64], seconds: float) -> Callable[[Sums], float]:
-    """The shortfall from a third of every tolerance, 0 once the time is up."""
+    """A shortfall function: the largest standard error over a third of its tolerance, and 0 once the time is up."""
     allowed, begun_s = tolerance / 3, time.monotonic()
     return lambda sums: float((sums.standard_error() / allowed).max()) if time.monotonic() < begun_s + seconds else 0.0
 
@@ -38,8 +38,8 @@ def rule(tolerance: NDArray[np.float64], seconds: float) -> Callable[[Sums], flo
 def measure(
     case: SlabCase, tolerance: NDArray[np.float64], shortfall: Callable[[Sums], float], seed: int
 ) -> Iterator[dict[str, object]]:
-    """One row per value; ``reached`` is its standard error over a third of its tolerance, so 1 or less fulfils the
-    rule.
+    """Yield one row per value; ``reached`` is its standard error over a third of its tolerance, so that 1 or less
+    fulfils the rule.
     """
     began = time.perf_counter()
     sums = simulate(case, shortfall, seed)

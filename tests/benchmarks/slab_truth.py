@@ -1,9 +1,9 @@
-"""The slab's fit on truths of another program: errors beside their ± and bounds, over seeds. About half a minute a fit.
+"""The slab's fit on truths of another program: its errors, their ± and bounds, over seeds. About half a minute per fit.
 
 python -m tests.benchmarks.slab_truth --seeds 5 --json slab_truth.json
 
-Noise of 1 % (Poisson, at a pixel of its image's mean) is added to noise-free images anew for each seed, and the fit is
-given the same seed. The file keeps what an earlier run measured, and a run goes on after it.
+For each seed, new Poisson noise is added to noise-free images (1 % at a pixel of its image's mean), and the fit uses
+the same seed. The file keeps the results of an earlier run, and a new run continues after them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def material_of(truth: dict[str, Any]) -> Material:
 
 
 def bound_for(name: str, truth: dict[str, Any]) -> Bound:
-    """The bound from the shot noise and the truth's own variance."""
+    """The Cramér-Rao bound from the shot noise and the variance of the truth's own rendering."""
     root = shared_path(f"data/slab-truth/{name}")
     folder = read_folder(root)
     rig = rig_of(folder, folder.wavelengths_nm[0])
@@ -50,7 +50,7 @@ def bound_for(name: str, truth: dict[str, Any]) -> Bound:
 
 
 def measured(name: str, seed: int, bounds: dict[str, Bound]) -> dict[str, Any]:
-    """One fit."""
+    """Fit one truth with one seed; returns its row."""
     with tempfile.TemporaryDirectory() as place:
         truth: dict[str, Any] = noisy_truth(name, Path(place), seed)
         (fit,) = fit_slab(Path(place), SlabOptions(seed=seed))
@@ -80,7 +80,7 @@ def measured(name: str, seed: int, bounds: dict[str, Bound]) -> dict[str, Any]:
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """The rms of each truth's errors, and the median of what a fit took."""
+    """Rms of each truth's errors, and median core-seconds of a fit, as text."""
     lines = []
     for name in NAMES:
         if not (own := [row for row in rows if row["truth"] == name]):

@@ -1,9 +1,10 @@
-"""How often a stated time range holds what then happens: jobs of differing sizes through a live server, as JSON.
+"""Share of stated time ranges that contain the true remaining time, for jobs of several sizes on a live server, as
+JSON.
 
 python -m tests.benchmarks.time_ranges --jobs 45 --stages real --json time_ranges.json
 
-Jobs come one, two or three at a time, so that some wait for others. Each is asked for its range once it is submitted
-and once its fit has begun.
+Jobs are submitted one, two or three at a time, so that some wait for others. The server is asked for a job's range
+after its submission and after its fit has begun.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from tests.support.uploading import write_capture
 Moment = Literal["submitted", "fit"]
 DENTINE = [sys.executable, "-m", "services"]
 PHANTOMS = (("3.0", "1", "4"), ("2.5", "1", "4"), ("2.0", "1", "4"), ("2.0", "1", "6"))
-"""Size of a pixel in mm, cameras, lights."""
+"""Pixel size in mm, number of cameras and number of lights of each phantom, as text."""
 
 
 def write_phantoms(folder: Path) -> list[Path]:
-    """Small teeth of several sizes."""
+    """Write phantom captures of several sizes; returns their folders."""
     captures = []
     for pixel_mm, cameras, lights in PHANTOMS:
         captures.append(folder / f"mouth-{pixel_mm}-{cameras}-{lights}")
@@ -42,7 +43,7 @@ def write_phantoms(folder: Path) -> list[Path]:
 
 
 def draw_job(chance: random.Random, captures: list[Path], samples: tuple[int, ...]) -> JobSpec:
-    """A small job: the same thing done to another size."""
+    """Draw a small job: the options are fixed, capture and samples per pixel are drawn."""
     options: dict[str, Any] = {
         "boundary": "matched",
         "dentin": "known",
@@ -62,7 +63,11 @@ def draw_job(chance: random.Random, captures: list[Path], samples: tuple[int, ..
 
 
 def run_job(client: Client, job: str, told: dict[str, Any]) -> dict[str, Any]:
-    """Follow a job to its end; what it was told about it, and the truth."""
+    """Follow a job to its end; returns its ranges with the true remaining times.
+
+    Args:
+        told: range that the server stated after the submission.
+    """
     asked: dict[Moment, dict[str, Any]] = {"submitted": told}
     ended_s = 0.0
     for event in client.events(job):
@@ -80,7 +85,7 @@ def run_job(client: Client, job: str, told: dict[str, Any]) -> dict[str, Any]:
 
 
 def ask(client: Client, job: str) -> dict[str, Any]:
-    """A job's range, and when it was asked for."""
+    """A job's stated range, and the Unix time of the question."""
     asked_s, remaining = time.time(), client.get(job)["remaining"]
     return {"low_s": None, "high_s": None, **(remaining or {}), "asked_s": asked_s}
 
@@ -88,7 +93,7 @@ def ask(client: Client, job: str) -> dict[str, Any]:
 def measure(
     client: Client, captures: list[Path], samples: tuple[int, ...], jobs: int, seed: int
 ) -> list[dict[str, Any]]:
-    """Jobs in small groups."""
+    """Submit jobs in small groups; returns one row per job."""
     chance, rows = random.Random(seed), list[dict[str, Any]]()
     while len(rows) < jobs:
         group = [
@@ -103,7 +108,7 @@ def measure(
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """How often ranges held, by the moment and by whether others came first."""
+    """Share of ranges that contain the truth, by the moment of the question and by whether other jobs came first."""
     loads = [row["load"] for row in rows]
     told: dict[str, Any] = {
         "machine": machine_class(),

@@ -26,7 +26,7 @@ BLOCK_BYTES = 16 * 2**20
 
 
 def write_large(path: Path, size_bytes: int, seed: int) -> None:
-    """An array of random bytes that fills a file of this size."""
+    """Write an array of random bytes as a .npy file of this size."""
     rng = np.random.default_rng(seed)
     with path.open("wb") as stream:
         npy.write_array_header_1_0(stream, {"descr": "|u1", "fortran_order": False, "shape": (size_bytes - 128,)})
@@ -36,19 +36,19 @@ def write_large(path: Path, size_bytes: int, seed: int) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Of a whole file."""
+    """SHA-256 of a file, as hexadecimal text."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def peak_bytes(process: int) -> int:
-    """Most memory that a process has had resident."""
+    """Largest resident memory of a process so far."""
     status = Path(f"/proc/{process}/status").read_text()
     return next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM"))
 
 
 def measure(work: Path, size_bytes: int, cuts: int, seed: int) -> dict[str, Any]:
-    """Upload, cut, resume, verify."""
+    """Upload a file through a connection that is cut, and verify the stored file."""
     folder = write_capture(work / "capture")
     write_large(folder / "large.npy", size_bytes, seed)
     places = np.random.default_rng(seed).integers(0, size_bytes, cuts).tolist()

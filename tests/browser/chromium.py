@@ -1,4 +1,4 @@
-"""A headless Chromium that can reach loopback and nothing else."""
+"""A headless Chromium that can reach only loopback."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ ARGUMENTS = (
 
 
 PATIENCE_MS = 60_000
-"""A page may take long to show what it must show on a machine with other work; how long is not what these tests
-judge."""
+"""Time limit for a page to show what is expected, long enough for a busy machine; these tests do not judge speed."""
 
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
-    """Skips where no Chromium is installed."""
+    """A headless Chromium; the test is skipped where none is installed."""
     expect.set_options(timeout=PATIENCE_MS)
     path = shutil.which("chromium") or shutil.which("google-chrome")
     if path is None:

@@ -33,6 +33,6 @@ _SCRIPT = """
 
 
 def contrast_failures(page: Page) -> list[str]:
-    """Every visible text below 4.5 : 1 with its ratio."""
+    """Every visible text with a contrast below 4.5 : 1, with its ratio."""
     failures: list[str] = page.evaluate(_SCRIPT)
     return failures

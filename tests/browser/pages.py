@@ -1,4 +1,4 @@
-"""A page whose errors fail the test: what the console says, what scripts throw, and what is asked of other servers."""
+"""A page whose errors fail the test: console messages, exceptions of scripts, and requests to other servers."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ WIDE, PHONE = (1440, 900), (390, 844)
 def watched_page(
     chromium: Browser, address: str, scheme: str = "light", width: int = WIDE[0], expected: tuple[str, ...] = ()
 ) -> Iterator[Page]:
-    """A page on a server.
+    """Open a page on a server for the time of the block; afterwards, assert that it had no errors.
 
     Args:
-        expected: texts in console messages that the test provokes, such as the browser's own line on a refusal.
+        expected: texts of console messages that the test provokes, such as the browser's message on a refusal.
     """
     if not (STATIC / "app.js").exists():
         pytest.skip("the dashboard is not built; run make dashboard")
@@ -42,7 +42,9 @@ def watched_page(
 
 
 def looked_at(page: Page, name: str) -> None:
-    """Hold what is shown to contrast and width; keeps a picture where the variable SCREENSHOTS names a folder."""
+    """Assert that the shown page has enough contrast and is not too wide; store a screenshot in the folder that the
+    environment variable SCREENSHOTS names, if it is set.
+    """
     if folder := os.environ.get("SCREENSHOTS"):
         page.screenshot(path=f"{folder}/{name}.png", full_page=True)
     assert contrast_failures(page) == []

@@ -1,4 +1,6 @@
-"""A job that reports what a fit reports, one step whenever a test lets it; the page cannot tell it from a fit."""
+"""A job that reports the same events as a fit, one step whenever a test releases it, and so looks like a fit to the
+page.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ STEPS = 6
 
 
 class ScriptedJob:
-    """Goes on by one of its ``steps`` whenever a test releases one; fails of ``problem`` if there is one by then."""
+    """A job that runs one step whenever a test releases the semaphore ``steps``; it fails with ``problem`` if one is
+    set then.
+    """
 
     def __init__(self) -> None:
         self.steps = threading.Semaphore(0)

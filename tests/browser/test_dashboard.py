@@ -1,6 +1,4 @@
-"""The dashboard in a real browser on the real API: live updates, keyboard, contrast, and nothing asked of the
-network.
-"""
+"""The dashboard in a real browser on the real API: live updates, keyboard, contrast, no requests to other servers."""
 
 from __future__ import annotations
 
@@ -96,7 +94,7 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     job.steps.release()
     expect(page.locator(".job .badge")).to_have_text("succeeded")
     expect(page.locator("tr", has_text="enamel.sigma").first).to_contain_text("4.032 ± 0.051")
-    # Shares of the square, 0.04² of it by the gain; what is less than a twentieth is left out.
+    # Sources are shares of the squared ± (the gain's is 0.04² / 0.0512²); those below a twentieth are left out.
     expect(page.locator("tr", has_text="enamel.sigma").first.locator(".sources").first).to_have_text(
         "gain 61 %, photographs 38 %"
     )

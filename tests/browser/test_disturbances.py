@@ -1,5 +1,5 @@
-"""The dashboard while the server refuses, is late or is away: what it shows is true, and it finds its way back by
-itself.
+"""The dashboard while the server refuses, answers late or is unreachable: the page shows the true state, and recovers
+by itself.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def refuse(route: Route, status: int, detail: str) -> None:
 
 
 def await_refresh(page: Page) -> None:
-    """Until the page has asked for the list anew and has had time to show the answer."""
+    """Wait until the page has requested the list again and has had time to show the answer."""
     with page.expect_response(lambda answer: "/v1/jobs?" in answer.url):
         pass
     page.evaluate("new Promise(requestAnimationFrame)")
@@ -125,7 +125,7 @@ def test_a_late_answer_leaves_the_view_that_was_opened_since(page: Page, is_refu
 
     page.route(f"**/v1/jobs/{first}", hold)
     page.goto(f"/#/{first}")
-    while not held:  # asked for once a lane is free
+    while not held:  # the page sends the request when one of its lanes is free
         page.wait_for_timeout(20)
     page.locator(f"#jobs a[href='#/{second}']").click()
     expect(page.locator(".job h2")).to_have_text("Job 2")
@@ -145,7 +145,7 @@ def test_a_view_that_is_left_lets_go_of_its_curve(page: Page, job: ScriptedJob) 
     job.steps.release()
     page.goto(f"/#/{first}")
     expect(page.locator(".chart canvas")).to_be_visible()
-    second = submit(page)  # not before: jobs run side by side, and it might have taken the first one's step
+    second = submit(page)  # only now, because jobs run concurrently and it might have taken the first job's step
     expect(page.locator(f"#jobs a[href='#/{second}']")).to_be_visible()
     chart = page.evaluate_handle("document.querySelector('.chart')")
     listeners = page.evaluate("listeners")

@@ -68,7 +68,7 @@ def test_a_light_and_all_off_by_keyboard(page: Page, request: pytest.FixtureRequ
     assert contrast_failures(page) == []
 
     page.locator(".all-off").focus()
-    for _ in range(4):  # level, seconds, switch it off, the lights
+    for _ in range(4):  # level, seconds, switch-off button, lights
         page.keyboard.press("Tab")
     expect(lights.first).to_be_focused()
     page.keyboard.press("ArrowDown")

@@ -1,5 +1,5 @@
-"""The first minutes of a stranger: an empty page leads to the demonstration's report, or to a rig; the form says what
-it takes.
+"""The first steps of a new user: an empty page leads to the demonstration's report or to a rig, and the form follows
+the schema of jobs.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def test_an_empty_page_leads_to_the_report_in_three_clicks(
         with page.context.expect_page() as opened:
             clicks[1].click()
         expect(opened.value).to_have_title("report")
-        page.get_by_role("link", name="New job").click()  # the ways stay where there are jobs
+        page.get_by_role("link", name="New job").click()  # the first steps stay reachable when there are jobs
         expect(page.get_by_role("button", name="Run the demo")).to_be_visible()
         expect(page.locator("#new")).to_have_attribute("aria-current", "page")
 

@@ -1,4 +1,4 @@
-"""What a person does with a job in the page: name, download, retry, delete."""
+"""Actions on a job in the page: name, download, retry, delete."""
 
 from __future__ import annotations
 

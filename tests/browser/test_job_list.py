@@ -1,4 +1,6 @@
-"""The list of jobs in a real browser: older jobs on demand, without gap or repetition, and as true as newer ones."""
+"""The list of jobs in a real browser: older jobs are loaded on demand, without gaps or repetitions, and are kept up to
+date like newer ones.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Landmarks that are clicked in the page of ``dentine landmarks`` are those of the scan and of the photographs."""
+"""Landmarks clicked in the page of ``dentine landmarks`` have the right coordinates in the scan and in photographs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def mouth(tmp_path: Path) -> RawMouth:
 
 
 def on_the_scan(page: Page, root: Path, xyz_mm: list[float]) -> tuple[float, float]:
-    """Where a point of the scan is seen at first: rows of ``turn`` lead to the right, up, and to the eye."""
+    """Position in the page of a point of the scan in the first view. The rows of ``turn`` point right, up and to the
+    viewer.
+    """
     mesh = read_scan_file(root / "scan.ply").mesh
     places = mesh.vertices_mm[np.unique(mesh.faces)]
     low, high = places.min(axis=0), places.max(axis=0)
@@ -53,7 +55,7 @@ def test_what_is_clicked_is_saved_as_landmarks(chromium: Browser, mouth: RawMout
     write_toml(mouth.root, mouth.tree | {"landmark": known[:1]})
     written = write_clicking_page(mouth.root, tmp_path / "page.html")
     folder = read_raw_folder(mouth.root)
-    # High enough for all views at once, as a view that scrolls in between moves under the mouse.
+    # The window is high enough for all views at once, because scrolling would move them under the mouse.
     page = chromium.new_page(viewport={"width": 1400, "height": 2600})
     trouble: list[str] = []
     page.on("pageerror", lambda error: trouble.append(str(error)))
@@ -73,7 +75,8 @@ def test_what_is_clicked_is_saved_as_landmarks(chromium: Browser, mouth: RawMout
     saved = tomllib.loads(Path(download.value.path()).read_text())["landmark"]
     assert trouble == []
 
-    # A click counts as good to 0.3 mm; a pixel of the page is 0.1 mm of the scan and less than one of a photograph.
+    # A click is assumed to be accurate to 0.3 mm. A pixel of the page is 0.1 mm of the scan and less than one pixel of
+    # a photograph.
     assert [(one["tooth"], one["point"]) for one in saved] == [(one["tooth"], one["point"]) for one in known]
     for one, true in zip(saved, known, strict=True):
         assert np.linalg.norm(np.subtract(one["xyz_mm"], true["xyz_mm"])) < 0.3

@@ -1,5 +1,5 @@
-"""Many pages of one browser, which opens six connections to a server and no more: they share one stream of events, and
-ALL OFF is answered.
+"""Many pages of one browser, which opens at most six connections to a server: they share one stream of events, and ALL
+OFF is always answered.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.browser
 LIGHTS = 155
 TABS = 8
 CONNECTIONS, LANES = 6, 3
-"""That Chromium opens to one server, and that are for what pages ask (lanes.ts)."""
+"""Number of connections that Chromium opens to one server, and number of them for the pages' requests (lanes.ts)."""
 DOWNLOADS = (
     "job => { for (let n = 0; n < 12; n++) void fetch(`/v1/jobs/${job}/artifacts.zip?n=${n}`).catch(() => {}); }"
 )
@@ -41,13 +41,13 @@ HIDE = """hidden => {
 
 @dataclass
 class Bench:
-    """A server with a simulated dome, the streams of events that it sends now, and downloads that hang."""
+    """A server with a simulated dome, its open event streams, and downloads that hang."""
 
     address: str
     job: ScriptedJob
     streams: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
-    """Requests of pages that are under way, streams and ALL OFF left out."""
+    """Open requests of pages, without streams and ALL OFF."""
     most_asked: int = 0
     go_on: threading.Event = field(default_factory=threading.Event)
 
@@ -147,7 +147,7 @@ def test_a_hidden_page_follows_nothing_and_catches_up_when_it_is_shown(context: 
     job = submit(page)
     page.goto(f"/#/{job}")
     until(page, lambda: len(bench.streams) == 1)
-    expect(page.locator(".job .badge")).to_have_text("running")  # or the page's first look at the job might come late
+    expect(page.locator(".job .badge")).to_have_text("running")  # so that the page's first request of the job is over
     page.evaluate(HIDE, arg=True)
     until(page, lambda: not bench.streams)
     bench.job.steps.release(STEPS)
@@ -161,7 +161,7 @@ def test_a_hidden_page_follows_nothing_and_catches_up_when_it_is_shown(context: 
 def test_all_off_is_answered_while_every_connection_is_held(
     context: BrowserContext, monkeypatch: pytest.MonkeyPatch, bench: Bench
 ) -> None:
-    """As by long downloads; a server that asks nobody for a token is asked over a connection of its own."""
+    """Long downloads hold the connections. On a server without tokens, ALL OFF is sent over a connection of its own."""
     dome = dome_page(context)
     light_up(dome)
     asked: list[str] = []
@@ -185,7 +185,7 @@ def test_all_off_is_answered_while_every_connection_is_held(
 def test_all_off_of_a_session_is_answered_while_every_connection_is_held(
     chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the page asks with its cookie shares the six connections with downloads; ALL OFF goes without it."""
+    """Requests with the page's cookie share the six connections with downloads; ALL OFF is sent without the cookie."""
     asked, go_on = [], threading.Event()
 
     def hang(*_: object) -> list[object]:

@@ -1,5 +1,5 @@
-"""serve -> submit -> live loss curve -> report, with the real stages on a tooth of few pixels: nothing between page and
-kernel is replaced.
+"""serve -> submit -> live loss curve -> report with the real stages on a tooth of few pixels: nothing between the page
+and the rendering kernel is replaced by a stand-in.
 """
 
 from __future__ import annotations

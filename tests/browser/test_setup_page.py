@@ -1,4 +1,4 @@
-"""The setup link in a real browser: makes the token, signs in, and is refused the second time."""
+"""The setup link in a real browser: it makes the token, signs in, and is refused the second time."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_setup_link_works_once(chromium: Browser, server: httpx.Client, link: 
         assert "setup" not in page.url
         assert server.get("/v1/tokens", headers={"Authorization": f"Bearer {token}"}).status_code == 200
         page.get_by_role("link", name="New job").click()
-        expect(page.locator(".token")).to_be_visible()  # until its owner has kept it
+        expect(page.locator(".token")).to_be_visible()  # until its owner says that it is stored
         page.get_by_role("button", name="I have kept it").click()
         expect(page.locator(".token")).to_have_count(0)
         expect(page.locator("#account")).to_contain_text("administrator")

@@ -1,4 +1,4 @@
-"""The dashboard on a server that asks for tokens."""
+"""The dashboard on a server that requires tokens."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FAILING_SEED = 2
 
 
 def run(spec: JobSpec, *_: object) -> None:
-    """A job that succeeds at once, or fails at once by its seed."""
+    """Run a job that succeeds at once, or fails at once if its seed is ``FAILING_SEED``."""
     if spec.seed == FAILING_SEED:
         raise CaptureInputError("Frame c0_l3.npy is missing; copy it there.")
 

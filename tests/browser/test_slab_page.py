@@ -1,4 +1,4 @@
-"""What the page shows of a job of kind slab: its wavelengths, coefficients with ± and the report's phase functions."""
+"""The page of a job of kind slab shows its wavelengths, coefficients with ± and the report's phase functions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WAVELENGTHS_NM = (532, 635)
 
 
 def slab_job(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """Reports and writes what a fit of two wavelengths does."""
+    """Write the events and files of a fit of two wavelengths."""
     with events.open() as log:
         fit = log.begin_stage("fit")
         for number, nm in enumerate(WAVELENGTHS_NM, start=1):
@@ -53,7 +53,7 @@ def slab_job(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, str]]:
-    """A server, and its job that has run."""
+    """Client of a server, and the id of its slab job."""
     captures = tmp_path_factory.mktemp("captures")
     settings = ServerSettings(data=tmp_path_factory.mktemp("data"))
     write_folder(captures / "cell", description())

@@ -1,4 +1,4 @@
-"""A folder is uploaded in the page: by choice and by drop, through broken connections, and on after a reload."""
+"""Upload of a folder in the page: by choice and by drop, over broken connections, and resumed after a reload."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.browser
 BLOCK_BYTES = 4 * 2**20
 LARGE = "large.npy"
 BROKEN = ("Failed to load resource",)
-"""What the browser says of a connection that the test breaks."""
+"""Console message of the browser for a connection that the test breaks."""
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def server(tmp_path: Path) -> Iterator[httpx.Client]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A capture with a file of three blocks, and files that are none of a capture's."""
+    """A capture with a file that is sent in three blocks."""
     folder = write_capture(tmp_path / "mine")
     np.save(folder / LARGE, np.random.default_rng(0).random(5 * BLOCK_BYTES // 2 // 4, dtype=np.float32))
     return folder
@@ -44,7 +44,7 @@ def choose(page: Page, folder: Path) -> None:
 
 
 def expect_uploaded(page: Page, server: httpx.Client, data: Path, contents: dict[str, bytes]) -> None:
-    """The page has gone on to the form, with this capture chosen; what the server stores is what was sent."""
+    """Assert that the page shows the form with this capture chosen, and that the server stores the sent contents."""
     expect(page.get_by_role("heading", name="Submit a job")).to_be_visible()
     (capture,) = server.get("/v1/captures").json()["captures"]
     assert capture["state"] == "committed"
@@ -68,7 +68,7 @@ def test_a_folder_is_uploaded_and_its_job_submitted(
         expect(page.locator(".upload")).to_contain_text("Left out, as no part of a capture: ")
         expect(page.locator(".upload")).to_contain_text("notes.txt")
         looked_at(page, f"upload-{scheme}-{width}")
-        page.unroute("**/v1/uploads/**")  # what was held goes on
+        page.unroute("**/v1/uploads/**")  # the upload goes on
         expect_uploaded(page, server, tmp_path / "data", contents)
         page.get_by_role("button", name="Submit the job").click()
         expect(page.locator(".job .badge")).to_have_text("succeeded")

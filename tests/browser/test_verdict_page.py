@@ -1,5 +1,5 @@
-"""What the page shows of how well a fit went: the report's words and numbers, the worst first; and that a job waits, as
-soon as it does.
+"""The page shows a fit's quality in the report's words and numbers, the worst first, and shows at once that a job
+waits.
 """
 
 from __future__ import annotations
@@ -110,18 +110,18 @@ def test_a_job_without_a_verdict_shows_none(chromium: Browser, server: httpx.Cli
 def test_a_job_that_waits_for_disk_says_so_at_once(
     chromium: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, job: ScriptedJob
 ) -> None:
-    """By an event and not by asking again: the page asks anew only after five seconds, and a round comes every ten."""
+    """The page learns it by an event: it repeats its requests only after five seconds, and a round comes every ten."""
     monkeypatch.setattr("services.api.jobs.runner.ROUND_S", 3600.0)
     with (
         serving(create_app(ServerSettings(data=tmp_path), job)) as client,
         watched_page(chromium, address_of(client)) as page,
     ):
-        page.clock.install()  # time stands still in the page, so that it asks for nothing by itself
+        page.clock.install()  # time stands still in the page, so that it repeats no request by itself
         full = Machine(free_disk_bytes=2**20, disk_bytes=2**40, memory_bytes=2**40)
         monkeypatch.setattr(Machine, "of", classmethod(lambda *_, **__: full))
         waiting = submit(page)
         page.goto(f"/#/{waiting}")
-        page.clock.run_for(100)  # the stream is opened
+        page.clock.run_for(100)  # long enough to open the stream
         expect(page.locator(".job")).to_contain_text("Waits for disk: about 0.3 GiB are needed and 0.0 GiB are free.")
         looked_at(page, "waits-for-disk")
         events = client.get(f"/v1/jobs/{waiting}/logs").json()["lines"]

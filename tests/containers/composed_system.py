@@ -1,8 +1,8 @@
-"""The composed system in real containers, as the tests start, disturb and ask it.
+"""The composed system in real containers, with methods by which tests start, disturb and query it.
 
-Which engine runs it is the environment's choice: ``DENTINE_COMPOSE`` is the compose command (``docker compose`` by
-default, or ``podman-compose``), ``DENTINE_ENGINE`` the engine's (``docker`` by default), and ``DOCKER_HOST`` where it
-listens.
+Environment variables choose the container engine: ``DENTINE_COMPOSE`` is the compose command (``docker compose`` by
+default, or ``podman-compose``), ``DENTINE_ENGINE`` the engine's command (``docker`` by default), and ``DOCKER_HOST``
+the engine's address.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tests.support.small_system import free_port
 ROOT = Path(__file__).parents[2]
 COMPOSE_FILES = (ROOT / "deploy" / "compose.yaml", Path(__file__).parent / "compose.override.yaml")
 USER = 10001
-"""Of the images' processes."""
+"""User id of the images' processes."""
 PATIENCE_S = 300.0
 JOB = {
     "boundary": "matched",
@@ -44,8 +44,9 @@ class ComposedSystem:
     """One project of the compose file.
 
     Args:
-        project: its name, the prefix of its containers, networks and volumes.
-        data: folder on the host that is the data volume.
+        project: name of the project, the prefix of its containers, networks and volumes.
+        data: folder on the host that is mounted as the data volume.
+        environment: further variables of the compose commands.
     """
 
     def __init__(self, project: str, data: Path, **environment: str) -> None:
@@ -56,16 +57,16 @@ class ComposedSystem:
         self.address = f"http://127.0.0.1:{self.port}"
 
     def compose(self, *arguments: str, check: bool = True) -> str:
-        """Run a compose command and return what it prints."""
+        """Run a compose command and return its output."""
         files = [part for file in COMPOSE_FILES for part in ("--file", str(file))]
         return self._run([*self._compose, "--project-name", self.project, *files, *arguments], check=check)
 
     def engine(self, *arguments: str, check: bool = True) -> str:
-        """Run a command of the engine and return what it prints."""
+        """Run a command of the engine and return its output."""
         return self._run([*self._engine, *arguments], check=check)
 
     def inside(self, service: str, *command: str, check: bool = True) -> str:
-        """Run a command in a service's container."""
+        """Run a command in a service's container and return its output."""
         return self.engine("exec", self.container(service), *command, check=check)
 
     def container(self, service: str) -> str:
@@ -73,28 +74,28 @@ class ComposedSystem:
         return f"{self.project}-{service}-1"
 
     def network(self, name: str) -> str:
-        """The engine's name of one of the file's networks."""
+        """The engine's name of one of the compose file's networks."""
         return f"{self.project}_{name}"
 
     def inspect(self, what: str) -> dict[str, Any]:
-        """All that the engine knows of a container or an image."""
+        """The engine's description of a container or an image."""
         return dict(json.loads(self.engine("inspect", what))[0])
 
     def address_of(self, service: str, network: str) -> str:
-        """Where a container is reached on a network."""
+        """IP address of a service's container on a network."""
         return str(
             self.inspect(self.container(service))["NetworkSettings"]["Networks"][self.network(network)]["IPAddress"]
         )
 
     def client(self, token: str | None = None) -> httpx.Client:
-        """A client of the API."""
+        """A client of the API, with a token if one is given."""
         client = connect(self.address)
         if token is not None:
             client.headers["Authorization"] = f"Bearer {token}"
         return client
 
     def up(self, *arguments: str) -> float:
-        """Start everything and wait until a job would run; returns how long that took, s."""
+        """Start all services and wait until the system is ready to run jobs; returns the time that this took, s."""
         start = time.monotonic()
         self.compose("up", "--detach", *arguments)
         self.wait_until(self.is_live, "the API does not answer")
@@ -107,7 +108,7 @@ class ComposedSystem:
         self.compose("down", *arguments)
 
     def token(self, name: str, *scopes: str) -> str:
-        """A new token, whose name begins with ``name``."""
+        """Create a token whose name begins with ``name``."""
         chosen = [part for scope in scopes for part in ("--scope", scope)]
         said = self.inside("api", "dentine", "token", "create", f"{name}-{secrets.token_hex(3)}", *chosen)
         return next(line for line in said.splitlines() if line.startswith("dentine_"))
@@ -121,7 +122,7 @@ class ComposedSystem:
             return False
 
     def is_ready(self, token: str) -> bool:
-        """Whether a job would run."""
+        """Whether the system is ready to run jobs."""
         try:
             with self.client(token) as client:
                 return client.get("/v1/health/ready").status_code == 200
@@ -132,7 +133,7 @@ class ComposedSystem:
         """Wait for a condition.
 
         Raises:
-            AssertionError: it does not hold in time; with the last lines of all logs.
+            AssertionError: the condition does not hold in time; the message has the last lines of all logs.
         """
         deadline = time.monotonic() + seconds
         while not condition():
@@ -141,7 +142,7 @@ class ComposedSystem:
             time.sleep(0.2)
 
     def run_dentine(self, token: str, *arguments: str, cwd: Path) -> str:
-        """A command of the client on this host."""
+        """Run a client command on this host and return its output."""
         environment = self.environment | {"DENTINE__CLIENT__TOKEN": token}
         command = [str(ROOT / ".venv/bin/dentine"), *arguments]
         done = subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, check=False)
@@ -155,7 +156,7 @@ class ComposedSystem:
 
 
 def follow(client: httpx.Client, job: str, seconds: float = PATIENCE_S) -> dict[str, Any]:
-    """Wait for a job's end; the API may be away meanwhile."""
+    """Wait for a job's end and return the API's record of it; the API may be unreachable meanwhile."""
     deadline = time.monotonic() + seconds
     while True:
         try:

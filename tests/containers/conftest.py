@@ -26,7 +26,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def figures() -> Iterator[dict[str, object]]:
-    """What was measured; written to the file that ``DENTINE_FIGURES`` names."""
+    """Figures that the tests measure; at the end they are written to the file that ``DENTINE_FIGURES`` names."""
     measured: dict[str, object] = {}
     yield measured
     if file := os.environ.get("DENTINE_FIGURES"):
@@ -46,7 +46,7 @@ def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreDisk]:
 
 @pytest.fixture(scope="session")
 def system(disk: StoreDisk, figures: dict[str, object]) -> Iterator[ComposedSystem]:
-    """A system that is up, built beforehand by ``make deploy-test``."""
+    """A running system; ``make deploy-test`` builds its images beforehand."""
     system = ComposedSystem("dentinetest", disk.folder)
     try:
         system.engine("info")

@@ -1,4 +1,4 @@
-"""Runs as a stranger beside the system: tries every address that it is given and prints how each answers, as JSON."""
+"""A script of an outsider beside the system: connects to every address given and prints each answer, as JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PATIENCE_S = 3.0
 
 
 def answer_of(host: str, port: int) -> str:
-    """``closed``, ``tls refuses``, ``http STATUS``, ``silent``, or what it sends to whoever connects."""
+    """Kind of answer at an address: ``closed``, ``tls refuses``, ``tls lets in``, ``http STATUS`` or ``silent``."""
     try:
         with socket.create_connection((host, port), PATIENCE_S):
             pass

@@ -1,5 +1,5 @@
-"""From the setup link in the log to the demonstration's report, in a real browser and a system that was just started,
-and what that system weighs.
+"""The way from the setup link in the log to the demonstration's report, in a real browser on a new system, and the size
+of the system's images and memory.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from tests.support.store_disk import StoreDisk
 
 MEGA = 1e6
 DEMO_MS = 1_800_000
-"""The demonstration renders a tooth and fits it: minutes on two idle cores, longer beside other work."""
+"""Time limit of the demonstration, which renders a tooth and fits it: minutes on two idle cores, more on busy ones."""
 
 
 @pytest.fixture
 def fresh(tmp_path: Path) -> Iterator[ComposedSystem]:
-    """A second system, that nobody has used."""
+    """A second system without any data."""
     disk = StoreDisk(tmp_path / "data", 4 * 2**30)
     disk.open()
     os.chown(disk.folder, USER, USER)

@@ -1,4 +1,4 @@
-"""A job in real containers ends with the answer of an undisturbed one, whatever is taken away from under it."""
+"""A job in real containers gives the result of an undisturbed job after any part fails during it."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ STAGES = {"prepare": "prepared", "fit": "fit", "export": "asset"}
 
 @pytest.fixture(scope="module")
 def capture(system: ComposedSystem, token: str, mouth: Path) -> str:
-    """The uploaded capture."""
+    """Path of the uploaded capture, as jobs name it."""
     return system.run_dentine(token, "upload", str(mouth), "--server", system.address, cwd=mouth).strip()
 
 
 @pytest.fixture(scope="module")
 def undisturbed(system: ComposedSystem, token: str, capture: str) -> dict[str, Any]:
-    """Result of the job that nothing happens to."""
+    """Result of an undisturbed job."""
     job = submit(system, token, capture)
     return result_of(system, token, job)
 
@@ -45,8 +45,8 @@ def submit(system: ComposedSystem, token: str, capture: str) -> str:
 
 
 def result_of(system: ComposedSystem, token: str, job: str) -> dict[str, Any]:
-    """What a job found, without the time that it took; asserts that it succeeded and that one attempt published each
-    stage.
+    """A job's parameters without the time that it took; asserts that the job succeeded and that each stage was
+    finished once, by the attempt that published it.
     """
     with system.client(token) as client:
         detail = follow(client, job)
@@ -80,7 +80,7 @@ def test_the_asset_of_a_job_renders(
 
 
 def kill(service: str) -> Callable[[ComposedSystem, StoreDisk], None]:
-    """Kill -9 the container's first process; its restart policy starts it again."""
+    """A fault that kills the container's first process by SIGKILL; its restart policy starts it again."""
 
     def strike(system: ComposedSystem, _disk: StoreDisk) -> None:
         os.kill(system.inspect(system.container(service))["State"]["Pid"], signal.SIGKILL)
@@ -89,9 +89,7 @@ def kill(service: str) -> Callable[[ComposedSystem, StoreDisk], None]:
 
 
 def cut_worker(system: ComposedSystem, _disk: StoreDisk) -> None:
-    """Every packet to and from the worker is lost for a minute, also where it starts again meanwhile; its addresses
-    stay.
-    """
+    """Drop every packet to and from the worker for a minute, also if it restarts meanwhile; its addresses stay."""
     rules = (["INPUT", "!", "-i", "lo", "-j", "DROP"], ["OUTPUT", "!", "-o", "lo", "-j", "DROP"])
     cut, end = 0, time.monotonic() + CUT_S
     while time.monotonic() < end:

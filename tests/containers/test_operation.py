@@ -1,6 +1,4 @@
-"""What whoever runs the system does with it: back up and restore, change passwords and certificates, upgrade, add a
-machine.
-"""
+"""Tasks of an operator: back up and restore, change passwords and certificates, add a machine, stop and start."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ def finished(system: ComposedSystem, token: str, mouth: Path) -> str:
 
 
 def digests(system: ComposedSystem, token: str, job: str) -> dict[str, str]:
-    """SHA-256 of every artifact, as the API gives it."""
+    """SHA-256 of every artifact of a job, as the API delivers it."""
     with system.client(token) as client:
         paths = [one["path"] for one in client.get(f"/v1/jobs/{job}/artifacts").json()]
         return {
@@ -85,13 +83,13 @@ def test_a_new_database_password_needs_no_restart(system: ComposedSystem, token:
     assert system.inside("api", "cat", "/secrets/database/password") != before
     system.engine(
         "restart", system.container("postgres")
-    )  # ends all connections, so that new ones show the new password
+    )  # ends all connections, so that the API must connect with the new password
     system.wait_until(lambda: system.is_ready(token), "the API does not come back with the new password")
     assert system.inspect(system.container("api"))["State"]["StartedAt"] == started
     with system.client(token) as client:
         assert (
             client.post(f"/v1/jobs/{finished}/retry").status_code == 409
-        )  # answered, as it reads and writes the database
+        )  # a refusal of the API itself, which has read the database
 
 
 def test_a_wrong_password_is_told_in_one_sentence(system: ComposedSystem) -> None:
@@ -124,9 +122,7 @@ def test_certificates_are_renewed(system: ComposedSystem, token: str, mouth: Pat
 
 @contextmanager
 def further_machine(system: ComposedSystem, folder: Path) -> Iterator[None]:
-    """Another project of the engine with one worker, as another host would run it on the same network as the
-    scheduler.
-    """
+    """Run another compose project with one worker, as a further host on the scheduler's network would."""
     secrets = folder / "secrets"
     for name in ("tls", "database"):
         volume = system.engine(

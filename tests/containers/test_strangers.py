@@ -1,4 +1,4 @@
-"""Who is not of the system is let into nothing: another container on each of its networks, and another user of the
+"""Outsiders get access to no part of the system: another container on each of its networks, and another user of the
 host.
 """
 
@@ -19,13 +19,13 @@ NETWORKS = ("front", "parts", "database", "dome")
 STRANGER = Path(__file__).with_name("stranger.py")
 NOBODY = 65534
 PYTHON = shutil.which("python3", path=os.defpath) or sys.executable
-"""The system's, as another user may not enter the folder of this one."""
+"""The system's Python, because another user may have no access to the folder of this one."""
 POSTGRES, SCHEDULER, API, DOME = 5432, 8786, 8000, 5020
 _LISTENING = "0A"
 
 
 def listening(system: ComposedSystem, service: str) -> set[int]:
-    """TCP ports on which a container listens beyond its own loopback."""
+    """TCP ports on which a container listens on addresses other than its own loopback."""
     lines = system.inside(service, "cat", "/proc/net/tcp", "/proc/net/tcp6", check=False).splitlines()
     rows = [line.split() for line in lines if ":" in line]
     ours = (row[1].rpartition(":") for row in rows if len(row) > 3 and row[3] == _LISTENING)
@@ -37,7 +37,7 @@ def listening(system: ComposedSystem, service: str) -> set[int]:
 
 
 def targets(system: ComposedSystem) -> dict[tuple[str, int], str]:
-    """Every address and port at which some part listens, with the part's name."""
+    """Every address and port at which a service listens, with the service's name."""
     found = {}
     for service in ("api", "scheduler", "worker", "rig", "postgres", "dome"):
         networks = system.inspect(system.container(service))["NetworkSettings"]["Networks"].values()
@@ -46,7 +46,7 @@ def targets(system: ComposedSystem) -> dict[tuple[str, int], str]:
 
 
 def expected(service: str, port: int) -> set[str]:
-    """How a part may answer a stranger on one of its ports."""
+    """Answers that a service may give an outsider on one of its ports."""
     if service == "api":
         return {"http 401"}
     if service == "postgres":
@@ -84,7 +84,7 @@ def test_another_user_of_the_host_is_let_into_nothing(system: ComposedSystem) ->
 
 
 def check(aims: dict[tuple[str, int], str], told: dict[str, str]) -> set[str]:
-    """Each answer is a refusal; returns who answered at all."""
+    """Assert that each answer is a refusal; returns the services that answered at all."""
     assert set(aims.values()) == {"api", "scheduler", "worker", "rig", "postgres", "dome"}
     for (host, port), service in aims.items():
         answer = told[f"{host}:{port}"]

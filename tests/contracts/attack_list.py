@@ -1,9 +1,9 @@
-"""The attack list: every test that is marked ``attack(kind, what)``, run, and its table.
+"""The attack list: runs every test that is marked ``attack(kind, what)``, and writes a table of the results.
 
 python -m tests.contracts.attack_list --json attacks.json
 
-The table goes into the JSON file and into the page beside the API's documentation. An attack has held off when all its
-cases passed; one that a machine cannot try, such as another user without being the superuser, says so.
+The table goes into the JSON file and into the page beside the API's documentation. An attack is held off when all its
+cases passed. The table says which attacks this machine cannot try, such as those that need root.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MARK = re.compile(
     r"(?:(?!def |@pytest\.mark\.attack).*\n)*def (?P<test>\w+)\(",
     re.MULTILINE,
 )
-"""A mark, the decorators below it, each on one line or on several, and the test's name."""
+"""Pattern of a mark, the decorators below it, each on one or several lines, and the test's name."""
 TITLE = """# Attacks that are tried
 
 `make attacks` runs these tests and writes this page; what each of them does stands in its source below `tests/`.
@@ -43,9 +43,9 @@ class Attack:
     kind: str
     what: str
     test: str
-    """File and function."""
+    """The test's file and function."""
     outcomes: Counter[str] = field(default_factory=Counter)
-    """Of its cases: passed, failed or skipped."""
+    """Number of cases by outcome: passed, failed or skipped."""
 
     def row(self) -> dict[str, Any]:
         """The attack as JSON."""
@@ -59,14 +59,14 @@ class Attack:
 
     @property
     def outcome(self) -> str:
-        """What came of it, in words."""
+        """The result of the attack, in words."""
         if not self.outcomes or self.outcomes["failed"]:
             return "broke through" if self.outcomes["failed"] else "not run"
         return "held off" if not self.outcomes["skipped"] else f"held off, {self.outcomes['skipped']} not tried here"
 
 
 def listed() -> list[Attack]:
-    """Every attack that the tests' sources name, in their order."""
+    """Find every attack that the tests' sources mark, in their order."""
     found = []
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         of = path.relative_to(ROOT)
@@ -83,14 +83,14 @@ class Collector:
         self._attacks = {attack.test: attack for attack in attacks}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Count a case once: when it was called, or where it failed or was skipped before or after that."""
+        """Count a case once: when its test function ran, or when its set-up or tear-down failed or skipped it."""
         attack = self._attacks.get(report.nodeid.partition("[")[0])
         if attack is not None and (report.when == "call" or report.outcome != "passed"):
             attack.outcomes[report.outcome] += 1
 
 
 def table(attacks: Iterable[Attack]) -> str:
-    """The page."""
+    """Text of the page: one table per kind of attack."""
     by_kind: dict[str, list[Attack]] = defaultdict(list)
     for attack in attacks:
         by_kind[attack.kind].append(attack)
@@ -105,7 +105,7 @@ def table(attacks: Iterable[Attack]) -> str:
 
 
 def main() -> None:
-    """Run, write the page and the JSON file, and tell what broke through."""
+    """Run the attacks, write the page and the JSON file, and print those that were not held off."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--only", help="kind of attacks; without it all, and the page is written")

@@ -1,7 +1,6 @@
-"""What generated requests can name so that they get past the lookup: ids that exist, and headers and bodies that fit
-together.
+"""Ids that exist, and headers and bodies that fit together, for generated requests that must get past the lookup.
 
-The description says of an id only that it is text, so a generated one is never anybody's.
+The API's description says of an id only that it is text, so a generated id never exists.
 """
 
 from __future__ import annotations
@@ -22,15 +21,15 @@ from tests.contracts.kept_data import KeptData
 from tests.support.uploading import CAMERA, TUS, checksum, manifest_of
 
 MAX_KEPT = 200
-"""Newest things that are named again."""
+"""Number of the newest objects that later requests can name."""
 SPARED = 3
-"""Newest things of a kind that are not deleted yet."""
+"""Number of the newest objects of a kind that generated requests do not delete."""
 HOLD = "hold-fit"
-"""Lets a toy job wait in its fit."""
+"""Name of the file that makes a toy job wait in its fit."""
 PNG_TYPE = "image/png"
 DOME_LIGHTS = 155
 NOWHERE = "http://127.0.0.1:9/"
-"""Where nobody listens."""
+"""Address at which no server listens."""
 _ID_OF = {"/v1/jobs": "job_id", "/v1/captures": "capture", "/v1/tokens": "token_id", "/v1/webhooks": "webhook_id"}
 _FILE = "capture.json"
 _LIGHTS = ("l0", "l1", "all")
@@ -38,13 +37,13 @@ _UNITS: dict[str, Any] = {"units": "mm", "channels": ["green"], "cameras": [CAME
 
 
 def content_of(choice: int) -> bytes:
-    """The one file of a small capture, of which there are many."""
+    """Content of the one file of a small capture; different choices give different files."""
     light = {"name": "l0", "position_mm": [0, 0, -50], "intensity": [1.0]}
     return json.dumps(_UNITS | {"lights": [light]}).encode() + b" " * (choice % 5000)
 
 
 class ExistingIds:
-    """Parameters of paths that exist on the server. Those of the witnesses are not deleted."""
+    """Path parameters of objects that exist on the server. Those of the witnesses are never deleted."""
 
     def __init__(self, witnesses: KeptData, data: Path, mouth: Path) -> None:
         self._jobs, self._mouth, self._job_count = data / "jobs", mouth, 0
@@ -58,7 +57,7 @@ class ExistingIds:
         self._source = witnesses.capture["path"]
 
     def place(self, case: Case, choice: int) -> None:
-        """Let a case name something that exists, unless its path is what is wrong with it."""
+        """Make a case name an object that exists, unless the case is meant to have a wrong path."""
         known = self._deleted if case.path.startswith("/v1/deletions") else self._kept + self._made
         there = [one for one in known if set(one) <= set(case.path_parameters)]
         if case.method.upper() == "DELETE":
@@ -70,7 +69,7 @@ class ExistingIds:
             case.path_parameters = case.path_parameters | there[choice % len(there)]
 
     def fit(self, case: Case, choice: int) -> None:
-        """Let a case that is right by the description be right for the server too."""
+        """Change a case that is valid by the description so that the server can carry it out."""
         match f"{case.method.upper()} {case.path}":
             case "POST /v1/jobs":
                 case.body = {
@@ -114,7 +113,7 @@ class ExistingIds:
                 case.headers.update(TUS)
 
     def learn(self, case: Case, response: Response) -> None:
-        """Remember what a request has made."""
+        """Remember the objects that a request has made or deleted."""
         if response.status_code not in {200, 201, 202, 204}:
             return
         if case.method.upper() == "DELETE":
@@ -138,12 +137,12 @@ class ExistingIds:
         self._made = self._made[-MAX_KEPT:]
 
     def release(self) -> None:
-        """Let the jobs go on that wait."""
+        """Let the waiting jobs go on."""
         for hold in self._jobs.glob(f"*/{HOLD}"):
             hold.unlink()
 
     def _steer(self, job: str) -> None:
-        # Some jobs fail, and some wait and let others queue, so that there is something to retry and to cancel.
+        # Some jobs fail, and some wait and let others queue, so that there are jobs to retry and to cancel.
         self._job_count += 1
         flag = HOLD if self._job_count % 8 == 5 else "bad-input" if self._job_count % 3 == 1 else None
         if flag is not None:

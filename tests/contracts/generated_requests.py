@@ -1,13 +1,13 @@
-"""Requests generated from the description of the API, right and wrong ones, to a server that runs jobs.
+"""Valid and invalid requests, generated from the description of the API, to a server that runs jobs.
 
 python -m tests.contracts.generated_requests --cases 10000 --seed 1 --json cases.json
 
-The description that the server itself gives is read; a part of the cases goes along the borders of what it allows, the
-others are drawn from it, half of them against it. They come with a token of every scope, with one that may only read,
-with a wrong one, or without any. An answer is good when its status, content type, headers and body are described, when
-what the description forbids is refused, when a refusal is a problem document with a known code, and when it is no
-failure of the server. The server has a simulated dome. In the end the server must be ready, run a further job, and have
-kept what was there before.
+The cases come from the description that the server itself gives. Some of them test the limits of what it allows; the
+others are random, half of them valid and half of them invalid by the description. They are sent with a token of the
+scope admin, with one that may only read, with a wrong token, or without a token. An answer is good if its status,
+content type, headers and body are described, if a request that the description forbids is refused, if a refusal is a
+problem document with a known code, and if it is no failure of the server. The server has a simulated dome. In the end
+the server must be ready, run a further job, and have kept the data of before.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ CHECKS = [
 CONFIG = {"checks": {"negative_data_rejection": {"expected-statuses": ["4xx", "507"]}}}
 CALLERS = ("admin",) * 16 + ("read", "read", "wrong", "nobody")
 BORDER_SHARE = 0.2
-"""Of the cases, at most: those along the borders of what the description allows."""
+"""Largest share of cases at the limits of what the description allows."""
 MAX_AT_ONCE = 25
-"""Cases of one operation and mode that are drawn together."""
+"""Largest number of cases of one operation and mode that are drawn together."""
 ANSWER_S, STREAM_S = 60.0, 3.0
-"""How long an answer may take, and how long a stream of events is read."""
+"""Longest time of an answer, and time for which a stream of events is read."""
 STRAY_HEADERS: Mapping[str, tuple[str, ...]] = {
     "Range": ("bytes=0-0", "bytes=9-1", "bytes=-1", "bytes=0-,0-", "bytes=99999999999999999999-", "lines=1"),
     "If-None-Match": ("*", '"', "W/"),
@@ -81,7 +81,15 @@ _PHRASES = {status.phrase.lower().replace(" ", "-") for status in HTTPStatus} | 
 
 @dataclass(frozen=True)
 class Dressing:
-    """What a case is sent with besides what the description says of it."""
+    """Properties with which a case is sent, besides those that the description generates.
+
+    Attributes:
+        caller: owner of the token; see ``CALLERS``.
+        choice: number that selects among existing objects and contents.
+        is_placed: whether the path names an object that exists.
+        is_fit: whether a valid case is changed so that the server can carry it out.
+        stray: headers that the description does not know.
+    """
 
     caller: str
     choice: int
@@ -92,7 +100,7 @@ class Dressing:
 
 @dataclass
 class Fault:
-    """One kind of bad answer of one operation."""
+    """One kind of bad answer to one operation."""
 
     operation: str
     kind: str
@@ -103,19 +111,19 @@ class Fault:
 
 @dataclass
 class Tally:
-    """What came of the cases so far."""
+    """Results of the cases so far."""
 
     statuses: dict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
-    """Of each operation."""
+    """Number of answers by status, by operation; status 0 stands for no answer."""
     faults: dict[tuple[str, str], Fault] = field(default_factory=dict)
 
     @property
     def cases(self) -> int:
-        """How many there were."""
+        """Number of cases sent."""
         return sum(counter.total() for counter in self.statuses.values())
 
     def blame(self, operation: str, kind: str, sentence: str, example: str) -> None:
-        """Note a bad answer."""
+        """Record a bad answer."""
         fault = self.faults.setdefault((operation, kind), Fault(operation, kind, sentence, example, 0))
         fault.times += 1
 
@@ -131,7 +139,7 @@ dressings = st.builds(
 
 
 class Sender:
-    """Sends generated cases to one server and judges the answers."""
+    """Sends generated cases to one server and checks the answers."""
 
     def __init__(self, address: str, tokens: Mapping[str, str | None], living: ExistingIds) -> None:
         self._address, self._tokens, self._living = address, tokens, living
@@ -143,18 +151,18 @@ class Sender:
         told.raise_for_status()
         described = told.json()
         for operation in (one for path in described["paths"].values() for one in path.values()):
-            operation.pop("security", None)  # the callers say who asks
+            operation.pop("security", None)  # because the cases are sent with the tokens of ``CALLERS``
         self._schema = schemathesis.openapi.from_dict(described, config=schemathesis.Config.from_dict(CONFIG))
         self._operations = [found.ok() for found in self._schema.get_all_operations()]
         self.tally = Tally()
 
     @property
     def tags(self) -> dict[str, str]:
-        """The class of each operation: the tag that it is described under."""
+        """Class of each operation: the first tag of its description."""
         return {operation.label: (operation.tags or ["other"])[0] for operation in self._operations}
 
     def run(self, cases: int, start: int, tell: Callable[[str], None]) -> None:
-        """Send so many cases; ``start`` seeds them, ``tell`` is told how far it is."""
+        """Send ``cases`` cases; ``start`` seeds them, and ``tell`` receives lines of progress."""
         dice = random.Random(start)
         border = [case for operation in self._operations for case in self._border(operation)]
         border = dice.sample(border, min(len(border), round(BORDER_SHARE * cases)))
@@ -182,7 +190,7 @@ class Sender:
         )
 
     def _draw(self, operation: Any, mode: GenerationMode, most: int, start: int) -> bool:
-        # Whether there are such cases at all.
+        # Send up to ``most`` cases; returns whether the operation has cases of this mode.
         @seed(start)
         @settings(
             max_examples=most,
@@ -227,13 +235,13 @@ class Sender:
         self._session.cookies.clear()
         where: dict[str, Any] = {"base_url": self._address, "session": self._session, "headers": headers}
         if case.path.endswith("/events"):
-            with suppress(requests.ReadTimeout):  # not even the head came, which may take its time
+            with suppress(requests.ReadTimeout):  # no head came within STREAM_S, so ask again with more time
                 return case.call(timeout=STREAM_S, **where)
         return case.call(timeout=ANSWER_S, **where)
 
 
 def _takes_input(operation: Any) -> bool:
-    # What takes none cannot be asked wrongly.
+    # An operation without parameters or body has no invalid requests.
     return any(operation.iter_parameters()) or bool(operation.body)
 
 
@@ -242,7 +250,7 @@ def _faults(case: Case, response: Response, headers: dict[str, str], of: list[An
         yield f"failure of the server ({response.status_code})", str(response.headers.get("x-request-id"))
         return
     if response.status_code not in {HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN, HTTPStatus.TOO_MANY_REQUESTS}:
-        of = [*of, checks.unsupported_method]  # who may not pass is not told what is there
+        of = [*of, checks.unsupported_method]  # refused callers are not told which methods exist
     try:
         case.validate_response(response, checks=of, headers=headers)
     except FailureGroup as group:
@@ -252,7 +260,7 @@ def _faults(case: Case, response: Response, headers: dict[str, str], of: list[An
 
 
 def _flaws(response: Response) -> Iterator[str]:
-    # What is wrong with a refusal. A database that is there is not lost, so its loss is none that may be told of here.
+    # Errors in a refusal's problem document. The code database-lost counts as one, because the database is there.
     if response.headers.get("content-type") != [MEDIA_TYPE]:
         yield f"content type {response.headers.get('content-type')}"
         return
@@ -275,16 +283,19 @@ class Outcome:
     cases: int
     seconds: float
     classes: dict[str, dict[str, int]]
-    """Answers by their class, of each class of operations."""
+    """Number of answers by class of status (such as 2xx), by class of operations."""
     operations: dict[str, dict[int, int]]
+    """Number of answers by status, by operation."""
     jobs: dict[str, int]
-    """That there are in the end, by state."""
+    """Number of jobs at the end, by state."""
     faults: list[Fault]
 
 
 @contextmanager
 def served(folder: Path, database: str | None) -> Iterator[tuple[httpx.Client, Any, dict[str, str | None]]]:
-    """A server that asks for tokens and runs toy jobs, a client that may do anything, and the callers' tokens."""
+    """Run a server that requires tokens and runs toy jobs; yields a client of the scope admin, the server's process and
+    the callers' tokens.
+    """
     data = folder / "data"
     data.mkdir()
     tokens: dict[str, str | None] = {
@@ -307,7 +318,7 @@ def served(folder: Path, database: str | None) -> Iterator[tuple[httpx.Client, A
 def survey(
     folder: Path, cases: int, start: int, database: str | None = None, tell: Callable[[str], None] = lambda _: None
 ) -> Outcome:
-    """Serve a new data folder in ``folder``, send the cases and judge what is left."""
+    """Serve a new data folder in ``folder``, send the cases, and check the server and its data afterwards."""
     began = time.monotonic()
     with served(folder, database) as (client, process, tokens):
         witnesses = leave_witnesses(client, folder / "data", folder / "capture")
@@ -335,7 +346,7 @@ def survey(
 
 
 def main() -> None:
-    """Run, print a table and the faults, and write all of it."""
+    """Run, print a table and the faults, and write both."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)

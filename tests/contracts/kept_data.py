@@ -1,4 +1,4 @@
-"""A capture and a job that were there before the generated requests, and are compared with themselves afterwards."""
+"""A capture and a job that exist before the generated requests, and are compared to their earlier state afterwards."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.uploading import announce, contents_of, send, write_capture
 
 @dataclass(frozen=True)
 class KeptData:
-    """All that the server tells of one capture and one job, and what lies on its disk of the capture."""
+    """The server's records of one capture and one job, and the capture's files on its disk."""
 
     capture: dict[str, Any]
     contents: dict[str, bytes]
@@ -25,13 +25,13 @@ class KeptData:
 
     @classmethod
     def of(cls, client: httpx.Client, data: Path, capture: str, job: str) -> KeptData:
-        """What is there now."""
+        """Read the present state of a capture and a job."""
         told = client.get(f"/v1/jobs/{job}").raise_for_status().json()
         paths = [file["path"] for file in client.get(f"/v1/jobs/{job}/artifacts").raise_for_status().json()]
         return cls(
             client.get(f"/v1/captures/{capture}").raise_for_status().json(),
             contents_of(data / "captures" / capture),
-            {key: value for key, value in told.items() if key != "name"},  # which whoever may submit jobs may change
+            {key: value for key, value in told.items() if key != "name"},  # callers who may submit may change the name
             {
                 path: hashlib.sha256(
                     client.get(f"/v1/jobs/{job}/artifacts/{path}").raise_for_status().content
@@ -43,7 +43,7 @@ class KeptData:
         )
 
     def losses(self, client: httpx.Client, data: Path) -> list[str]:
-        """What is gone or different now."""
+        """One sentence for each part that is missing or has changed."""
         try:
             now = KeptData.of(client, data, self.capture["id"], self.job["id"])
         except httpx.HTTPError as problem:
@@ -57,7 +57,7 @@ class KeptData:
 
 
 def _where(before: object, now: object) -> str:
-    """The entries of two mappings that differ; nothing for other things."""
+    """The entries in which two mappings differ, as text; empty for other objects."""
     if not isinstance(before, dict) or not isinstance(now, dict):
         return ""
     return ": " + ", ".join(
@@ -68,7 +68,7 @@ def _where(before: object, now: object) -> str:
 
 
 def leave_witnesses(client: httpx.Client, data: Path, folder: Path) -> KeptData:
-    """Upload a capture and run a job on it."""
+    """Upload a capture and run a job on it; returns their state."""
     contents = contents_of(write_capture(folder))
     capture = announce(client, contents)["id"]
     for path, content in contents.items():

@@ -1,4 +1,4 @@
-"""Toy stages whose preparation and pictures can be asked for like those of a real job."""
+"""Toy stages that leave a preparation and pictures, so that requests for them work as for a real job."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LIGHTS = tuple(Light(name=f"l{number}", position_mm=(0, 0, -50), intensity=(1.0,
 
 
 def prepare(_spec: JobSpec, context: StageContext) -> PreparedManifest:
-    """Publishes bits of one camera and two lights; fails with a sentence while ``bad-input`` exists."""
+    """Publish the validity bits of one camera and two lights; fail with an input error while ``bad-input`` exists."""
     if (context.root / "bad-input").exists():
         raise CaptureInputError("Frame c0_l3.npy is missing from the capture; copy it there.")
     camera = Camera.model_validate(CAMERA)
@@ -39,7 +39,7 @@ def prepare(_spec: JobSpec, context: StageContext) -> PreparedManifest:
 
 
 def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Draws a picture first."""
+    """Report a preview picture, then run the toy fit."""
     path = "previews/0.png"
     (context.root / "previews").mkdir(exist_ok=True)
     (context.root / path).write_bytes(picture_of(np.zeros((6, 8), dtype=np.uint8)))

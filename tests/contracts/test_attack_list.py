@@ -1,4 +1,4 @@
-"""The page of attacks names each attack that is tried, and none besides; see ``attack_list``."""
+"""The page of attacks names every attack that a test tries, and no other; see ``attack_list``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_every_attack_is_on_the_page() -> None:
 
 def test_every_mark_is_read() -> None:
     marks = sum(path.read_text().count("@pytest.mark.attack(") for path in (ROOT / "tests").rglob("test_*.py"))
-    assert len(listed()) == marks - 1  # but the one above
+    assert len(listed()) == marks - 1  # the text in the line above is no mark
 
 
 def test_every_kind_has_attacks() -> None:

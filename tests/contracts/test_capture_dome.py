@@ -1,4 +1,4 @@
-"""What every dome must do, run on the Modbus driver against the simulated controller."""
+"""Contract of every dome driver, run on the Modbus driver with the simulated controller."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def address() -> Iterator[tuple[str, int]]:
 
 
 class DomeContract:
-    """Inherit and provide ``dome`` (entered), ``observer`` (of the same dome) and ``make`` (another driver of it)."""
+    """Tests for any driver. A subclass provides the fixtures ``dome`` (entered), ``observer`` (of the same dome) and
+    ``make`` (which opens another driver of it).
+    """
 
     def test_one_light_at_a_time(self, dome: Dome, observer: DomeObserver) -> None:
         for light in (0, 17, LIGHTS - 1):

@@ -1,6 +1,5 @@
-"""Whatever a capture, a job file or an array holds: it is taken, or refused in one sentence that is of the error tree.
-
-Nothing else is ever raised.
+"""Any content of a capture, a job file, an array or the environment is either accepted or refused by an error of the
+error tree with a one-sentence message. No other exception is raised.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from tests.support.mouth import write_mouth
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning"
-)  # of arithmetic with what is absurd; the answer counts
+)  # warnings of arithmetic with absurd values; only the result counts here
 EXAMPLES = settings(
     max_examples=150,
     deadline=None,
@@ -101,7 +100,7 @@ VALUES = st.recursive(
 
 @contextmanager
 def only_sentences() -> Iterator[None]:
-    """Let pass what is taken, and what is refused as it should be."""
+    """Pass if the block succeeds or raises a ``DentineError`` whose message is a sentence on one line."""
     told = "."
     try:
         yield
@@ -112,7 +111,7 @@ def only_sentences() -> Iterator[None]:
 
 
 def places(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Every place in a JSON tree but its root."""
+    """Path of every node in a JSON tree except its root."""
     inner = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in inner:
         yield (*path, key)
@@ -120,7 +119,7 @@ def places(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def changed(tree: Any, path: tuple[Any, ...], change: Callable[[Any, Any], None]) -> Any:
-    """A copy in which ``change(container, key)`` was applied at one place."""
+    """A copy of a tree in which ``change(container, key)`` was applied at one path."""
     result = copy.deepcopy(tree)
     holder = result
     for key in path[:-1]:
@@ -142,7 +141,7 @@ def repeat(holder: Any, key: Any) -> None:
 
 @st.composite
 def mutations(draw: st.DrawFn, tree: Any) -> Any:
-    """A JSON tree with one or two places replaced, dropped or repeated."""
+    """A JSON tree with one or two nodes replaced, dropped or repeated."""
     for _ in range(draw(st.integers(1, 2))):
         path = draw(st.sampled_from(list(places(tree))))
         value = draw(VALUES)
@@ -238,7 +237,7 @@ def test_every_kind_of_array(
 
 
 def toml(value: Any) -> str:
-    """A value as TOML; what has no such form becomes a text."""
+    """A value as TOML; values without a TOML form become strings."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -257,12 +256,12 @@ CAMERA_OPTIONS = sorted(SimulatedCameraSpec.model_fields)
 
 
 def plan(path: Path) -> None:
-    """Read a job file, and plan its rig if it has one that is simulated."""
+    """Read a job file, and plan its rig if it has one."""
     with only_sentences():
         spec = read_job(path)
         if spec.rig is not None:
             rig = PlannedRig.read(spec.rig)
-            rig._cameras("127.0.0.1", 1, time.sleep)  # which connect when they are opened
+            rig._cameras("127.0.0.1", 1, time.sleep)  # not opened, so they do not connect
 
 
 @EXAMPLES

@@ -1,4 +1,4 @@
-"""Some hundred requests generated from the description of the API; ``make contracts`` sends ten thousand."""
+"""Three hundred requests generated from the API's description; ``make contracts`` sends ten thousand."""
 
 from __future__ import annotations
 

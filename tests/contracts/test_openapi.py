@@ -1,4 +1,4 @@
-"""The description of the API beside the code is that of the code, and says what a client needs."""
+"""The stored description of the API matches the code, and describes every operation and every refusal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_stored_description_is_current() -> None:
 
 
 NAMED_ANEW = {413: "Content Too Large", 414: "URI Too Long", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
-"""By Python 3.13, after RFC 9110."""
+"""Titles of statuses that Python 3.13 renamed, after RFC 9110."""
 
 
 def test_the_description_is_the_same_on_every_python(monkeypatch: pytest.MonkeyPatch) -> None:

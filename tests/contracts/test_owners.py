@@ -1,6 +1,6 @@
-"""Who may what: every route × every scope × whose thing it names.
+"""Access rights: every route × every scope × the owner of the object that the path names.
 
-What is somebody else's is answered like what is not there.
+A request for another group's object gets the same answer as one for an object that does not exist.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import httpx
 import pytest
 
-from services.api.auth.scopes import LIVENESS, SETUP, guarded_routes
+from services.api.auth.scopes import LIVENESS, SETUP, scoped_routes
 from services.api.auth.tokens import Scope
 from services.api.dome.dome import Dome
 from services.api.jobs.jobs import Jobs
@@ -26,15 +26,15 @@ from tests.support.guarded_server import Guarded, guarded, make_token
 from tests.support.uploading import TUS, announce, contents_of, manifest_of, send, upload_capture, write_capture
 
 UNKNOWN = {"job_id": "0123456789ab", "capture": "fedcba9876543210"}
-"""Ids of the form that the server makes, of nothing."""
+"""Ids in the server's format of objects that do not exist."""
 GROUPS: Mapping[str, str | None] = {"own": "orthodontics", "other": "surgery", "alone": None}
 LAST = ("DELETE /v1/uploads/{capture}/{number}", "DELETE /v1/captures/{capture}", "DELETE /v1/jobs/{job_id}")
-"""What takes away what the other routes name."""
+"""Routes that delete the objects that the other routes name; they are tried last."""
 
 
 @dataclass(frozen=True)
 class House:
-    """A server with what belongs to one group, and callers of several."""
+    """A server with the objects of one group, and tokens of callers of several groups."""
 
     server: Guarded
     tokens: Mapping[tuple[str, Scope], str]
@@ -42,7 +42,7 @@ class House:
     receipt: str
 
     def ask(self, method: str, path: str, whose: str, scope: Scope, **options: Any) -> httpx.Response:
-        """A request by a caller of a group."""
+        """Send a request with the token of a group and scope."""
         headers = {"Authorization": f"Bearer {self.tokens[whose, scope]}"} | options.pop("headers", {})
         return self.server.ask(method, path, headers=headers, **options)
 
@@ -77,8 +77,8 @@ def run_to_report(_spec: object, folder: Path, _events: object) -> None:
 
 
 def operations(house: House) -> list[tuple[str, str, Scope]]:
-    """Method, template and scope of every route that names a job or a capture, those last that take it away."""
-    routes = [route for route in guarded_routes(house.server.app.routes) if route.template not in {LIVENESS, SETUP}]
+    """Method, template and scope of every route that names a job or a capture; deleting routes come last."""
+    routes = [route for route in scoped_routes(house.server.app.routes) if route.template not in {LIVENESS, SETUP}]
     found = [(method, route.template, route.needs.scope) for route in routes if route.needs for method in route.methods]
     named = [one for one in found if re.search(r"{(job_id|capture)}", one[1])]
     return sorted(named, key=lambda one: LAST.index(f"{one[0]} {one[1]}") if f"{one[0]} {one[1]}" in LAST else -1)
@@ -99,7 +99,7 @@ def path_of(template: str, ids: Mapping[str, str], receipt: str) -> str:
 
 
 def told(answer: httpx.Response, ids: Mapping[str, str], receipt: str) -> tuple[int, str, dict[str, str]]:
-    """An answer without what differs by the name that was asked for."""
+    """Status, text and headers of an answer, without the parts that depend on the id in the request."""
     text = answer.text
     for name in {*ids.values(), receipt}:
         text = text.replace(name, "ID")
@@ -137,7 +137,7 @@ def test_every_route_with_every_scope_for_every_owner(house: House) -> None:
 
 @pytest.fixture
 def fresh(tmp_path: Path) -> Iterator[House]:
-    """A server of its own, for what changes who has what."""
+    """A server for one test alone, for tests that add or delete objects."""
     data = tmp_path / "data"
     tokens = {
         (whose, scope): make_token(data, f"{whose}-{scope}", scope, group=group)
@@ -165,7 +165,7 @@ def test_lists_show_what_is_ones_own(fresh: House, tmp_path: Path) -> None:
             units["lights"][0]["position_mm"][2] -= len(made)
             assert client.put("/v1/calibrations/rig", json=units).status_code == 201
             made[whose] = capture, job.json()["id"], client.get("/v1/calibrations/rig").json()["id"]
-    assert len({capture for capture, _, _ in made.values()}) == 3  # the same files, and no capture in common
+    assert len({capture for capture, _, _ in made.values()}) == 3  # the same files give a capture for each group
 
     def seen(whose: str, scope: Scope) -> tuple[set[str], ...]:
         answers = [
@@ -238,7 +238,7 @@ def test_who_knows_a_hash_alone_neither_gets_the_content_nor_learns_that_it_is_h
         assert other.post(f"/v1/captures/{asked['id']}/commit").status_code == 200
         assert other.delete(f"/v1/captures/{asked['id']}").status_code == 204
         again = own.post("/v1/captures", json=manifest_of(contents)).json()
-        assert (again["state"], again["missing_bytes"]) == ("committed", 0)  # whose content was not taken away
+        assert (again["state"], again["missing_bytes"]) == ("committed", 0)  # the other deletion left this content
 
 
 @pytest.mark.attack("traversal", "a job on a folder outside the roots, by '..', by a link, or in the data folder")
@@ -312,22 +312,22 @@ def test_a_session_that_was_signed_out_opens_nothing(tmp_path: Path) -> None:
         assert server.client.get("/v1/jobs", headers=cookie).status_code == 200
         here = cookie | {"Origin": str(server.client.base_url).rstrip("/")}
         assert server.client.delete("/v1/session", headers=here).status_code == 204
-        refused = server.client.get("/v1/jobs", headers=cookie)  # as whoever has copied it would ask
+        refused = server.client.get("/v1/jobs", headers=cookie)  # as a thief of the cookie would ask
         assert (refused.status_code, refused.json()["code"]) == (401, "unauthenticated")
-        assert server.client.get("/v1/jobs", headers=other).status_code == 200  # of the same token, elsewhere
+        assert server.client.get("/v1/jobs", headers=other).status_code == 200  # another session of the same token
         assert server.ask("GET", "/v1/jobs", Scope.READ).status_code == 200
 
 
 @pytest.mark.attack("cross-site", "a report inside another page")
 def test_a_report_is_shown_inside_no_other_page(house: House) -> None:
     answer = house.ask("GET", f"/v1/jobs/{house.ids['job_id']}/artifacts/report.html", "other", Scope.ADMIN)
-    assert answer.status_code in {200, 404}  # the table above may have deleted the job
+    assert answer.status_code in {200, 404}  # an earlier test may have deleted the job
     assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
 
 
 @pytest.mark.attack("routes × scopes", "the ids of others' jobs in the dome's answers")
 def test_the_dome_names_jobs_to_those_alone_who_may_see_them(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A job of its own, as the tests above may have deleted the other.
+    # Submit a new job, because earlier tests may have deleted the others.
     asked = {"capture": f"captures/{house.ids['capture']}", "seed": 3}
     job = house.ask("POST", "/v1/jobs", "own", Scope.SUBMIT, json=asked).json()["id"]
     status = dict.fromkeys(("interlock_closed", "emergency_stop", "supply_on", "stopped"), False)

@@ -1,12 +1,12 @@
-"""Faults of every part of the service in every stage, kill -9 also at every boundary.
+"""Matrix of faults: each part of the service fails in each stage of a job; kills strike also at the stages' boundaries.
 
 python -m tests.faults.kill_matrix --json matrix.json
 
 A job of toy stages runs through the real API, database, scheduler and workers, each on a host of its own. It is held at
-one point, one fault strikes, the job is let go on, and what an orchestrator restarts is started again. A cell is good
-when the job succeeded, every stage was published once and by an attempt that the events tell of, what is published is
-whole, the dome is dark, the events tell of it in order, and there is one job for every submission. In the end all
-stores are looked at once more, as an attempt that was given up may write late.
+one point, one fault strikes, the job continues, and parts that ended are started again, as an orchestrator does. A cell
+is good if the job succeeded, every stage was published once and by a known attempt, the published files are intact, the
+dome is dark, the events are complete and in order, and there is one job for every submission. At the end all stores are
+checked once more, because an abandoned attempt may write late.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FOLDERS = {"capture": "capture", "prepare": "prepared", "fit": "fit", "export": 
 
 @dataclass(frozen=True)
 class Cell:
-    """What went wrong where, and how the job ended."""
+    """One fault at one point of one stage, and the result of the job."""
 
     fault: str
     stage: str
@@ -44,11 +44,11 @@ class Cell:
     job: str
     state: str
     attempts: dict[str, int]
-    """Starts of each stage."""
+    """Number of starts of each stage."""
     seconds: float
-    """From the fault to the job's end."""
+    """Time from the fault to the job's end."""
     faults: tuple[str, ...]
-    """What is wrong; empty when the cell is good."""
+    """Sentences about errors of the result; empty if the cell is good."""
 
 
 def run_cell(system: SmallSystem, fault: str, stage: str, point: str) -> Cell:
@@ -101,7 +101,7 @@ def _judge(held: Held, steering: Path, cell: Cell) -> Cell:
 
 
 def _events(held: Held) -> list[dict[str, Any]]:
-    """All of a job's, as the stream replays them."""
+    """All events of a job, as the stream replays them."""
     with held.system.client() as client:
         lines = client.get(f"/v1/jobs/{held.job}/events").text.splitlines()
     told = (json.loads(line.removeprefix("data: ")) for line in lines if line.startswith("data: {"))
@@ -122,19 +122,19 @@ def _store_faults(folder: Path, attempts: dict[str, int]) -> list[str]:
 
 
 def run_cells(system: SmallSystem, cells: Sequence[tuple[str, str, str]]) -> Iterator[Cell]:
-    """One cell after the other, on one system."""
+    """Run cells one after the other on one system."""
     for fault, stage, point in cells:
         yield run_cell(system, fault, stage, point)
 
 
 def all_cells() -> list[tuple[str, str, str]]:
-    """Every kill at every point of every stage, every other fault in the middle of each."""
+    """All cells as (fault, stage, point): every kill at every point of every stage, every other fault in its middle."""
     kills = [(part, stage, point) for part in KILLS for stage in STAGES for point in POINTS]
     return kills + [(fault, stage, "middle") for fault in FAULTS if fault not in KILLS for stage in STAGES]
 
 
 def main() -> None:
-    """Run all cells, print them as they end and write them."""
+    """Run the cells; print each when it ends, and write all of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--fault", action="append", choices=tuple(FAULTS), help="only this one; may be repeated")

@@ -1,7 +1,8 @@
-"""What can go wrong while a job is held at one point of one stage.
+"""Faults that strike while a job is held at one point of one stage.
 
-Each fault is a context: struck when it is entered; when the job has been let go on it is
-looked at from outside while it lasts, and mended in the end."""
+Each fault is a context manager. It strikes when the context is entered. The block lets the job continue; afterwards the
+context checks the system from outside while the fault lasts, and finally mends it.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from tests.support.small_system import SmallSystem
 from tests.support.store_disk import read_only
 
 OUTLASTED_S = 16.0
-"""Longer than the lease and Dask's timeouts in the small system."""
+"""Time longer than the lease and Dask's timeouts in the small system."""
 CLOCK_STEP_S = 3600.0
 TWINS = 8
 ENDED = frozenset({"SUCCEEDED", "FAILED", "CANCELLED"})
@@ -32,7 +33,7 @@ ENDED = frozenset({"SUCCEEDED", "FAILED", "CANCELLED"})
 
 @dataclass(frozen=True)
 class Held:
-    """A job that waits where a stage holds it."""
+    """A job that waits at a point at which a stage holds it."""
 
     system: SmallSystem
     job: str
@@ -41,17 +42,17 @@ class Held:
     spec: Mapping[str, Any]
     stage: str
     reached: Path
-    """Says which process runs the stage."""
+    """File with the id of the process that runs the stage."""
     pid: int
-    """That process, as it was held."""
+    """Id of that process when the job was held."""
 
     @property
     def host(self) -> str:
-        """The host of that process."""
+        """Name of the part that runs the process ``pid``: ``worker`` or ``rig``."""
         return next(name for name in ("worker", "rig") if self.pid in self.system.pids(name))
 
     def get(self, path: str) -> Any:
-        """What the API says, empty while it says nothing."""
+        """The API's JSON answer for a path; an empty mapping while the API does not answer."""
         with suppress(httpx.TransportError), self.system.client() as client:
             return client.get(path).json()
         return {}
@@ -61,24 +62,24 @@ class Held:
         return self.get(f"/v1/jobs/{self.job}").get("state") in ENDED
 
     def submit(self, **changes: Any) -> httpx.Response:
-        """The same submission once more."""
+        """Submit the job again under the same key, with changed fields if any are given."""
         with self.system.client() as client:
             return client.post("/v1/jobs", json={**self.spec, **changes}, headers={"Idempotency-Key": self.key})
 
     def outlast(self, seconds: float = OUTLASTED_S) -> None:
-        """Let some time pass; what ends is started again."""
+        """Let some time pass; parts that end meanwhile are started again."""
         until = time.monotonic() + seconds
         self.system.wait_until(lambda: time.monotonic() > until, "time stands still")
 
     def require_pause(self, what: str) -> None:
-        """Wait until the API says that the job waits for something."""
+        """Wait until the API states that the job waits for ``what``."""
         self.system.wait_until(
             lambda: str(self.get(f"/v1/jobs/{self.job}").get("waits_for")).startswith(f"Waits for {what}: "),
             f"job {self.job} does not wait for {what}",
         )
 
     def require_bad(self, *parts: str) -> None:
-        """Wait until readiness names just these parts as bad."""
+        """Wait until the readiness route names exactly these parts as bad."""
 
         def bad() -> set[str]:
             return {check["name"] for check in self.get("/v1/health/ready").get("checks", ()) if not check["ok"]}
@@ -91,7 +92,7 @@ Fault = Callable[[Held], AbstractContextManager[None]]
 
 @contextmanager
 def killed(part: str, held: Held) -> Iterator[None]:
-    """Kill -9; an orchestrator starts it again."""
+    """Kill a part by SIGKILL, and start it again as an orchestrator does."""
     if part == "stage":
         os.kill(held.pid, signal.SIGKILL)
     else:
@@ -102,10 +103,10 @@ def killed(part: str, held: Held) -> Iterator[None]:
 
 @contextmanager
 def worker_cut_off(held: Held) -> Iterator[None]:
-    """The stage's host is cut from the scheduler, until another one has begun the same stage and both go on: the lost
-    one still has database and store.
+    """Cut the stage's host from the scheduler. It stays cut until another host has begun the same stage; then both go
+    on, because the lost host still reaches database and store.
 
-    Nobody else can take over a capture, which goes on alone.
+    No other host can take over a capture, which goes on alone.
     """
     host = held.host
     with _cut(held, host, "scheduler"):
@@ -120,16 +121,16 @@ def worker_cut_off(held: Held) -> Iterator[None]:
 
 @contextmanager
 def api_without_scheduler(held: Held) -> Iterator[None]:
-    """The API is cut from the scheduler, the workers go on."""
+    """Cut the API from the scheduler; the workers go on."""
     with _cut(held, HERE, "scheduler"):
         yield
         held.outlast()
-        held.require_bad("scheduler", "workers")  # nobody is left that could work for it
+        held.require_bad("scheduler", "workers")  # without the scheduler, the API has no workers
 
 
 @contextmanager
 def api_without_database(held: Held) -> Iterator[None]:
-    """The API is cut from the database, the workers go on."""
+    """Cut the API from the database; the workers go on."""
     with _cut(held, HERE, "database"):
         yield
         held.outlast()
@@ -138,7 +139,7 @@ def api_without_database(held: Held) -> Iterator[None]:
 
 @contextmanager
 def full_disk(held: Held) -> Iterator[None]:
-    """No block is free; the job pauses and says so."""
+    """Leave no free block on the disk; the job must pause and state the reason."""
     assert held.system.disk is not None
     with held.system.disk.full():
         yield
@@ -148,7 +149,7 @@ def full_disk(held: Held) -> Iterator[None]:
 
 @contextmanager
 def read_only_store(held: Held) -> Iterator[None]:
-    """The jobs' folder takes no write; the job pauses and says so."""
+    """Make the jobs' folder read-only; the job must pause and state the reason."""
     with read_only(held.system.data / "jobs"):
         yield
         held.require_pause("store")
@@ -157,7 +158,7 @@ def read_only_store(held: Held) -> Iterator[None]:
 
 @contextmanager
 def frozen_store(held: Held) -> Iterator[None]:
-    """Every write hangs; the API answers and says so."""
+    """Make every write hang; the API must answer and name the store as bad."""
     assert held.system.disk is not None
     with held.system.disk.frozen():
         yield
@@ -168,7 +169,7 @@ def frozen_store(held: Held) -> Iterator[None]:
 
 @contextmanager
 def clock_ahead(held: Held) -> Iterator[None]:
-    """The API's clock steps an hour ahead and, once the job has ended, back."""
+    """Step the API's clock an hour ahead and, after the job has ended, back."""
     held.system.step_clock(CLOCK_STEP_S)
     yield
     held.system.wait_until(held.ended, f"job {held.job} did not end after the clock stepped ahead")
@@ -177,9 +178,7 @@ def clock_ahead(held: Held) -> Iterator[None]:
 
 @contextmanager
 def clock_back(held: Held) -> Iterator[None]:
-    """The API is killed, and is started again with a clock that stepped back by an hour: the lease it left ends far
-    ahead.
-    """
+    """Kill the API and start it again with its clock an hour behind, so that its old lease ends far in the future."""
     held.system.kill("api")
     held.system.step_clock(-CLOCK_STEP_S)
     held.system.start()
@@ -190,7 +189,7 @@ def clock_back(held: Held) -> Iterator[None]:
 
 @contextmanager
 def submitted_again(held: Held) -> Iterator[None]:
-    """The same submission many times at once, and under the same key another one."""
+    """Repeat the submission several times at once, and submit a different job under the same key."""
     with ThreadPoolExecutor(TWINS) as together:
         answers = [answer.result() for answer in [together.submit(held.submit) for _ in range(TWINS)]]
     assert {(answer.status_code, answer.json()["id"]) for answer in answers} == {(200, held.job)}

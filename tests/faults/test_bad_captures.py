@@ -1,4 +1,4 @@
-"""Faulty captures from the folder to the asset, by the real engine: what each says, and what stays."""
+"""Faulty captures from the folder to the asset, with the real engine: the advice for each, and its effect on a fit."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def fit(root: Path, capture: Path, damage: Callable[[Path], None], **options: Any) -> tuple[FitReport, str]:
-    """Fit a damaged copy of a capture; returns the report and its page."""
+    """Fit a damaged copy of a capture; returns the report and the text of its page."""
     shutil.copytree(capture, root / "capture")
     damage(root / "capture")
     short: dict[str, Any] = {
@@ -80,7 +80,7 @@ def test_meshes_beside_their_images_are_noticed_and_measured(capture: Path, tmp_
     assert not report.converged
     first = report.advice.split(". ")[0]
     assert "recalibrate the camera or register the mesh again" in first
-    # Both cameras look nearly along y at an x of 2 mm; pixels of 0.8 mm.
+    # Both cameras look nearly along y, so they see the shift of 2 mm in x; the tolerance is one pixel of 0.8 mm.
     assert float(first.split("about ")[1].split(" mm")[0]) == pytest.approx(2.0, abs=0.8)
     assert page.index("recalibrate the camera") < page.index("Error on held-out images")
     assert (tmp_path / "job" / "asset" / "NOT-CONVERGED.txt").is_file()

@@ -1,4 +1,4 @@
-"""What a user may type: one sentence on standard error and an exit status, never a traceback."""
+"""Wrong command lines end with one sentence on standard error and an exit status, never with a traceback."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from services.core.settings import ServerSettings, UploadLimits
 from tests.support.mouth import write_mouth
 
 PATIENCE_S = 280.0
-"""For a call that ends by itself, on a machine that is busy with something else."""
+"""Time limit of a call that ends by itself, long enough for a busy machine."""
 AT_WORK_S = 30.0
-"""A drawn call that is still at work after this time is ended: it was taken."""
+"""Time after which a random call that still runs counts as accepted, and is ended."""
 
 
 def call(
@@ -32,7 +32,7 @@ def call(
     folder: Path | None = None,
     patience_s: float = PATIENCE_S,
 ) -> tuple[int | None, str]:
-    """Exit status and standard error of one call; no status where it went to work."""
+    """Exit status and standard error of one call; the status is None if it still ran after ``patience_s``."""
     command = [sys.executable, "-m", "services", *arguments]
     where = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])} | (environment or {})
     with subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Every fault the simulator knows, ordered while a light is on: the right error, and darkness after it."""
+"""Every fault of the simulated dome, triggered while a light is on, ends with the right error and with a dark dome."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def open_dome(address: Address) -> ModbusDome:
 
 
 def require_dark_within_watchdog(observer: DomeObserver, since_s: float) -> None:
-    """No light may be seen by a request that starts a watchdog period after the driver gave up."""
+    """Assert that no request that starts a watchdog period after the driver gave up sees light."""
     deadline_s = since_s + WATCHDOG_S
     while True:
         asked_s = time.monotonic()
@@ -199,7 +199,7 @@ def test_a_dome_larger_than_the_register_map_is_refused() -> None:
         serve_dome("127.0.0.1", 0, lights=156, watchdog_s=1.0)
 
 
-# What a shell starts in the background ignores interrupts, and under nohup hang-ups too; so would this.
+# A process inherits ignored signals: interrupts from a shell's background job, hang-ups from nohup. So both are reset.
 SIGNALLED = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -228,5 +228,5 @@ def test_a_signal_goes_dark_before_the_process_ends(
         assert observer.outputs()[3].all()
         process.send_signal(number)
         assert process.wait(30) == status
-    # The watchdog would wait for 60 s: this darkness is the driver's.
+    # The watchdog would wait for 60 s, so the driver itself darkened the dome.
     assert not observer.outputs().any()

@@ -1,5 +1,5 @@
-"""kill -9 of a capturing process: dark within the watchdog period, acknowledged frames safe, the next attempt goes
-on.
+"""After SIGKILL of a capturing process, the dome is dark within the watchdog period, acknowledged frames are intact,
+and the next attempt continues.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def wait_for(condition: object, *arguments: object) -> None:
 
 
 def stopped_under_light(process: subprocess.Popen[bytes], observer: DomeObserver) -> bool:
-    """Halt the process if that catches it with a light on, so that the kill certainly does."""
+    """Stop the process; keep it stopped if a light is on, so that the kill strikes during an exposure."""
     process.send_signal(signal.SIGSTOP)
     if observer.outputs().any():
         return True
@@ -78,8 +78,8 @@ def test_killed_in_mid_exposure(tmp_path: Path) -> None:
             process.wait()
             killed_s = time.monotonic()
 
-        # No request that starts a watchdog period after the death may see light; the watchdog, not the strobe, made it
-        # dark.
+        # No request that starts a watchdog period after the death may see light. The watchdog, not the end of the
+        # exposure, must have darkened the dome.
         seen_lit = 0
         while (asked_s := time.monotonic()) < killed_s + WATCHDOG_S:
             seen_lit += int(observer.outputs().any())

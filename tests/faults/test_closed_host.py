@@ -1,5 +1,5 @@
-"""The host is closed: workers on loopback run nothing for other users of the machine, files are the service's own, and
-nobody takes all connections.
+"""Protection of the host: workers on loopback refuse other users of the machine, only the service's user can read its
+files, and no client can occupy all connections.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import httpx
 import psutil
 import pytest
 
-from services.api.http.connections import Crowd
+from services.api.http.connections import ConnectionLimiter
 from services.cli import dask as dask_command
 from services.core.settings import ConnectionLimits
 from services.pipeline.workers import Workers
@@ -32,16 +32,17 @@ from tests.support.uploading import contents_of, upload_capture, write_capture
 
 NOBODY = 65534
 PYTHON = shutil.which("python3", path=os.defpath) or sys.executable
-"""The system's, as another user may not enter the folder of this one."""
+"""The system's Python, because another user may have no access to the folder of this one."""
 OTHER_USER: dict[str, Any] = {} if os.geteuid() else {"user": NOBODY, "group": NOBODY, "extra_groups": []}
-"""Only the superuser can be somebody else; for others the test asks as the same user, who is refused likewise."""
+"""Options of a subprocess that run it as another user. This needs root; without root the test uses the same user, who
+must be refused too."""
 PLACES, HEADER_S = 12, 1.0
-"""Connections of the server that is tried here, and how long each may take for the head of a request."""
+"""Number of connections of the tested server, and the time that each may take for the head of a request."""
 STRANGER = Path(__file__).parents[1] / "containers" / "stranger.py"
 
 
 def listening() -> set[int]:
-    """Ports on which this process and what it started listen."""
+    """Ports on which this process and its child processes listen."""
     here = psutil.Process()
     those = [here, *here.children(recursive=True)]
     return {
@@ -73,7 +74,7 @@ def test_whoever_shows_no_certificate_is_refused_on_every_port() -> None:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, Path]]:
-    """A server with few connections and a simulated dome, begun by somebody whose files others may read."""
+    """A server with few connections and a simulated dome, started with a umask that lets others read files."""
     data, log = tmp_path_factory.mktemp("host") / "data", tmp_path_factory.mktemp("log") / "server.log"
     before = os.umask(0o022)
     try:
@@ -115,14 +116,14 @@ def test_what_is_started_for_dask_inherits_a_private_mask(monkeypatch: pytest.Mo
     try:
         for part in ("scheduler", "worker"):
             with pytest.raises(SystemExit):
-                dask_command._become(part, ["tcp://127.0.0.1:9"], None)
+                dask_command._exec_dask(part, ["tcp://127.0.0.1:9"], None)
     finally:
         os.umask(before)
     assert masks == [0o077] * 2
 
 
 def half_open(address: httpx.URL, count: int) -> list[socket.socket]:
-    """Connections that begin a request and never end its head."""
+    """Open connections that begin a request and never end its head."""
     opened = [socket.create_connection((address.host, address.port or 80), timeout=20) for _ in range(count)]
     for one in opened:
         one.sendall(b"POST /v1/dome/off HTTP/1.1\r\nHost: 127.0.0.1\r\nX-More: ")
@@ -138,14 +139,14 @@ def test_half_open_connections_keep_nobody_from_all_off(served: tuple[httpx.Clie
     kept = known.sock
     opened = half_open(client.base_url, 3 * PLACES)
     try:
-        known.request("GET", "/v1/health/live")  # whoever has asked before is closed last
+        known.request("GET", "/v1/health/live")  # connections with an earlier request are closed last
         assert known.getresponse().status == 200
         assert known.sock is kept
         for _ in range(3):
             with httpx.Client(base_url=client.base_url, timeout=20) as newcomer:
                 assert newcomer.post("/v1/dome/off").status_code == 200
         closed = [one for one in opened[:PLACES] if is_closed(one)]
-        assert len(closed) == PLACES  # those that have waited longest
+        assert len(closed) == PLACES  # the connections that have waited longest
     finally:
         known.close()
         for one in opened:
@@ -172,7 +173,7 @@ def test_a_request_whose_head_does_not_end_is_given_up_whatever_is_sent_of_it(
         answer, until = b"", began + 30 * HEADER_S
         while not answer and time.monotonic() < until:
             try:
-                slow.sendall(b"x")  # a byte now and then, which is not what the time counts from
+                slow.sendall(b"x")  # a byte now and then must not restart the time limit
                 answer = slow.recv(4096) or b"closed"
             except TimeoutError:
                 continue
@@ -185,8 +186,8 @@ def test_a_request_whose_head_does_not_end_is_given_up_whatever_is_sent_of_it(
 @pytest.mark.attack("exhaustion", "a log that grows by an accept without descriptors")
 def test_a_lack_of_descriptors_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     async def run_out() -> int:
-        loop, crowd = asyncio.get_running_loop(), Crowd(ConnectionLimits())
-        loop.set_exception_handler(crowd.handle_exception)
+        loop, limiter = asyncio.get_running_loop(), ConnectionLimiter(ConnectionLimits())
+        loop.set_exception_handler(limiter.handle_exception)
         context = {
             "message": "socket.accept() out of system resource",
             "exception": OSError(errno.EMFILE, "Too many open files"),

@@ -1,4 +1,4 @@
-"""kill -9 of a server, and of the process that works its dome, while a light is on by hand: dark."""
+"""After SIGKILL of a server, or of the process that drives its dome, while a light is on by hand, the dome is dark."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def kill(killed: str, data: Path, address: tuple[str, int], observer: DomeObserv
             killed_s = time.monotonic()
             wait_until(lambda: observer.status().lit == ())
             if killed == "server":
-                # Its dome process noticed and darkened the dome in order; it leaves nothing behind.
+                # The dome process noticed the server's death, darkened the dome itself, and ended.
                 assert observer.faults() == FaultBit(0)
                 console.wait(30)
             else:

@@ -1,5 +1,5 @@
-"""A rendering process that grows, crashes or hangs: each is told apart, with evidence, and whoever waits for it stays
-alive.
+"""A rendering process that grows, crashes or hangs gives a different error for each, with evidence, and the process
+that waits for it survives.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def test_a_process_that_outgrows_its_share_is_ended_with_evidence(recipe: Stored
         host.call("grow", recipe, 8 * MIB)
     evidence = failure.value.evidence
     assert evidence["memory_limit_bytes"] == 600 * MIB
-    # It was looked at every quarter of a second and grows by at most 8 MiB in ten milliseconds: half as much again is
-    # never reached.
+    # Memory is checked every quarter of a second and grows by at most 8 MiB in ten milliseconds, so it stays below one
+    # and a half times the limit.
     assert 600 * MIB < int(evidence["peak_memory_bytes"] or 0) < 900 * MIB
     assert host.pid is None
     assert host.call("answer", recipe, 3) == 3
@@ -108,7 +108,7 @@ def test_a_crash_is_told_by_its_signal_after_a_second_try(
 def test_a_kill_that_the_system_counts_as_one_for_memory_is_told_as_that(
     host: ChildHost, recipe: StoredFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The system's counter moves while the process is killed; nothing in the process differs from any other kill.
+    # Only the system's counter of memory kills shows the cause; the kill itself is like any other.
     counted = iter([7, 8])
     monkeypatch.setattr("services.fit.execution.engine_process.memory_kills", lambda: next(counted))
     with pytest.raises(MemoryKillError, match="lack of memory"):

@@ -1,5 +1,5 @@
-"""Ways to fail, a cancel and a want of disk, through the API of a live server: each is told as what it was, with what
-was measured and what to do next.
+"""Failures, a cancel and a lack of disk space on a live server: the API states the cause of each, the measured evidence
+and the next step.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ def test_bad_input(client: httpx.Client, tmp_path: Path) -> None:
 
 
 def held_after_preparation(client: httpx.Client, tmp_path: Path) -> tuple[Path, str]:
-    """A job whose preparation is published and whose fit waits until ``hold-prepare-end`` is gone from the folder that
-    is returned with its id.
+    """Submit a job whose preparation gets published and whose fit waits while ``hold-prepare-end`` exists; returns the
+    folder of that file and the job's id.
     """
     steering = tmp_path / "steering"
     steering.mkdir()
@@ -176,7 +176,7 @@ def test_tasks_cancelled_by_nobody_here_hold_the_job_back_instead_of_starting_it
 
 
 def test_a_want_of_disk_refuses_what_never_fits_and_loses_nothing_of_what_will(tmp_path: Path) -> None:
-    # The server's SQLite lies on the same disk.
+    # The server's SQLite database is on the same disk.
     steering = tmp_path / "teeth" / "steering"
     steering.mkdir(parents=True)
     (steering / "hold-fit-middle").touch()
@@ -207,5 +207,5 @@ def test_a_want_of_disk_refuses_what_never_fits_and_loses_nothing_of_what_will(t
 
 
 def bad_parts(client: httpx.Client) -> set[str]:
-    """What readiness complains about."""
+    """Names of the parts that the readiness route names as bad."""
     return {check["name"] for check in client.get("/v1/health/ready").json()["checks"] if not check["ok"]}

@@ -1,5 +1,5 @@
-"""The fit on a Dask cluster: both kinds of pass at once on two workers, and the same answer after a worker or a
-renderer is killed.
+"""The fit on a Dask cluster: passes for images and Jacobians run at once on two workers, and the result is the same
+after a worker or a rendering process is killed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.support.small_jaw import jaw_spec, write_prepared_jaw
 
 pytestmark = pytest.mark.timeout(3600)
 PATIENCE_S = 1200.0
-"""A bound for a machine that is busy with something else; alone, each test takes seconds."""
+"""Time limit of every wait, long enough for a busy machine; on an idle one, each test takes seconds."""
 SLOW = "tests.support.fake_engine:SlowFakeEngine"
 SLOW_MOUTH = "tests.support.fake_mouth:SlowFakeMouthEngine"
 
@@ -53,7 +53,7 @@ def spec_for(root: Path) -> JobSpec:
 
 
 def fit_once(root: Path, engine: str, **options: Any) -> None:
-    """What the pipeline's stage task does: a higher attempt each time it is run."""
+    """Run the fit as the pipeline's stage task does, with a higher attempt number each time."""
     lease = root / "fit.lease"
     attempt = int(lease.read_text()) + 1 if lease.exists() else 1
     (root / "driver.pid").write_text(str(os.getpid()))
@@ -102,7 +102,7 @@ def test_a_cluster_gives_the_answer_of_one_process(undisturbed: Path, tmp_path: 
 def test_every_kind_of_pass_gives_a_cluster_the_answer_of_one_process(
     client: Client, tmp_path: Path, options: dict[str, Any]
 ) -> None:
-    # Photographs too uneven for media alone: stains and weights have something to say.
+    # The photographs are too uneven for media alone, so that stains and robust weights have an effect.
     for name in ("cluster", "here"):
         write_prepared(tmp_path / name, uneven=0.2, shadowed=0.05)
     client.submit(fit_once, tmp_path / "cluster", FAKE, pure=False, **options).result(timeout=PATIENCE_S)
@@ -127,7 +127,7 @@ def wait_for(_host: object, path: Path) -> str:
 def test_results_are_given_as_tasks_end(client: Client, tmp_path: Path) -> None:
     run_on = DaskExecutor(client, FAKE, "ends", tmp_path / "never")
     told = tmp_path / "told"
-    ended = run_on.as_they_end([("late", wait_for, (told,)), ("early", echo, (7,))])
+    ended = run_on.as_completed([("late", wait_for, (told,)), ("early", echo, (7,))])
     assert next(ended) == 7  # though it was the second, and the first waits for this line
     told.touch()
     assert list(ended) == ["waited"]
@@ -178,7 +178,8 @@ async def _claim(dask_worker: Any) -> None:
 
 
 def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:
-    # The driver's own worker dies: Dask runs the stage again elsewhere, a new attempt that continues from the journal.
+    # The driver's own worker dies. Dask runs the stage again on the other worker, as a new attempt that continues from
+    # the journal.
     write_prepared(tmp_path)
     future = client.submit(fit_once, tmp_path, SLOW, pure=False, retries=2)
     entries = await_entries(tmp_path, 5)
@@ -191,7 +192,7 @@ def test_killed_worker_in_mid_fit_changes_nothing(client: Client, undisturbed: P
 
 @pytest.mark.slow
 def test_killed_helper_worker_changes_nothing(client: Client, undisturbed: Path, tmp_path: Path) -> None:
-    # The other worker dies with whatever blocks it held; the driver goes on.
+    # The other worker dies with the blocks it held; the driver goes on.
     write_prepared(tmp_path)
     future = client.submit(fit_once, tmp_path, SLOW, pure=False)
     await_entries(tmp_path, 5)
@@ -223,8 +224,8 @@ def fit_jaw_once(root: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path) -> None:
-    # Two teeth, one of them hidden. The driver's worker dies while teeth are looked at alone, and its successor in the
-    # joint fit.
+    # There are two teeth, one of them hidden. The driver's worker dies during the fits of single teeth, and the next
+    # one during the joint fit.
     answers = []
     for name, kills in (("undisturbed", ()), ("killed", (3, 8))):
         root = tmp_path / name

@@ -1,5 +1,5 @@
-"""Guesses, ten thousand where tests may be slow, pass not once, leave few rows, and do not keep a valid token out,
-though it comes from the same address.
+"""Guessed tokens never pass and leave few rows in the audit log, and a valid token from the same address still works.
+The slow test tries ten thousand guesses.
 """
 
 from __future__ import annotations

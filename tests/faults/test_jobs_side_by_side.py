@@ -1,5 +1,5 @@
-"""Jobs run side by side: a fit keeps no other job and no capture waiting, a cancel leaves the others alone, and whoever
-waits is told why.
+"""Concurrent jobs: a fit makes neither another job nor a capture wait, a cancel does not affect other jobs, and a
+waiting job states its reason.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ pytestmark = pytest.mark.timeout(600)
 
 
 class HeldJobs:
-    """Jobs of toy stages that wait in their fit, or at another point, until they are let go on."""
+    """Submits jobs of toy stages that wait in their fit, or at another point, until the test releases them."""
 
     def __init__(self, client: httpx.Client, folder: Path) -> None:
         self.client, self._folder, self._made = client, folder, 0
 
     def submit(self, hold: str | None = "fit-start", *, rig: bool = False, **options: Any) -> tuple[str, Path]:
-        """Id of a new job, and where its stages are steered."""
+        """Submit a job; returns its id and the folder of the files that steer its stages."""
         self._made += 1
         steering = self._folder / f"source-{self._made}" / "steering"
         steering.mkdir(parents=True)
@@ -60,7 +60,7 @@ def release(steering: Path) -> None:
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SmallSystem]:
-    """Two workers for stages and one for captures."""
+    """A system with two workers for stages and one for captures."""
     with small_system(tmp_path_factory.mktemp("system"), has_rig_apart=True) as system:
         yield system
 

@@ -1,5 +1,5 @@
-"""Eight cells of the fault matrix: every part killed once, two in the capture, and what needs no host or disk of its
-own; ``make faults`` runs all of them.
+"""Eight cells of the fault matrix: kills of every part, two of them in the capture, and two faults that need no network
+or disk of their own. ``make faults`` runs all cells.
 """
 
 from __future__ import annotations

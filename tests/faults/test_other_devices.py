@@ -1,4 +1,4 @@
-"""An address that is not a dome's: what answers there as something else is read and never written to."""
+"""A device at the dome's address that identifies itself as something else is only read, never written to."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ ALL_OFF_WRITTEN: Request = (5, reg.ALL_OFF.address)
 
 
 class Device(socketserver.ThreadingTCPServer):
-    """Speaks Modbus TCP; keeps (function, address) of what it is asked.
+    """A device that speaks Modbus TCP and records (function, address) of every request.
 
     Args:
-        identities: its answers for the identity, the last one for good; None for no answer, 0 for the exception
-            "illegal address".
+        identities: answers to requests for the identity, in order; the last one is repeated. None stands for no answer,
+            0 for the exception "illegal address".
     """
 
     allow_reuse_address = daemon_threads = True
@@ -46,7 +46,7 @@ class Device(socketserver.ThreadingTCPServer):
         return [request for request in self.asked if request[0] > READ_INPUT]
 
     def answer(self, request: bytes) -> bytes | None:
-        """The answer to a request, both from the function code on."""
+        """The answer to a request; both begin with the function code."""
         function, address, count = struct.unpack(">BHH", request[:5])
         self.asked.append((function, address))
         if (function, address) == (READ_INPUT, reg.IDENTITY.address):

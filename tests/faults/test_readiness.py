@@ -1,5 +1,5 @@
-"""Readiness and metrics tell the truth while database, scheduler, store or disk are broken, and again once they are
-mended.
+"""Readiness and metrics are correct while the database, the scheduler, the store or the disk fails, and after it works
+again.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def client(tmp_path: Path) -> Iterator[httpx.Client]:
 
 
 def bad_checks(client: httpx.Client) -> dict[str, str]:
-    """Name and sentence of each check that fails; status, problem document and metrics must say the same."""
+    """Name and sentence of each failing check; asserts that status, problem document and metrics agree with them."""
     answer = client.get("/v1/health/ready")
     told = answer.json()
     assert [check["name"] for check in told["checks"]] == ["database", "scheduler", "workers", "store", "disk"]
@@ -164,7 +164,7 @@ def test_a_runner_that_died_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_read_only_data_folder_is_told() -> None:
-    """Asked as a user without rights, since the superuser may write anywhere."""
+    """Readiness is checked as a user without root's rights, because root may write anywhere."""
     data = Path(tempfile.mkdtemp())
     try:
         data.chmod(0o755)
@@ -189,7 +189,7 @@ def test_a_read_only_data_folder_is_told() -> None:
 
 @contextmanager
 def unprivileged() -> Iterator[None]:
-    """Without the superuser's rights, where the process has them."""
+    """Drop root's rights for the time of the block, if the process has them."""
     if os.geteuid() != 0:
         yield
         return
@@ -222,7 +222,7 @@ def test_a_scheduler_that_does_not_answer_is_told(tmp_path: Path) -> None:
                 while client.get("/v1/health/ready").status_code != 200:
                     assert scheduler.poll() is None
                 assert bad_checks(client) == {}
-                scheduler.send_signal(signal.SIGSTOP)  # the system still takes connections for it
+                scheduler.send_signal(signal.SIGSTOP)  # the kernel still accepts connections for it
                 assert bad_checks(client) == told
                 scheduler.send_signal(signal.SIGCONT)
                 while client.get("/v1/health/ready").status_code != 200:

@@ -1,4 +1,4 @@
-"""kill -9 and orderly stops of the server in mid-job: the job and its history survive, and the next server ends the
+"""SIGKILL and orderly stops of the server in mid-job: the job and its history survive, and the next server finishes the
 job.
 """
 
@@ -23,7 +23,7 @@ def submit(client: httpx.Client, data: Path, hold: str, **options: Any) -> tuple
 
 
 def event_ids(client: httpx.Client, job: str, *, until: str) -> list[int]:
-    """Ids of the job's events, read from the stream until a line contains a text."""
+    """Ids of the job's events, read from the stream until a line contains the text ``until``."""
     ids = []
     with client.stream("GET", f"/v1/jobs/{job}/events") as response:
         for line in response.iter_lines():

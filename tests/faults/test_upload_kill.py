@@ -1,5 +1,5 @@
-"""kill -9 of the server in mid-request, of the client in mid-file, and deaths in the middle of a commit and of a
-deletion.
+"""SIGKILL of the server in mid-request and of the client in mid-file, and deaths of the server during a commit and
+during a deletion.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ KILLS = 3
 
 
 class Death(BaseException):
-    """The process ends here, as far as the code around can tell."""
+    """Exception that stands for the end of the process, because no handler of ``Exception`` catches it."""
 
 
 def upload_in_new_process(folder: Path, server: str) -> dict[str, object]:
@@ -50,9 +50,7 @@ def upload_in_new_process(folder: Path, server: str) -> dict[str, object]:
 def send_until_killed(
     server: httpx.Client, process: subprocess.Popen[str], upload: str, offset: int, content: bytes
 ) -> None:
-    """Send some bytes of a request that never ends, then kill the server once it has read them all but the last
-    ones.
-    """
+    """Send some bytes of a request that never ends, then kill the server, which has read all but the last of them."""
     is_sent = threading.Event()
 
     def body() -> Iterator[bytes]:
@@ -127,14 +125,14 @@ def test_a_killed_client_is_continued_by_another(tmp_path: Path) -> None:
 
 @contextmanager
 def captures_of(data: Path) -> Iterator[Captures]:
-    """What a server makes of a data folder when it starts."""
+    """The captures of a data folder, as a starting server opens them."""
     engine = upgraded(data / "db.sqlite")
     yield Captures(engine, data, UploadLimits(keep_free_bytes=0))
     engine.dispose()
 
 
 def receive_all(captures: Captures, contents: dict[str, bytes], sent: dict[str, bytes]) -> str:
-    """Open a capture of some contents and receive what is sent for them, without HTTP."""
+    """Create a capture of some contents and store the bytes sent for it, without HTTP; returns its id."""
     capture = captures.create(UploadManifest.model_validate(manifest_of(contents))).capture
     for number, file in enumerate(capture.files):
         upload = captures.uploads.create(capture.id, file.path, file.bytes)

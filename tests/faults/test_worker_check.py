@@ -1,5 +1,5 @@
-"""A worker that cannot run what it claims to takes no such task and does not count, and says why: in its log, to the
-server and to its container.
+"""A worker that cannot run a kind of task gets no such task and does not count as able. It states the reason in its
+log, to the server and to its container.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import httpx
 import pytest
 
 from services.capture import stage as capture_stage
-from services.cli.dask import _claiming
+from services.cli.dask import _with_resources
 from services.core.errors import PlatformError
 from services.core.placement import DOME, STAGES
 from services.fit import stage as fit_stage
@@ -33,7 +33,9 @@ IMPORTED_AS = {"pillow": "PIL", "opencv-contrib-python-headless": "cv2"}
 
 
 def environment(folder: Path, *, broken: str | None = None) -> dict[str, str]:
-    """With a temporary folder of its own for signs of life, and a package that cannot be imported."""
+    """Environment of a process with its own temporary folder for signs of life and, if ``broken`` is given, with a
+    package that cannot be imported.
+    """
     paths = [str(ROOT)]
     if broken is not None:
         (folder / "shadow" / broken).mkdir(parents=True)
@@ -78,7 +80,7 @@ def until(client: httpx.Client, status: int, text: str) -> str:
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, str, Path]]:
-    """A server whose scheduler has no workers yet, and that scheduler's address."""
+    """Client of a server whose scheduler has no workers yet, the scheduler's address, and the folder of the logs."""
     folder, port = tmp_path_factory.mktemp("system"), str(free_port())
     address = f"tcp://127.0.0.1:{port}"
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
@@ -168,7 +170,7 @@ def test_every_package_of_an_extra_is_tried() -> None:
     ],
 )
 def test_what_a_worker_claims_is_added_to_its_own_resources(given: list[str], claimed: str) -> None:
-    assert _claiming(["tcp://s:1", *given, "--nthreads", "1"], {STAGES: 7}) == [
+    assert _with_resources(["tcp://s:1", *given, "--nthreads", "1"], {STAGES: 7}) == [
         "tcp://s:1",
         "--nthreads",
         "1",

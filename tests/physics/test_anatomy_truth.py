@@ -32,14 +32,14 @@ def test_the_scanned_incisors_images_come_out_again() -> None:
         stored, stored_variance = (
             np.load(root / f"{name}.npy")[..., 0].astype(float) for name in (stem, f"{stem}_var")
         )
-        # Blocks of four rows average heavy-tailed pixels to something near normal.
+        # The pixels' noise is heavy-tailed; sums over blocks of four rows are nearly normal.
         for row in range(0, mean.shape[0], 4):
             part = slice(row, row + 4)
             noise = variance[part].sum() + stored_variance[part].sum()
             if stored[part].sum() > 0.02 * stored.sum():
                 scores.append((mean[part] - stored[part]).sum() / np.sqrt(noise))
-    # About 15 values: |z| <= 4.5 fails one correct run in 10,000; a camera half a pixel off or a wrong medium gives |z|
-    # of 10 and more.
+    # With about 15 values, |z| <= 4.5 fails one correct run in 10,000. An error of half a pixel in a camera, or a wrong
+    # medium, gives |z| of 10 and more.
     assert len(scores) >= 12
     assert np.abs(scores).max() <= 4.5
     assert np.sqrt(np.mean(np.square(scores))) < 1.7

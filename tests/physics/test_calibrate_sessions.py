@@ -1,4 +1,4 @@
-"""Whole calibration sessions with drawn errors keep the limits and know their errors."""
+"""Whole calibration sessions with random errors keep the limits, and their stated standard errors are right."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from tests.benchmarks.calibrate_sessions import one_session, summary
 
 @pytest.mark.slow
 def test_sessions_keep_their_limits_and_know_their_errors() -> None:
-    """Four sessions: 168 scores of cameras, 144 of lights and of intensities, so their rms has a standard error of
-    0.06.
+    """Four sessions give 168 scores of cameras and 144 each of lights and intensities, so that their rms has a standard
+    error of 0.06.
     """
     told = summary([one_session(seed) for seed in range(4)])
     assert told["rms_shift_mm"] < 0.05

@@ -1,4 +1,4 @@
-"""The grid of clearances never promises more room than there is, however often some of several inner surfaces move."""
+"""The grid of clearances never overstates the distance to the nearest surface, however often inner surfaces move."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.fit.transport.platform import prepare_device
 
 EDGE_MM, RADIUS_MM = (12.0, 6.0, 6.0), 1.5
 ROUNDING_MM = 1e-4
-"""Of places and bounds in single precision."""
+"""Rounding error of positions and bounds in single precision."""
 
 
 def ball(x_mm: float) -> Mesh:
@@ -29,13 +29,13 @@ def test_bounds_hold_and_tell_something_as_surfaces_move() -> None:
     outer = Mesh(np.asarray(box.vertices), np.asarray(box.faces, dtype=np.int32))
     points = np.random.default_rng(1).uniform(-0.5, 0.5, (4000, 3)) * EDGE_MM
     grid = Clearance(outer.vertices_mm, outer.faces)
-    # A little, which only lowers the bound; far, which is measured again; and back.
+    # A small move only lowers the bound; after a large move distances are measured again; then one ball moves back.
     for left, right in ((-3.0, 3.0), (-3.08, 3.0), (-4.0, 3.0), (-3.0, 3.5)):
         inner = [ball(left), ball(right)]
         grid.move_inner(inner)
         bound = np.asarray(grid(mi.Point3f(*points.T.astype(np.float32)), mi.Bool(True)))
         true = np.min([SurfaceDistance(mesh).closest(points)[1] for mesh in (outer, *inner)], axis=0)
         assert (bound <= true + ROUNDING_MM).all()
-        # A cell's half diagonal twice, the spacing of samples and the slack of a small move: a third of a millimetre at
-        # cells of 0.1.
+        # The bound loses twice a cell's half diagonal, the spacing of samples and the slack of a small move: a third of
+        # a millimetre with cells of 0.1 mm.
         assert np.mean(true - bound) < 0.35

@@ -1,8 +1,8 @@
-"""Every derivative against central differences with common random numbers, on a small tooth.
+"""Every derivative compared to central differences with common random numbers, on a small tooth.
 
-Each is compared on the scalar that shows it best: the image projected on the derivative's own picture, taken from
-another seed. Two steps tell the differences' bias apart: it grows as the square of the step, so (4 fd(h/2) - fd(h)) / 3
-is free of it to fourth order.
+Each is compared on a scalar with a strong signal: the image projected on the derivative's own image from another seed.
+The differences' bias grows as the square of the step, so Richardson extrapolation (4 fd(h/2) - fd(h)) / 3 of two steps
+leaves an error of fourth order.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tests.support.small_tooth import camera_at, recipe, whole_view
 
 SEEDS = 8
 LARGEST_ERROR = 0.05
-"""Standard error of score and of extrapolated difference, as a fraction of the derivative."""
+"""Largest standard error of the score and of the extrapolated difference, as a fraction of the derivative."""
 FAMILY_FALSE_ALARM = 1e-3
 """Chance that any t-test of a group fails a correct engine (Bonferroni)."""
 STEPS = {
@@ -43,7 +43,7 @@ STEPS = {
 
 @dataclass(frozen=True)
 class Group:
-    """Derivatives tested at one tissue, and the paths per pixel, seed and image that 5 % takes."""
+    """Derivatives tested at one tissue, with the paths per pixel, seed and image that a standard error of 5 % needs."""
 
     tissue: Tissue | Mouth
     samples: dict[str, int]
@@ -68,7 +68,8 @@ SHAPE = Group(
     {"shape.0": 1024, "shape.1": 2048},
     4096,
 )
-"""Dentin clearer than enamel: of both modes, Eq. 32 alone is 2.5 times the derivative, and noise stays small."""
+"""Group with dentin clearer than enamel: for both modes, Eq. 32 alone gives 2.5 times the derivative, with little
+noise."""
 
 GRADUAL = Group(
     Tissue(Medium(1.5, 0.6, 0.9, 0.7, -0.3), Medium(1.2, 0.95, 0.3, 0.5, -0.2), (0.5, 0.4)),
@@ -76,8 +77,8 @@ GRADUAL = Group(
     2048,
     lambda boundary: replace(recipe(boundary), border_width_mm=1.2),
 )
-"""Albedo and phase function differ far more than extinction, so that what they change near the border rules the
-derivative to its shape."""
+"""Group in which albedo and phase function differ far more than extinction, so that their changes near the border
+dominate the derivative to its shape."""
 IN_A_MOUTH = Group(
     MOUTH,
     {
@@ -95,7 +96,7 @@ IN_A_MOUTH = Group(
 
 
 def compare(group: Group, boundary: Boundary) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """By name, over seeds: scores and extrapolated central differences, both relative to the mean score."""
+    """Scores and extrapolated central differences (S,) over seeds by name, both relative to the mean score."""
     engine, view, names = (
         Engine(group.scene(boundary)),
         whole_view(camera_at((0.2, 1, 0.1), span_mm=group.span_mm), 1),
@@ -117,7 +118,7 @@ def compare(group: Group, boundary: Boundary) -> dict[str, tuple[NDArray[np.floa
                 (engine.images(tissue, view, samples=group.samples[name], seed=12_000 + seed).mean * picture).sum()
             )
 
-        # All seeds at one value in turn: a new value may mean new surfaces.
+        # Render all seeds at one value before the next value, because a new value may need new surfaces.
         up, down = (
             {h: np.array([value(middle + sign * h, seed) for seed in range(SEEDS)]) for h in (step, step / 2)}
             for sign in (1, -1)
@@ -177,5 +178,5 @@ def test_what_a_second_lobe_would_bring_is_told_where_there_is_none() -> None:
         ).jacobian
         for beta in (1.0, 1 - 1e-6)
     )
-    # A path in some thousands turns by the other lobe.
+    # Only one path in some thousands samples the other lobe.
     assert np.linalg.norm(none - hardly) < 0.02 * np.linalg.norm(hardly)

@@ -1,4 +1,4 @@
-"""What the engine and the slab cannot take is refused before any kernel runs, with a sentence that names parameter and
+"""The engine and the slab refuse impossible input before any kernel runs, with a sentence that names parameter and
 value.
 """
 
@@ -44,7 +44,7 @@ def engine() -> Engine:
 
 @pytest.fixture
 def no_kernel(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
-    """Fails the test if a walk is traced."""
+    """Make the test fail if a walk is traced."""
     from services.fit.transport.paths.walk import Walk
 
     def refuse(*_: Any) -> None:
@@ -54,7 +54,7 @@ def no_kernel(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
 
 
 def require_sentence(error: DentineError, *parts: str) -> None:
-    """One sentence that names what is wrong."""
+    """Assert that an error's message is on one line, ends with a full stop and contains the parts."""
     assert all(part in error.message for part in parts), error.message
     assert error.message.endswith(".")
     assert "\n" not in error.message
@@ -145,7 +145,7 @@ def with_dentin(mesh: Mesh) -> SceneRecipe:
 def test_dentin_that_breaks_through_the_enamel_is_refused() -> None:
     base = dentin_shape().base
     aside, larger = Mesh(base.vertices_mm + np.array([1.0, 0, 0]), base.faces), Mesh(base.vertices_mm * 1.2, base.faces)
-    # One cusp of an otherwise nested surface.
+    # One cusp of an otherwise nested surface breaks through.
     top = np.argmax(base.vertices_mm[:, 2])
     spike = Mesh(base.vertices_mm + 0.5 * np.eye(3)[2] * (np.arange(len(base.vertices_mm)) == top)[:, None], base.faces)
     for mesh in (aside, larger, spike):
@@ -220,8 +220,8 @@ def test_a_libllvm_that_would_crash_is_refused(version: tuple[int, int, int], pa
     ],
 )
 def test_an_unusable_libllvm_ends_with_a_sentence(tmp_path: Path, before: str, sentence: str) -> None:
-    # The whole way, in a process that cannot load the library, an empty file where it is looked for, and in one that is
-    # told it is old.
+    # Test the whole way in new processes: one cannot load the library, because the file is empty; the other reports an
+    # old version.
     library = tmp_path / "libLLVM.so"
     library.touch()
     script = (
@@ -312,7 +312,7 @@ def test_a_result_that_is_not_finite_raises_with_its_pixels(
 
 
 def test_a_mesh_alone_knows_its_volume_and_edges() -> None:
-    # What the refusals above rest on: an ellipsoid of 3, 2, 4 mm, less what flat facets cut off.
+    # The refusals above need the volume: that of an ellipsoid of 3, 2, 4 mm, less the part that flat facets cut off.
     mesh = ellipsoid(np.array([3.0, 2.0, 4.0]))
     assert mesh.signed_volume_mm3() == pytest.approx(4 / 3 * np.pi * 24, rel=0.02)
     assert (mesh.edge_counts() == 2).all()

@@ -1,6 +1,4 @@
-"""The same question gives the same answer: twice, in another process, at another thread count, and cut into other
-blocks.
-"""
+"""Renders are reproducible: in a repetition, another process, with another number of threads, and in other blocks."""
 
 from __future__ import annotations
 
@@ -46,7 +44,7 @@ def require_same_bits(first: Picture, second: Picture) -> None:
 
 
 def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Relative to the norm."""
+    """Norm of the difference relative to the norm of ``second``."""
     return float(np.linalg.norm(first - second) / np.linalg.norm(second))
 
 
@@ -93,9 +91,8 @@ def test_seeds_and_batches_are_independent() -> None:
     one, two = (engine.images(TISSUE, view, samples=512, seed=seed) for seed in (1, 2))
     lit = one.mean > 0
     assert (one.mean[lit] != two.mean[lit]).mean() > 0.99
-    # Differences of two seeds are as large as their variances say: an rms z from 16 batches a side. 80 values, one
-    # light's correlated with another's through common paths: 0.7 to 1.35 leaves an honest run out less than once in a
-    # thousand.
+    # Differences of two seeds must match their variances, which come from 16 batches each. The 80 values of z are
+    # correlated, as the lights share paths; a correct run has an rms outside 0.7 to 1.35 less than once in a thousand.
     z = (one.mean - two.mean)[lit] / np.sqrt(one.variance + two.variance)[lit]
     assert 0.7 <= np.sqrt(np.mean(z**2)) <= 1.35
 

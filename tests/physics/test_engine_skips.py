@@ -1,5 +1,5 @@
-"""What a view does not need is not rendered: lights it does not list come out as zero, and the rest as if those had
-never been there.
+"""The engine renders only what a view needs: lights that it does not list give zero, and the others give the same bits
+as in a scene without them. Kernels contain no code of features that are off.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def test_what_is_off_is_not_in_the_kernel(features: dict[str, Case], feature: st
     case = features[feature]
     off, without, on = (kernel_operations(call, 16) for call in (case.off, case.without, case.on))
     assert off == without
-    # Lights and pixels are numbers to a kernel, not code; more of them may not show in it.
+    # Lights and pixels are data of a kernel, not code, so more of them need not change it.
     assert on >= off if feature in FEATURES[-2:] else on > off
 
 
@@ -104,6 +104,6 @@ def slab_operations(**options: Any) -> int:
 @pytest.mark.parametrize("feature", SLAB_FEATURES)
 def test_a_slab_pays_only_for_what_is_asked_of_it(feature: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = slab_operations(**SLAB_FEATURES[feature])
-    # What is never built is in no kernel, whatever the counts say.
+    # The kernel without these features must not even construct the class ``Exits``.
     monkeypatch.delattr("services.fit.transport.paths.walk.Exits")
     assert slab_operations() < asked

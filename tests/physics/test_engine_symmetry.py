@@ -1,4 +1,4 @@
-"""Truths that need no other renderer: a white tooth vanishes in a uniform room, and light's way can be reversed."""
+"""Truths that need no other renderer: a white tooth is invisible in a uniform room, and light paths are reversible."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FAR_MM = 1e4
 
 
 def uniform_room(count: int) -> NDArray[np.float64]:
-    """Directions of lights spread evenly by a Fibonacci spiral."""
+    """Unit vectors (count, 3) of lights that are spread evenly by a Fibonacci spiral."""
     k = np.arange(count) + 0.5
     z, azimuth = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
     return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
@@ -28,8 +28,8 @@ def uniform_room(count: int) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize(("boundary", "first_surface"), [("matched", 0.0), ("thin", ((1.631 - 1) / (1.631 + 1)) ** 2)])
 def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surface: float) -> None:
-    # Radiance 1 from everywhere is 1 everywhere. The camera sees the centre of a ball so deep that no light comes
-    # straight through (optical depth 16); of a thin boundary the first reflection is left out, as highlights are.
+    # Radiance 1 from all directions gives radiance 1 everywhere. The camera sees the centre of a ball so deep that no
+    # unscattered light passes (optical depth 16). The first reflection of a thin boundary is left out, like highlights.
     lights = uniform_room(200)
     core = sphere(1.2)
     dentin = DentinShape.known(core)
@@ -48,7 +48,8 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surf
 
 @pytest.mark.parametrize("boundary", ["matched", "thin"])
 def test_camera_and_light_may_change_places(boundary: Boundary) -> None:
-    # Far away, radiance integrated over the tooth's outline per irradiance is the same with camera and light exchanged.
+    # At a large distance, the radiance integrated over the tooth's outline per irradiance is the same when camera and
+    # light are exchanged.
     directions = [(0.2, 1.0, 0.1), (0.9, -0.2, 0.6)]
     tissue = Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4, 0.7, 1, 0.5), (0.3, 0.9))
     values, variances = [], []
@@ -62,6 +63,6 @@ def test_camera_and_light_may_change_places(boundary: Boundary) -> None:
         values.append(estimate.mean.sum())
         variances.append(estimate.variance.sum())
     noise = np.sqrt(sum(variances))
-    # The two directions see outlines of different area, so equality is no accident.
+    # From the two directions the outlines have different areas, so equality is no coincidence.
     assert noise <= 0.01 * values[0]
     assert abs(values[0] - values[1]) <= LARGEST_Z * noise

@@ -1,4 +1,4 @@
-"""The asset, rendered by stock Mitsuba through its own script, shows what the engine shows."""
+"""The asset's own script renders it in stock Mitsuba with the same images as the engine's."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.stain_paint import painted_depth
 
 TISSUE = Tissue(Medium(2.5, 0.97, 0.9, 0.6, -0.1), Medium(6.0, 0.93, 1.0, 0.5, 0.0))
-"""Paths of some tens of scatters: the comparison costs seconds."""
+"""Tissue with paths of some tens of scattering events, so that the comparison takes seconds."""
 CHANNELS = ("red", "green")
 
 
@@ -96,7 +96,7 @@ def rig() -> Rig:
 
 @pytest.fixture(scope="module")
 def stains(rig: Rig) -> ToothStains:
-    # Strong ones, and in one channel only.
+    # The stains are strong, and in one channel only.
     layout = stain_layout(rig.tooth.outer, 1.0)
     return ToothStains(layout.corners_uv, {"green": layout.texture(painted_depth(layout, 3, strength=2.0))})
 
@@ -122,7 +122,7 @@ def test_stock_mitsuba_shows_what_the_engine_shows(
         for rows in np.array_split(np.arange(camera.size[1]), 4):
             noise = variance[rows, :, channel].sum() + ours_variance[rows].sum()
             scores.append((mean[rows, :, channel] - ours[rows]).sum() / np.sqrt(noise))
-            # The bands are resolved: one standard error is at most 3 % of a band that carries light.
+            # One standard error is at most 3 % of a band with light, so that errors of a band would show.
             if ours[rows].sum() > 0.1 * ours.sum():
                 assert np.sqrt(noise) < 0.03 * ours[rows].sum()
     # Eight values: |z| <= 4.5 fails one correct run in 10,000.
@@ -150,7 +150,7 @@ def test_textures_come_with_their_place_and_as_fitted(rig: Rig, stains: ToothSta
     assert {"teeth/11/stain_green.npy", "teeth/11/stain_green.png"} <= set(rig.write(tmp_path, "matched", stains))
     a_t = stains.textures["green"].transmittance
     np.testing.assert_allclose(np.load(tmp_path / "teeth/11/stain_green.npy"), a_t, rtol=1e-6)
-    # 16 bits, rounded.
+    # The picture stores 16 bits, rounded.
     np.testing.assert_allclose(
         1 - np.asarray(Image.open(tmp_path / "teeth/11/stain_green.png")) / 65535, a_t, atol=0.51 / 65535
     )
@@ -172,7 +172,7 @@ def test_the_script_runs_alone(rig: Rig, tmp_path: Path) -> None:
         "--out",
         str(tmp_path / "tooth.exr"),
     ]
-    # Isolated mode leaves out the script's folder, as a stranger's own set-up might.
+    # Isolated mode leaves the script's folder out of the module path, as a user's own set-up might.
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "tooth.exr").stat().st_size > 500
@@ -187,7 +187,7 @@ def test_a_table_becomes_the_tissue_it_describes() -> None:
 
 
 def test_pixels_land_where_the_camera_projects_them(rig: Rig) -> None:
-    # A shifted principal point and a rolled pose against Mitsuba's own rays.
+    # Compare a camera with a shifted principal point and a rolled pose to Mitsuba's own rays.
     prepare_device()
     import drjit as dr
     import mitsuba as mi
@@ -199,7 +199,8 @@ def test_pixels_land_where_the_camera_projects_them(rig: Rig) -> None:
     ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(scaled.T.astype(np.float32)), mi.Point2f(0.5))
     dr.eval(ray)
     _, directions = camera.rays(places[:, 0], places[:, 1])
-    # Single precision of a pixel's angle: 1e-3 rad at 1e-7 relative, with a margin for the matrix product.
+    # The tolerance is single precision of a pixel's angle, 1e-3 rad at 1e-7 relative, with a margin for the matrix
+    # product.
     np.testing.assert_allclose(np.array(ray.d).T, directions, atol=2e-6)
 
 
@@ -213,7 +214,7 @@ def test_a_calibrated_cameras_pixels_are_drawn_square_where_they_nearly_are(rig:
     camera = rig.cameras[0].model_copy(update={"K": ((3850.0, 0.0, 200.0), (0.0, 3853.0, 150.0), (0.0, 0.0, 1.0))})
     drawn = with_square_pixels(camera)
     sensor_dict(drawn)
-    # At a hundred pixels from the principal point a focal length that is off by 0.04 % moves a picture by 0.04 px.
+    # An error of 0.04 % in the focal length moves a point a hundred pixels from the principal point by 0.04 px.
     points = np.random.default_rng(0).uniform(-10, 10, (100, 3))
     near = np.abs(camera.project(points)[0] - [200.0, 150.0]).max(axis=1) < 100
     assert np.abs(drawn.project(points)[0] - camera.project(points)[0])[near].max(initial=0.0) < 0.05

@@ -1,6 +1,7 @@
-"""The gradient of an L2 loss to both media against stock ``prbvolpath`` backward, on a small tooth under two lights.
+"""The gradient of an L2 loss to both media, compared to the backward pass of stock ``prbvolpath`` on a small tooth
+under two lights.
 
-The two share no code. Honest ones fail one run in 1000 (t-tests with the fewest degrees of freedom there can be,
+The two share no code. Correct gradients fail one run in 1000 (t-tests with the fewest possible degrees of freedom,
 Bonferroni), and seeds are fixed.
 """
 
@@ -24,11 +25,11 @@ from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera
 
 TISSUE = Tissue(Medium(1.5, 0.9, 0.7, 0.6, -0.3), Medium(0.7, 0.7, g1=0.5))
 OTHER = Tissue(Medium(1.0, 0.6, 0.4, 0.8, -0.3), Medium(1.0, 0.5, g1=-0.2))
-"""Far away, so that no component is near 0."""
+"""Tissue of the reference images, so different that no component of the gradient is near 0."""
 REPEATS, SAMPLES = 16, 128
 LARGEST_ERROR = 0.15
-"""Standard error of the difference, as a fraction of the component: 13 % for sigma of dentin, 2 to 6 % for all others,
-where errors of a third are seen."""
+"""Largest standard error of the difference, as a fraction of the component. It is 13 % for sigma of dentin and 2 to 6 %
+for all others, for which errors of a third would show."""
 FALSE_ALARM = 1e-3
 
 

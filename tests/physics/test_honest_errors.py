@@ -1,10 +1,9 @@
-"""Standard errors are honest: 95 % intervals by Student's t hold the truth 95 times in a hundred, and an error asked
-for is the error there is.
+"""Standard errors are correct: 95 % intervals by Student's t contain the truth 95 times in a hundred, and a requested
+error is the true one.
 
-The lights of a pixel, and the derivatives of its images, come from the same walks. So every interval here is from a
-walk of its own: one value per seed and pixel, light and parameter drawn beforehand. Pixels lie inside the tooth's
-outline: where a pixel is mostly beside the tooth, few of its paths count, and a mean of so few is not normally
-distributed yet whatever its standard error.
+The lights of a pixel and the derivatives of its images share random walks. So every interval here comes from other
+walks: one value per seed and pixel, with light and parameter drawn beforehand. Pixels lie inside the tooth's outline,
+because few paths of a pixel at its edge hit the tooth, and a mean of so few is not normally distributed.
 """
 
 from __future__ import annotations
@@ -25,27 +24,32 @@ TISSUE = Tissue(Medium(2, 0.95, 0.8, 0.6, -0.3), Medium(3, 0.8, 0.7, 0.6, -0.3),
 NAMES = ("enamel.sigma", "dentin.alpha", "enamel.g1", "dentin.beta", "shape.0")
 VIEW = whole_view(camera_at((0.2, 1, 0.1), size=6, span_mm=4.0))
 SEEDS, SAMPLES, TRUTH_SAMPLES = 56, 1024, 64 * 1024
-"""The truth's own error must be small: it is counted by the few batches' wide quantile, so intervals that hold much of
-it hold the truth too often."""
+"""Number of seeds, paths per pixel of a run, and paths per pixel of the truth. The truth's own error must be small,
+because it enters with the wide quantile of few batches: if it is a large part, intervals contain the truth too
+often."""
 LEVEL, LOWEST, HIGHEST = 0.95, 0.93, 0.97
-"""Of 2016 independent intervals an honest 95 % holds 93 to 97 % but for once in 20,000 times: the binomial's standard
-deviation is 0.49 %."""
+"""Level of the intervals, and bounds on their coverage. Of 2016 independent intervals, correct ones cover 93 to 97 %
+except once in 20,000 runs; the binomial's standard deviation is 0.49 %."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Independent values with what they should be."""
+    """Independent values and their true values.
+
+    Attributes:
+        batches: number of batches from which a standard error was estimated.
+    """
 
     offset: Array
-    """Value less truth."""
+    """Value minus truth."""
     error: Array
-    """Standard error of that, the truth's own included."""
+    """Standard error of ``offset``, including that of the truth."""
     batches: int
 
     def covered(self, scale: float = 1.0) -> NDArray[np.bool_]:
-        """Which intervals hold the truth, had every standard error been ``scale`` times as large."""
+        """Which intervals contain the truth when every standard error is multiplied by ``scale``."""
         return np.abs(self.offset) <= stats.t.ppf((1 + LEVEL) / 2, self.batches - 1) * scale * self.error
 
 
@@ -57,7 +61,7 @@ def engine() -> Engine:
 def intervals(
     means: Array, variances: Array, truth: Array, truth_variance: Array, batches: int, which: NDArray[np.int64]
 ) -> Intervals:
-    """From values (seed, K, N) and truths (K, N), entry ``which`` (seed, N) of the K at each seed and pixel."""
+    """Select, from values (seed, K, N) and truths (K, N), the entry ``which`` (seed, N) at each seed and pixel."""
     rows, pixels = np.arange(len(means))[:, None], np.arange(means.shape[-1])
     offset = means[rows, which, pixels] - truth[which, pixels]
     error = np.sqrt(variances[rows, which, pixels] + truth_variance[which, pixels])
@@ -67,7 +71,7 @@ def intervals(
 def require_honest(found: Intervals) -> None:
     assert len(found.offset) >= 2000
     assert LOWEST <= found.covered().mean() <= HIGHEST
-    # The window is narrow enough to notice errors that are not.
+    # The bounds are narrow enough to find standard errors that are too small or too large.
     assert found.covered(0.7).mean() < LOWEST
     assert found.covered(1.5).mean() > HIGHEST
 
@@ -97,7 +101,7 @@ def test_errors_of_derivatives_are_honest(engine: Engine) -> None:
     entry = np.random.default_rng(2).integers(entries, size=(SEEDS, len(VIEW)))
     found = intervals(means, variances, true_mean, true_variance, 4, entry)
     require_honest(found)
-    # Each parameter has some 400 intervals: below 90 % an honest one comes once in 70,000 times.
+    # Each parameter has some 400 intervals; a correct one covers less than 90 % once in 70,000 runs.
     held, name = found.covered(), (entry // len(LIGHTS_MM)).ravel()
     assert {NAMES[k]: held[name == k].mean() for k in range(len(NAMES)) if held[name == k].mean() < 0.9} == {}
 
@@ -107,8 +111,8 @@ def test_an_error_asked_for_is_the_error_there_is(engine: Engine) -> None:
     truth = engine.images(TISSUE, VIEW, samples=TRUTH_SAMPLES, seed=9200)
     runs = [engine.images(TISSUE, VIEW, rel_error=asked, seed=9201 + seed) for seed in range(12)]
     assert all(run.complete and run.rel_error <= asked and run.samples > 64 for run in runs)
-    # Twelve images of 36 independent pixels know their mean square error to 7 % if a pixel's lights are one, and to 3 %
-    # if not: four of the former.
+    # Twelve images of 36 independent pixels give the mean square error to 7 % if the lights of a pixel are fully
+    # correlated, and to 3 % if they are independent. The bounds are four times the former.
     squares = [np.sum((run.mean - truth.mean) ** 2) for run in runs]
     reached = (np.mean(squares) - truth.variance.sum()) / np.sum(truth.mean**2)
     assert 0.72 <= reached / np.mean([run.rel_error**2 for run in runs]) <= 1.28
@@ -130,7 +134,7 @@ def test_a_limit_gives_the_result_as_it_stands(engine: Engine) -> None:
     assert few.rel_error > 0.01
     hurried = engine.images(TISSUE, VIEW, rel_error=0.01, seed=9400, max_seconds=0)
     assert not hurried.complete
-    # The first round is what a plain call of as many paths traces.
+    # The first round traces the same paths as a call with that number of samples.
     plain = engine.images(TISSUE, VIEW, samples=hurried.samples, seed=9400)
     np.testing.assert_array_equal(hurried.mean, plain.mean)
     assert plain.complete

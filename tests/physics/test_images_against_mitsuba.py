@@ -1,6 +1,6 @@
-"""Images against stock Mitsuba's ``prbvolpath`` on the same nested scene, pixel by pixel.
+"""Images compared to stock Mitsuba's ``prbvolpath`` on the same nested scene, pixel by pixel.
 
-The rule is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
+The rule is that of ``tests.support.pictures``; a correct engine fails one run in 500, and seeds are fixed.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path)
     [pytest.param(1024, 4, 250, id="blocks"), pytest.param(8192, 2, 800, id="small-blocks", marks=pytest.mark.slow)],
 )
 def test_the_scanned_incisor_looks_as_in_mitsuba(samples: int, block: int, least: int) -> None:
-    # Pixels of few paths are skewed, the truth's 5,120 among them, which no t-distribution corrects; sums over blocks
-    # of them are not.
+    # Pixels with few paths have skewed noise, as the truth has with 5,120, and no t-distribution corrects that; sums
+    # over blocks of pixels are not skewed.
     root = shared_path("data/tooth-ur1-truth")
     capture, tooth = read_record(root / "capture.json", FolderCapture), read_teeth(root)[0]
     truth = json.loads((root / "truth.json").read_text())

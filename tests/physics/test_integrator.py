@@ -1,7 +1,7 @@
-"""The integrator plug-in against stock Mitsuba and the project's own engine.
+"""The integrator plug-in compared to stock Mitsuba and to the project's own engine.
 
-Images are compared in blocks of pixels by the rule of ``test_images_against_mitsuba``; an honest integrator fails one
-run of such a comparison in 500. Seeds are fixed.
+Images are compared in blocks of pixels by the rule of ``tests.support.pictures``; a correct integrator fails one run of
+such a comparison in 500. Seeds are fixed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CORE = Mesh(SHAPE.vertices_mm((0.5, 0.4)), OUTER.faces)
 STOCK = {"type": "prbvolpath", "max_depth": 5000, "rr_depth": 100}
 LAMP = {
     "type": "rectangle",
-    # 8 mm wide, 12 mm towards the camera and above the tooth, facing it.
+    # The lamp is 8 mm wide, 12 mm towards the camera and above the tooth, and faces it.
     "to_world": np.array([[4.0, 0, 0, -6], [0, 0, -1, 12], [0, 4, 0, 6], [0, 0, 0, 1]]),
     "emitter": {"type": "area", "radiance": 8.0},
 }
@@ -55,7 +55,7 @@ def table(height_mm: float, reflectance: float | SceneDict) -> SceneDict:
 
 @pytest.fixture(scope="module")
 def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the small tooth's two surfaces; the plug-in is registered."""
+    """Folder with the small tooth's two surfaces; the plug-in is registered."""
     prepare_device()
     from services.fit.plugin.integrator import register_integrator
 
@@ -68,7 +68,7 @@ def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def variant(name: str) -> Iterator[None]:
-    """Another variant, for the time of a block."""
+    """Use another variant of Mitsuba for the time of the block."""
     import mitsuba as mi
 
     before = mi.variant()
@@ -80,7 +80,9 @@ def variant(name: str) -> Iterator[None]:
 
 
 def properties(*tissues: Tissue, **others: Any) -> SceneDict:
-    """The integrator, matched unless told otherwise, for tissues of one or three channels."""
+    """Description of the integrator for tissues of one or three channels, with matched boundaries unless ``others``
+    says otherwise.
+    """
     from services.fit.plugin.integrator import medium_properties
 
     media = {
@@ -92,8 +94,8 @@ def properties(*tissues: Tissue, **others: Any) -> SceneDict:
 
 
 def scene_dict(folder: Path, **shapes: SceneDict) -> SceneDict:
-    """The tooth in stock media under a point light, with other shapes: stock integrators and ours render the same
-    scene.
+    """Scene of the tooth in stock media under a point light, with further shapes, which stock integrators and ours can
+    both render.
     """
     return (
         nested_scene({"11": (folder / "outer.ply", folder / "dentin.ply")}, TISSUE, (CAMERA,), LIGHTS_MM[0], INTENSITY)
@@ -102,7 +104,7 @@ def scene_dict(folder: Path, **shapes: SceneDict) -> SceneDict:
 
 
 def render(scene: Any, integrator: SceneDict, samples: int, seed: int) -> tuple[Array, Array]:
-    """Mean and its variance, both (H, W) or (H, W, 3), from independent batches."""
+    """Mean image and variance of the mean, both (H, W) or (H, W, 3), from independent batches."""
     import mitsuba as mi
 
     chosen = mi.load_dict(integrator)
@@ -126,7 +128,7 @@ def engine_images(
     *,
     layered: bool = True,
 ) -> tuple[Array, Array]:
-    """What the project's own engine sees, mean and its variance."""
+    """Mean image (H, W) by the project's own engine, and variance of the mean."""
     dentin = DentinShape.known(CORE) if layered else None
     engine = Engine(single_tooth(OUTER, dentin, LIGHTS_MM[[light]], np.array([intensity]), boundary))
     image = engine.images(tissue, whole_view(CAMERA), samples=512, seed=seed, batches=BATCHES)
@@ -138,7 +140,7 @@ def compare(ours: tuple[Array, Array], truth: tuple[Array, Array], least: int = 
 
 
 def test_teeth_among_other_things_look_as_in_mitsuba(tooth: Path) -> None:
-    # Connections through two teeth, lights that paths find by chance, light that the table returns.
+    # The scene has connections through two teeth, lights that paths hit by chance, and light that the table reflects.
     surroundings: SceneDict = {"table": table(-4.05, 0.5), "lamp": LAMP, "sky": SKY}
     scene = scene_dict(tooth, **surroundings)
     for surface in ("outer", "dentin"):
@@ -163,7 +165,7 @@ def test_point_lights_give_the_engines_images(tooth: Path, boundary: Boundary, l
 
 
 def test_without_a_tooth_in_sight_it_is_a_path_tracer(tooth: Path) -> None:
-    # The tooth lies below the table; on it a ball of rough glass and one of metal.
+    # The tooth lies below the table; on the table are a ball of rough glass and one of metal.
     sensor = sensor_dict(CAMERA)
     sensor["to_world"][2, 3] += 6.3
     ball = {"type": "sphere", "radius": 1.2}
@@ -180,7 +182,7 @@ def test_without_a_tooth_in_sight_it_is_a_path_tracer(tooth: Path) -> None:
 
 
 def test_each_colour_has_its_own_media(tooth: Path) -> None:
-    # Each channel against the engine, which knows one channel at a time.
+    # Compare each channel to the engine, which renders one channel at a time.
     from services.fit.plugin.integrator import register_integrator
 
     tissues = (
@@ -210,9 +212,9 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(tooth: Path) -> None:
 
 
 def test_a_thin_face_gives_back_what_it_keeps_out(tooth: Path) -> None:
-    # With its mirror image the white tooth vanishes again but for what a single bounce between facets loses, here far
-    # under 0.5 %; without, it is darker. In sparse media much light is turned back inside and leaves without another
-    # scattering.
+    # With its mirror reflection the white tooth is invisible again, except for the energy that a model of single
+    # bounces between facets loses, here far below 0.5 %; without the reflection it is darker. In sparse media much
+    # light is reflected inside and leaves without another scattering.
     sparse = Tissue(Medium(0.2, 1.0, g1=0.3), Medium(0.4, 1.0))
     scene = load_scene(scene_dict(tooth, light={"type": "constant"}))
     brightness = []
@@ -222,12 +224,12 @@ def test_a_thin_face_gives_back_what_it_keeps_out(tooth: Path) -> None:
         assert np.sqrt(variance[seen].sum()) / seen.sum() < 0.005 / 3
         brightness.append(mean[seen].mean())
     assert abs(brightness[0] - 1) < 0.005
-    # Towards the viewer the face reflects at least what it does at normal incidence.
+    # At any angle to the viewer the face reflects at least as much as at normal incidence.
     assert brightness[1] < 1 - ((1.631 - 1) / (1.631 + 1)) ** 2 + 0.005
 
 
 def test_a_mirror_image_is_that_of_rough_plastic(tooth: Path) -> None:
-    # A tooth so dense and dark that only its outer face shows, against stock plastic without a base.
+    # Compare a tooth so dense and dark that only its outer face is visible to stock plastic without a diffuse base.
     scene = scene_dict(tooth, table=table(-4.05, 0.5), lamp=LAMP, sky=SKY)
     dark = properties(Tissue(Medium(50.0, 0.0), Medium(50.0, 0.0)), boundary="thin", roughness=0.3)
     ours = render(load_scene(scene), dark, 256, 11)
@@ -262,7 +264,9 @@ def test_a_moved_tooth_is_seen_where_it_is(tooth: Path) -> None:
 
 
 def sentence(problem: BaseException) -> str:
-    """Mitsuba wraps what a plug-in raises: of what it loads in text, of what it renders as the cause."""
+    """Message of the project's error inside an exception of Mitsuba, which keeps an error while rendering as the cause
+    and puts an error while loading into its text.
+    """
     while problem.__cause__ is not None and not isinstance(problem, DentineError):
         problem = problem.__cause__
     return str(problem)
@@ -343,7 +347,7 @@ def test_derivatives_are_refused(tooth: Path) -> None:
 
 
 def test_an_instance_beside_the_tooth_is_no_tooth(tooth: Path) -> None:
-    # What lies in a shape group is not among the scene's shapes.
+    # Shapes in a shape group are not among the scene's shapes.
     ball = {"type": "sphere", "radius": 1.0, "center": [2.5, 3.0, 3.5], "bsdf": {"type": "diffuse"}}
     group = {"type": "shapegroup", "ball": ball}
     scenes = ({"group": group, "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}}}, {"ball": ball})
@@ -368,7 +372,7 @@ def test_the_gallery_shows_a_tooth_on_a_table(tooth: Path, tmp_path: Path) -> No
     assert front.shape == (25, 20, 3)
     tooth_region, corner = (slice(8, 17), slice(8, 12)), (slice(0, 4), slice(0, 4))
     assert front[tooth_region].mean() > 1.5 * front[corner].mean()
-    # Against the light, dentin is darker and yellower than the enamel of the edge above it.
+    # With light from behind, dentin is darker and yellower than the enamel of the edge above it.
     edge, core = backlit[6:8, 9:12].mean(axis=(0, 1)), backlit[14:18, 9:12].mean(axis=(0, 1))
     assert edge.mean() > 1.3 * core.mean()
     assert core[0] / core[2] > 1.1 * edge[0] / edge[2]

@@ -1,7 +1,7 @@
-"""The phantom jaw by the engine, which lets solids overlap, and by stock Mitsuba on surfaces cut along each other,
-pixel by pixel.
+"""The phantom jaw rendered by the engine, which lets solids overlap, and by stock Mitsuba on surfaces that are cut
+along each other, compared pixel by pixel.
 
-The rule is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
+The rule is that of ``tests.support.pictures``; a correct engine fails one run in 500, and seeds are fixed.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from tests.support.shared_data import shared_path
 SUBJECT = 1
 FRONT = (11, 12, 21)
 BLOCK_PX = 4
-"""Of so few paths a single pixel's batches are skewed, differently by the two renderers, which moves its z; sums over
-blocks are not."""
+"""Edge of the blocks in pixels. With so few paths the noise of a single pixel is skewed, differently in the two
+renderers, which biases its z; sums over blocks are not skewed."""
 
 
 def scores(jaw: JawSurfaces, folder: Path, *, pixel_mm: float, samples: int, block: int) -> np.ndarray:
-    """z of two lights' images by one camera from the patient's right."""
+    """z-scores of the images of two lights by one camera from the patient's right."""
     prepare_device()
     lights = dome_lights(2, ("green",), seed=SUBJECT)
     camera = dome_cameras(3, pixel_mm, tuple(tooth.outer for tooth in jaw.teeth))[0]

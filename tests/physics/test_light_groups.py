@@ -1,6 +1,4 @@
-"""A connection looks up one light of every group: each light as often as its brightness asks for, for any number of
-lights.
-"""
+"""A connection chooses one light of every group, each in proportion to its brightness, for any number of lights."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ DRAWS = 4096
 
 
 def lobe(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Brightest to darkest light 3 million times."""
+    """Test importance by the cosine; the ratio of its largest to its smallest value is 3 million."""
     return (1.005 - cosine) ** -2.5
 
 
@@ -47,8 +45,8 @@ def test_a_light_is_chosen_as_often_as_it_is_bright(lights: int) -> None:
     towards = positions - POINT_MM
     squared = np.sum(towards**2, axis=1)
     brightness = lobe(towards @ AHEAD / np.sqrt(squared)) * intensities / squared
-    # Draws at equal steps fall into an interval of (0, 1) as often as its width says, give or take one; the rest is
-    # single precision.
+    # The number of equally spaced draws in an interval of (0, 1) is its width times their count, to within one; the
+    # rest of the tolerance is single precision.
     counts = np.array([np.bincount(row, minlength=lights) for row in found.reshape(groups.count, DRAWS)])
     of = counts.argmax(axis=0)
     of[counts.sum(axis=0) == 0] = -1
@@ -66,7 +64,7 @@ def test_no_light_of_no_brightness_is_chosen() -> None:
 
     from services.fit.transport.lighting.light_groups import LightGroups
 
-    # Seven lights fill three groups with two places to spare; those on the left are behind the vertex.
+    # Seven lights fill three groups and leave two places empty; lights at negative x have zero importance.
     positions = np.array([light.position_mm for light in dome_lights(7, ("green",), seed=1)])
     groups = LightGroups(positions, np.ones(7))
     draw = dr.arange(mi.UInt32, groups.count * DRAWS)

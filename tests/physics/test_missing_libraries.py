@@ -1,5 +1,5 @@
-"""A system library that the renderer's wheels need and the machine lacks is told as one sentence, wherever the renderer
-is entered.
+"""If the machine lacks a system library that the renderer's wheels need, every entry to the renderer fails with one
+sentence that names it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ ENTRIES = {
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with Dr.Jit as installed, but for the name of a library that it asks the system for: no system has that
-    one.
-    """
+    """Folder with a copy of the installed Dr.Jit that requires a system library of a name that no system has."""
     spec = importlib.util.find_spec("drjit")
     assert spec is not None
     assert spec.submodule_search_locations is not None

@@ -1,7 +1,7 @@
-"""A gradual border between enamel and dentin: images against stock Mitsuba, which takes albedo and lobe weight from
-volumes, and derivatives to the shape.
+"""A gradual border between enamel and dentin: images compared to stock Mitsuba, which reads albedo and lobe weight from
+volumes, and derivatives to the shape compared to differences.
 
-The rule for images is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
+The rule for images is that of ``tests.support.pictures``; a correct engine fails one run in 500, and seeds are fixed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ from tests.support.small_tooth import (
 )
 
 WIDTH_MM = 2.0
-# One pair of lobes, whose weight and albedo differ: stock media mix these by volumes, but not a lobe's g.
+# Both media have the same two lobes and differ in their weight and in albedo, because stock Mitsuba can mix these by
+# volumes, but not a lobe's g.
 TISSUE = Tissue(Medium(1.5, 0.98, 0.9, 0.6, -0.3), Medium(4.0, 0.75, 0.3, 0.6, -0.3))
 
 
@@ -84,7 +85,7 @@ def share_of_enamel(core: Mesh, cells: int = 64) -> NDArray[np.float64]:
     z, y, x = (grid.ravel() for grid in np.meshgrid(*axes, indexing="ij"))
     points = np.stack([x, y, z], axis=1)
     distance = SurfaceDistance(core).closest(points)[1]
-    # The core is convex and centred, so a ray from the middle tells inside from outside.
+    # The core is a centred ellipsoid, so its equation says whether a point is inside.
     inside = ((points / (SEMI_AXES_MM - 0.7)) ** 2).sum(axis=1) < 1
     q = np.where(inside, -distance, distance)
     return (1 / (1 + np.exp(-8 * q / WIDTH_MM))).reshape(cells, cells, cells)
@@ -106,7 +107,7 @@ def test_the_distance_moves_as_the_surface_does() -> None:
     shape = dentin_shape()
     directions = np.random.default_rng(3).normal(size=(4000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # Near a surface shrunk half-way by the first mode.
+    # Choose points near the surface that the first mode has shrunk half-way.
     middle = SEMI_AXES_MM - 0.3 - 0.45
     points = directions * (middle + np.random.default_rng(4).uniform(-0.4, 0.4, (4000, 1)))
     x = mi.Point3f(points.T.astype(np.float32))
@@ -125,8 +126,8 @@ def test_the_distance_moves_as_the_surface_does() -> None:
     here = border_at(0.5)
     (speed, _), q = (np.array(values) for values in here.motion(x, mi.Bool(True))), distance(here)
     dr.sync_thread()
-    # Interpolated on a grid of 0.15 mm both are a few hundredths off at a point, and on average much less; the surface
-    # itself has edges.
+    # Both are interpolated on a grid of 0.15 mm, with errors of a few hundredths at a point and much less on average;
+    # the surface itself has edges.
     band = (np.abs(q) > 0.1) & (np.abs(q) < 0.4)
     assert band.sum() > 1000
     gap = (moved - speed)[band]
@@ -141,7 +142,7 @@ def test_borders_of_no_possible_width_are_refused(width_mm: float) -> None:
 
 
 def test_no_part_of_a_mouth_with_gradual_borders_has_a_table() -> None:
-    # Gums do not mix, but what mixes reads lobes alone.
+    # Gums do not mix, but the code that mixes media reads lobes alone.
     engine = Engine(replace(mouth_recipe("matched"), border_width_mm=1.0))
     tabulated = replace(MOUTH, gums=Medium(1, 0.9, table=PhaseTable((0.0, np.pi), (1.0, 1.0))))
     with pytest.raises(InputError, match="phase table; make the border sharp"):
@@ -150,10 +151,10 @@ def test_no_part_of_a_mouth_with_gradual_borders_has_a_table() -> None:
 
 @pytest.mark.parametrize("whole", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_mixture_changes_where_the_border_moves(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Albedos far apart and extinctions near: nearly all of the derivative of the images' sum is what the mixture's
-    # albedo does, and without it the test fails.
+    # Albedos differ much and extinctions little, so nearly all of the derivative of the images' sum comes from the
+    # mixture's albedo, and without this term the test fails.
     if not whole:
-        monkeypatch.setattr(Scores, "mixed_albedo_motion", lambda *_: mi_zero())
+        monkeypatch.setattr(Scores, "albedo_slope", lambda *_: mi_zero())
     tissue = Tissue(Medium(1.5, 0.6, 0.9, 0.7, -0.3), Medium(1.2, 0.95, 0.3, 0.5, -0.2), (0.5, 0.4))
     engine, view = Engine(replace(recipe(), border_width_mm=1.2)), whole_view(camera_at((0.2, 1, 0.1)), 1)
     scores = np.array(
@@ -169,7 +170,7 @@ def test_the_mixture_changes_where_the_border_moves(whole: bool, monkeypatch: py
     gap = scores - differences
     error = gap.std(ddof=1) / np.sqrt(len(gap))
     assert error <= 0.05 * abs(differences.mean())
-    # Both grids of distances are off by a hundredth on average (the test above).
+    # Both grids of distances have errors of a hundredth on average (see the test of distances above).
     allowed = stats.t.isf(5e-4, len(gap) - 1) * error + 0.01 * abs(differences.mean())
     assert (abs(gap.mean()) <= allowed) == whole
 

@@ -1,7 +1,6 @@
-"""Several teeth, gums and the wall of the mouth: images against stock Mitsuba's ``prbvolpath``, pixel by pixel, and
-derivatives against differences.
+"""Several teeth, gums and the wall of the mouth: images compared to stock Mitsuba's ``prbvolpath``, pixel by pixel.
 
-The rule for images is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
+The rule for images is that of ``tests.support.pictures``; a correct engine fails one run in 500, and seeds are fixed.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def test_coarser_tables_of_larger_scenes_change_the_noise_alone(monkeypatch: pyt
     monkeypatch.setattr(MouthMaps, "MAX_BYTES", 2**14)
     monkeypatch.setattr("services.fit.transport.scene.clearance.MAX_CELLS", 2000)
     coarse = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=6, batches=BATCHES)
-    # One pixel is independent of the next; its two lights are not.
+    # Pixels are independent of each other, but the two lights of a pixel are not.
     spread = np.sqrt(sum(image.variance.sum(axis=1) for image in (fine, coarse)))
     assert (np.abs(fine.mean.sum(axis=1) - coarse.mean.sum(axis=1)) < 4 * spread).all()
     assert (spread < 0.01 * fine.mean.sum(axis=1)).all()

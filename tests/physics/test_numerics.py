@@ -1,5 +1,5 @@
-"""Fixed seeds give the numbers that they gave when the numerics were last raised, so that a checkpoint is continued by
-none but its own.
+"""Fixed seeds give the numbers that were stored when ``NUMERICS`` was last raised, so that a fit continues a checkpoint
+only with the numerics that wrote it.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ REMEDY = (
     "if that is meant, raise services.fit.execution.numerics.NUMERICS and run python -m tests.support.golden_numerics"
 )
 RENDER_TOLERANCE = 1e-3
-"""Of the largest value. Thread counts alone change an image by 1e-5 and a derivative by 1e-4 of its norm
-(test_engine_repeats); other random numbers change most of them by a tenth."""
+"""Tolerance of rendered values as a fraction of the largest one. The number of threads alone changes an image by 1e-5
+and a derivative by 1e-4 of its norm (test_engine_repeats); other random numbers change most values by a tenth."""
 ALIKE = 0.95
-"""Fraction of the values that agree: another processor may round a path's decision the other way now and then, which
-changes one pixel."""
+"""Least fraction of the values that must agree. On another processor, rounding may now and then change a decision of a
+path, which changes one pixel."""
 FIT_TOLERANCE = 1e-6
-"""Relative. NumPy's sums differ between processors by some 1e-15, which a few steps of a well-posed solver amplify;
-another solver changes the third digit."""
+"""Relative tolerance of a fit's results. NumPy's sums differ between processors by some 1e-15, which a few steps of a
+well-posed solver amplify; another solver changes the third digit."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Kernel formulas in single precision against NumPy in double, over the corners of their domains."""
+"""Kernel formulas in single precision compared to NumPy in double precision, up to the limits of their domains."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.support.z_scores import LARGEST_Z
 G = np.array(
     [0.0, 1e-7, -1e-6, 1e-3, -0.05, 0.3, -0.3, 0.5, -0.7, 0.9, -0.95, 0.99, -0.999, 0.9999, -0.9999], dtype=np.float32
 )
-"""Mean cosines. In single precision 1 - |g| is exact for |g| >= 0.5, so the corner loses nothing that its input still
-has."""
+"""Mean cosines. In single precision 1 - |g| is exact for |g| >= 0.5, so that values near 1 lose no precision beyond the
+rounding of g itself."""
 ROUNDING = 6e-8
 """Half a unit in the last place of single precision."""
 
@@ -39,12 +39,12 @@ def kernel(function: Callable[..., Any], *columns: NDArray[np.float32]) -> NDArr
 
 
 def deviations() -> NDArray[np.float32]:
-    """m = 1 - sign(g) cos(theta), from the tip of the narrowest lobe to straight behind."""
+    """Values of m = 1 - sign(g) cos(theta), from the peak of the narrowest lobe to the opposite direction."""
     return np.concatenate([[0.0], np.logspace(-12, 0, 200), np.linspace(1, 2, 50)]).astype(np.float32)
 
 
 def density64(g: NDArray[np.float64], m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Henyey-Greenstein value at cos(theta) = sign(g) (1 - m), with 1 + g^2 - 2 |g| (1 - m) expanded about the tip."""
+    """Henyey-Greenstein value at cos(theta) = sign(g) (1 - m), with 1 + g^2 - 2 |g| (1 - m) expanded about the peak."""
     a = np.abs(g)
     return (1 - a**2) / (4 * np.pi * ((1 - a) ** 2 + 2 * a * m) ** 1.5)
 
@@ -53,7 +53,7 @@ def test_phase_function_values() -> None:
     from services.fit.optics import phase
 
     g, m = G[:, None], deviations()[None, :]
-    # A dozen roundings, one of them to the power 3/2.
+    # The formula has a dozen roundings, one of them to the power 3/2.
     np.testing.assert_allclose(kernel(phase.density, g, m), density64(np.float64(g), np.float64(m)), rtol=20 * ROUNDING)
 
 
@@ -65,11 +65,11 @@ def test_phase_function_derivatives() -> None:
     d = (1 - a) ** 2 + 2 * a * m
     truth = sign * (-2 * a / (1 - a**2) + 3 * ((1 - a) - m) / d)
     ours = kernel(phase.score_g, G[:, None], deviations()[None, :])
-    # The score passes through zero, where its terms cancel: rounding is relative to them.
+    # The score passes through zero, where its terms cancel, so rounding is relative to the terms.
     size = 2 * a / (1 - a**2) + 3 * ((1 - a) + m) / d
     assert (np.abs(ours - truth) <= 20 * ROUNDING * size).all()
 
-    # The formula itself against differences of log density at fixed angle; its step leaves a relative error of 1e-8.
+    # Compare the formula itself to differences of the log density at a fixed angle; their relative error is 1e-8.
     inner = np.abs(np.float64(G)) < 0.9995
     step = 1e-4 * (1 - a[inner])
     up, down = (
@@ -81,7 +81,7 @@ def test_phase_function_derivatives() -> None:
 def test_phase_functions_integrate_to_one() -> None:
     from services.fit.optics import phase
 
-    # Gauss-Legendre on panels that shrink towards the tip of the narrowest lobe.
+    # Integrate by Gauss-Legendre quadrature on panels that shrink towards the peak of the narrowest lobe.
     nodes, weights = np.polynomial.legendre.leggauss(8)
     edges = np.concatenate([[0.0], np.logspace(-11, np.log10(2), 120)])
     half = np.diff(edges)[:, None] / 2
@@ -102,8 +102,8 @@ def test_sampled_deviations_invert_the_distribution() -> None:
     s = 2 * v - 1
     series = (s + a * (s**2 + 3) / 2 + a**2 * s + a**3 * (s**2 - 1) / 2) / (1 + a * s) ** 2
     truth = 1 - np.where(a < 0.3, series, textbook)
-    # Relative where the lobe is narrow, since m is what the density takes; the reference itself has 1e-13 left of 1 -
-    # cos.
+    # The tolerance is relative, also where the lobe is narrow, because the density takes m as its argument. The
+    # reference itself computes 1 - cos to 1e-13.
     assert (np.abs(ours - truth) <= 20 * ROUNDING * truth + 1e-13).all()
 
 
@@ -117,16 +117,17 @@ def test_sampled_directions_have_the_right_moments() -> None:
     for number, g in enumerate(G):
         rng = mi.PCG32(count, initstate=number)
         omega = dr.normalize(mi.Vector3f(rng.next_float32() - 0.5, rng.next_float32() - 0.5, rng.next_float32() - 0.5))
-        turned = phase.turn(
+        turned = phase.deflected(
             omega, mi.Float(g), phase.sample_deviation(mi.Float(g), rng.next_float32()), rng.next_float32()
         )
         before, after = np.array(omega, dtype=np.float64), np.array(turned, dtype=np.float64)
         np.testing.assert_allclose(np.linalg.norm(after, axis=0), 1, atol=1e-6)
         cosine = np.einsum("ij,ij->j", before, after)
-        # First two Legendre moments of a Henyey-Greenstein lobe are g and g^2; |z| <= 4.5 fails one honest run in 5000.
+        # The first two Legendre moments of a Henyey-Greenstein lobe are g and g^2; |z| <= 4.5 fails one correct run in
+        # 5000.
         for sample, truth in ((cosine, g), ((3 * cosine**2 - 1) / 2, g**2)):
             assert abs(sample.mean() - truth) <= LARGEST_Z * sample.std() / np.sqrt(count) + 1e-6
-        # The azimuth about omega prefers no side.
+        # The azimuth about omega is uniform.
         side = np.cross(before.T, [0.0, 0.0, 1.0])
         across = np.einsum("ij,ij->i", after.T, side / np.linalg.norm(side, axis=1, keepdims=True))
         assert abs(across.mean()) <= LARGEST_Z * across.std() / np.sqrt(count) + 1e-6
@@ -190,7 +191,7 @@ def test_albedos_near_one_keep_their_absorption() -> None:
 
     from services.fit.transport.scene.media import Media
 
-    # alpha^k as the walk carries it, for as many scatters as it takes to notice.
+    # Compute alpha^k as the walk does, for numbers of scattering events k up to where the absorption shows.
     for absorbed in (1e-7, 1e-6, 1e-4, 0.01, 0.5, 0.9):
         (log_alpha,) = Media([Medium(1, 1 - absorbed)]).log_alpha
         count = np.float64([1, 10, 1000, 1e5, 1e7])

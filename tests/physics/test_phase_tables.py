@@ -1,5 +1,5 @@
-"""Tabulated phase functions: values and sampling in single precision, slabs and a tooth against truths that know no
-table of ours.
+"""Tabulated phase functions: values and sampling in single precision, and slabs and a tooth compared to references that
+do not use the project's tables.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ TABLES = {
 SAMPLES = 1 << 20
 CELLS = 256
 FALSE_ALARM = 1e-6
-"""Of each chi-square test; seeds are fixed."""
+"""False-alarm rate of each chi-square test; seeds are fixed."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -72,13 +72,14 @@ def test_tables_are_normalised_and_know_their_mean(name: str) -> None:
         np.concatenate([np.linspace(0, math.pi, 20001), np.geomspace(1e-7, 1e-2, 20000), table.angles_rad])
     )
     assert abs(cumulative(table, np.array([math.pi]))[0] - 1) < 1e-12
-    # By parts, the mean cosine is 1 less the integral of (1 - F) sin; the trapezoidal rule leaves 1e-7.
+    # Integrated by parts, the mean cosine is 1 minus the integral of (1 - F) sin; the trapezoidal rule is exact to
+    # 1e-7.
     mean = 1 - np.trapezoid((1 - cumulative(table, angle)) * np.sin(angle), angle)
     assert table.mean_cosine == pytest.approx(mean, abs=1e-6)
 
 
 def test_a_dictionary_of_tents_adds_up() -> None:
-    # Any table is the mix of its tents, each of unit light, in proportion to value times weight.
+    # Any table is a mixture of normalised tents, with proportions of value times weight.
     nodes = np.linspace(0, math.pi, 200)
     weights = tent_weights(nodes)
     assert weights.sum() == pytest.approx(4 * math.pi, rel=1e-13)
@@ -110,7 +111,7 @@ def test_values_in_a_kernel(name: str) -> None:
     columns = [mi.Vector3f(np.ascontiguousarray(v, dtype=np.float32)) for v in (before, frame @ turned)]
     kernel = PhaseTables([None, table])
     ours = np.array(kernel.density(mi.UInt32(2), *columns), dtype=np.float64)
-    # Rounded directions are up to 3e-7 off, over which the table may change by so much.
+    # Rounded directions have errors of up to 3e-7 rad, so compare to the table's range over that angle.
     near = np.stack([density(table, np.clip(angle + shift, 0, math.pi)) for shift in (-3e-7, 0, 3e-7)])
     slack = 1e-5 * near.max(axis=0) + 1e-6 * max(table.values) * (near.max(axis=0) > 0)
     assert (ours >= near.min(axis=0) - slack).all()
@@ -146,23 +147,23 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
         half < 0.7, np.arcsin(np.minimum(half, 1)), np.arccos(np.minimum(np.linalg.norm(after + before, axis=0) / 2, 1))
     )
 
-    # What the table calls empty is hit only by rounding of a direction at its rim.
+    # Angles at which the table is zero are hit only by rounding of a direction at their edge.
     assert np.count_nonzero(value == 0) <= 1e-4 * SAMPLES
-    # Through its distribution function the angle is uniform. The finest peak is as narrow as directions are round, so
-    # its cells are wide.
+    # The distribution function maps the angle to a uniform variable. The narrowest peak is as narrow as the rounding of
+    # directions, so its cells are wide.
     cells = 4 if "thousandth" in name else CELLS
     uniform = cumulative(table, angle)
     counts = np.bincount(np.minimum((uniform * cells).astype(int), cells - 1), minlength=cells)
     assert stats.chisquare(counts).pvalue > FALSE_ALARM
-    # The azimuth prefers no side.
+    # The azimuth is uniform.
     side = np.cross(before.T, [0.0, 0.0, 1.0])
     across = np.einsum("ij,ij->i", after.T, side / np.linalg.norm(side, axis=1, keepdims=True))
     assert abs(across.mean()) <= 4.5 * across.std() / math.sqrt(SAMPLES) + 1e-7
 
 
 def test_tabulated_lobes_reproduce_slab_totals() -> None:
-    # Two walks that draw from phase functions of distance d differ in at most d of their scatterings; of (1 - R - T)
-    # alpha / (1 - alpha) on average. The tables are so fine that this is below a tenth of a standard error.
+    # Two walks with phase functions of distance d differ in at most a share d of their scatterings, of which there are
+    # (1 - R - T) alpha / (1 - alpha) on average. The tables are so fine that this is below a tenth of a standard error.
     rows = (
         "a=0.9 g=0.75 tau=2 n=1 ",
         "a=0.8 g=-0.9 tau=2 n=1 ",
@@ -184,7 +185,7 @@ def test_tabulated_lobes_reproduce_slab_totals() -> None:
 
 
 def test_connections_know_the_table() -> None:
-    # Radiances of van de Hulst's slab to 1 %, where the table is off by 2e-6.
+    # Compare to radiances of van de Hulst's slab within 1 %; the table's own error is 2e-6.
     for number, case in enumerate(angular_cases(0.01)):
         if case.layer.g1 != 0:
             table, _ = henyey_greenstein(case.layer.g1, spacing=0.002)
@@ -194,7 +195,8 @@ def test_connections_know_the_table() -> None:
 
 def test_a_tabulated_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     prepare_device()
-    # Equal steps of the cosine are what Mitsuba's tabphase has: a forward lobe, a gap and a backward one.
+    # The table has equal steps of the cosine, as Mitsuba's tabphase needs, with a forward lobe, a gap and a backward
+    # lobe.
     cosine = np.linspace(1, -1, 41)
     values = np.where(cosine > 0.3, (cosine - 0.3) ** 2, 0) + np.where(cosine < -0.6, 0.1 * (-0.6 - cosine), 0)
     lobes = Medium(4.0, 0.85, 0.8, 0.5, -0.2)

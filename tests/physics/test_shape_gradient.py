@@ -1,9 +1,9 @@
-"""The shape gradient by light and importance on the border, against central differences of the images with common
+"""The shape gradient from light and importance on the border, compared to central differences of the images with common
 random numbers.
 
-Tolerance: the series ends and light is averaged over patches of the border. On these scenes, thin enamel, lights nearly
-behind the camera and media that are clear, or scatter forwards, that was measured to move the derivative by 1 % and by
-10 to 15 % (``docs/how/shape-gradient.md``): the bias each case allows.
+Tolerance: the gradient is biased, because the series is truncated and light is averaged over patches of the border. On
+these scenes (thin enamel, lights nearly behind the camera) the measured bias is 1 % with clear media and 10 to 15 %
+with forward scattering (``docs/how/shape-gradient.md``); each case allows for it.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from tests.support.small_tooth import camera_at, recipe, whole_view
 
 SEEDS = 8
 LARGEST_ERROR = 0.05
-"""Standard error of gradient and of difference, as a fraction of the derivative."""
+"""Largest standard error of gradient and of difference, as a fraction of the derivative."""
 FALSE_ALARM = 1e-3
 """Chance that any t-test of this file's differences fails a gradient whose bias is below the case's (Bonferroni)."""
 STEP = 0.3
 
 CLEAR = Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3), (0.5, 0.4))
-"""Dentin clearer than enamel, two lobes."""
+"""Tissue whose dentin is clearer than its enamel, with two lobes."""
 FORWARD = Tissue(Medium(2, 0.95, 0.93, 0.82, -0.1), Medium(4, 0.85, 1.0, 0.75), (0.5, 0.4))
-"""As the dark incisor of the benchmark, with thinner enamel."""
+"""Tissue of the benchmark's dark incisor; enamel is thinner here."""
 CASES = [
     pytest.param(CLEAR, "matched", 1024, 0.03, id="clear-matched"),
     pytest.param(CLEAR, "thin", 1024, 0.03, id="clear-thin", marks=pytest.mark.slow),
     pytest.param(FORWARD, "matched", 16384, 0.15, id="forward-matched", marks=pytest.mark.slow),
 ]
-"""With the paths per pixel that differences take, and the bias allowed."""
+"""Tissue, boundary, paths per pixel of the differences, and allowed relative bias."""
 
 
 @pytest.mark.parametrize(("tissue", "boundary", "paths", "bias"), CASES)
@@ -73,8 +73,8 @@ def test_its_errors_are_honest() -> None:
     runs = [engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=64, photons=512) for seed in range(64)]
     claimed = np.mean([run.variance for run in runs], axis=0)
     found = np.var([run.gradient for run in runs], axis=0, ddof=1)
-    # The variance of 64 values is chi-square with 63 degrees of freedom; 0.6 to 1.6 holds it but once in 1e4, and the
-    # claim's own noise beside it.
+    # The variance of 64 values is chi-square with 63 degrees of freedom and lies in 0.6 to 1.6 except once in 1e4; the
+    # bounds also allow for the noise of the claimed variance.
     assert ((found / claimed > 0.55) & (found / claimed < 1.7)).all()
 
 
@@ -176,7 +176,7 @@ def _residual(engine: Engine, tissue: Tissue, view: View) -> NDArray[np.float64]
 def _difference(
     engine: Engine, tissue: Tissue, view: View, weights: NDArray[np.float64], mode: int, paths: int, seed: int
 ) -> float:
-    """Free of its bias to fourth order by two steps."""
+    """Central difference extrapolated from two steps, with an error of fourth order."""
     middle = tissue.shape[mode]
 
     def at(step: float) -> float:

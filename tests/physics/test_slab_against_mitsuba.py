@@ -1,8 +1,8 @@
-"""Index-matched cells against stock Mitsuba.
+"""Index-matched cells compared to stock Mitsuba.
 
-Stock Mitsuba has no narrow beam that a path from a camera can be connected to, but a directional light. A cell that is
-wide against its light's way lets both be compared: the radiance under irradiance 1 across the beam is the sum over
-pixels of the beam's image times their area times the cosine of the beam, as shifting the beam shifts the image.
+Stock Mitsuba has a directional light but no narrow beam to which paths from a camera can be connected. In a cell much
+wider than the paths of light, the two can be compared. Since shifting the beam shifts its image, the radiance under
+irradiance 1 across the beam is the sum over pixels of the beam's image times the pixel area times the beam's cosine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BATCHES = 16
 
 
 def direction(side: str, angle_deg: float, *, arriving: bool) -> np.ndarray:
-    """Travelling direction of a light that arrives at a face or of light that leaves it."""
+    """Unit vector (3,) along the travel of light that arrives at a face or leaves it."""
     forward = (side == "front") == arriving
     return np.array(
         [math.sin(math.radians(angle_deg)), 0.0, math.cos(math.radians(angle_deg)) * (1 if forward else -1)]
@@ -37,8 +37,8 @@ def direction(side: str, angle_deg: float, *, arriving: bool) -> np.ndarray:
 
 
 def by_mitsuba(sigma_s: float, g: float, sigma_a: float) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance (lights, cameras) under irradiance 1 across the beam, unscattered light left out, and standard
-    errors.
+    """Radiance (lights * cameras,) under irradiance 1 across the beam, without unscattered light, and its standard
+    errors, by stock Mitsuba.
     """
     prepare_device()
     import mitsuba as mi
@@ -103,6 +103,6 @@ def test_matched_cells_agree_with_stock_mitsuba(sigma_s: float, g: float, sigma_
     ours = images.sum(axis=-1) * rig.grid.area_mm2 * slants
     truth, truth_error = by_mitsuba(sigma_s, g, sigma_a)
     error = np.hypot(ours.std(axis=0, ddof=1) / math.sqrt(BATCHES), truth_error)
-    # Tolerance 2 %: the joint standard error is at most a third of it.
+    # The tolerance is 2 %; the joint standard error is at most a third of it.
     assert (error <= 0.02 / 3 * truth).all()
     require_unbiased(student_to_normal((ours.mean(axis=0) - truth) / error, BATCHES), independent=len(truth))

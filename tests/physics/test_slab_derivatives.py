@@ -1,10 +1,10 @@
-"""Slab derivatives against ``slab_derivatives.csv``, and the moving border against cases whose derivative is exactly
-zero.
+"""Slab derivatives compared to ``slab_derivatives.csv``, and the moving border compared to cases whose derivative is
+exactly zero.
 
-The rule asks for a standard error of a third of 1 % (of the value, or of 1e-3 of the largest derivative of the same
-case and source). Some values of the table cost minutes at that error and the border's ``c`` by its own two terms days,
-as it is the small difference of two much larger terms. So the rule is applied in full to the cases that reach it, and
-to the border in the form of the zero test; all 320 values are tested for bias at the error that seconds reach.
+The rule requires a standard error of a third of 1 % (of the value, or of 1e-3 of the largest derivative of the same
+case and source). Some values of the table need minutes for that. The border's ``c`` computed from its own two terms
+needs days, because it is the small difference of two much larger terms. So the full rule is applied to the cases that
+reach it, and to the border by the zero test; all 320 values are tested for bias at the error that seconds allow.
 ``tests/benchmarks/slab_table.py`` writes the error of every value.
 """
 
@@ -19,14 +19,14 @@ from tests.support.slab_tables import SlabCase, derivative_cases, named, passes,
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
 
 ZERO_TOLERANCE = 0.02
-"""Of the one-sided border term."""
+"""Tolerance of the zero derivative, as a fraction of the one-sided border term."""
 AT_TOLERANCE = 70
-"""Of the table's 320 values, at least this many reach the full rule's standard error in the short runs (74 were
+"""Least number of the table's 320 values that reach the full rule's standard error in the short runs (74 were
 counted)."""
 
 
 def to_one_percent(case: SlabCase, seed: int) -> NDArray[np.float64]:
-    """Scores of a case traced until every standard error is a third of its tolerance."""
+    """z-scores of a case that is traced until every standard error is a third of its tolerance."""
     allowed = case.derivative_tolerance() / 3
     sums = simulate(case, lambda sums: float((sums.standard_error()[1:] / allowed).max()), seed)
     assert (sums.standard_error()[1:] <= allowed).all(), case.name
@@ -36,7 +36,8 @@ def to_one_percent(case: SlabCase, seed: int) -> NDArray[np.float64]:
 def test_derivatives_agree_within_one_percent() -> None:
     cases = named(derivative_cases(), "S01", "S02", "S05")
     scores = [to_one_percent(case, seed=300 + number) for number, case in enumerate(cases)]
-    # The derivatives of one simulation share its paths: one independent value each, the case that strays furthest.
+    # The derivatives of one simulation share its paths, so each simulation counts as one independent value, which is
+    # the worst case.
     require_unbiased(np.concatenate(scores), independent=len(cases))
 
 
@@ -60,8 +61,8 @@ def test_all_derivatives_are_unbiased_at_the_error_reached() -> None:
 
 
 def test_extinction_scores_give_the_borders_derivative_too() -> None:
-    # R and T depend on sigma_i d_i alone, so dR/dc = (sigma1/d1) dR/dsigma1 - (sigma2/d2) dR/dsigma2, with a fraction
-    # of the noise.
+    # R and T depend on sigma_i d_i alone, so dR/dc = (sigma1/d1) dR/dsigma1 - (sigma2/d2) dR/dsigma2, which has a
+    # fraction of the noise.
     cases, scores = named(derivative_cases(), "S10", "S14", "S16"), []
     for number, case in enumerate(cases):
         sums = simulate(case, passes(1), seed=700 + number)
@@ -85,11 +86,11 @@ def test_a_border_between_media_of_equal_albedo_and_phase_does_nothing(
     leave_out_scattering(monkeypatch)
     one_sided = simulate(slab, passes(1), seed, border_terms_only=True)
 
-    # Rows: total reflectance first, dR/dc last.
+    # The first row is the total reflectance, the last one dR/dc.
     value, error = sums.mean()[:, 0], sums.standard_error()[:, 0]
     assert abs(value[0] - slab.values[0, 0]) <= LARGEST_Z * error[0]
     assert error[-1] <= ZERO_TOLERANCE / 3 * abs(one_sided.mean()[-1, 0])
     assert is_zero(value[-1], error[-1])
-    # Without the scattering partner the same assertion fails, by hundreds of standard errors.
+    # Without the scattering term the same assertion fails, by hundreds of standard errors.
     assert not is_zero(one_sided.mean()[-1, 0], one_sided.standard_error()[-1, 0])
     assert abs(one_sided.mean()[-1, 0]) > 100 * one_sided.standard_error()[-1, 0]

@@ -1,4 +1,6 @@
-"""The paper's solver: its projection, its gradient, and why the two images of a product need streams of their own."""
+"""The paper's solver: its projection, its gradient, and the reason why the two images of a product need independent
+random streams.
+"""
 
 from __future__ import annotations
 
@@ -25,21 +27,21 @@ def test_points_are_projected_on_the_simplex(point: list[float], nearest: list[f
 
 def test_weights_have_the_derivatives_of_their_mixtures() -> None:
     rig, material = small_rig(), henyey_greenstein(1.0, 0.5, 0.2)
-    pulls = np.random.default_rng(3).random(rig.shape)
+    cotangent = np.random.default_rng(3).random(rig.shape)
     _, rows = single_scattering(rig, material, scores=True)
-    gradient = weight_gradient(rows, material, pulls)
+    gradient = weight_gradient(rows, material, cotangent)
     weights, small = material.weights(), 1e-8
     for atom in (5, 100, KNOTS):
         sides = []
         for sign in (1, -1):
             changed = weights + sign * small * (np.eye(KNOTS + 2)[atom] - np.eye(KNOTS + 2)[-1])
-            sides.append(float((pulls * single_scattering(rig, mixture(changed), scores=False)[0]).sum()))
+            sides.append(float((cotangent * single_scattering(rig, mixture(changed), scores=False)[0]).sum()))
         assert gradient[atom] == pytest.approx((sides[0] - sides[1]) / (2 * small), rel=1e-4)
 
 
 def test_algorithm_1_as_printed_is_biased_and_independent_streams_are_not() -> None:
-    """At the truth the gradient is zero; the printed product of an image with its own derivative has their covariance
-    instead.
+    """At the truth the gradient is zero, but the printed product of an image with a derivative from the same paths has
+    their covariance as its mean.
     """
     rig = small_rig(pixels={"x_mm": [-4.0, 4.0], "y_mm": [-4.0, 4.0], "columns": 4, "rows": 4})
     material = henyey_greenstein(1.0, 0.5, 0.1)
@@ -48,7 +50,7 @@ def test_algorithm_1_as_printed_is_biased_and_independent_streams_are_not() -> N
     batches = render(rig, material, seed=2, step=0, batches=count, paths=200, scores=True)
 
     def total(image: np.ndarray, rows: np.ndarray) -> float:
-        # The direction of more scattering of the same shape.
+        # Project on the direction of more scattering with the same phase function.
         gradient = weight_gradient(rows, material, weights * (image - truth))
         return float(gradient @ np.append(material.weights()[:-1], 0.0))
 

@@ -1,9 +1,9 @@
-"""Where, and in which directions, light leaves a slab, against van de Hulst's tables, Chandrasekhar's H function and
-rings of a pencil beam.
+"""Positions and directions in which light leaves a slab, compared to van de Hulst's tables, Chandrasekhar's H function
+and rings of a pencil beam.
 
 The rule is that of ``tests.support.z_scores``. Totals have a tolerance of 1e-3 (rings 5e-4, the half space of albedo
-0.5 1e-4) in every run and of 1e-4 in the slow ones. Radiances have one of 0.3 % of their value: their standard error of
-0.1 % is then at least ten times what rounding leaves of the printed digits.
+0.5 1e-4) in every run and of 1e-4 in the slow ones. Radiances have a tolerance of 0.3 % of their value; their standard
+error of 0.1 % is then at least ten times the rounding error of the printed digits.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
 
 def require_truth(cases: list[ExitCase], seed: int) -> None:
     scores = [case.scores(case.simulate(seed + number)) for number, case in enumerate(cases)]
-    # Values of one simulation share its paths: one independent value each, the case that strays furthest.
+    # The values of one simulation share its paths, so each simulation counts as one independent value, which is the
+    # worst case.
     require_unbiased(np.concatenate(scores), independent=len(cases))
 
 
@@ -44,7 +45,8 @@ def test_half_spaces_agree_with_the_h_function() -> None:
 
 @pytest.mark.slow
 def test_half_spaces_agree_with_the_h_function_to_four_digits() -> None:
-    # At 0.999 a path scatters 40 times on average, at 0.99999 several hundred times, which has the wider tolerance.
+    # At albedo 0.999 a path scatters 40 times on average. At 0.99999 it scatters several hundred times, so this case
+    # has the wider tolerance.
     cases = half_space_cases(FINE_TOLERANCE, RADIANCE_TOLERANCE, "0.5", "0.8", "0.9", "0.99", "0.999")
     require_truth(cases + half_space_cases(TOLERANCE, RADIANCE_TOLERANCE, "0.99999"), seed=821)
 
@@ -61,8 +63,8 @@ def test_a_pencil_beam_leaves_within_its_rings_to_four_digits() -> None:
 
 
 def scattered_totals(layer: Layer, ior: float, boundary: str, R: float, T: float) -> NDArray[np.float64]:
-    """Known totals (R, T) at normal incidence less the light that leaves without scattering, which faces turn back any
-    number of times.
+    """Known totals (R, T) at normal incidence minus the light that leaves without scattering, after any number of
+    reflections between the faces.
     """
     depth, mirrored = layer.sigma * layer.thickness_mm, 0.0 if boundary == "matched" else ((ior - 1) / (ior + 1)) ** 2
     through = (1 - mirrored) ** 2 * math.exp(-depth) / (1 - mirrored**2 * math.exp(-2 * depth))
@@ -70,7 +72,7 @@ def scattered_totals(layer: Layer, ior: float, boundary: str, R: float, T: float
 
 
 def hemisphere(result: SlabResult, weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Flux of radiances (R, T), and no less than its standard error, as they share their paths."""
+    """Flux (R, T) of radiances, and an upper bound of its standard error: the sum of theirs, as they share paths."""
     assert result.radiance is not None
     found = result.radiance
     return np.array([found.R, found.T]) @ weights, np.array([found.R_se, found.T_se]) @ weights
@@ -85,8 +87,8 @@ def hemisphere(result: SlabResult, weights: NDArray[np.float64]) -> tuple[NDArra
     ],
 )
 def test_radiance_adds_up_to_the_reference_totals(layer: Layer, boundary: str, ior: float, R: float, T: float) -> None:
-    # Refraction, its solid angles and faces that reflect have no table by direction. Totals are rows of the slab
-    # tables; 16 Gauss nodes integrate these smooth radiances to 1e-5.
+    # For refraction, its solid angles and reflecting faces there is no reference table by direction. The totals are
+    # rows of the slab tables; 16 Gauss nodes integrate these smooth radiances to 1e-5.
     nodes, weights = np.polynomial.legendre.leggauss(16)
     cosines = 0.5 * (nodes + 1)
     result = simulate_slab((layer,), boundary=boundary, ior=ior, exit_cosines=tuple(cosines), rel_error=4e-3, seed=851)  # type: ignore[arg-type]
@@ -96,7 +98,7 @@ def test_radiance_adds_up_to_the_reference_totals(layer: Layer, boundary: str, i
 
 
 def test_layers_cut_in_two_look_as_one() -> None:
-    # The way out crosses layers; equal halves must look as the whole does, and rings must not know either.
+    # Light leaves through several layers. Two equal halves must give the same radiance and rings as the whole layer.
     whole = Layer(sigma=2, alpha=0.95, g1=0.5, thickness_mm=1)
     half = whole.model_copy(update={"thickness_mm": 0.5})
     options = {"mu_incident": 0.6, "exit_cosines": (0.2, 0.9), "ring_edges_mm": (0.2, 1.0), "rel_error": 4e-3}
@@ -111,7 +113,7 @@ def test_layers_cut_in_two_look_as_one() -> None:
 
 
 def test_rings_and_radiance_leave_unscattered_light_out() -> None:
-    # Nothing scatters, so nothing but the beam and its mirror images leaves.
+    # Nothing scatters, so only the beam and its mirror reflections leave.
     black = Layer(sigma=1, alpha=0, thickness_mm=1)
     result = simulate_slab(
         (black,), boundary="smooth", ior=1.5, exit_cosines=(1.0,), ring_edges_mm=(0.1,), rel_error=0.5, max_seconds=1

@@ -1,4 +1,6 @@
-"""The plain walk that gives truths to the slab's fit: against the fit's own kernel, with which it shares no code."""
+"""The plain photon walk that renders truths for the slab's fit, compared to the fit's own kernel, with which it shares
+no code, and to stock Mitsuba.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def henyey_greenstein_shape(angles_rad: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("index", [1.0, 1.5])
 def test_both_walks_give_the_same_images(index: float) -> None:
     cell = {"width_mm": 1.0, "index": index, "boundary": "smooth" if index > 1 else "matched"}
-    # Two by two pixels hold all light, so that each collects enough photons for its noise to be normal.
+    # Two by two pixels receive all light, so that each collects enough photons for its noise to be normal.
     pixels = {"x_mm": [-40.0, 40.0], "y_mm": [-40.0, 40.0], "columns": 2, "rows": 2}
     folder = SlabFolder.model_validate(description(cell=cell, pixels=pixels))
     images, variances = plain_images(folder, 2.2, 2.0 / 2.2, henyey_greenstein_shape, photons=160_000, seed=5)
@@ -38,7 +40,7 @@ def test_both_walks_give_the_same_images(index: float) -> None:
     ours = render(
         rig, henyey_greenstein(2.0, G, 0.2), seed=3, step=0, batches=KERNEL_BATCHES, paths=20_000, scores=False
     ).images
-    # The kernel's grid is folded at y = 0: both rows of the plain images have its expectation.
+    # The kernel's grid is folded at y = 0, so its expected value is that of both rows of the plain images.
     plain, of_plain = images.mean(axis=1), variances.sum(axis=1) / 4
     error = np.sqrt(of_plain + ours.var(axis=0, ddof=1) / KERNEL_BATCHES)
     assert (error < 0.02 * plain).all()
@@ -50,7 +52,7 @@ def test_dispersions_are_those_of_the_reference() -> None:
     folder = near_beam_folder()
     for row in rows_of("mie_dispersions.csv"):
         truth = mie_truth(float(row["diameter_nm"]), row["channel"], 1.0, folder)
-        # The table's digits, and the dictionary's knots for g.
+        # The tolerances are the table's digits and, for g, the spacing of the dictionary's knots.
         assert truth.scattering_per_mm == pytest.approx(float(row["mu_s_per_mm"]), rel=1e-4)
         assert truth.material().mean_cosine == pytest.approx(float(row["g"]), abs=2e-4)
 
@@ -65,11 +67,11 @@ def test_every_dispersion_is_diluted_to_where_a_cell_tells_most() -> None:
 @pytest.mark.slow
 def test_images_of_a_matched_cell_agree_with_stock_mitsuba() -> None:
     told = matched_folder()
-    # Cameras on both faces, one of which looks 3 degrees beside the beam.
+    # The cameras are on both faces; one of them looks 3 degrees beside the beam.
     folder = told.model_copy(update={"images": tuple(told.images[k] for k in (1, 3, 4))})
     plain, of_plain = plain_images(folder, 1.02, 1 / 1.02, henyey_greenstein_shape, photons=1_000_000, seed=5)
     stock, of_stock = stock_images(folder, medium_of(1.02, 1 / 1.02, henyey_greenstein_shape), 2**16, seed=1)
-    # Whole images and the row through the beam's middle, seen from each end, tell of scale, place and orientation.
+    # Whole images and parts of the rows through the beam's centre test scale, position and orientation.
     middle = slice(5, 7)
     parts = [(slice(None), slice(None)), (middle, slice(0, 4)), (middle, slice(4, 8)), (middle, slice(8, 12))]
     scores = []

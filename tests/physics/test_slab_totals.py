@@ -1,4 +1,4 @@
-"""Slab totals against ``slab_totals.csv``, energy, and the layered tables' totals."""
+"""Slab totals compared to ``slab_totals.csv``, and conservation of energy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
 
 
 def simulate_totals(case: SlabCase, tolerance: float, seed: int) -> Sums:
-    """Totals whose standard error is a third of the tolerance."""
+    """Simulate totals until their standard error is a third of the tolerance."""
     return simulate(case, lambda sums: float(sums.standard_error().max() / (tolerance / 3)), seed)
 
 
@@ -23,7 +23,8 @@ def require_totals(cases: list[SlabCase], tolerance: float, seed: int) -> None:
         sums = simulate_totals(case, tolerance, seed + number)
         assert sums.standard_error().max() <= tolerance / 3, case.name
         scores.append(z_scores(sums.mean(), case.values, sums.standard_error()))
-    # R and T of one simulation share their paths: one independent value each, the case that strays furthest.
+    # R and T of one simulation share their paths, so each simulation counts as one independent value, which is the
+    # worst case.
     require_unbiased(np.concatenate(scores), independent=len(cases))
 
 
@@ -55,8 +56,8 @@ def test_totals_of_the_deepest_white_slabs_agree(source: str) -> None:
 @pytest.mark.parametrize(("boundary", "ior"), [("matched", 1.0), ("thin", 1.631), ("smooth", 1.5)])
 @pytest.mark.parametrize("source", SOURCES)
 def test_white_slabs_return_all_light(boundary: str, ior: float, source: str) -> None:
-    # |R + T - 1| < 1e-3. R and T of a white slab are nearly perfectly anticorrelated, so 2e-4 each leaves their sum far
-    # below that.
+    # |R + T - 1| < 1e-3. R and T of a white slab are nearly perfectly anticorrelated, so the error of their sum is far
+    # below this even with larger errors of each.
     layers = (
         Layer(sigma=3, alpha=1, g1=0.6, thickness_mm=0.5),
         Layer(sigma=6, alpha=1, beta=0.8, g1=0.7, g2=-0.2, thickness_mm=0.5),
@@ -69,7 +70,7 @@ def test_white_slabs_return_all_light(boundary: str, ior: float, source: str) ->
 
 @pytest.mark.parametrize("boundary", ["matched", "thin", "smooth"])
 def test_energy_never_grows(boundary: str) -> None:
-    # Absorption takes light from both faces together.
+    # More absorption lowers the sum of R and T.
     last = 1.001
     for alpha in (1 - 1e-7, 0.999, 0.9, 0.0):
         layers = (Layer(sigma=4, alpha=alpha, g1=0.7, thickness_mm=1),)

@@ -1,5 +1,5 @@
-"""The slab's own walk: energy, totals of the table, scores against differences, single scattering against the walk's
-shape.
+"""The walk of the slab's fit: energy, totals compared to the table, scores compared to differences, and single
+scattering.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ NORMAL_LIGHT = [{"name": "l0", "side": "front", "angle_deg": 0.0}]
 def totals(
     material: Material, index: float, *, blocks: int, paths: int, glass: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """R and T of light at normal incidence, all orders, and their standard errors; index 1 is a matched boundary."""
+    """R and T (2,) at normal incidence over all orders of scattering, and their standard errors; index 1 stands for a
+    matched boundary.
+    """
     walls = None if glass is None else {"index": glass, "thickness_mm": 1.0}
     cell = {
         "width_mm": 1.0,
@@ -40,7 +42,7 @@ def totals(
         [run_block(Block(rig, 0, material, 7, (0, number), paths, False)).totals for number in range(blocks)]
     )
     assert (sums[:, 2] == 0).all()
-    # What was never scattered goes to and fro between the faces.
+    # Unscattered light is reflected to and fro between the faces.
     reflected = 1 - rig.interface.transmittance(0.0)
     through = math.exp(-material.extinction_per_mm)
     passed = (1 - reflected) ** 2 * through / (1 - (reflected * through) ** 2)
@@ -50,8 +52,8 @@ def totals(
 
 @pytest.mark.parametrize(("index", "glass"), [(1.0, None), (1.33, None), (1.33, 1.52)])
 def test_white_cells_return_all_light(index: float, glass: float | None) -> None:
-    # |R + T - 1| < 1e-3 at albedo 1 and sigma_t w = 10. Paths end outside alone, so the sum has only the draw of
-    # cosines as noise.
+    # |R + T - 1| < 1e-3 at albedo 1 and sigma_t w = 10. All paths leave the cell, so the sum's only noise is that of
+    # the random cosines.
     got, _ = totals(henyey_greenstein(10.0, 0.8, 0.0), index, blocks=4, paths=5000, glass=glass)
     assert abs(got.sum() - 1) < 1e-3
 
@@ -61,7 +63,7 @@ def test_totals_agree_with_adding_doubling() -> None:
         rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
     scores = []
     for row in rows:
-        # Deeper ones take thousands of scatters a path; those are the business of simulate_slab.
+        # Deeper slabs need thousands of scattering events per path; simulate_slab is tested on them.
         if not (0.01 <= row["tau"] <= 10 and abs(row["g"]) <= 0.9):
             continue
         sigma = row["tau"]
@@ -69,7 +71,7 @@ def test_totals_agree_with_adding_doubling() -> None:
             henyey_greenstein(sigma * row["a"], row["g"], sigma * (1 - row["a"])), row["n"], blocks=16, paths=12000
         )
         truth = np.array([row["R_normal"], row["T_normal"]])
-        # Tolerance 3e-3. HG on straight lines between knots 0.9 degrees apart moves totals by some 1e-5.
+        # The tolerance is 3e-3. Linear interpolation of HG between knots 0.9 degrees apart changes totals by some 1e-5.
         assert (error <= 1e-3).all(), row
         scores.append(student_to_normal((got - truth) / error, 15))
     assert len(scores) >= 6
@@ -77,8 +79,8 @@ def test_totals_agree_with_adding_doubling() -> None:
 
 
 def test_a_beam_that_is_never_scattered_twice_agrees_with_quadrature_by_hand() -> None:
-    # Isotropic scattering, matched, normal beam, camera behind at 0 degrees: the image's sum is T p sigma_s w
-    # exp(-sigma_t w).
+    # For isotropic scattering, matched faces, a normal beam and a camera behind at 0 degrees, the image's sum is
+    # T p sigma_s w exp(-sigma_t w).
     rig = small_rig(
         cell={"width_mm": 1.0, "index": None, "boundary": "matched"},
         lights=NORMAL_LIGHT,
@@ -87,7 +89,7 @@ def test_a_beam_that_is_never_scattered_twice_agrees_with_quadrature_by_hand() -
     material = henyey_greenstein(0.7, 0.0, 0.2)
     images, rows = single_scattering(rig, material, scores=True)
     assert images.sum() * rig.grid.area_mm2 == pytest.approx(0.7 / (4 * math.pi) * math.exp(-0.9), rel=1e-6)
-    # Everything scatters at one angle, on ways of 1 mm.
+    # All light scatters at one angle, on paths of 1 mm.
     np.testing.assert_allclose(rows[..., :KNOTS].sum(axis=-1), images)
     np.testing.assert_allclose(rows[..., KNOTS], images, rtol=1e-9)
 
@@ -106,7 +108,7 @@ def test_single_scattering_has_its_derivatives(profile: str) -> None:
 
 
 def moved(material: Material, change: np.ndarray) -> Material:
-    """A material at ln f and sigma_a changed."""
+    """A material with changes added to ln f and to sigma_a."""
     return Material(material.scattering * np.exp(change[:KNOTS]), material.absorption_per_mm + float(change[-1]))
 
 
@@ -152,11 +154,11 @@ def test_glass_of_no_thickness_and_the_samples_index_changes_nothing() -> None:
 
 @pytest.mark.parametrize("thickness", [pytest.param(1.0, marks=pytest.mark.slow), 8.0])
 def test_scores_agree_with_differences(thickness: float) -> None:
-    """12 atoms and 12 random directions: differences with common random numbers against scores from other paths.
+    """Compare scores to differences with common random numbers from other paths, for 12 atoms and 12 random directions.
 
-    The functional is the sum of images over their own means, so that all pixels count alike. Changes are made in f
-    itself, in which an image is nearly linear: +-0.4 of f at one knot, or of random sign at all. Absorption is changed
-    by a tenth of that, as the longest ways are tens of millimetres.
+    The functional is the sum of images divided by their own means, so that all pixels count equally. Changes are made
+    in f itself, in which an image is nearly linear: +-0.4 of f at one knot, or with random signs at all knots.
+    Absorption is changed by a tenth of that, because the longest paths are tens of millimetres.
     """
     rig = small_rig(pixels={"x_mm": [-4.0, 4.0], "y_mm": [-4.0, 4.0], "columns": 4, "rows": 4})
     material = henyey_greenstein(thickness, 0.6, 0.05)
@@ -186,7 +188,8 @@ def test_scores_agree_with_differences(thickness: float) -> None:
 
 
 def test_a_light_meets_its_face_at_the_brewster_angle_without_parallel_loss() -> None:
-    # Half of the s-reflectance is left: (n^2 - 1)^2 / (n^2 + 1)^2 / 2.
+    # At this angle only s-polarised light is reflected, so the reflectance is half of it: (n^2 - 1)^2 / (n^2 + 1)^2 /
+    # 2.
     index = 1.5
     light = Light(name="l", side="front", angle_deg=math.degrees(math.atan(index)))
     face = Interface(index)

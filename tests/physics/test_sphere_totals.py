@@ -1,4 +1,4 @@
-"""Totals by discrete ordinates against adding-doubling, and what a sphere reads of them."""
+"""Totals by discrete ordinates compared to adding-doubling, and the readings of an integrating sphere."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from tests.support.slab_tables import total_cases
 GLASS = Cell(width_mm=1, index=1.34, glass=Glass(index=1.5, thickness_mm=1))
 SPHERE = Sphere(diameter_mm=203.2, sample_port_mm=25.4, third_port_mm=12.7, detector_port_mm=1, wall_reflectance=0.96)
 FIRST_BOUNCE = 1 - 0.000978
-"""What is not the entrance port. IAD 3.16 counts the first bounce behind the baffle, this times the wall's reflectance,
-for the sample and not for the standard; its figures are compared with ours times both."""
+"""Share of the sphere's wall without the entrance port. IAD 3.16 counts the first bounce behind the baffle (this
+share times the wall's reflectance) for the sample but not for the standard, so its figures are compared to ours
+times both."""
 
 TABLE = [
     (0.9, 0.75, 2.0, 1.0, (0.09739464, 0.66095770, 0.19109023, 0.50181606)),
@@ -29,8 +30,8 @@ TABLE = [
     (0.5, 0.9, 1.0, 1.4, (0.03895326, 0.54506757, 0.09199007, 0.43747217)),
     (0.99, 0.8, 5.0, 1.631, (0.32853474, 0.46492220, 0.38193355, 0.41305722)),
 ]
-"""Albedo, g, optical thickness, index; R and T for a beam and for diffuse light: adding-doubling with 256 to 512 nodes.
-The first row is van de Hulst's, the fifth Giovanelli's."""
+"""Albedo, g, optical thickness, index, and (R, T) for a beam and for diffuse light by adding-doubling with 256 to 512
+nodes. The first row is also in van de Hulst's tables, the fifth in Giovanelli's."""
 
 
 def four(totals: Totals) -> tuple[float, float, float, float]:
@@ -42,12 +43,12 @@ def test_totals_agree_with_adding_doubling(
     albedo: float, g: float, depth: float, index: float, values: tuple[float, float, float, float]
 ) -> None:
     totals = slab_totals(Optics(1 - albedo, albedo, g), depth, Interface(index))
-    # 4e-5 is what 32 nodes leave of g = 0.9 behind a refracting face; the other rows are nearer.
+    # With 32 nodes the error is 4e-5 for g = 0.9 behind a refracting face, and smaller for the other rows.
     assert four(totals) == pytest.approx(values, abs=5e-5)
 
 
 def test_totals_converge() -> None:
-    # The table's own error is 6e-8, its printed digits leave 5e-9.
+    # The table's own error is 6e-8, and that of its printed digits 5e-9.
     for albedo, g, depth, index, values in TABLE:
         assert four(slab_totals(Optics(1 - albedo, albedo, g), depth, Interface(index), nodes=96)) == pytest.approx(
             values, abs=1e-7
@@ -61,16 +62,16 @@ def test_totals_agree_with_the_whole_table() -> None:
         assert layer.sigma == 1
         totals = four(slab_totals(Optics(1 - layer.alpha, layer.alpha, layer.g1), layer.thickness_mm, interface))
         told = totals[:2] if case.source == "normal" else totals[2:]
-        # A peak of |g| = 0.99 is sharper than 32 nodes resolve.
+        # 32 nodes do not resolve the peak of |g| = 0.99.
         assert told == pytest.approx(case.values[0], abs=2e-4 if abs(layer.g1) > 0.95 else 5e-5), case.name
 
 
 def test_a_slab_between_glass_slides_reads_as_measured() -> None:
-    # Sample A of iadpython's examples at 810 nm, converged with 64 of its points: 0.16208, 0.26446.
+    # The values 0.16208 and 0.26446 are for sample A of iadpython's examples at 810 nm, converged with 64 points.
     totals = slab_totals(Optics(0.4445, 1.206, 0), 1, interface_of(GLASS))
     assert totals.reflectance == pytest.approx(0.16208, abs=1e-5)
     assert totals.transmittance == pytest.approx(0.26446, abs=1e-5)
-    # The readings that were inverted with 8 points.
+    # These are the readings, which were inverted with 8 points.
     assert totals.reflectance == pytest.approx(0.16271, abs=7e-4)
     assert totals.transmittance == pytest.approx(0.26479, abs=4e-4)
 
@@ -88,7 +89,7 @@ def test_unscattered_light_is_what_is_left_without_scattering() -> None:
     clear = slab_totals(Optics(0.7, 0, 0), 2, interface_of(GLASS))
     assert clear.transmittance == pytest.approx(clear.transmittance_unscattered, abs=1e-9)
     assert clear.reflectance == pytest.approx(clear.reflectance_unscattered, abs=1e-9)
-    # By hand, without the second way through: both slides pass 1 - r each way.
+    # By hand, without multiple reflections: light passes both slides once.
     passes = interface_of(GLASS).transmittance(0)
     assert clear.transmittance == pytest.approx(passes**2 * math.exp(-1.4), rel=2e-3)
 
@@ -109,7 +110,7 @@ def test_a_sample_that_is_the_standard_reads_as_the_standard() -> None:
     totals = Totals(0.7, 0.1, 0.0, 0.0, 0.7, 0.1)
     file = file_of(SPHERE, standard_reflectance=0.7)
     assert reflection(totals, file) == pytest.approx(0.7, rel=1e-12)
-    # A sample darker than the standard lets less light go round, so it reads darker than it is.
+    # With a sample darker than the standard, less light circulates in the sphere, so the sample reads too dark.
     darker = Totals(0.3, 0.1, 0.0, 0.0, 0.3, 0.1)
     assert reflection(darker, file) < 0.3
 
@@ -137,7 +138,7 @@ def test_readings_of_one_sphere_agree_with_iad(
     file = file_of(SPHERE, standard_reflectance=standard, totals=[told])
     totals = slab_totals(Optics(absorption, reduced, 0), 1, interface_of(GLASS))
     reflected, through = reflection(totals, file), expected(totals, file, file.totals[0]).T
-    # IAD inverts with 8 points, which moves R by 6e-4 and T by 4e-4 (see above).
+    # IAD inverts with 8 points, which changes R by 6e-4 and T by 4e-4 (see above).
     assert reflected * FIRST_BOUNCE * walls[0] == pytest.approx(read[0], abs=7e-4)
     assert through == pytest.approx(read[1], abs=7e-4)
 

@@ -1,4 +1,4 @@
-"""Numerical stress: the corners of parameter space, difficult scenes, and the defects that were found there."""
+"""Numerical stress tests: limits of the parameter space, difficult scenes, and regressions of defects found there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
 from services.bench.stability.corners import MATCHED, REGIONS, SMOOTH, THIN, Corners, draw
-from services.bench.stability.difficult_scenes import Scene, ellipsoid, look, scenes, with_slivers
+from services.bench.stability.difficult_scenes import Scene, check_scene, ellipsoid, scenes, with_slivers
 from services.bench.stability.formula_errors import FORMULAS
 from services.bench.stability.run import WHITE, as_table, formula_rows, stress_plan, trace, walk_rows
 from services.core.errors import InputError, MeshError
@@ -51,8 +51,8 @@ def test_the_walk_holds_in_every_corner(corners: Corners) -> None:
     rows = walk_rows(corners, most_steps=STEPS)
     assert [row.region for row in rows] == [*REGIONS, WHITE]
     assert sum(row.non_finite for row in rows) == 0
-    # Energy never grows, and none is lost in white sets: of 13 values an honest run has one beyond 4.5 standard errors
-    # in 10,000.
+    # Energy never grows, and none is lost in white sets. Of these 13 values, a correct run has one beyond 4.5 standard
+    # errors once in 10,000 runs.
     for row in rows:
         assert row.gain is not None
         assert row.gain_error is not None
@@ -106,7 +106,7 @@ def test_slab_tables_as_lanes_of_one_kernel() -> None:
     def both(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.stack([values, values])
 
-    # Light meets a first layer without forced collisions, so that one is made too thin to matter.
+    # Light meets the first layer without forced collisions, so this layer is made too thin to matter.
     film = 1e-6 * np.minimum(thickness, 1)
     sets = Corners(
         region=np.zeros(len(alpha), dtype=np.int64), sigma=both(np.ones_like(alpha)), absorbed=both(1 - alpha),
@@ -118,8 +118,8 @@ def test_slab_tables_as_lanes_of_one_kernel() -> None:
     mean, error = totals[:, :, :2].mean(axis=1), totals[:, :, :2].std(axis=1, ddof=1) / np.sqrt(copies)
     mean[:, 0] += [specular_share(case.ior, case.source) for case in cases]
     truth = np.concatenate([case.values for case in cases])
-    # Transmittances near 1 are sure to a rounding; one of 1e-4 through a deep slab is a path in ten thousand, seen or
-    # not.
+    # Transmittances near 1 have only rounding errors. One of 1e-4 through a deep slab is one path in ten thousand, so
+    # its estimated error is useless and it is left out.
     error = np.maximum(error, 1e-6)
     resolved = (truth > 1e-3) | np.array([[slab.thickness_mm < 1] for slab in slabs])
     assert resolved.sum() == 64
@@ -129,10 +129,10 @@ def test_slab_tables_as_lanes_of_one_kernel() -> None:
 
 @pytest.mark.parametrize("scene", tuple(scenes()), ids=lambda scene: scene.name)
 def test_difficult_scenes_render(scene: Scene) -> None:
-    seen = look(scene, samples=64, seed=3)
-    assert seen.negative == 0
-    # A scene that must look like another: five lights of four scenes, one false alarm in 7000.
-    assert seen.z is None or seen.z <= LARGEST_Z
+    check = check_scene(scene, samples=64, seed=3)
+    assert check.negative == 0
+    # Four scenes must look like another one under five lights each, which gives one false alarm in 7000 runs.
+    assert check.z is None or check.z <= LARGEST_Z
 
 
 def test_slivers_leave_the_surface_where_it_was() -> None:
@@ -165,7 +165,7 @@ def test_sets_out_of_range_are_refused(corners: Corners, monkeypatch: pytest.Mon
 
 
 def test_black_layers_end_and_tell_what_albedo_would_bring() -> None:
-    # Between two media that scatter nothing the border's secondary walk had no direction and never ended.
+    # Between two media without scattering, the border's secondary walk has no direction and must end at once.
     import mitsuba as mi
 
     from services.fit.transport.gradients.border import BorderScattering, no_crossing
@@ -184,14 +184,14 @@ def test_black_layers_end_and_tell_what_albedo_would_bring() -> None:
         < 1e-20
     )
 
-    # Single scattering, integrated over depth and direction: dR/dalpha at albedo 0, which used to be 0 with error 0.
+    # Single scattering, integrated over depth and direction, gives dR/dalpha at albedo 0, which is not 0.
     nodes, weights = np.polynomial.legendre.leggauss(100)
     cosine = (nodes + 1) / 2
     truth = np.sum(weights / 4 * cosine / (1 + cosine) * -np.expm1(-(1 + 1 / cosine)))
     for alpha in (0.0, 1e-6):
         result = simulate_slab((Layer(sigma=1, alpha=alpha, thickness_mm=1),), gradient=True, rel_error=0.02)
         assert result.dR_se["alpha"] <= 0.01 * truth
-        # The next order changes it by alpha.
+        # The next order of scattering changes it by a term of the size of alpha.
         assert abs(result.dR["alpha"] - truth) <= LARGEST_Z * result.dR_se["alpha"] + 1e-5
 
 
@@ -216,8 +216,8 @@ def test_dentin_has_room_inside_enamel() -> None:
 
 
 def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Coincident surfaces hide one another, and a lane outside believed to be inside scattered in endless enamel: 100
-    # times too bright.
+    # Coincident surfaces hide one another. A path outside that counts as inside must not scatter in endless enamel,
+    # which would be 100 times too bright.
     monkeypatch.setattr("services.fit.transport.scene.mesh_geometry.require_nested", lambda *_: None)
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
     known = DentinShape.known(outer)

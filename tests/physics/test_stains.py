@@ -1,7 +1,7 @@
-"""Stains: images against stock Mitsuba, where a stain is a mask over black, and the derivative to texels against
+"""Stains: images compared to stock Mitsuba, where a stain is a mask over black, and derivatives to texels compared to
 central differences.
 
-The rule for images is that of ``tests.support.pictures``; an honest engine fails one run in 500, and seeds are fixed.
+The rule for images is that of ``tests.support.pictures``; a correct engine fails one run in 500, and seeds are fixed.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def test_a_stained_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
 
 
 def write_textured(path: Path, mesh: Mesh, uv: NDArray[np.float64]) -> None:
-    """A Wavefront file with texture coordinates of vertices."""
+    """Write a Wavefront file with texture coordinates (V, 2) of the vertices."""
     lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in mesh.vertices_mm] + [
         "vt {:.9g} {:.9g}".format(*place) for place in uv
     ]
@@ -107,8 +107,8 @@ def test_texels_derivatives_are_those_of_the_images(boundary: Boundary) -> None:
             image = engine.images(replace(TISSUE, stain=Stain(moved)), view, samples=640, seed=200 + seed).mean
             return float((image * cotangent).sum())
 
-        # A path crosses two faces, so images are quadratic in a texel, near enough, and central differences without
-        # bias.
+        # Nearly all paths cross the outer surface twice, so images are quadratic in a texel, and central differences
+        # have no bias.
         differences = np.array([(projected(0.2, seed) - projected(-0.2, seed)) / 0.4 for seed in range(SEEDS)])
         gap = (gradients[:, row, column] - differences) / gradients[:, row, column].mean()
         error = gap.std(ddof=1) / np.sqrt(SEEDS)
@@ -123,7 +123,7 @@ def texels(gradient: tuple[NDArray[np.float64] | None, ...]) -> NDArray[np.float
 
 
 def test_errors_of_the_gradient_are_honest() -> None:
-    # Each texel's spread over seeds against its own standard error: a chi-square test of the strongest ones.
+    # Compare the variance of each strong texel over seeds to its stated variance by a chi-square test.
     engine, view = Engine(stained_recipe("matched")), whole_view(camera_at((0.2, 1, 0.1)), 1)
     cotangent = np.ones((len(LIGHTS_MM), len(view)))
     estimates = [engine.stain_gradient(TISSUE, view, cotangent, seed=seed, samples=512) for seed in range(24)]
@@ -139,14 +139,14 @@ def test_errors_of_the_gradient_are_honest() -> None:
 
 
 def test_an_image_dims_with_the_square_of_a_common_stain() -> None:
-    # Every path goes in once and out once here, so a_t = 0.6 everywhere dims the same paths by 0.36.
+    # With matched boundaries every path enters once and leaves once, so a_t = 0.6 everywhere dims each by 0.36.
     engine, view = Engine(stained_recipe("matched")), whole_view(camera_at((0.2, 1, 0.1)), 1)
     clean, dim = (
         engine.images(replace(TISSUE, stain=given), view, samples=1024, seed=3)
         for given in (Stain(np.ones((2, 3))), Stain(np.full((2, 3), 0.6)))
     )
-    # Pixels are independent, the lights of one are not; four standard errors of the two as if they had nothing in
-    # common.
+    # Pixels are independent, but the lights of a pixel are not. The bound is four standard errors, computed as if the
+    # two renders were independent.
     spread = np.sqrt(
         sum(scale**2 * (np.sqrt(image.variance).sum(axis=0) ** 2).sum() for scale, image in ((0.36, clean), (1, dim)))
     )

@@ -1,5 +1,5 @@
-"""The peer of the fit's race goes downhill: stock gradients in our unbounded domain lead from a start that is far off
-towards the truth.
+"""The stock peer of the fit's benchmark descends: stock gradients in the project's unbounded domain lead from a distant
+start towards the truth.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from services.phantom.tooth import write_phantom
 
 @pytest.mark.slow
 def test_stock_fit_goes_downhill(tmp_path: Path) -> None:
-    # Rates are so large that twelve rounds at half the photographs' error left are many times the noise of their
-    # gradients.
+    # The rate is so large that twelve rounds halve the error, which is many times the noise of the gradients.
     write_phantom(tmp_path / "capture", pixel_mm=1.0, cameras=1, lights=4, samples=256, subject=2)
     options = {"capture": tmp_path / "capture", "boundary": "matched", "dentin": "known"}
     case = prepared_tooth(tmp_path / "job", JobSpec.model_validate(options))

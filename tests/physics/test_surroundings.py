@@ -1,4 +1,4 @@
-"""Light from all around a fitted tooth: as bright as it is, and from where the environment has it."""
+"""Light of an environment around a fitted tooth has the right brightness and direction."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.bench.figures.surroundings import environment_light, read_environment, seen_under
+from services.bench.figures.surroundings import environment_light, read_environment, render_under
 from services.core.errors import InputError
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
@@ -26,14 +26,14 @@ def test_a_white_tooth_is_lit_from_the_roots_by_the_top_of_an_environment() -> N
     sky = np.zeros((16, 32))
     sky[:8] = 2.0
     common = {"samples": SAMPLES, "boundary": "matched", "ior": 1.631, "roughness": None}
-    # Seen from the front, z upwards: the roots are below.
-    image = seen_under(environment_light(sky, 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)  # type: ignore[arg-type]
+    # The view is from the front with z upwards, so the roots are below.
+    image = render_under(environment_light(sky, 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)  # type: ignore[arg-type]
     centre = slice(3, 5)
     roots, crown = image[5:7, centre].mean(), image[1:3, centre].mean()
     assert roots > crown + 0.3
     # What a white tooth sends out under half a sky of 2 and one turned over adds to 2: 4 standard errors of some 6 % of
     # a pixel, sixteen of them.
-    turned = seen_under(environment_light(sky[::-1].copy(), 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)  # type: ignore[arg-type]
+    turned = render_under(environment_light(sky[::-1].copy(), 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)  # type: ignore[arg-type]
     middle = (image + turned)[2:6, 2:6]
     assert middle.mean() == pytest.approx(2.0, abs=4 * middle.std() / 4)
     assert middle.std() < 0.4

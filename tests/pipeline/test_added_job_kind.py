@@ -1,6 +1,4 @@
-"""A package from outside adds a kind of job, which runs on workers that were spawned and learn of it by its entry
-point.
-"""
+"""An external package adds a kind of job by an entry point, and the job runs on spawned workers, which find it so."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ def export(spec, context):
 
 @pytest.fixture
 def environment(tmp_path: Path) -> dict[str, str]:
-    """With the package installed in a folder of its own."""
+    """Environment in which the package is installed in a folder of its own."""
     site = tmp_path / "site"
     described = site / "weighing-1.dist-info"
     described.mkdir(parents=True)

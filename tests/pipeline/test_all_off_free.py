@@ -1,6 +1,4 @@
-"""ALL OFF and cancels are answered while everything else of the server hangs, and the loop that serves everybody goes
-on meanwhile.
-"""
+"""ALL OFF and cancels are answered while all other requests hang, and the server's event loop goes on meanwhile."""
 
 from __future__ import annotations
 
@@ -33,22 +31,23 @@ from tests.support.live_server import serving
 
 LIGHTS = 6
 EACH = 45
-"""More than there are threads in any pool: FastAPI calls plain handlers in forty."""
+"""Number of hanging requests of each kind, larger than any thread pool: FastAPI calls plain handlers in forty
+threads."""
 PATIENCE_S = 30.0
 ANSWERED_WITHIN_S = 20.0
-"""Of a request that must not wait for those that hang for a minute."""
+"""Time limit of a request that must not wait for the requests that hang for a minute."""
 BODY_BYTES = 2**20
-"""That a body may have by default."""
+"""Default size limit of a request body."""
 TURNS, LOOP_PATIENCE_S = 10, 10.0
-"""So many turns must the loop make while something else works, which gives up after this time."""
+"""Number of turns that the event loop must make while another function works, and time limit for them."""
 POOLS = (1, 1, min(32, (os.cpu_count() or 1) + 4), 40)
-"""Threads that read the database, open files, do what coroutines wait for (asyncio's default), and call plain handlers
-(FastAPI's)."""
+"""Sizes of the thread pools that read the database, open files, run blocking calls of coroutines (asyncio's default)
+and call plain handlers (FastAPI's)."""
 TUS = "Tus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\nContent-Type: application/offset+octet-stream\r\n"
 
 
 class Hanging:
-    """Stands for functions that do not return until it is over."""
+    """Replaces functions by one that does not return until the test ends it."""
 
     def __init__(self) -> None:
         self.is_over, self.begun = threading.Event(), 0
@@ -76,8 +75,8 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 def occupy(address: str, job: str) -> ExitStack:
-    """Send so many requests of each kind that takes threads: those that read jobs and files, send and commit captures,
-    or delete jobs.
+    """Send ``EACH`` requests of every kind that occupies threads: reading jobs and files, sending and committing
+    captures, deleting jobs.
     """
     host, port = address.removeprefix("http://").split(":")
     kinds = [
@@ -138,7 +137,7 @@ def test_all_off_and_cancel_are_answered_while_all_other_threads_hang(
 
 @dataclass
 class Looped:
-    """A server whose loop is counted in its turns, and the errors that it lists."""
+    """A server whose event loop counts its turns, and the errors of the tested function."""
 
     client: httpx.Client
     job: str
@@ -148,7 +147,7 @@ class Looped:
     """Types whose validators were built for the first request."""
 
     async def count_turns(self) -> None:
-        """One turn of the loop each, for ever."""
+        """Count the turns of the event loop, for ever."""
         while True:
             await asyncio.sleep(0)
             await asyncio.sleep(0.001)
@@ -198,7 +197,7 @@ def test_the_first_request_finds_its_route_built(counted: Looped) -> None:
 
 
 def many(item: object) -> str:
-    """As many of them, as a list in JSON, as a body may hold."""
+    """A JSON list of as many copies of an item as a body may hold."""
     text = json.dumps(item)
     return f"[{','.join([text] * ((BODY_BYTES - 100) // (len(text) + 1)))}]"
 
@@ -230,7 +229,7 @@ def test_a_body_of_many_faults_is_refused_at_its_first_ones(
 
 
 MANIFEST = {"files": [{"path": f"{number}.png", "bytes": 1, "sha256": "0" * 64} for number in range(200)]}
-"""Longer than what is parsed on the loop."""
+"""Manifest that is longer than bodies that are parsed on the event loop."""
 WAITS_FOR_THE_LOOP: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
     ("services.api.http.bodies.parse", "POST", "/v1/captures", {"json": MANIFEST}),
     ("services.api.captures.captures.Captures.commit", "POST", "/v1/captures/absent/commit", {}),
@@ -256,7 +255,7 @@ WAITS_FOR_THE_LOOP: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
     ("services.api.jobs.routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts", {}),
     ("services.api.jobs.routes.open_artifact", "GET", "/v1/jobs/{job}/artifacts/report.html", {}),
     ("services.api.jobs.history_routes.list_artifacts", "GET", "/v1/jobs/{job}/artifacts.zip", {}),
-    ("services.api.jobs.history.Histories.read", "GET", "/v1/jobs/{job}/history", {}),
+    ("services.api.jobs.history.HistoryCache.read", "GET", "/v1/jobs/{job}/history", {}),
     ("services.api.jobs.event_stream._read", "GET", "/v1/jobs/{job}/events", {}),
     ("services.api.health.worker_routes.list_workers", "GET", "/v1/workers", {}),
     ("services.api.health.readiness.Readiness.checks", "GET", "/v1/health/ready", {}),

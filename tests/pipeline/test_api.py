@@ -22,7 +22,7 @@ from tests.support.live_server import serving
 
 
 def write_results(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """The least that a job does: an event and files."""
+    """Do the least that a job does: write an event and files."""
     with events.open() as log:
         log.begin_stage("fit")
     (folder / "asset").mkdir(parents=True)
@@ -56,7 +56,7 @@ def submit(client: Client, capture: str, key: str | None = None, **options: Any)
 
 
 def finish(client: Client, job_id: str) -> str:
-    """Read the event stream to its end."""
+    """Read a job's event stream to its end; returns its text."""
     return client.get(f"/v1/jobs/{job_id}/events").text
 
 
@@ -265,7 +265,7 @@ def test_a_deleted_job_is_gone_and_its_receipt_stays(serve: Any, capture_folder:
     assert client.delete(f"/v1/jobs/{job_id}").status_code == 404
     assert client.get("/v1/jobs").json()["jobs"] == []
     assert list((tmp_path / "data" / "jobs").iterdir()) == []
-    # Nor do its options lie in the database's files any more.
+    # The database's files do not contain its options either.
     engine = open_database(sqlite_url(tmp_path / "data" / DATABASE_FILE))
     with engine.connect() as connection:
         connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")

@@ -1,5 +1,5 @@
-"""``dentine[api]`` alone is a server: installed into an empty environment, it starts, answers, and says the truth of a
-job that its workers run elsewhere.
+"""``dentine[api]`` alone is a complete server: installed into an empty environment, it starts, answers, and reports the
+true state of a job that workers run elsewhere.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def served(environment: Path, data: Path, **settings: str) -> Iterator[httpx.Client]:
-    """The installed server, which sees nothing of this tree."""
+    """Run the installed server without access to this source tree; yields its client."""
     command = [str(environment / "bin/dentine"), "serve", "--port", "0", "--data", str(data)]
     with running_server(command, cwd=data.parent, environment=environment_without_this_tree(**settings)) as (client, _):
         yield client

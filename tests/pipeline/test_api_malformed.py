@@ -1,6 +1,4 @@
-"""Malformed requests of which each once was a failure of the server, or was answered with something else than a problem
-document.
-"""
+"""Regression tests of malformed requests: each must be refused with a problem document and not fail in the server."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from tests.support.postgres import new_database, postgres_server
 
 JSON = {"Content-Type": "application/json"}
 LARGE = 2**31
-"""More than a row of Postgres is numbered with."""
+"""Number larger than any row number in Postgres."""
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgres"])

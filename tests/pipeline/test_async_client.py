@@ -1,4 +1,4 @@
-"""The asynchronous client does what the blocking one does: same answers, same errors, same patience."""
+"""The asynchronous client behaves like the blocking one: the same answers, errors and retries."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from tests.support.uploading import contents_of, write_capture
 
 STEPS = 200
 CUTS_BYTES = (100, 20_000, 20_500, 90_000, 150_001)
-"""Of an event stream of about 240 kB."""
+"""Positions at which an event stream of about 240 kB is cut."""
 
 
 class Telling:
-    """Tells of some steps, then ends once it is let to; fails while ``fails`` is set."""
+    """A job that reports some steps and ends when the test releases it; it fails while ``fails`` is set."""
 
     def __init__(self) -> None:
         self.ends, self.fails = threading.Event(), False
@@ -165,7 +165,7 @@ def test_a_folder_is_uploaded_through_cuts(server: httpx.Client, tmp_path: Path)
 
 
 def test_the_loop_is_free_while_a_folder_is_hashed(server: httpx.Client, tmp_path: Path) -> None:
-    """Hashing waits for something that only the loop can do."""
+    """Hashing waits for an event that only the event loop can set."""
     folder, is_free, was_free = write_capture(tmp_path / "mine"), threading.Event(), list[bool]()
 
     async def use() -> None:

@@ -1,5 +1,5 @@
-"""What uploads say of themselves is read in processes of bounded memory and time: no file of anybody takes the
-server's.
+"""Descriptions inside uploads are read in processes with bounded memory and time, so that no file exhausts those of the
+server.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from services.api.app import create_app
 from services.api.captures import reading
 from services.api.captures.contents import content_fault
 from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES
-from services.api.captures.reading import ReadApart
+from services.api.captures.reading import SubprocessReader
 from services.core.errors import CaptureInputError
 from services.core.settings import ServerSettings, UploadLimits
 from tests.support.live_server import serving
@@ -26,17 +26,17 @@ from tests.support.uploading import announce, contents_of, send, write_capture
 
 LIMITS = UploadLimits(keep_free_bytes=0)
 FILES, FILE_BYTES = 10, 2 * 10**9
-"""A raw capture of 20 GB, of which the disk holds nothing."""
+"""Number and size of the files of a raw capture of 20 GB, which are sparse and take no disk space."""
 
 
 @pytest.fixture(scope="module")
-def apart() -> Iterator[ReadApart]:
-    reader = ReadApart()
+def apart() -> Iterator[SubprocessReader]:
+    reader = SubprocessReader()
     yield reader
     reader.close()
 
 
-def faults(reader: ReadApart, *files: tuple[Path, str], names: frozenset[str] = frozenset()) -> dict[str, str]:
+def faults(reader: SubprocessReader, *files: tuple[Path, str], names: frozenset[str] = frozenset()) -> dict[str, str]:
     return dict(reader.content_faults(files, LIMITS, names))
 
 
@@ -44,7 +44,7 @@ def children() -> list[psutil.Process]:
     return [one for one in psutil.Process().children() if "services.api.captures.reading_process" in one.cmdline()]
 
 
-def test_it_says_what_would_be_said_in_this_process(apart: ReadApart, tmp_path: Path) -> None:
+def test_it_says_what_would_be_said_in_this_process(apart: SubprocessReader, tmp_path: Path) -> None:
     folder = write_capture(tmp_path / "capture")
     (folder / "c0_l1.npy").write_bytes(b"no array")
     (folder / "broken.json").write_text("[")
@@ -62,7 +62,9 @@ def test_it_says_what_would_be_said_in_this_process(apart: ReadApart, tmp_path: 
 
 
 @pytest.mark.attack("uploads", "a description that takes memory")
-def test_a_description_that_takes_memory_costs_a_process_and_a_sentence(apart: ReadApart, tmp_path: Path) -> None:
+def test_a_description_that_takes_memory_costs_a_process_and_a_sentence(
+    apart: SubprocessReader, tmp_path: Path
+) -> None:
     folder = write_capture(tmp_path / "capture")
     whole = (folder / "capture.json").read_text()
     costly, large = tmp_path / "costly.json", tmp_path / "large.json"
@@ -70,7 +72,7 @@ def test_a_description_that_takes_memory_costs_a_process_and_a_sentence(apart: R
     large.write_text(whole + " " * MAX_DESCRIPTION_BYTES)
     (told,) = faults(apart, (costly, "capture.json"), (folder / "c0_l0.npy", "c0_l0.npy")).values()
     assert told.startswith("capture.json cannot be read within 96 MiB of memory")
-    assert told.count(".") == 2  # one sentence, and the name's
+    assert told.count(".") == 2  # the full stop of one sentence, and the dot in the file's name
     (told,) = faults(apart, (large, "capture.json")).values()
     assert f"{MAX_DESCRIPTION_BYTES} are allowed" in told
     (folder / "capture.json").write_bytes(large.read_bytes())
@@ -81,7 +83,7 @@ def test_a_description_that_takes_memory_costs_a_process_and_a_sentence(apart: R
 
 @pytest.mark.attack("uploads", "a file that takes time")
 def test_a_file_that_takes_time_costs_a_process_and_a_sentence(
-    apart: ReadApart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    apart: SubprocessReader, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     os.mkfifo(tmp_path / "hangs.npy")
     monkeypatch.setattr(reading, "MAX_S", 0.3)
@@ -90,7 +92,7 @@ def test_a_file_that_takes_time_costs_a_process_and_a_sentence(
     assert len(children()) <= reading.PROCESSES
 
 
-def test_one_that_was_killed_is_replaced(apart: ReadApart, tmp_path: Path) -> None:
+def test_one_that_was_killed_is_replaced(apart: SubprocessReader, tmp_path: Path) -> None:
     folder = write_capture(tmp_path / "capture")
     assert faults(apart, (folder / "c0_l0.npy", "c0_l0.npy")) == {}
     for one in children():
@@ -100,9 +102,11 @@ def test_one_that_was_killed_is_replaced(apart: ReadApart, tmp_path: Path) -> No
 
 
 @pytest.mark.attack("uploads", "secrets of the server beside what reads uploads")
-def test_it_knows_nothing_of_the_server(apart: ReadApart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_knows_nothing_of_the_server(
+    apart: SubprocessReader, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("DENTINE__SERVER__DATABASE", "postgresql://a:secret@b/c")
-    fresh = ReadApart()
+    fresh = SubprocessReader()
     try:
         fresh.describe(write_capture(tmp_path / "capture"))
         assert not any("DENTINE" in name for one in children() for name in one.environ())
@@ -110,7 +114,7 @@ def test_it_knows_nothing_of_the_server(apart: ReadApart, tmp_path: Path, monkey
         fresh.close()
 
 
-def test_a_raw_capture_of_20_gigabytes_is_looked_at_by_its_headers(apart: ReadApart, tmp_path: Path) -> None:
+def test_a_raw_capture_of_20_gigabytes_is_looked_at_by_its_headers(apart: SubprocessReader, tmp_path: Path) -> None:
     files = []
     for number in range(FILES):
         path = tmp_path / f"raw_{number}.npy"

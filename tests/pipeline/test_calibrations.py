@@ -1,4 +1,4 @@
-"""Calibrations by name over the API, and what the preparation makes of one."""
+"""Calibrations by name over the API, and their use by the preparation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.support.uploading import announce, contents_of, send
 
 
 def prepare(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """A job's preparation, without a worker around it; a calibration job publishes what its folder holds."""
+    """Run a job's preparation in this process; a calibration job publishes the calibration in its folder."""
     if spec.kind == "calibration":
         publish_calibration(spec, folder, events)
         return
@@ -59,7 +59,7 @@ def mouth(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def calibration(mouth: Path) -> dict[str, Any]:
-    """What the mouth's own file says, the light l1 moved."""
+    """The calibration of the mouth's own file, with the light l1 moved."""
     tree: dict[str, Any] = json.loads((mouth / "capture.json").read_text())
     del tree["images"]
     tree["lights"][1]["position_mm"] = [40.0, 0.0, -900.0]
@@ -75,7 +75,7 @@ def renamed(tree: dict[str, Any], part: str, change: Callable[[dict[str, Any]], 
 def test_a_name_means_one_content_for_ever(client: httpx.Client, calibration: dict[str, Any]) -> None:
     first = client.put("/v1/calibrations/rig-1.2026", json=calibration)
     assert (first.status_code, first.headers["location"]) == (201, "/v1/calibrations/rig-1.2026")
-    # Another order of keys and another way to write a number are the same content.
+    # Another order of keys or another notation of a number is the same content.
     otherwise = json.dumps(calibration, sort_keys=True).replace("40.0", "4e1")
     again = client.put("/v1/calibrations/rig-1.2026", content=otherwise, headers={"Content-Type": "application/json"})
     assert (again.status_code, again.json()) == (200, first.json())
@@ -125,7 +125,7 @@ def test_a_name_is_no_path(client: httpx.Client, calibration: dict[str, Any], na
 def test_a_job_is_prepared_with_the_calibration_that_it_names(
     client: httpx.Client, data: Path, mouth: Path, calibration: dict[str, Any]
 ) -> None:
-    # A calibration of the whole rig has lights that this capture does not, in an order of its own.
+    # A calibration of the whole rig has more lights than this capture, in another order.
     calibration["lights"] = [
         {"name": "l7", "position_mm": [0, 0, -950], "intensity": [1e6]},
         *calibration["lights"][::-1],
@@ -261,7 +261,7 @@ def test_what_a_calibration_job_made_is_put_under_a_name(
     assert told == "calibrations/by-job: beyond its limits\n"
     assert client.put(f"/v1/jobs/{made}/calibration/by-job").status_code == 200
     assert client.put("/v1/calibrations/by-hand", json=calibration | BEYOND).json()["id"] == kept.json()["id"]
-    # Whoever names it does not need the job any more.
+    # Jobs can use the calibration by its name after the job that made it is deleted.
     client.delete(f"/v1/jobs/{made}").raise_for_status()
     assert client.get("/v1/calibrations/by-job").json() == kept.json()
     assert client.put(f"/v1/jobs/{made}/calibration/again").json()["code"] == "job-unknown"

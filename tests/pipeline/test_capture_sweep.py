@@ -1,4 +1,4 @@
-"""Captures go on expiring after the database or the disk has failed once."""
+"""The removal of expired captures continues after the database or the disk has failed once."""
 
 from __future__ import annotations
 

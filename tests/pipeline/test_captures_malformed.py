@@ -1,5 +1,5 @@
-"""Whatever a client sends to the routes of captures and uploads, the answer is a problem document of the 4xx family and
-nothing is opened.
+"""Malformed requests to the routes of captures and uploads get a problem document with a 4xx status, and no capture or
+upload is opened.
 """
 
 from __future__ import annotations

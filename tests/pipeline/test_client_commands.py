@@ -1,5 +1,5 @@
-"""The commands that speak to a server: list, name, download, delete; one sentence where they cannot; and nothing but
-the base install.
+"""Commands that use a server: list, name, download, delete. They fail with one sentence, and need only the base
+dependencies.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 runpy.run_module('services', run_name='__main__', alter_sys=True)
 """
-"""The command line as it is where ``pip install dentine`` brought the base dependencies alone."""
+"""Program that runs the command line with only the base dependencies of ``pip install dentine``."""
 
 
 def dentine(*arguments: str, command: list[str] = DENTINE) -> subprocess.CompletedProcess[str]:

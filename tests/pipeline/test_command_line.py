@@ -1,4 +1,4 @@
-"""The command line as a user meets it: exit status, one sentence on standard error, JSON on standard output."""
+"""The command line's interface: exit status, one sentence on standard error, JSON on standard output."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def dentine(*arguments: str, **environment: str) -> subprocess.CompletedProcess[
 
 
 def sentence(answer: subprocess.CompletedProcess[str]) -> str:
-    """The one line on standard error."""
+    """The only line on standard error."""
     assert answer.stdout == ""
     (line,) = answer.stderr.splitlines()
     assert re.fullmatch(r"dentine: .*[.]", line)

@@ -1,6 +1,6 @@
-"""The compose file: valid, and what it starts works together.
+"""The compose file is valid, and the services that it starts work together.
 
-Its own commands and environments run as processes on loopback, and a small job through them.
+Its commands and environments are run as processes on loopback, and they run a small job.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ pytestmark = pytest.mark.timeout(1800)
 
 
 def services() -> dict[str, dict[str, Any]]:
-    """The services that start without a profile, with the defaults of their variables."""
+    """Services that start without a profile, with the default values of their variables."""
     text = COMPOSE.read_text()
     for _ in range(2):  # a default may name another variable
         text = re.sub(r"\$\{\w+:-([^${}]*)\}", r"\1", text)
@@ -121,7 +121,7 @@ def test_each_image_is_built_once() -> None:
 
 
 class Composition:
-    """The file's services as processes, with names and folders of this machine."""
+    """The file's services as processes, with host names and folders of this machine."""
 
     def __init__(self, folder: Path, postgres: PostgresServer) -> None:
         self._folder = folder
@@ -140,7 +140,7 @@ class Composition:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def environment(self, name: str) -> dict[str, str]:
-        """Of a service, on top of this machine's own."""
+        """Environment of a service, added to that of this machine."""
         return (
             os.environ
             | {"PYTHONPATH": str(ROOT)}
@@ -148,7 +148,7 @@ class Composition:
         )
 
     def command(self, name: str) -> list[str]:
-        """Of a service, after the program's name."""
+        """Command line of a service, without the program's name."""
         program, *arguments = services()[name]["command"]
         assert program == "dentine"
         return [self._here(part) for part in arguments]
@@ -162,7 +162,7 @@ class Composition:
             )
 
     def close(self) -> None:
-        """End all of them in order, as the engine does."""
+        """End all services in order, as a container engine does."""
         for process in self._processes.values():
             below = psutil.Process(process.pid).children(recursive=True) if process.poll() is None else []
             process.terminate()
@@ -228,7 +228,7 @@ def test_a_small_job_runs_through_what_the_file_starts(composition: Composition,
     size = ["--pixel-mm", "1.5", "--cameras", "1", "--lights", "4", "--samples", "64"]
     dentine(tmp_path, environment, "phantom", "--out", "mouth", *size)
     (tmp_path / "job.toml").write_text(JOB)
-    # So few pixels and paths tell little: whether the fit converged is not asked here.
+    # With so few pixels and paths the fit may not converge, which is not tested here.
     submit = ["submit", "job.toml", "--upload", "--watch", "--server", composition.address]
     job = dentine(tmp_path, environment, *submit, ends_with=(0, NOT_CONVERGED_STATUS)).splitlines()[0]
 
@@ -245,7 +245,7 @@ def test_a_small_job_runs_through_what_the_file_starts(composition: Composition,
 
 
 def work_the_dome(client: httpx.Client, token: str) -> None:
-    """Status, a light and ALL OFF, by the API as composed."""
+    """Read the dome's status, switch on a light and press ALL OFF over the composed API."""
     headers = {"Authorization": f"Bearer {token}"}
     told = client.get("/v1/dome", headers=headers).json()
     assert (told["capturing"], told["status"]["lit"], told["status"]["stopped"]) == ([], [], False)

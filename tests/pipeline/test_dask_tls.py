@@ -1,6 +1,4 @@
-"""TLS between API, scheduler and workers by one setting: who shows a certificate of the authority is let in, and nobody
-else.
-"""
+"""TLS between API, scheduler and workers by one setting: only programs with the authority's certificate can connect."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ PATIENCE_S = 120.0
 
 @contextmanager
 def part(folder: Path, tls: Path, *arguments: str) -> Iterator[None]:
-    """``dentine scheduler`` or ``dentine worker``, with TLS by the one setting."""
+    """Run ``dentine scheduler`` or ``dentine worker`` with TLS for the time of the block."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "DENTINE__SERVER__TLS": str(tls)}
     with (folder / f"{arguments[0]}.log").open("wb") as log:
         command = [sys.executable, "-m", "services", *arguments, "--no-dashboard"]
@@ -56,14 +54,14 @@ def await_scheduler(address: str, tls: Path) -> None:
 
 
 def ready(client: httpx.Client) -> dict[str, str]:
-    """What readiness complains about."""
+    """Name and sentence of each part that the readiness route names as bad."""
     return {
         check["name"]: check["sentence"] for check in client.get("/v1/health/ready").json()["checks"] if not check["ok"]
     }
 
 
 def await_ready(client: httpx.Client) -> None:
-    """Wait until nothing is missing: the worker first shows what it can do."""
+    """Wait until readiness names no bad part; the worker must first show that it can run stages."""
     until = time.monotonic() + PATIENCE_S
     while missing := ready(client):
         assert time.monotonic() < until, missing

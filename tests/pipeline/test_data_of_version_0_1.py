@@ -1,4 +1,4 @@
-"""What version 0.1 stored is still there: its data folder, its database, and the store of a job that succeeded."""
+"""Data of version 0.1 can still be read: its data folder, its database, and the store of a job that succeeded."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ LARGEST_BYTES = 300_000
 SUCCEEDED, CANCELLED = "24511ac8078a", "f953d5a22fe3"
 CAPTURE = "484b114ab782e1c2"
 TOKEN = "dentine_934c742644a2_Xh2jmxrD-aiH_yEkV72DqltIhKmt7WHW-bxCT2BcyY8"
-"""Of a server that has never been reached by anybody else."""
+"""Token of the server that wrote the data. That server was never reachable for others, so the token is no secret."""
 PARAMETERS_SHA256 = "62a06638e6210319869dbceda2206d220b251a5a50b8b27a4e7dc595d1ab610e"
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    # Python 3.11 knows filters from 3.11.4 on, Debian 12 has 3.11.2, and later versions warn where none is named.
+    # Python 3.11 has extraction filters from 3.11.4 on, Debian 12 has 3.11.2, and later versions warn without a filter.
     safely: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}
     with tarfile.open(ARCHIVE) as archive:
         archive.extractall(tmp_path, **safely)

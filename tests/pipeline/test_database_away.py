@@ -1,4 +1,4 @@
-"""What a server with tokens answers while its database does not: 503, and streams that are open stay so."""
+"""While the database does not answer, a server with tokens answers 503, and open event streams stay open."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.live_server import serving
 
 @contextmanager
 def without(table: str, server: Guarded) -> Iterator[None]:
-    """Keep a table from the server for the time of the block."""
+    """Hide a table from the server for the time of the block."""
     with closing(sqlite3.connect(sql.make_url(ServerSettings(data=server.data).database_url).database)) as database:
         database.execute(f"ALTER TABLE {table} RENAME TO away")
         try:

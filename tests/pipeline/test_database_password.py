@@ -1,4 +1,6 @@
-"""The database's password: from a file, changed without a restart, in no task, and told of in one sentence."""
+"""The database's password is read from a file, can change without a restart, is in no task, and errors with it are one
+sentence.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,12 @@ from tests.support.postgres import PostgresServer, new_database, postgres_server
 from tests.support.uploading import write_capture
 
 AWKWARD = "q/8+Zk@1#x:%"
-"""As people draw them."""
+"""Password with characters that URLs escape, as generated passwords have them."""
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[PostgresServer]:
-    """A server that wants passwords, over its socket too."""
+    """A Postgres server that requires passwords, also over its socket."""
     with postgres_server() as server:
         engine = open_database(server.url("postgres"))
         with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
@@ -40,7 +42,7 @@ def server() -> Iterator[PostgresServer]:
 
 @pytest.fixture
 def url(server: PostgresServer, request: pytest.FixtureRequest) -> str:
-    """Of an empty database of the role, without its password."""
+    """URL of an empty database of the role, without the password."""
     name = f"of_{abs(hash(request.node.name))}"
     address = new_database(server, name).replace("postgres@", "dentine@", 1)
     owner = open_database(server.url(name))
@@ -96,7 +98,7 @@ def test_a_changed_password_needs_no_restart(tmp_path: Path, url: str, server: P
     try:
         change_database_password(chosen.database_url, tmp_path / "password")
         assert (tmp_path / "password").read_text().strip() != AWKWARD
-        jobs.repository.engine.dispose()  # every connection from here on shows the new one
+        jobs.repository.engine.dispose()  # all later connections use the new password
         assert jobs.repository.queued() == []
     finally:
         jobs.repository.close()

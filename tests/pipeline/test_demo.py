@@ -1,4 +1,4 @@
-"""The demonstration: a job that makes the mouth it captures, so that it needs no file on any host."""
+"""The demonstration is a job that makes the mouth that it captures, so that it needs no files on any host."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SMALL: Mapping[str, str] = MappingProxyType({"pixel-mm": "2", "cameras": "1", "l
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mouth that is rendered in seconds."""
+    """Make the demonstration's mouth small enough to be rendered in seconds."""
     monkeypatch.setattr(demo_mouth, "OPTIONS", SMALL)
     monkeypatch.setattr(demo_mouth, "NAME", "small")
 
@@ -137,7 +137,7 @@ def test_each_stage_sees_the_mouth_where_it_is(tmp_path: Path) -> None:
 
 
 def tell_mouth(spec: JobSpec, context: LocalContext) -> None:
-    """A stage that says where it sees the rig's mouth."""
+    """A stage that records the path of the rig's mouth."""
     assert spec.rig is not None
     context.report(StageEvent(stage="capture", kind="log", message=str(spec.rig.mouth)))
 
@@ -186,4 +186,4 @@ def test_the_demonstration_finds_the_optics_of_its_mouth(tmp_path: Path) -> None
     ]
     assert (
         abs(found["value"] - truth) < 4 * found["se"]
-    )  # four standard errors: one in 16,000 runs of an honest ± would fail
+    )  # four standard errors; with a correct ± one run in 16,000 fails

@@ -1,4 +1,4 @@
-"""The files of ``deploy/`` against their formats' own validators, each of which is shown to find a fault."""
+"""The files of ``deploy/`` pass the validators of their formats, and each validator is shown to find a fault."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def promtool(*arguments: str, cwd: Path) -> int:
 
 @pytest.mark.parametrize("file", COMPOSED, ids=lambda file: file.name)
 def test_compose_files_follow_the_specification(file: Path, tmp_path: Path) -> None:
-    plain = tmp_path / file.name  # the schema does not know compose's tag that takes a value back
+    plain = tmp_path / file.name  # the schema does not know compose's tag ``!reset``
     plain.write_text(file.read_text().replace("!reset", ""))
     assert compose_schema(plain) == 0
     plain.write_text(plain.read_text().replace("read_only:", "readonly:").replace("network_mode:", "networkmode:"))

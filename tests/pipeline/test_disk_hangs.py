@@ -1,4 +1,4 @@
-"""A disk that does not answer keeps nobody waiting who does not ask for what is on it."""
+"""While a disk does not answer, requests that do not need it are still answered."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from services.core.settings import ServerSettings
 from tests.support.live_server import serving
 
 FILE_READERS = 50
-"""More than the threads in which FastAPI calls handlers, which are forty."""
+"""Number of requests for files, more than the forty threads in which FastAPI calls handlers."""
 
 
 class Disk:
-    """Hangs from the first look at it until it is mended."""
+    """A disk that hangs from the first access until the test mends it."""
 
     def __init__(self) -> None:
         self.is_asked, self.is_mended = threading.Event(), threading.Event()
@@ -29,7 +29,7 @@ class Disk:
         self.is_mended.wait(60)
 
     def list_nothing(self, *_: object) -> list[object]:
-        """What a folder holds that can be looked at again."""
+        """Hang while the disk hangs, then list an empty folder."""
         self()
         return []
 
@@ -45,10 +45,10 @@ def test_a_job_is_told_without_its_time_and_everything_else_as_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: Disk
 ) -> None:
     monkeypatch.setattr("services.api.jobs.time_ranges.size_of", disk)
-    monkeypatch.setattr("services.api.jobs.routes.LOOK_S", 0.1)
+    monkeypatch.setattr("services.api.jobs.routes.ESTIMATE_TIMEOUT_S", 0.1)
     with serving(create_app(ServerSettings(data=tmp_path / "data"), lambda *_: disk.is_mended.wait(60))) as client:
         job = submit(client, tmp_path)
-        for _ in range(2):  # the second one finds the looker still busy with the first
+        for _ in range(2):  # at the second request the prober still waits for the first
             told = client.get(f"/v1/jobs/{job}").json()
             assert (told["id"], told["remaining"]["low_s"]) == (job, None)
             assert "could not be looked at within 0.1 s" in told["remaining"]["reason"]

@@ -1,5 +1,5 @@
-"""The dome by hand where something is in its way: no connection left for ALL OFF, and a rig that asks for more than the
-server allows.
+"""The dome by hand under difficulties: no connection left for ALL OFF, and a rig that requests more than the server
+allows.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.support.dome_proxy import Proxy
 from tests.support.mouth import write_mouth
 
 LIGHTS = 4
-# Far beyond the tests' length: a light that goes dark was switched off.
+# The watchdog's period is much longer than the tests, so a light that goes dark was switched off.
 WATCHDOG_S = 30.0
 Address = tuple[str, int]
 
@@ -55,7 +55,7 @@ def rig(tmp_path: Path) -> Callable[..., RigSpec]:
 
 @contextmanager
 def console(address: Address, **limits: float) -> Iterator[Callable[..., DomeAnswer]]:
-    """The dome's process without a process around it."""
+    """Give the console of the dome's process, run inside the test instead of in a process of its own."""
     worked = Console(*address, DomeSettings(**{"watchdog_s": WATCHDOG_S} | limits))
     try:
         yield lambda **command: worked.answer(DomeCommand(**{"number": 1} | command))
@@ -96,7 +96,7 @@ def test_all_off_ends_a_preflight_though_the_controller_takes_no_further_connect
             target=lambda: answers.append(answer(do="preflight", rig=rig(exposure_s=exposure_s, level=0.4)))
         )
         asking.start()
-        # All lights at once are those of its last exposure.
+        # All lights are on together only in its last exposure.
         wait_until(lambda: len(observer.status().lit) == LIGHTS)
         lit_s = time.monotonic()
         proxy.close()
@@ -114,13 +114,13 @@ def test_all_off_ends_a_preflight_though_the_controller_takes_no_further_connect
 def test_a_preflight_lights_no_further_light_once_it_is_unwanted(address: Address, rig: Callable[..., RigSpec]) -> None:
     spent_s: dict[int, float] = {}
 
-    def raise_if_unwanted() -> None:
+    def raise_if_cancelled() -> None:
         if len(spent_s) == 2:
             raise RigStoppedError("ALL OFF was pressed.")
 
     planned = PlannedRig.read(rig(dome=f"{address[0]}:{address[1]}"))
     with planned.in_use(spent_s) as (dome, cameras), pytest.raises(RigStoppedError):
-        preflight(planned.plan, dome, cameras, planned.spec, raise_if_unwanted)
+        preflight(planned.plan, dome, cameras, planned.spec, raise_if_cancelled)
     assert set(spent_s) == {0, 1}
 
 
@@ -140,9 +140,9 @@ def test_a_preflight_may_not_ask_for_more_than_the_server_allows(
 def test_preflights_add_up_to_the_limit_with_light_by_hand(
     address: Address, observer: DomeObserver, rig: Callable[..., RigSpec]
 ) -> None:
-    # The last light is on for 0.3 s and for a glimpse of some milliseconds in each preflight, the others for the
-    # glimpse. A preflight and the capture after it are within the limit. How long a glimpse lasts decides whether a
-    # second preflight is; a third one passes the limit by 0.3 s.
+    # In each preflight the last light is on for 0.3 s and for a flash of some milliseconds, the others for the flash
+    # alone. One preflight and the capture after it are within the limit. Whether a second preflight is depends on the
+    # length of the flash; a third one exceeds the limit by 0.3 s.
     wanted = rig(level=1.0, exposure_s=0.3, tracking_every=0)
     with console(address, light_exposure_limit_s=0.607) as answer:
         assert answer(do="preflight", rig=wanted).code is None

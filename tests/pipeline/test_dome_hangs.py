@@ -1,4 +1,4 @@
-"""A dome's process that no longer reads what it is told: it keeps nobody from darkness, nor the server from its end."""
+"""A dome's process that no longer reads its commands prevents neither ALL OFF nor the end of the server."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from services.core.settings import DomeSettings, ServerSettings
 
 WATCHDOG_S = 10.0
 COMMANDS = 2000
-"""More than a pipe of 64 KiB holds."""
+"""Number of commands, more than a pipe of 64 KiB holds."""
 LONGEST_S = 20.0
 
 
 @dataclass(frozen=True)
 class Hanging:
-    """A dome with a light on, eyes on it, and its process, which is suspended with a full pipe."""
+    """A dome with a light on, its observer, and its process, which is suspended with a full pipe."""
 
     dome: Dome
     observer: DomeObserver
@@ -61,7 +61,7 @@ def ask(dome: Dome) -> None:
 
 
 def require_end(work: Callable[[], object]) -> None:
-    """Do it in a thread, so that a test fails where the work would wait for ever."""
+    """Run a function in a thread, so that the test fails if it never returns."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(LONGEST_S)
@@ -77,6 +77,6 @@ def test_all_off_gets_past_a_process_that_no_longer_reads(hanging: Hanging, monk
 
 
 def test_the_server_ends_with_a_process_that_no_longer_reads(hanging: Hanging, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.api.dome.process.END_S", 0.2)
+    monkeypatch.setattr("services.api.dome.process.EXIT_TIMEOUT_S", 0.2)
     require_end(hanging.dome.close)
     assert not hanging.process.is_running()

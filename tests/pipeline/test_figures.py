@@ -1,5 +1,5 @@
-"""A figure from nothing: capture and fit by the command line, renders beside photographs, a caption with their errors;
-then again from what is kept.
+"""A figure made from scratch by the command line: capture, fit, renders beside photographs, and a caption with their
+errors; then again from the kept files.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def test_a_figure_is_made_from_nothing_and_its_fit_used_again(tmp_path: Path) ->
     assert main(arguments) == 0
     caption = (tmp_path / "fig13.txt").read_text()
     fitted, unseen = (float(number) for number in re.findall(r"([\d.]+) % on", caption))
-    # A fit that is called converged explains its images this well.
+    # A converged fit explains its images at least this well.
     assert 0 < fitted < 100 * MAX_ERROR
     assert 0 < unseen < 100 * MAX_ERROR
     with Image.open(tmp_path / "fig13.png") as image:

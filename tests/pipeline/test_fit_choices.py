@@ -1,4 +1,4 @@
-"""Losses, solvers and priors that a job may choose, on the fake engine whose truth is known."""
+"""Losses, solvers and priors that a job can choose, on the fake engine with a known truth."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def fit(root: Path, *, attempt: int = 1, listen: Any = None, **options: Any) -> 
     values: dict[str, Any] = {
         "capture": root, "boundary": "matched", "dentin": "known", "samples_per_pixel": 64,
         "max_samples_per_pixel": 1024, "max_steps": 8, "search_candidates": 500,
-        # This engine's renders are so noisy that they drown what the instrument's errors leave to tell;
-        # test_fit_instrument.py fits those.
+        # This engine's renders are too noisy for estimates with errors of the instrument; test_fit_instrument.py fits
+        # those errors.
         "instrument": "off",
     }  # fmt: skip
     return run(JobSpec(**(values | options)), LocalContext(root, attempt, listen), engine=FAKE)
 
 
 def scores(report: FitReport) -> list[float]:
-    """Errors of the reduced quantities in their own standard errors."""
+    """Errors of the reduced quantities divided by their standard errors."""
     table, z = report.parameters["green"], []
     for part, leaf in QUANTITIES:
         estimate, medium = table[f"{part}.{leaf}"], getattr(TRUTH, part)
@@ -55,14 +55,15 @@ def off(report: FitReport) -> float:
 
 
 def require_truth(report: FitReport, largest: float = 0.1) -> None:
-    # One fit at one seed: 4.5 of its own standard errors, and these are small enough to mean something.
+    # For one fit at one seed, errors are at most 4.5 of its standard errors, which must be small enough for a
+    # meaningful test.
     table = report.parameters["green"]
     assert max(map(abs, scores(report))) < 4.5
     assert all((table[f"{part}.{leaf}"].se or 1) < largest * table[f"{part}.{leaf}"].value for part, leaf in QUANTITIES)
 
 
 def test_a_tighter_tolerance_goes_on_to_smaller_errors(tmp_path: Path) -> None:
-    # One seed, so that both fits are the same until the one at the default has converged.
+    # Both fits use one seed, so that they are identical until the one with the default tolerance has converged.
     reports = []
     for name, options in (("default", {}), ("tight", {"image_tolerance": 0.0001})):
         write_prepared(tmp_path / name)
@@ -76,21 +77,21 @@ def test_a_tighter_tolerance_goes_on_to_smaller_errors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("loss", ["relative_l2", "l1", "relative_l1", "robust"])
 def test_every_loss_finds_the_truth_where_the_model_holds(loss: str, tmp_path: Path) -> None:
-    # Unmodelled is the noise alone, so all losses have one minimum.
+    # The model explains everything except the noise, so all losses have the same minimum.
     write_prepared(tmp_path)
     require_truth(fit(tmp_path, loss=loss))
 
 
 def test_images_outvote_the_literature(tmp_path: Path) -> None:
-    # Dentin's true albedo lies 2.5 widths from the table's centre. A fifth is far below the widths of densities,
-    # factors of 5.7 and 3.4.
+    # Dentin's true albedo is 2.5 widths from the prior's centre. The limit of a fifth is far below the prior widths of
+    # densities, which are factors of 5.7 and 3.4.
     write_prepared(tmp_path)
     require_truth(fit(tmp_path, prior="literature"), largest=0.2)
 
 
 def test_a_robust_loss_forgives_shadows(tmp_path: Path) -> None:
-    # A fifth of all measurements in shadow moves L2 by 15 to 23 %; what is left of the robust fit's 2 % is Monte Carlo
-    # noise.
+    # With a fifth of all measurements in shadow, the L2 fit has errors of 15 to 23 %. The robust fit's error of 2 % is
+    # Monte Carlo noise.
     errors = {}
     for loss in ("l2", "robust"):
         write_prepared(tmp_path / loss, shadowed=0.2)
@@ -126,11 +127,11 @@ def test_adam_finds_the_truth_and_resumes(tmp_path: Path) -> None:
     options = {"solver": "adam", "adam_steps": 80}
     write_prepared(tmp_path / "whole")
     report = fit(tmp_path / "whole", **options)
-    # A constant rate of 0.05 leaves densities wandering by 3 % a step, several times that where enamel and dentin trade
-    # places.
+    # With a constant rate of 0.05 densities vary by 3 % per step, and by several times that where enamel and dentin can
+    # compensate each other.
     assert off(report) < 0.15
     assert report.held_out_error["green"] < 0.02
-    # Its standard errors are those of normal equations at the end.
+    # Its standard errors come from normal equations at the end.
     assert all(report.parameters["green"][f"{part}.{leaf}"].se for part, leaf in QUANTITIES)
     write_prepared(tmp_path / "twice")
 

@@ -21,7 +21,7 @@ from tests.support.shared_data import shared_path
 
 
 def noisy_copy(target: Path, seed: int) -> Path:
-    """The capture with sensor noise: 1 % of the value and 0.2 % of the image's maximum."""
+    """Copy the capture and add sensor noise of 1 % of the value and 0.2 % of the image's maximum."""
     source = shared_path("data/tooth-ur1-truth")
     target.mkdir()
     for path in source.rglob("*"):
@@ -59,8 +59,8 @@ def run_both_stages(spec: JobSpec, root: Path) -> None:
 
 @pytest.mark.slow
 def test_quarter_of_the_pixels_on_two_workers(tmp_path: Path) -> None:
-    # Every second pixel in x and y, few samples: the goals of the full fit (20 %, 5 %) plus three of the fit's own
-    # standard errors, Monte Carlo included.
+    # This fit uses every second pixel in x and y and few samples. The limits are the goals of the full fit (20 %, 5 %)
+    # plus three of this fit's standard errors, including Monte Carlo errors.
     spec = spec_for(tmp_path, seed=3, pixel_step=2, max_samples_per_pixel=256, max_steps=4, search_candidates=5000)
     with (
         dask.config.set({"distributed.worker.daemon": False}),
@@ -79,7 +79,7 @@ def test_quarter_of_the_pixels_on_two_workers(tmp_path: Path) -> None:
     last = json.loads((folder / "history.json").read_text())[-1]
     assert report.held_out_error["green"] < 0.05 + 3 * last["held_out_se"]
 
-    # Image and Jacobian tasks of one step overlapped on different workers.
+    # Image and Jacobian tasks of one step must have overlapped on different workers.
     rows = json.loads((folder / "trace.json").read_text())
     images, jacobians = ([row for row in rows if row["kind"] == kind] for kind in ("image", "jacobian"))
     assert any(

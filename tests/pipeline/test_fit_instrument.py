@@ -1,4 +1,4 @@
-"""Fits by a formula of photographs whose instrument was off: what the errors become, and what the ± say of them."""
+"""Fits with a formula engine to photographs whose instrument had errors: the estimated errors and the effect on ±."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ TRUE = {
 
 
 def fit(root: Path, gains: tuple[float, ...] = (1.0,) * 6, flare: float = 0.0, **options: Any) -> FitReport:
-    """A fit of photographs that are brighter by one gain a light, and by a share of the brightest pixel."""
+    """Fit photographs with one gain per light and with flare, a share of the brightest pixel."""
     write_prepared(root)
 
     def photographed(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
@@ -50,7 +50,7 @@ def fit(root: Path, gains: tuple[float, ...] = (1.0,) * 6, flare: float = 0.0, *
 
 
 def off(report: FitReport) -> dict[str, float]:
-    """How many ± each quantity of the media is off the truth."""
+    """Error of each quantity of the media, divided by its ±."""
     table = report.parameters["green"]
     return {name: (table[name].value - true) / (table[name].se or np.nan) for name, true in TRUE.items()}
 
@@ -68,9 +68,9 @@ def test_a_gain_that_is_off_is_in_the_errors(brighter: tuple[Path, FitReport], t
     assert not report.instrument_faults
     for name, one in report.instrument["green"].items():
         assert one.se is not None
-        # A prior that is used in full leaves no error worse known than it was.
+        # With its prior, no error of the instrument is known worse than before the fit.
         assert one.se <= report.instrument_prior["green"][name] * (1 + 1e-9), name
-    # The gain is off by two of its ±, so what it moves is off by at most two of theirs, and noise adds its own.
+    # The gain's error is two of its ±, so it changes other quantities by at most two of their ±; noise adds to that.
     assert max(map(abs, off(report).values())) < 2.5
     alone = fit(tmp_path, gains=(1.02,) * 6, instrument="off")
     assert max(map(abs, off(alone).values())) > 4
@@ -151,7 +151,7 @@ def test_a_fit_whose_prior_took_it_too_far_looks_again_from_there(tmp_path: Path
     found: list[Uncertainty] = []
 
     def cut_at_first(*args: Any, **named: Any) -> Uncertainty:
-        found.append(replace(uncertainty(*args, **named), is_whole=bool(found)))
+        found.append(replace(uncertainty(*args, **named), is_full_step=bool(found)))
         return found[-1]
 
     with patch("services.fit.execution.channel_fit.uncertainty", cut_at_first):
@@ -161,7 +161,7 @@ def test_a_fit_whose_prior_took_it_too_far_looks_again_from_there(tmp_path: Path
     assert history[-1]["stage"] == "again"
     assert [step["step"] for step in history] == list(range(1, report.steps + 1))
     assert report.converged, report.advice
-    # What the second end says is told: from where the first was, which lay at the minimum, it is nowhere else.
+    # The second end's values are reported. The first end was at the minimum, so the second one must agree with it.
     first, second = found
     assert report.instrument["green"]["gain.green"].value == second.x[second.domain.tissue_count]
     assert np.abs((second.x - first.x) / np.sqrt(np.diag(first.covariance))).max() < 1

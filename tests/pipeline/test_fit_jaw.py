@@ -1,5 +1,5 @@
-"""A jaw's fit through the service's door: all teeth with gums and wall, one that fails, one that is hidden, and what is
-written of them.
+"""A jaw's fit through the stage's ``run``: all teeth with gums and wall, a tooth that fails, a hidden tooth, and the
+stored results.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def test_teeth_that_are_seen_are_found_within_their_errors(finished: tuple[Path,
                 estimate = tooth.parameters["green"][f"{part}.{leaf}"]
                 truth = getattr(TRUE_TEETH[int(fdi)].medium(part), leaf)
                 assert estimate.se is not None
-                # One fit at one seed: 4.5 of its own standard errors.
+                # For one fit at one seed, errors are at most 4.5 of its standard errors.
                 assert abs(estimate.value - truth) < 4.5 * estimate.se, (fdi, part, leaf, estimate)
     table = report.parameters["green"]
     for name, truth in (("gums.alpha_reduced", TRUE_GUMS.alpha_reduced), ("cavity.reflectance", TRUE_REFLECTANCE)):
@@ -90,8 +90,8 @@ def test_hidden_and_failed_teeth_are_held_near_the_others_and_marked(
             others = [
                 np.log(report.teeth[other].parameters["green"][f"{part}.sigma_s_reduced"].value) for other in FITTED
             ]
-            # No fitted pixel of the formula depends on them: their prior alone speaks, the median of two front teeth as
-            # the last stage found them.
+            # No fitted pixel of the formula depends on these quantities, so they stay at their prior: the median of the
+            # two front teeth in the last stage.
             assert np.log(found.value) == pytest.approx(np.mean(others), abs=TIED_SD["sigma"])
             assert not found.determined
             assert found.se == pytest.approx(TIED_SD["sigma"] * found.value, rel=0.01)
@@ -107,7 +107,7 @@ def test_steps_of_single_teeth_come_before_those_of_the_whole(
     assert set(teeth) == {11, 12, None}
     assert teeth.index(None) == len(teeth) - teeth[::-1].index(12)
     stages = {s["stage"] for s in steps if s["tooth"] is None}
-    # The last stage looks again where the prior of the instrument's errors has moved the answer far.
+    # The last stage runs again where the prior of the instrument's errors has changed the result much.
     assert stages - {"again"} == {"start.0", "start.1", "start.2", "joint", "exact"}
     folder, stored = open_stage(root, "fit", FitReport)
     assert stored == report
@@ -172,16 +172,16 @@ def test_interrupted_fit_resumes_and_ends_with_the_same_answer(
 
 def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
     truth: tuple[float, ...] = (1.0, 0.0, 1.0)
-    # This engine's renders are so noisy that they drown what the instrument's errors leave to tell of a shape;
-    # test_jaw_instrument.py fits those.
+    # This engine's renders are too noisy to estimate a shape together with errors of the instrument;
+    # test_jaw_instrument.py fits those errors.
     options: dict[str, Any] = {"dentin": "fit", "max_steps": 5, "search_candidates": 400, "instrument": "off"}
     write_prepared_jaw(tmp_path, FAKE, (11, 12, 21), hidden=(21,), shape=truth, noise=0.003, samples=20_000)
     report = fit(tmp_path, **options)
     for fdi in ("11", "12"):
         tooth = report.teeth[fdi]
         for k, (found, true) in enumerate(zip(tooth.shape, truth, strict=True)):
-            # Sixty pixels leave a weight open by 0.2 to 0.5, half of which the weak prior takes off; nearer to the
-            # truth than where it started is asked.
+            # Sixty pixels determine a weight to 0.2 to 0.5, and the weak prior halves that. The test requires that the
+            # weight is nearer to the truth than at the start.
             assert abs(found - true) < 0.75 * abs(SHAPE[0] - true), (fdi, tooth.shape)
             estimate = tooth.parameters["green"][f"shape.{k}"]
             assert estimate.value == found
@@ -189,7 +189,7 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
             assert abs(found - true) < 4.5 * estimate.se
         assert tooth.enamel_thickness is not None
         assert tooth.enamel_thickness.se is not None
-    # What is hidden keeps the shape that every tooth starts from, and nothing of its thickness is known.
+    # The hidden tooth keeps the initial shape, and its thickness is unknown.
     assert report.teeth["21"].shape == (SHAPE[0],) * 3
     assumed = report.teeth["21"].enamel_thickness
     assert assumed is None or (assumed.se is None and not assumed.determined)
@@ -202,10 +202,10 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
-    # Two teeth without dentin, so that every number is determined by a few hundred pixels; photographs of another seed,
-    # with 1 % of sensor noise.
+    # The two teeth have no dentin, so that a few hundred pixels determine every number. The photographs have another
+    # seed and 1 % of sensor noise.
     write_prepared_jaw(tmp_path, ENGINE, (11, 12), dentin=False)
-    # These photographs' instrument is perfect, and the limits below are on what noise alone leaves.
+    # The instrument of these photographs is perfect, and the limits below are for noise alone.
     spec = jaw_spec(
         tmp_path, dentin="none", samples_per_pixel=64, max_samples_per_pixel=256, max_steps=4, search_candidates=1600,
         instrument="off"
@@ -227,7 +227,8 @@ def test_engine_finds_teeth_gums_and_wall_together(tmp_path: Path) -> None:
     for name, estimate in found.items():
         assert estimate.determined, (name, estimate)
         assert estimate.se is not None
-        # One fit at one seed: 4.5 of its own standard errors, which are small enough to mean something.
+        # For one fit at one seed, errors are at most 4.5 of its standard errors, which must be small enough for a
+        # meaningful test.
         assert abs(estimate.value - truth[name]) < 4.5 * estimate.se, (name, truth[name], estimate)
         assert estimate.se < 0.15 * estimate.value, (name, estimate)
     assert report.held_out_error["green"] < 0.05

@@ -1,5 +1,5 @@
-"""What a jaw's fit reaches on fourteen teeth rendered by stock Mitsuba: limits are those of
-``tests/benchmarks/jaw_table.py``, which prints them.
+"""Accuracy of a jaw's fit on fourteen teeth rendered by stock Mitsuba; the limits are those of
+``tests/benchmarks/jaw_table.py``, which prints the figures.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ def test_a_figure_is_judged_with_its_noise() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(14400)
 def test_jaw_of_fourteen(tmp_path: Path) -> None:
-    # The instrument of these renders is perfect, and limits are on what noise alone leaves.
+    # The instrument of these renders is perfect, and the limits are for noise alone.
     options = {"samples_per_pixel": 32, "max_samples_per_pixel": 512, "instrument": "off"}
     found = list(figures(tmp_path, read_jaw_truth(), options))
     assert len(found) == 1 + 3 * 14
-    # Limits are on what the fit adds to the photographs' own noise: three standard errors, beyond which one of 43
-    # honest numbers on its limit falls in 17 runs.
+    # The limits are for the errors that the fit adds to the photographs' noise, so three standard errors are allowed.
+    # Of 43 correct numbers at their limits, one exceeds that in 17 runs.
     missed = [
         f"{one.subject}, {one.figure}: {one.value:.3f} ± {one.resolution:.3f} > {one.must:g}"
         for one in found
         if one.is_beyond_noise
     ]
     assert not missed
-    # Noise excuses little where it can: of all images together, and of enamel's scattering. Dentin's absorption is
-    # known to 3 to 16 % from these photographs.
+    # The allowance for noise is small for all images together and for enamel's scattering. Dentin's absorption is known
+    # to 3 to 16 % from these photographs.
     assert found[0].resolution < IMAGE_MUST
     assert median(one.resolution for one in found if one.figure.startswith("enamel")) < ENAMEL_MUST

@@ -1,4 +1,4 @@
-"""A tooth whose number is another kind's, whose dentin's shape then cannot be right."""
+"""A tooth whose FDI number is that of another kind of tooth; its dentin then gets a wrong shape."""
 
 from __future__ import annotations
 

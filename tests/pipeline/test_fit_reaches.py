@@ -1,4 +1,4 @@
-"""What a fit must reach on single teeth that stock Mitsuba rendered: the limits are those of
+"""Accuracy that a fit must reach on single teeth rendered by stock Mitsuba; the limits are those of
 ``tests/benchmarks/fit_table.py``, which prints the figures.
 """
 

@@ -1,4 +1,4 @@
-"""The fit's door with a fake engine: from a prepared stage to a report, what it writes, and what it refuses."""
+"""The fit's ``run`` with a fake engine: from a prepared stage to a report, its files, and its refusals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.core.verdict import VERDICT, verdict_of
-from services.fit.checks.identifiability import NOTHING
+from services.fit.checks.identifiability import NOT_EXPLAINED
 from services.fit.execution.numerics import NUMERICS, numerics_name
 from services.fit.stage import export, run
 from tests.support.prepared import FAKE, TRUTH, write_prepared
@@ -25,8 +25,8 @@ def spec_for(root: Path, **options: Any) -> JobSpec:
     defaults: dict[str, Any] = {
         "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "max_samples_per_pixel": 1024,
         "max_steps": 15, "search_candidates": 2000,
-        # This engine's renders are so noisy that they drown what the instrument's errors leave to tell;
-        # test_fit_instrument.py fits those.
+        # This engine's renders are too noisy for estimates with errors of the instrument; test_fit_instrument.py fits
+        # those errors.
         "instrument": "off",
     }  # fmt: skip
     return JobSpec(capture=root, **(defaults | options))
@@ -57,8 +57,8 @@ def test_finds_the_reduced_quantities_within_their_errors(finished: tuple[Path, 
             estimate = table[f"{part}.{leaf}"]
             assert estimate.determined
             assert estimate.se is not None
-            # One fit at one seed: 4.5 of its own standard errors, and the errors themselves are small enough to mean
-            # something.
+            # For one fit at one seed, errors are at most 4.5 of its standard errors, which must be small enough for a
+            # meaningful test.
             assert abs(estimate.value - getattr(medium, leaf)) < 4.5 * estimate.se, (part, leaf, estimate)
             assert estimate.se < 0.1 * estimate.value
     assert report.held_out_error["green"] < 0.02
@@ -80,8 +80,8 @@ def test_says_what_is_known_what_goes_together_and_what_would_help(
 
 @pytest.mark.slow
 def test_standard_errors_are_those_seen_over_noise(tmp_path: Path) -> None:
-    # z of 4 quantities over 6 captures and seeds: the mean square of 24 values lies in 0.2 to 2.6 for all but 1e-3 of
-    # cases even if the 4 move together.
+    # z-scores of 4 quantities over 6 captures and seeds: the mean square of the 24 values lies in 0.2 to 2.6 except in
+    # 1e-3 of the cases, even if the 4 are fully correlated.
     z = []
     for seed in range(6):
         root = tmp_path / str(seed)
@@ -119,16 +119,16 @@ def test_renders_around_the_answer_are_announced(finished: tuple[Path, FitReport
 
 
 def test_photographs_that_no_medium_explains_do_not_count_as_converged(tmp_path: Path) -> None:
-    # Alternate photographs differ by a factor 1.5: the best common scale leaves 0.2 of the images, above the 0.15 that
-    # still counts as explained.
+    # Alternate photographs differ by a factor 1.5. With the best common scale the relative error is 0.2, above the
+    # limit of 0.15 for explained images.
     write_prepared(tmp_path, uneven=0.5)
     report = fit(tmp_path)
     assert max(report.fit_error["green"], report.held_out_error["green"]) > 0.15
     assert not report.converged
     assert "the images are still" in report.advice
-    assert report.told == NOTHING
+    assert report.told == NOT_EXPLAINED
 
-    # Neither report nor asset hides it.
+    # Report and asset both say that the fit did not converge.
     spec = spec_for(tmp_path)
     manifest = export(spec, LocalContext(tmp_path))
     assert not manifest.converged
@@ -229,7 +229,7 @@ def test_a_fit_out_of_steps_says_what_to_do(tmp_path: Path) -> None:
     assert "max_steps" in report.advice
     manifest = export(spec_for(tmp_path, max_steps=1), LocalContext(tmp_path))
     assert (manifest.converged, manifest.advice) == (False, report.advice)
-    # One judgement, with what the renders leave open of its errors, in all that is stored and told.
+    # The same verdict, including the uncertainty from the renders, is in all stored records and events.
     verdict = verdict_of(report)
     assert manifest.verdict == verdict
     assert (events[-1].message, events[-1].data[VERDICT]) == (verdict.headline, verdict.model_dump(mode="json"))
@@ -239,7 +239,7 @@ def test_a_fit_out_of_steps_says_what_to_do(tmp_path: Path) -> None:
     assert report.advice in (tmp_path / "asset" / "NOT-CONVERGED.txt").read_text()
     page = (tmp_path / "report.html").read_text()
     assert page.index("did not converge") < page.index("Error on held-out images")
-    assert "max_steps = 1; " in page  # the options that it was made with
+    assert "max_steps = 1; " in page  # one of the job's options
 
 
 def test_what_the_preparation_noted_leads_the_report(tmp_path: Path) -> None:

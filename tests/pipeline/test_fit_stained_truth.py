@@ -1,5 +1,5 @@
-"""A stained incisor by stock Mitsuba, fitted end to end: every stage of teeth 2018 Fig. 9 lowers the loss, and the
-texture holds on lights it never saw.
+"""A stained incisor rendered by stock Mitsuba and fitted end to end: every stage of Fig. 9 of the teeth paper of 2018
+lowers the loss, and the texture also explains held-out lights.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from services.bench.fits.tooth_capture import prepared_tooth, tissue_of
 from services.core.files.meshes import read_mesh
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
-from services.fit.export.stains import kept_stains
+from services.fit.export.stains import read_stains
 from services.fit.inputs.observations import channel_scene
 from services.fit.inputs.stain_uv import stain_layout, texel_edge_mm
 from services.fit.optics.domain import similar_tissue
@@ -29,13 +29,13 @@ from services.preprocess.stage import run as prepare
 
 PIXEL_MM, SEED = 0.8, 4
 MIN_GAIN = 0.2
-"""Of the loss, by each stage."""
+"""Least relative reduction of the loss by each stage."""
 JUDGE_SAMPLES = 2048
-"""Held-out errors of 13 and 6 % come with 0.4 and 0.9 of Monte Carlo error; those of the fit's own steps, of at most
-512 paths, with 3 to 9."""
+"""Paths per pixel of the renders that judge the fit. Held-out errors of 13 and 6 % then have Monte Carlo errors of 0.4
+and 0.9 %; those of the fit's own steps, with at most 512 paths, have 3 to 9 %."""
 CERTAINTY = 3.0
-"""Standard errors by which the texture must help on held-out images: a false alarm in 700, had it no effect beyond the
-least that is asked."""
+"""Number of standard errors by which the texture must lower the error of held-out images beyond the least reduction;
+one false alarm in 700 runs."""
 
 
 @pytest.mark.slow
@@ -51,10 +51,10 @@ def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path:
     events: list[StageEvent] = []
     prepare(spec, LocalContext(tmp_path))
     report = run(spec, LocalContext(tmp_path, 1, events.append), engine="services.fit.transport.engine:Engine")
-    found = kept_stains(tmp_path / "fit")
+    found = read_stains(tmp_path / "fit")
     assert found is not None
 
-    # What every stage left, judged alike: homogeneous and both media as their stages ended, and what is reported.
+    # Judge the results of all stages in the same way: the homogeneous stage, the stage of both media, and the report.
     ends = {event.data["stage"]: tissue_of(event.data["parameters"]) for event in events if event.kind == "step"}
     reported = tissue_of({name: estimate.value for name, estimate in report.parameters["green"].items()})
     tooth = prepared_tooth(tmp_path, spec)
@@ -73,7 +73,8 @@ def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path:
     (before, before_se), (after, after_se) = ((sums.error, sums.error_se) for sums in held_out[1:])
     assert after + CERTAINTY * np.hypot(after_se, before_se) < (1 - MIN_GAIN) * before
 
-    # The texture against the painted one where light came through it; the common depth is the media's to share.
+    # Compare the texture to the painted one where light passed through it, up to a common depth that the media can
+    # explain.
     painted = stain_layout(read_mesh(capture / "teeth" / "11" / "outer.ply"), TEXEL_MM)
     fitted_texels = stain_layout(
         read_mesh(tmp_path / "prepared" / "teeth" / "11" / "outer.ply"), texel_edge_mm(PIXEL_MM)

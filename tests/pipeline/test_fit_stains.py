@@ -1,4 +1,6 @@
-"""A fit with stains from end to end on the fake engine: the texture is found, resumes, and reaches asset and report."""
+"""An end-to-end fit with stains on the fake engine: the texture is recovered, kept when a fit resumes, and part of
+asset and report.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.fit.execution.journal import read_entries
-from services.fit.export.stains import kept_stains
+from services.fit.export.stains import read_stains
 from services.fit.inputs.stain_uv import StainLayout, stain_layout, texel_edge_mm
 from services.fit.optics.parameters import Tissue
 from services.fit.stage import export, run
@@ -24,11 +26,11 @@ from tests.support.prepared import FAKE, SIZE, TRUTH, camera, sphere, write_prep
 
 RECIPE = single_tooth(sphere(4.0), None, np.array([[0.0, 300.0, -700.0]]), np.ones(1))
 PIXEL_MM = 0.5
-"""Cameras of the prepared stage stand 500 mm away with a focal length of 1000 pixels."""
+"""Pixel size at the tooth: the prepared stage's cameras are 500 mm away with a focal length of 1000 pixels."""
 
 
 def layout_of(root: Path) -> StainLayout:
-    # As the fit makes it, from the mesh as stored.
+    # Compute the layout as the fit does, from the stored mesh.
     return stain_layout(read_mesh(root / "prepared" / "teeth" / "11" / "outer.ply"), texel_edge_mm(PIXEL_MM))
 
 
@@ -44,8 +46,8 @@ def spec_for(root: Path, **options: Any) -> JobSpec:
     values: dict[str, Any] = {
         "capture": root, "boundary": "matched", "dentin": "known", "stains": True,
         "samples_per_pixel": 64, "max_samples_per_pixel": 256, "max_steps": 6, "search_candidates": 500,
-        # A gain of the instrument is much like a stain that is the same everywhere; what media cannot explain is to be
-        # the stains' here.
+        # A gain of the instrument is like a uniform stain, so it is left out; here stains must explain the residual of
+        # the media.
         "instrument": "off",
     }  # fmt: skip
     return JobSpec(**(values | options))
@@ -66,12 +68,12 @@ def test_the_texture_explains_what_media_cannot(stained: tuple[Path, FitReport, 
     last = {name: next(s for s in reversed(steps) if s["stage"] == name) for name in ("exact", "stained.2")}
     assert last["stained.2"]["loss"] < 0.5 * last["exact"]["loss"]
     assert last["stained.2"]["held_out_error"] < 0.5 * last["exact"]["held_out_error"]
-    # The fake engine's noise at 256 paths, 6 % of a pixel, leaves the texture about 2 %.
+    # The fake engine's noise at 256 paths is 6 % of a pixel and gives the texture an error of about 2 %.
     assert report.held_out_error["green"] < 0.03
 
-    # What pixels see of the texture, up to the common factor that the media may carry: half the surface is clean, so
-    # correlation needs both kinds right.
-    found = kept_stains(root / "fit")
+    # Compare the part of the texture that pixels show, up to a common factor that the media can explain. Half of the
+    # surface is clean, so the correlation is high only if clean and stained parts are both right.
+    found = read_stains(root / "fit")
     truth, layout = stained_truth(root)
     assert found is not None
     assert truth.stain is not None
@@ -103,7 +105,7 @@ def test_an_interrupted_fit_ends_with_the_same_texture(
         run(spec_for(tmp_path), LocalContext(tmp_path, 1, stop), engine=FAKE)
     again = run(spec_for(tmp_path), LocalContext(tmp_path, 2), engine=FAKE)
     assert again.model_dump(exclude={"seconds"}) == report.model_dump(exclude={"seconds"})
-    ours, other = kept_stains(tmp_path / "fit"), kept_stains(root / "fit")
+    ours, other = read_stains(tmp_path / "fit"), read_stains(root / "fit")
     assert ours is not None
     assert other is not None
     np.testing.assert_array_equal(ours.textures["green"].transmittance, other.textures["green"].transmittance)
@@ -113,13 +115,13 @@ def test_asset_and_report_carry_the_texture(stained: tuple[Path, FitReport, list
     root, _, _ = stained
     manifest = export(spec_for(root), LocalContext(root, 3))
     assert {"teeth/11/stain_green.npy", "teeth/11/stain_green.png", "teeth/11/outer.ply"} <= set(manifest.files)
-    kept = kept_stains(root / "fit")
+    kept = read_stains(root / "fit")
     assert kept is not None
     np.testing.assert_allclose(
         np.load(root / "asset/teeth/11/stain_green.npy"), kept.textures["green"].transmittance, rtol=1e-6
     )
     assert "teeth/11/stain_green.png" in (root / "asset/scene_green.xml").read_text()
-    # Vertices that the seams split are one again for whoever reads the surface.
+    # Reading the surface merges the vertices that the texture's seams split.
     assert len(read_mesh(root / "asset/teeth/11/outer.ply").vertices_mm) == len(sphere(4.0).vertices_mm)
     page = (root / "report.html").read_text()
     assert "<h2>Stains</h2>" in page
@@ -129,10 +131,10 @@ def test_asset_and_report_carry_the_texture(stained: tuple[Path, FitReport, list
 def test_a_clean_tooth_gets_no_texture(tmp_path: Path) -> None:
     write_prepared(tmp_path)
     plain = run(spec_for(tmp_path), LocalContext(tmp_path, 1), engine=FAKE)
-    assert kept_stains(tmp_path / "fit") is None
+    assert read_stains(tmp_path / "fit") is None
     compared = read_entries(tmp_path / "fit-checkpoint" / "journal.jsonl")["green/stain.compare"]
     assert compared["se"] > 0
-    # Then the answer is that of a fit that never looked.
+    # Then the result is that of a fit without stains.
     write_prepared(tmp_path / "without")
     without = run(spec_for(tmp_path / "without", stains=False), LocalContext(tmp_path / "without", 1), engine=FAKE)
     assert plain.parameters == without.parameters

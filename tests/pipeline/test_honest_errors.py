@@ -1,5 +1,5 @@
-"""The ± of whole fits is true: 95 % intervals hold the truth, from sensor noise to a mean cosine that was held at
-another value.
+"""The ± of whole fits is correct: 95 % intervals contain the truth, with errors from sensor noise to a mean cosine that
+was held at another value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ OPTIONS: dict[str, object] = {
 
 
 def held(fits: int, first: int, *, with_shape: bool = False) -> dict[str, int]:
-    """How many intervals of each quantity hold the truth."""
+    """Number of intervals that contain the truth, by quantity."""
     rng, count = np.random.default_rng(first), dict[str, int]()
     for seed in range(first, first + fits):
         truth = drawn_tissue(rng, with_shape=with_shape)
@@ -29,7 +29,7 @@ def held(fits: int, first: int, *, with_shape: bool = False) -> dict[str, int]:
 
 
 def test_a_few_fits_hold_the_truth() -> None:
-    # Of 6 honest intervals 4 or more hold the truth but for once in 680 times; of intervals half as wide once in 3.
+    # Of 6 correct intervals, fewer than 4 contain the truth once in 680 runs; of intervals half as wide, once in 3.
     found = held(6, 400)
     assert len(found) == 4
     assert min(found.values()) >= 4, found
@@ -37,7 +37,7 @@ def test_a_few_fits_hold_the_truth() -> None:
 
 @pytest.mark.slow
 def test_a_few_thicknesses_hold_the_truth() -> None:
-    # 2 of 3 or more but for once in 138 times; of intervals half as wide once in 4.
+    # Fewer than 2 of 3 correct intervals contain the truth once in 138 runs; of intervals half as wide, once in 4.
     found = held(3, 500, with_shape=True)
     assert found["enamel.thickness"] >= 2, found
 
@@ -45,7 +45,7 @@ def test_a_few_thicknesses_hold_the_truth() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_a_hundred_fits_hold_the_truth() -> None:
-    # 88 to 100 of 100: below 88 an honest 95 % comes once in 680 times.
+    # Of 100 correct intervals, fewer than 88 contain the truth once in 680 runs.
     found = held(100, 1000)
     assert min(found.values()) >= 88, found
 

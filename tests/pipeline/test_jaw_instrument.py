@@ -1,5 +1,5 @@
-"""A jaw's fit by a formula of photographs that are all brighter: one gain for all its teeth, and what each ± is made
-of.
+"""A jaw's fit with a formula engine to photographs that are all too bright: one gain for all teeth, and the parts of
+each ±.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def test_a_jaws_errors_are_those_of_one_instrument(brighter: tuple[Path, JobSpec
     assert list(found) == ["gain.green", *lights, "flare.c0.green", "flare.c1.green"]
     gain = found["gain.green"]
     assert gain.se is not None
-    # Two prior ± off: one fit at one seed, 3 of what it says.
+    # The gain's error is two prior standard errors. For one fit at one seed, the estimate is within 3 of its standard
+    # errors.
     assert abs(gain.value - (GAIN - 1)) < 3 * gain.se
     assert report.assumed == (*found, "teeth", "dome")
     assert report.instrument_told[0].startswith("Assumed, as the calibration does not state")

@@ -1,4 +1,4 @@
-"""A coarse virtual laboratory, from its raw frames to the comparison with the truth."""
+"""A coarse virtual laboratory, from its raw frames to the comparison of the fit with the truth."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def test_a_tooth_is_measured_from_raw_frames(tmp_path: Path) -> None:
     outcome = CliRunner().invoke(build_app(), arguments, catch_exceptions=False)
     assert outcome.exit_code == 0
     told = json.loads(outcome.stdout)
-    # The design's target, and three times what pixels of 0.19 mm leave of a turn
+    # The limits are the design's target for the position, and three times the error of rotation with pixels of 0.19 mm
     # (docs/measured/registration.md).
     assert told["steps"]["teeth_mm"] < 0.05
     assert told["steps"]["teeth_deg"] < 0.25
     asked = told["asked"]["held-out error over that with perfect calibration and pose"]
     assert asked["value"] < asked["limit"]
     assert (tmp_path / "summary.html").is_file()
-    # What is there and whole is kept.
+    # A complete existing result is kept.
     before = (tmp_path / TRUTH / LAB_RECORD).stat().st_mtime_ns
     assert not make_lab(tmp_path, COARSE_SIZE, 3, 1, lambda _: None)
     assert (tmp_path / TRUTH / LAB_RECORD).stat().st_mtime_ns == before

@@ -1,4 +1,4 @@
-"""Who may light a dome through a job, which one, and how far: the server decides, whatever the job asks for."""
+"""The server decides who may light a dome by a job, which dome, and up to which dose, whatever the job requests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from services.api.app import create_app
 from services.api.auth.tokens import Scope
 from services.api.jobs.repository import Repository
-from services.api.server import _dark_at_once
+from services.api.server import _darken_on_signal
 from services.core.records import JobSpec
 from services.core.settings import DomeSettings, ServerSettings
 from tests.support.guarded_server import Guarded, guarded, make_token
@@ -34,7 +34,7 @@ SETTINGS = DomeSettings(
 
 
 class Ran:
-    """In place of the stages: keeps the options that a job was run with."""
+    """Stand-in for the stages that records the options of a job."""
 
     def __init__(self) -> None:
         self.specs: list[JobSpec] = []
@@ -56,7 +56,7 @@ def server(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guard
 
 @pytest.fixture(scope="module")
 def chair(server: Guarded) -> Callable[..., httpx.Response]:
-    """Ask as one who may submit jobs and operate the dome."""
+    """Function that sends requests with a token that may submit jobs and operate the dome."""
     token = make_token(server.data, "chair", Scope.SUBMIT, Scope.OPERATE_DOME)
     return lambda method, path, **options: server.ask(
         method, path, headers={"Authorization": f"Bearer {token}"}, **options
@@ -88,7 +88,7 @@ def test_a_retry_that_lights_a_dome_needs_the_scope_too(server: Guarded, chair: 
     for one in made.values():
         server.ask("GET", f"/v1/jobs/{one}/events", Scope.READ)
     assert problem_of(server.ask("POST", f"/v1/jobs/{made[OWN]}/retry", Scope.SUBMIT))[:2] == (403, "scope-missing")
-    # It succeeded, so there is nothing to do again; what counts is that the scope was not asked for.
+    # The job succeeded, so a retry is refused for its state; the point is that the scope was not required.
     assert problem_of(chair("POST", f"/v1/jobs/{made[OWN]}/retry"))[:2] == (409, "job-state")
     assert problem_of(server.ask("POST", f"/v1/jobs/{made['simulated']}/retry", Scope.SUBMIT))[:2] == (409, "job-state")
 
@@ -166,7 +166,7 @@ def test_a_job_that_was_accepted_under_other_settings_lights_nothing(tmp_path: P
 
 def test_a_signal_darkens_before_open_requests_are_waited_for() -> None:
     darkened, left = threading.Event(), []
-    server = _dark_at_once(SimpleNamespace(handle_exit=lambda sig, _frame: left.append(sig)), darkened.set)  # type: ignore[arg-type]
+    server = _darken_on_signal(SimpleNamespace(handle_exit=lambda sig, _frame: left.append(sig)), darkened.set)  # type: ignore[arg-type]
     server.handle_exit(15, None)
     assert darkened.wait(60)
     assert left == [15]

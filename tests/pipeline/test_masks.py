@@ -1,4 +1,4 @@
-"""Masks by hand: over the API, into the preparation, and what a changed one makes of a job that is done."""
+"""Masks by hand: over the API, in the preparation, and the effect of a changed mask on a finished job."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Bits = NDArray[np.uint8]
 
 
 class InThisProcess:
-    """The pipeline's own order of stages without workers: a real preparation, then a toy fit and export."""
+    """Runs the pipeline's stages in order without workers: a real preparation, then a toy fit and export."""
 
     def __init__(self) -> None:
         self.go = threading.Event()
@@ -86,7 +86,7 @@ def mouth(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def finished(client: httpx.Client, mouth: Path, **options: Any) -> str:
-    """A new job that has succeeded."""
+    """Submit a job and wait for its success; returns its id."""
     job: str = client.post("/v1/jobs", json={"capture": str(mouth), **options}).json()["id"]
     assert state_at_end(client, job) == "SUCCEEDED"
     return job
@@ -99,7 +99,7 @@ def state_at_end(client: httpx.Client, job: str) -> str:
 
 
 def mask(*rows: slice) -> bytes:
-    """A mask of some rows."""
+    """PNG of a mask of some rows."""
     bits = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     for one in rows:
         bits[one] = 255
@@ -152,7 +152,7 @@ def test_a_mask_is_prepared_again_and_nothing_of_before_is_left(client: httpx.Cl
     quality = json.loads((folder / "prepared" / "quality.json").read_text())["images"]
     assert [round(image["masked"].get("manual", 0), 3) > 0 for image in quality] == [True, True, False, False]
 
-    # Taken back, both of them, it is as before.
+    # After both masks are deleted, the result is as before.
     for light in ("l1", "all"):
         assert client.delete(f"/v1/jobs/{job}/masks/c0/{light}").status_code == 204
     assert client.get(f"/v1/jobs/{job}/masks/c0/all").json()["code"] == "mask-unknown"
@@ -247,7 +247,7 @@ def shared_job(client: httpx.Client, mouth: Path) -> str:
 def test_masks_of_other_programs_are_taken(
     client: httpx.Client, mouth: Path, data: Path, depth: int, shared_job: str
 ) -> None:
-    """As Pillow writes them."""
+    """Masks as Pillow writes them are accepted."""
     image = pytest.importorskip("PIL.Image")
     bits = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     bits[5:8, 3:21] = 255

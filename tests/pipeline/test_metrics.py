@@ -1,4 +1,4 @@
-"""What is scraped agrees with what happened, stays bounded, and costs few queries."""
+"""Scraped metrics agree with the events, have a bounded number of series, and need few queries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The light or view that is advised does what was said of it."""
+"""The advised light or view lowers the errors as predicted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ import pytest
 
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera
-from services.fit.checks.next_capture import LIGHTS, VIEWS, Candidate, Sensor, advice, probes_of, sentence, turned
+from services.fit.checks.next_capture import (
+    LIGHTS,
+    VIEWS,
+    Candidate,
+    Sensor,
+    capture_advice,
+    probes_of,
+    rotated_camera,
+    sentence,
+)
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block, write_recipe
 from services.fit.execution.engine_host import InProcessHost
 from services.fit.execution.executors import LocalExecutor
@@ -18,7 +27,7 @@ from services.fit.execution.passes import Passes, StackProblem
 from services.fit.execution.seeds import Seeds
 from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.estimates import estimates
-from services.fit.solve.information import Addition, covariance_with
+from services.fit.solve.information import AddedInformation, covariance_with
 from services.fit.tooth.schedule import media_domain
 from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
 from tests.support.fake_engine import FakeEngine
@@ -55,8 +64,7 @@ def problem_of(folder: Path, recipe: SceneRecipe) -> StackProblem:
 
 
 def known_of(problem: StackProblem) -> Uncertainty:
-    # At the truth, where nothing is left of the step to the minimum but what noise makes of it; that is no part of a
-    # prediction.
+    # Linearise at the truth, where the step to the minimum is only noise, which is not part of a prediction.
     x = DOMAIN.x_of(TRUTH)
     known = uncertainty(DOMAIN, x, problem.linearise(x, samples=SAMPLES, step=0))
     assert known.sandwich is not None
@@ -70,7 +78,7 @@ def few_lights(
     folder = tmp_path_factory.mktemp("few")
     problem = problem_of(folder, scene((-300.0, 300.0, -700.0)))
     known = known_of(problem)
-    text, candidates = advice(problem, known, folder, PARTS, SENSOR, WEIGHT, SAMPLES)
+    text, candidates = capture_advice(problem, known, folder, PARTS, SENSOR, WEIGHT, SAMPLES)
     return problem, known, text, candidates, folder
 
 
@@ -93,7 +101,7 @@ def test_adding_a_light_gives_the_error_that_was_predicted(
         for name in ("enamel.sigma_s_reduced", "enamel.sigma_a", "dentin.sigma_s_reduced", "dentin.sigma_a"):
             assert after[name].se == pytest.approx(actual[name].se, rel=0.3), (words, name)
             changed += (actual[name].se or 0.0) < 0.7 * (before[name].se or 0.0)
-    # Predictions of no change at all would not have passed.
+    # The test would fail for predictions of no change.
     assert changed > 4
 
 
@@ -112,7 +120,7 @@ def test_where_nothing_helps_that_is_said(
     few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path],
 ) -> None:
     _, known, _, _, _ = few_lights
-    nothing = Addition(np.zeros((4, 4)), np.zeros((4, 4)))
+    nothing = AddedInformation(np.zeros((4, 4)), np.zeros((4, 4)))
     assert sentence(TRUTH, PARTS, known, [Candidate("A light above", (nothing, nothing))]).startswith(
         "None of the 1 further lights and views"
     )
@@ -125,8 +133,8 @@ def test_new_images_have_the_errors_that_are_known_and_one_of_their_own(tmp_path
     blocks = (write_block(tmp_path, replace(block, instrument=known)),)
     problem = replace(problem, passes=replace(problem.passes, blocks=blocks))
     lights, *views = probes_of(problem, tmp_path)[1]
-    # A new light under the fit's camera has that camera's flare, and a gain of its own; a new camera the old lights'
-    # gains, and a flare.
+    # A new light with the fit's camera has that camera's flare and a new gain; a new camera has the old lights' gains
+    # and a new flare.
     acting = read_block(lights.block).instrument
     assert acting is not None
     assert (acting.flare, acting.lights[:2], lights.own_error) == (known.flare, ("light_gain.a", ""), "light_gain")
@@ -139,7 +147,7 @@ def test_new_images_have_the_errors_that_are_known_and_one_of_their_own(tmp_path
 def test_a_turned_camera_keeps_its_distance_and_looks_at_the_tooth() -> None:
     first, centre = camera("c0"), np.array([1.0, -2.0, 3.0])
     before, depth = first.project(centre[None])
-    moved: Camera = turned(first, centre, np.array([0.0, 1.0, 0.0]))
+    moved: Camera = rotated_camera(first, centre, np.array([0.0, 1.0, 0.0]))
     after, moved_depth = moved.project(centre[None])
     np.testing.assert_allclose(after, before, atol=1e-6)
     np.testing.assert_allclose(moved_depth, depth)

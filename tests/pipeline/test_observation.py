@@ -1,4 +1,4 @@
-"""What a job did, as the API shows it: log, curve, pictures, archive, presets, and jobs that fit a filter."""
+"""Observation of jobs over the API: log, loss curve, pictures, archive, presets, and filtered lists."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
 
 @pytest.fixture(scope="module")
 def job(client: httpx.Client) -> str:
-    """Path of a job that has run."""
+    """URL path of a job that has run."""
     return run_job(client)
 
 

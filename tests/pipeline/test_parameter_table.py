@@ -1,4 +1,4 @@
-"""What a job has measured, as a table that a spreadsheet opens."""
+"""A job's measured parameters as a table for spreadsheets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FILES = {
     1: json.dumps({name: {leaf: one.model_dump() for leaf, one in row.items()} for name, row in MEASURED.items()}),
     2: '{"green": {"enamel.sigma": 3}}',
 }
-"""By the job's seed; other jobs write none."""
+"""Contents of the parameter file by the job's seed; jobs with other seeds write none."""
 
 
 def measure(spec: JobSpec, folder: Path, _events: object) -> None:
@@ -40,7 +40,7 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
 
 
 def ask_table(client: httpx.Client, **options: Any) -> tuple[str, httpx.Response]:
-    """The id of a job that has run, and the answer with its table."""
+    """Run a job; returns its id and the answer with its table."""
     job = client.post("/v1/jobs", json={"capture": "/"} | options).json()["id"]
     assert 'data: "SUCCEEDED"' in client.get(f"/v1/jobs/{job}/events").text
     return job, client.get(f"/v1/jobs/{job}/parameters.csv")

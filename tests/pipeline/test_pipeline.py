@@ -1,4 +1,4 @@
-"""What the pipeline promises around any stages: order, resume, retry, cancel, one owner."""
+"""Guarantees of the pipeline for any stages: order, resume, retry, cancel, and a single owner."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""A virtual jaw from the command that writes it to the prepared store: every pixel's surface and mask is what a ray
-tracer sees.
+"""A virtual jaw from the command that writes it to the prepared store: surface and mask of every pixel agree with a ray
+tracer.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def scene(capture: Path) -> RayScene:
 
 
 def first_surface(scene: RayScene, camera: Camera, offset: tuple[float, float]) -> NDArray[np.int64]:
-    """Number (H, W) of the surface that a ray through each pixel meets first, -1 for none."""
+    """Index (H, W) of the surface that a ray through each pixel hits first, -1 for none."""
     hits = scene.first_hits(*pixel_rays(camera, offset))
     return np.where(hits.hit, hits.mesh, -1).reshape(camera.size[::-1])
 
@@ -98,15 +98,15 @@ def test_everything_but_the_background_is_valid_for_a_jaw(capture: Path, scene: 
         width, height = camera.size
         surface, valid = arrays["surface"][k, :height, :width], arrays["valid"][k, :, :height, :width]
         traced = first_surface(scene, camera, (0.5, 0.5))
-        # A ray along an edge may fall on either side of it; the z-buffer counts edges as inside.
+        # A ray along an edge may hit either side of it; the z-buffer counts edges as inside.
         assert np.count_nonzero(surface != traced) <= 2
         shown |= set(surface.reshape(-1).tolist())
         met = [first_surface(scene, camera, offset) >= 0 for offset in ((0.5, 0.5), (0, 0), (1, 0), (0, 1), (1, 1))]
         outside = valid & MaskBit.OUTSIDE > 0
         assert all(np.count_nonzero(one != ~np.all(met, axis=0)) <= 2 for one in outside)
         assert (arrays["surface"][k, height:] == -1).all()
-        # Of what is left only pixels without light, whose variance is 0, are not used: a matched surface reflects
-        # nothing.
+        # Of the other pixels only unlit ones, whose variance is 0, are not valid, because a matched surface has no
+        # highlights.
         assert set(np.unique(valid[~outside]).tolist()) <= {0, int(MaskBit.NOT_FINITE)}
         dark = arrays["variance"][k, :, :height, :width, 0] == 0
         assert np.array_equal(valid & MaskBit.NOT_FINITE > 0, dark)
@@ -140,7 +140,7 @@ def test_a_hidden_tooth_is_named_and_does_no_harm(capture: Path, tmp_path: Path)
     log: list[str] = []
     manifest, _ = prepare(tmp_path / "capture", tmp_path, log=log)
     pixels = dict(zip(manifest.fdi, manifest.tooth_pixels, strict=True))
-    # From the patient's right the last teeth of the left are behind the front ones.
+    # Seen from the patient's right, the last teeth on the left are hidden by the front ones.
     assert pixels[27] == 0 < pixels[11]
     (line,) = [message for message in log if "nothing will be known" in message]
     assert "27" in line
@@ -159,7 +159,7 @@ def test_surroundings_that_bound_nothing_are_refused(capture: Path, tmp_path: Pa
         prepare(with_gums("open", Mesh(gums.vertices_mm, gums.faces[1:])), tmp_path / "a")
     with pytest.raises(MeshError, match=r"gums\.ply is 0\.06.* units across"):
         prepare(with_gums("metres", Mesh(gums.vertices_mm / 1000, gums.faces)), tmp_path / "b")
-    # Gums that cover all teeth.
+    # These gums cover all teeth.
     cover = trimesh.creation.icosphere(radius=45.0)
     with pytest.raises(CaptureInputError, match="No tooth projects"):
         prepare(

@@ -1,4 +1,4 @@
-"""A preparation whose arrays lie on an S3 server: the same pixels, counted requests, kills, losses and refusals."""
+"""A preparation with its arrays on an S3 server: the same pixels, the number of requests, kills, losses, refusals."""
 
 from __future__ import annotations
 
@@ -70,7 +70,8 @@ def pointer(root: Path) -> dict[str, Any]:
 def test_same_pixels_by_one_put_a_shard(server: S3Server, capture: Path, tmp_path: Path) -> None:
     here, there = prepare(capture, tmp_path / "here"), prepare(capture, tmp_path / "there", store=URL)
     assert here == there
-    # An object an image in three arrays, one a camera in one, and the descriptions of the arrays and of their group
+    # Three arrays have one object per image, one array has one per camera, and each array and their group have a
+    # description.
     shards, descriptions = 3 * IMAGES + 2, len(ARRAYS) + 1
     assert server.count("PUT", found=True) == shards + descriptions == len(server.objects())
     assert not [one for one in (tmp_path / "there" / "prepared").rglob("c") if one.is_dir()]
@@ -90,7 +91,7 @@ def test_shadows_are_flagged_there_too(server: S3Server, capture: Path, tmp_path
 
 
 def of_size(root: Path, size: tuple[int, int]) -> Path:
-    """One camera of this size that sees the same tooth by as many pixels, 90 of them across, in its middle."""
+    """Write a capture of one camera of this image size, with the same tooth of 90 pixels across at its centre."""
     root.mkdir()
     tree = write_folder(root)
     width, height = size
@@ -105,9 +106,9 @@ def of_size(root: Path, size: tuple[int, int]) -> Path:
 
 
 def test_reading_a_tooth_at_a_level_asks_as_often_of_any_size(server: S3Server, tmp_path: Path) -> None:
-    """In an image 16 times as large the tooth is read by as many requests, and nearly as many bytes."""
+    """In an image 16 times as large, reading the tooth needs the same number of requests and nearly as many bytes."""
     asked = []
-    # Multiples of the pieces' 512 px, so that the tooth lies across four of them in both
+    # The sizes are multiples of the chunks' 512 px, so that the tooth lies across four chunks in both.
     for edge in (1024, 4096):
         root = tmp_path / f"{edge}"
         prepare(of_size(tmp_path / f"capture-{edge}", (edge, edge)), root, store=URL)
@@ -121,16 +122,16 @@ def test_reading_a_tooth_at_a_level_asks_as_often_of_any_size(server: S3Server, 
         numbers = sum(one.bytes for one in server.asked if "valid" not in one.key)
         asked.append((server.count("GET"), numbers, sum(one.bytes for one in server.asked) - numbers))
     small, large = asked
-    # A description of each of three arrays, then one object for each array and light
+    # There is one request for the description of each of three arrays, then one for each array and light.
     assert small[0] == large[0] == 3 + 3 * 2
-    # 16 bytes of index a piece, and other noise
+    # The larger image has 16 bytes of index more per chunk, and its noise compresses differently.
     assert large[1] <= 1.02 * small[1]
-    # The mask is one piece; beside the tooth it is all alike, and LZ4 takes a 255th of that at best
+    # The mask is one chunk. It is constant outside the tooth, and LZ4 compresses that to a 255th at best.
     assert large[2] <= 2 * 2 * 4096**2 / 200
 
 
 def begin(capture: Path, root: Path, attempt: int) -> subprocess.Popen[bytes]:
-    """An attempt in a process of its own."""
+    """Start an attempt in a process of its own."""
     code = (
         "import sys; from pathlib import Path; from services.core.records import JobSpec;"
         "from services.core.stage import LocalContext; from services.preprocess.stage import run;"
@@ -141,9 +142,8 @@ def begin(capture: Path, root: Path, attempt: int) -> subprocess.Popen[bytes]:
 
 
 def test_killed_while_it_writes(server: S3Server, capture: Path, tmp_path: Path) -> None:
-    """Killed by signal 9 while a shard is on its way, before and after it is stored, until an attempt ends.
-
-    What is there then is what an undisturbed one leaves.
+    """Attempts are killed by SIGKILL while they send a shard, before and after it is stored, until one ends. The store
+    is then that of an undisturbed attempt.
     """
     prepare(capture, tmp_path / "whole", store=URL)
     whole = {name.partition("prepared.zarr/")[2]: content for name, content in server.objects().items()}
@@ -192,7 +192,7 @@ def test_images_that_a_server_lost_meanwhile_are_made_again(
     server.remove(lost)
     server.asked.clear()
     run(JobSpec(capture=capture, store=URL), LocalContext(tmp_path / "job", 2))
-    # That image alone: radiance, variance and valid
+    # Only this image is written again: radiance, variance and valid.
     assert server.count("PUT") == 3
     prepare(capture, tmp_path / "here")
     assert_same(tmp_path / "here", tmp_path / "job")
@@ -226,7 +226,7 @@ def test_what_was_published_and_is_gone_is_told_and_made_anew(
 def test_a_server_that_refuses(
     server: S3Server, capture: Path, tmp_path: Path, status: str, sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At its beginning, and once it has written: the job then goes on."""
+    """The server refuses at the start, and after some writes; afterwards the job continues."""
     monkeypatch.setattr(object_store, "RETRIES", 1)
     server.before = lambda *_: status
     with pytest.raises(StoreError, match=rf"^The S3 server of {URL}/\S+ {sentence}.*\.$"):
@@ -264,7 +264,7 @@ def test_an_endpoint_where_nobody_listens(capture: Path, tmp_path: Path, monkeyp
 def test_without_credentials(
     server: S3Server, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacks: tuple[str, ...]
 ) -> None:
-    """Without any the library asks where Amazon's machines are told theirs, which is no place here."""
+    """Without credentials the library queries the metadata service of Amazon's machines, which does not exist here."""
     for name in lacks:
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_METADATA_ENDPOINT", "http://127.0.0.1:9")

@@ -1,6 +1,4 @@
-"""Preparation of a captured rig whose motion and highlights are known: frames of a moving, glossy tooth by stock
-Mitsuba.
-"""
+"""Preparation of a rig capture with known motion and highlights: frames of a moving, glossy tooth by stock Mitsuba."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ from services.preprocess.stage import run
 from tests.support.rig_capture import Rendered, write_capture
 
 LIGHTS = 12
-# All lights on before every fourth light and at the end
+# A frame with all lights on comes before every fourth light and at the end.
 ORDER = [light for k in range(LIGHTS) for light in ((-1, k) if k % 4 == 0 else (k,))] + [-1]
 FRAMES = tuple((light, k / (len(ORDER) - 1)) for k, light in enumerate(ORDER))
 AMPLITUDE_MM = 0.35
@@ -36,7 +34,7 @@ AMPLITUDE_MM = 0.35
 
 @pytest.fixture(scope="module")
 def renders(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
-    """Two views of 0.09 mm pixels; 12 lights, GGX roughness 0.1."""
+    """Renders of two views with pixels of 0.09 mm, 12 lights and GGX roughness 0.1."""
     out = tmp_path_factory.mktemp("renders") / "tooth.npz"
     options = {
         "size": [124, 156],
@@ -67,7 +65,7 @@ def description(renders: Mapping[str, Any]) -> Rendered:
 
 
 def true_displacement(rendered: Rendered, camera: Camera, footprint: Footprint, motion: np.ndarray) -> np.ndarray:
-    """Where each reference pixel's surface point is seen in a frame, minus the pixel; NaN beside the tooth."""
+    """Displacement in pixels of each reference pixel's surface point in a frame; NaN beside the tooth."""
     points = footprint.points_mm(camera, slice(None)).reshape(-1, 3).astype(np.float64)
     image, _ = camera.project(points @ motion[:3, :3].T + motion[:3, 3])
     width, height = camera.size
@@ -88,8 +86,8 @@ def moved(
 def test_residual_motion(
     moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]
 ) -> None:
-    """At most 0.2 px in the median after stabilisation (acceptance), of a motion of several pixels that includes a nod
-    and a turn.
+    """After stabilisation the median residual motion is at most 0.2 px (acceptance); the motion is several pixels and
+    includes a nod and a turn.
     """
     root, rendered, manifest, _ = moved
     folder, _ = open_stage(root, "prepared", PreparedManifest)
@@ -112,7 +110,7 @@ def test_residual_motion(
 def test_highlight_energy(
     moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]
 ) -> None:
-    """At least 90 % of the reflected light masked (acceptance; the goal is 95 %), and at most 3 % of the pixels that
+    """At least 90 % of the reflected light is masked (acceptance; the goal is 95 %), and at most 3 % of the pixels that
     reflect less than the noise of 1 %.
     """
     root, rendered, _, _ = moved
@@ -137,16 +135,16 @@ def test_highlight_energy(
 
 
 def test_still_capture_keeps_radiance_and_variance(renders: Mapping[str, Any], tmp_path: Path) -> None:
-    """Without motion a pixel is the rendered radiance plus the sensor's noise and nothing else.
+    """Without motion a pixel is the rendered radiance plus the sensor's noise.
 
-    About 300,000 z-scores against the true variance: mean and mean square within 5 standard errors (1e-6 false alarms
-    each), clipping and rounding included in the variance; black frames are shared within a camera, which correlates the
-    images of one pixel and triples the error.
+    For about 300,000 z-scores with the true variance, mean and mean square are tested to 5 standard errors (1e-6 false
+    alarms each). The variance includes clipping and rounding. Black frames are shared within a camera, which correlates
+    the images of a pixel and triples the error.
     """
     frozen = {**renders, "total": renders["total"].copy()}
     first = {light: number for number, (light, _) in enumerate(FRAMES) if light >= 0}
     rendered = description(frozen)
-    # Every all-on frame is the first one: the subject holds still
+    # All frames with all lights on are copies of the first one, as if the subject held still.
     for number, (light, _) in enumerate(FRAMES):
         if light < 0:
             rendered.radiance[:, number] = rendered.radiance[:, 0]
@@ -180,7 +178,7 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
     assert (events[0].kind, events[-1].kind) == ("started", "finished")
     report = read_record(root / "prepared" / "quality.json", QualityReport)
     assert sum(image.valid_by_tooth[11] for image in report.images) == manifest.tooth_pixels[0]
-    # Interpolated between four tracking frames, its own error is told and small
+    # The motion is interpolated between four tracking frames, and its stated error is small.
     assert all(image.motion_error_px is not None and image.motion_error_px < 0.5 for image in report.images)
     assert len(report.images) == 2 * LIGHTS
     assert (
@@ -191,8 +189,8 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
         (root / "prepared" / "quality" / f"{image.camera}_{image.light}.png").stat().st_size > 1000
         for image in report.images
     )
-    # Flow knows nothing of the scan: it sees the motion, and little but its own errors of some 0.2 px once it is taken
-    # out
+    # Optical flow does not use the scan. It shows the motion before stabilisation, and afterwards little more than its
+    # own errors of some 0.2 px.
     assert [flow.camera for flow in report.flows] == [camera.name for camera in rendered.cameras]
     for flow in report.flows:
         assert flow.before_px[0] > 2
@@ -200,7 +198,7 @@ def test_events_quality_and_pictures(moved: tuple[Path, Rendered, PreparedManife
         for name in ("before", "after"):
             assert (root / "prepared" / "quality" / "flow" / f"{flow.camera}_{name}.png").stat().st_size > 1000
             assert f'src="flow/{flow.camera}_{name}.png"' in (root / "prepared" / "quality" / "index.html").read_text()
-    # No light was named and the capture marks none: every fourth is kept from the fit, in all cameras
+    # Neither the job nor the capture names held-out lights, so every fourth light is held out in all cameras.
     assert manifest.held_out == tuple((camera.name, f"l{k}") for camera in rendered.cameras for k in (3, 7, 11))
 
 
@@ -216,7 +214,7 @@ def test_cancel_between_images_publishes_nothing(
     with pytest.raises(JobCancelledError):
         run(JobSpec(capture=root), LocalContext(tmp_path, listener=cancel_after_two))
     assert not (tmp_path / "prepared").exists()
-    # The next attempt starts over in the same folder
+    # The next attempt works in the same folder.
     (tmp_path / "cancel").unlink()
     with pytest.raises(JobCancelledError):
         run(JobSpec(capture=root), LocalContext(tmp_path, listener=cancel_after_two))

@@ -1,4 +1,4 @@
-"""A preparation that is cut off anywhere and gone on with leaves the very store that an undisturbed one leaves, here
+"""A preparation that is interrupted anywhere and resumed leaves the same store as an undisturbed one, in one process
 and on workers.
 """
 
@@ -33,15 +33,15 @@ from tests.support.folder_captures import write_folder, write_tree
 
 KILLS = 50
 IMPORTED = tuple(f"services.preprocess.{name}" for name in ("opening", "tasks.blocks", "tasks.plan", "tasks.summary"))
-"""What an attempt imports once it has begun."""
+"""Modules that an attempt imports after it has begun."""
 
 
 class KilledError(BaseException):
-    """In place of a kill: nothing catches it."""
+    """Exception that stands for a kill, because nothing catches it."""
 
 
 def contents(root: Path) -> dict[str, Any]:
-    """Every file of the published store, and its manifest but for the number of the attempt."""
+    """Every file of the published store, and its manifest without the number of the attempt."""
     folder = root / "prepared"
     files: dict[str, Any] = {
         path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
@@ -53,7 +53,7 @@ def contents(root: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """A folder capture and what becomes of it."""
+    """A folder capture and the contents of its store after an undisturbed preparation."""
     capture, root = tmp_path_factory.mktemp("capture"), tmp_path_factory.mktemp("whole")
     write_folder(capture)
     run(JobSpec(capture=capture), LocalContext(root))
@@ -61,7 +61,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[st
 
 
 def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
-    """Kill at the n-th of the writes: each begins or ends with one of these calls."""
+    """Raise ``KilledError`` at the n-th write; every write begins or ends with one of the patched calls."""
     count = 0
 
     def counted(original: Any, *, after: bool) -> Any:
@@ -89,9 +89,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
 def test_killed_at_any_write(
     undisturbed: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Killed after a few writes, and the next attempt likewise, until one ends; finding one camera's view takes seven
-    of them.
-    """
+    """Every attempt is killed after a few writes until one ends; finding the view of one camera takes seven writes."""
     capture, expected = undisturbed
     attempts = 0
     for attempt in range(1, 20):
@@ -162,10 +160,10 @@ def test_an_attempt_that_was_overtaken_records_nothing(
 
 
 def test_on_workers(undisturbed: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """Blocks of a stage that runs as a Dask task are tasks of the same cluster; the store is the same."""
+    """The blocks of a stage that runs as a Dask task are tasks of the same cluster, and the store is the same."""
     capture, expected = undisturbed
     with (
-        # As if no test before had opened workers in this process, whose settings are for processes of their own.
+        # Reset the settings of workers as separate processes, which earlier tests may have made in this process.
         dask.config.set({"distributed.worker.preload": []}),
         LocalCluster(
             n_workers=1,
@@ -181,18 +179,18 @@ def test_on_workers(undisturbed: tuple[Path, dict[str, Any]], tmp_path: Path) ->
         )
         stage.result(timeout=60)
         made = {str(row[0]) for row in cluster.scheduler.transition_log if str(row[0]).startswith("prepare-1-block-")}
-    # Two cameras are looked at, two blocks a camera follow
+    # There is one task per camera for its view, for two cameras, and then at least two blocks.
     assert len(made) >= 4
     assert contents(tmp_path) == expected
 
 
 def prepare(capture: Path, root: Path, attempt: int) -> None:
-    """One attempt, in a process of its own."""
+    """Run one attempt; called in a process of its own."""
     run(JobSpec(capture=capture), LocalContext(root, attempt))
 
 
 def start(capture: Path, root: Path, attempt: int) -> BaseProcess:
-    """Begin an attempt in a copy of a process that has imported all: what is killed is work, and not imports."""
+    """Start an attempt in a fork of a process that has imported all modules, so that kills strike work, not imports."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["distributed", "services.preprocess.stage", *IMPORTED, __name__])
     child = context.Process(target=prepare, args=(capture, root, attempt))
@@ -201,9 +199,9 @@ def start(capture: Path, root: Path, attempt: int) -> BaseProcess:
 
 
 def ended(child: BaseProcess, within_s: float = math.inf) -> tuple[bool, float]:
-    """Whether it has ended well within so much of its own processor time, else it is killed; and how much it took.
+    """Let a child run for a limited processor time, then kill it; returns whether it had ended, and the time it took.
 
-    Processor time is the same on a busy machine. A child that failed ends the test.
+    Processor time is used because it is the same on a busy machine. A child that failed fails the test.
     """
     process, used_s = psutil.Process(child.pid), 0.0
     while child.exitcode is None:
@@ -221,7 +219,7 @@ def ended(child: BaseProcess, within_s: float = math.inf) -> tuple[bool, float]:
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 def test_killed_at_random(tmp_path: Path) -> None:
-    """12 frames of 2 megapixels; a process is killed by signal 9 at random moments, 50 times in all."""
+    """With 12 frames of 2 megapixels, processes are killed by SIGKILL at random moments, 50 times in all."""
     rng, capture = random.Random(7), tmp_path / "capture"
     capture.mkdir()
     tree = write_folder(capture)

@@ -1,4 +1,4 @@
-"""The flag for shadows in a prepared store, where a job asks for it."""
+"""The mask bit for shadows in a prepared store, for jobs that request it."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from tests.support.folder_captures import prepare
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 
 CAMERA = camera(0.125)
-"""Pixels half as large as those in which shadows are looked for."""
+"""Camera with pixels half as large as those at which shadows are searched."""
 SHADED, RADIUS_MM = 3, 2.5
-"""The light before which a ball stands that no file of the capture shows."""
+"""Index of a light with a ball in front of it that is in no file of the capture, and the ball's radius."""
 
 
 def write_capture(root: Path, lights: int) -> NDArray[np.bool_]:
-    """A folder capture of a ball; returns which pixels lie in the shadow."""
+    """Write a folder capture of a ball; returns the mask of the pixels in the shadow."""
     write_mesh(root / "teeth" / "11" / "outer.ply", ball(BALL_MM))
     view, rng = project(CAMERA, [ball(BALL_MM)]), np.random.default_rng(5)
     points = view.points_mm(CAMERA, slice(None))
@@ -75,7 +75,7 @@ def test_shadows_are_flagged_where_a_job_asks(tmp_path: Path) -> None:
 def test_shading_that_was_cut_off_is_done_again_on_another_worker(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As Dask runs a block again whose worker died after it had written an image's flags and before their record."""
+    """Dask runs a block again if its worker died between writing an image's flags and writing their record."""
     (tmp_path / "capture").mkdir()
     write_capture(tmp_path / "capture", lights=8)
     kept = Block.__call__

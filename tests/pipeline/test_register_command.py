@@ -1,4 +1,4 @@
-"""``dentine register`` on a raw folder of a phantom mouth, and what it says where a folder cannot be registered."""
+"""``dentine register`` on a raw folder of a phantom mouth, and its messages for folders that cannot be registered."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def altered(mouth: RawMouth, root: Path, change: Tree) -> Path:
 
 
 def twist_to_truth(record: Registration, mouth: RawMouth) -> np.ndarray:
-    # About the teeth's centre.
+    # The twist is about the teeth's centre.
     pose = np.array(record.rig_from_scan)
     return RigidPose(pose[:3, :3], pose[:3, 3]).twist_to(mouth.rig_from_scan, np.array(record.centre_mm))
 
 
 def require_near(record: Registration, mouth: RawMouth) -> None:
-    # Six front teeth beside others that the scan does not have: the design's target of 0.05 mm. Few teeth leave the
-    # tilt open by more than its 0.1 degrees, which the record has to say: all six parts within 22.5, what one draw in a
-    # thousand exceeds (chi squared).
+    # The scan has six front teeth, the photographs show more. The position meets the design's target of 0.05 mm. So few
+    # teeth determine the tilt less well than the target of 0.1 degrees, and the record must state that: chi squared of
+    # all six components is below 22.5, which one draw in a thousand exceeds.
     twist = twist_to_truth(record, mouth)
     assert np.linalg.norm(twist[3:]) < 0.05
     assert twist @ np.linalg.solve(record.uncertainty.matrix, twist) < 22.5
-    # A record that says that nothing is known would pass the last line.
+    # The stated errors must also be small, because a record with huge errors would pass the last line.
     assert np.sqrt(np.diag(record.uncertainty.matrix)[3:]).max() < 0.05
     assert np.degrees(np.sqrt(np.diag(record.uncertainty.matrix)[:3])).max() < 0.3
 
@@ -55,7 +55,7 @@ def test_a_whole_arch_meets_the_target(tmp_path: Path) -> None:
     mouth = write_raw_mouth(tmp_path, places=7)
     record = register_folder(tmp_path)
     twist = twist_to_truth(record, mouth)
-    # The target of the design.
+    # The limits are the design's targets.
     assert np.linalg.norm(twist[3:]) < 0.05
     assert np.degrees(np.linalg.norm(twist[:3])) < 0.1
     assert record.misfit_mm < 0.1
@@ -64,7 +64,7 @@ def test_a_whole_arch_meets_the_target(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_another_persons_scan_is_refused_and_ones_own_is_not(tmp_path: Path, seed: int) -> None:
-    # Subjects that no threshold was looked at with; the operator clicks the same points of the wrong person's teeth.
+    # No threshold was chosen with these subjects. The operator clicks the same points on another person's teeth.
     own = write_raw_mouth(_made(tmp_path / "own"), 300 + seed, seed, places=7)
     other = write_raw_mouth(_made(tmp_path / "other"), 400 + seed, 50 + seed, places=7)
     register_folder(own.root)
@@ -105,7 +105,7 @@ def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     assert len(record.pictures) == 3
 
     require_near(record, mouth)
-    # In the rig's frame, where single precision holds 4e-6 mm.
+    # The files are in the rig's frame, where single precision resolves 4e-6 mm.
     vertices = np.concatenate([tooth.outer.vertices_mm for tooth in read_teeth(out)])
     np.testing.assert_allclose(vertices.mean(axis=0), record.centre_mm, atol=1e-3)
     read_mesh(out / "gums.ply").require_solid("gums.ply", (2.0, 200.0))
@@ -116,7 +116,7 @@ def test_a_scan_without_labels_is_parted_by_its_landmarks(tmp_path: Path) -> Non
     record = register_folder(tmp_path)
     assert record.teeth == (11, 12, 13, 21, 22, 23)
     assert record.repairs.startswith("Teeth parted along creases about landmarks of 6 teeth.")
-    # As with labels: the parts differ at necks and contacts alone.
+    # The pose is that of a labelled scan, because the teeth differ only at necks and contacts.
     require_near(record, bare)
 
     write_toml(tmp_path, bare.tree | {"landmark": [one for one in bare.tree["landmark"] if one["tooth"] == 11]})

@@ -36,7 +36,7 @@ def test_a_scan_without_a_pose_is_registered_first(mouth: RawMouth, tmp_path: Pa
     assert any(event.message.startswith("6 teeth stand in the rig, 0.0") for event in seen)
     assert not (mouth.root / "teeth").exists()
 
-    # What is prepared are the job's teeth in the raw folder's photographs, with the pose's covariance.
+    # The prepared stage has the job's teeth, the raw folder's photographs, and the pose's covariance.
     record = read_record(tmp_path / REGISTERED / "registration.json", Registration)
     prepared = open_stage(tmp_path, "prepared", PreparedManifest)[1]
     assert prepared.fdi == (11, 12, 13, 21, 22, 23)

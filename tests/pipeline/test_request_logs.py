@@ -1,5 +1,5 @@
-"""One id from an HTTP answer to the worker that runs the job, in lines that a program can read and that hold no
-secret.
+"""One request id connects an HTTP answer to the worker that runs the job, in log lines that programs can parse and that
+contain no secrets.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tests.support.live_server import serving, toy_server
 
 @pytest.fixture
 def lines() -> Iterator[Any]:
-    """Log as ``serve`` does, into memory; a call gives the lines so far."""
+    """Log as ``serve`` does, but into memory; yields a function that returns the lines so far."""
     root, services = logging.getLogger(), logging.getLogger("services")
     earlier = (root.handlers, root.level, services.level)
     stream = io.StringIO()
@@ -96,7 +96,7 @@ def test_a_line_holds_the_route_and_never_path_or_query(tmp_path: Path, lines: A
 def test_a_request_that_breaks_the_server_is_logged_with_its_id(tmp_path: Path, lines: Any) -> None:
     app = create_app(ServerSettings(data=tmp_path))
     app.add_api_route("/v1/broken", broken, dependencies=[needs("read")])
-    app.router.routes.insert(0, app.router.routes.pop())  # before the page, which takes every path
+    app.router.routes.insert(0, app.router.routes.pop())  # ahead of the dashboard's route, which matches every path
     with serving(app) as client:
         answer = client.get("/v1/broken", headers={"X-Request-ID": "r-500"})
     assert (answer.status_code, answer.json()["code"], answer.headers["x-request-id"]) == (

@@ -1,8 +1,8 @@
-"""Every part of the service, each in a virtual environment with its own extras alone, and a small job through all of
-them: ``make roles``.
+"""Every part of the service in a virtual environment with only its own extras, and a small job that uses all of them:
+``make roles``.
 
-The job lights the simulated dome from the rig's worker, uploads from a client without the server's packages, and fits
-on a worker without them.
+The job lights the simulated dome from the rig's worker, is submitted by a client without the server's packages, and is
+fitted on a worker without them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ LIGHTS_OF_THE_DOME = 8
 
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Folder of programs of each role; roles with the same extras share one."""
+    """Folder of programs by role; roles with the same extras share one."""
     folder = tmp_path_factory.mktemp("roles")
     wheel = build_wheel(folder / "build")
     made = {
@@ -102,7 +102,7 @@ class Parts:
         stack.callback(end, process)
 
     def run(self, role: str, *arguments: str, ends_with: Collection[int] = (0,)) -> str:
-        """Run a command to its end in a role's environment; gives what it printed."""
+        """Run a command to its end in a role's environment; returns its output."""
         command = [str(self._programs[role] / "dentine"), *arguments]
         ended = subprocess.run(
             command, cwd=self._folder, env=environment_without_this_tree(), capture_output=True, text=True, check=False
@@ -114,7 +114,7 @@ class Parts:
         return self._folder / f"{name}.log"
 
     def logs(self) -> str:
-        """The last words of every part."""
+        """The last log lines of every part."""
         return "\n".join(f"{name}: {self.log(name).read_text()[-2000:]}" for name in self._commands)
 
     def wait_until(self, condition: Callable[[], bool]) -> None:
@@ -124,7 +124,7 @@ class Parts:
             time.sleep(0.2)
 
     def workers(self) -> int:
-        """How many workers the API knows of, 0 while it does not answer."""
+        """Number of workers that the API knows; 0 while it does not answer."""
         try:
             with connect(self.address) as client:
                 return len(client.get("/v1/workers").raise_for_status().json()["workers"])
@@ -159,7 +159,7 @@ def test_a_small_job_runs_through_parts_that_have_only_their_own_packages(parts:
     assert (tmp_path / "data" / uploaded["path"]).is_dir()
 
     (tmp_path / "job.toml").write_text(JOB.format(port=parts.dome.rpartition(":")[2], mouth=tmp_path / "mouth"))
-    # So few pixels and paths tell little: whether the fit converged is not asked here.
+    # With so few pixels and paths the fit may not converge, which is not tested here.
     job = parts.run(
         "client", "submit", "job.toml", "--watch", "--server", parts.address, ends_with=(0, NOT_CONVERGED_STATUS)
     ).splitlines()[0]

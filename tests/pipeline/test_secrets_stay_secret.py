@@ -1,5 +1,5 @@
-"""Known secrets are driven through success and failure; afterwards they are nowhere in what the server wrote or
-said.
+"""Known secrets are used in requests that succeed and fail; afterwards no file, log or answer of the server contains
+them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ serve(ServerSettings(port=0, data=Path(sys.argv[1]), access="tokens", job_roots=
 
 @pytest.fixture
 def failing_server(tmp_path: Path) -> Iterator[tuple[httpx.Client, Path]]:
-    """A server whose jobs and whose retry route break, and the file that holds all that it prints."""
+    """A server whose jobs and whose retry route fail, and the file with all its output."""
     said = tmp_path / "said.txt"
     with said.open("w") as stream:
         command = [sys.executable, "-X", "dev", "-W", "ignore", "-c", FAILING_SERVER, str(tmp_path / "data")]
@@ -71,7 +71,7 @@ def test_secrets_are_nowhere_in_what_the_server_writes_and_says(
     guess = "dentine_0123456789ab_a-guess-that-nobody-may-read-again"
 
     made = ask("POST", "/v1/tokens", admin, json={"name": "made", "scopes": ["read"], "group": "default"})
-    answers.clear()  # the one answer that shows a secret
+    answers.clear()  # the answer to a new token is the only one that may contain a secret
     fresh = made.json()["token"]
     signed_in = client.post("/v1/session", headers={"Authorization": f"Bearer {reader}"})
     session = signed_in.cookies[COOKIE]

@@ -1,4 +1,6 @@
-"""The setup link: works once, for an hour, while there is no token; counted, audited, and kept as a hash alone."""
+"""The setup link works once, for an hour, while there is no token. Its use is rate-limited and audited, and only its
+hash is stored.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,7 @@ def test_a_link_makes_an_administrator_once(client: httpx.Client, engine: sql.En
     assert (token["name"], token["scopes"]) == ("administrator", ["admin"])
     assert "httponly" in made.headers["set-cookie"].lower()
     assert client.get("/v1/tokens", headers={"Authorization": f"Bearer {token['token']}"}).status_code == 200
-    assert client.get("/v1/session").json()["name"] == "administrator"  # by the cookie alone
+    assert client.get("/v1/session").json()["name"] == "administrator"  # signed in by the cookie alone
     client.cookies.clear()
     for used in (secret, other):
         again = client.post("/v1/setup", json={"secret": used})

@@ -1,4 +1,4 @@
-"""A slab folder to its material: a small cell by the walk itself, and the three truths that another program made."""
+"""From a slab folder to its material: a small cell rendered by the fit's own walk, three truths by another program."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ NOISE = 0.01
 
 @pytest.fixture(scope="module")
 def small_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cell of sigma_s 1.2, g 0.6, sigma_a 0.05 per mm seen by two lights and two cameras, one image held out, 1 %
-    noise.
+    """A folder of a cell with sigma_s 1.2 per mm, g 0.6 and sigma_a 0.05 per mm, two lights and two cameras, one image
+    held out, and 1 % noise.
     """
     root = tmp_path_factory.mktemp("slab")
     told = description()
@@ -52,7 +52,7 @@ def small_fit(small_folder: Path) -> SlabFit:
 
 def test_a_small_cell_gives_back_what_it_holds(small_fit: SlabFit) -> None:
     told = small_fit.parameters
-    # Within 4.5 of the stated standard errors, which themselves are at most 4 % of the values.
+    # Errors are within 4.5 of the stated standard errors, which are at most 4 % of the values.
     for got, true in ((told.sigma_s, 1.2), (told.sigma_s_reduced, 0.48)):
         assert abs(got.value - true) <= 4.5 * got.se
         assert got.se <= 0.04 * true
@@ -96,7 +96,7 @@ def test_the_command_refuses_a_folder_that_is_none(tmp_path: Path) -> None:
 
 
 def noisy_truth(name: str, out: Path, seed: int) -> dict[str, object]:
-    """A truth's folder with 1 % Poisson noise added to its images and to their variances; returns what is true."""
+    """Copy a truth's folder with 1 % Poisson noise added to its images and to their variances; returns the truth."""
     root = shared_path(f"data/slab-truth/{name}")
     folder = read_folder(root)
     (out / "slab.json").write_bytes((root / "slab.json").read_bytes())
@@ -110,7 +110,9 @@ def noisy_truth(name: str, out: Path, seed: int) -> dict[str, object]:
 
 
 def errors_of(fit: SlabFit, truth: dict[str, object]) -> dict[str, float]:
-    """Relative errors: sigma_s, sigma_s', phase L2 on steps of 0.5 degrees, and sine-weighted."""
+    """Relative errors of sigma_s, of sigma_s', and of the phase function: L2 over steps of 0.5 degrees, unweighted and
+    weighted by the sine.
+    """
     angles, true = np.radians(np.array(truth["theta_deg"])), np.array(truth["phase_per_sr"])
     found = np.interp(angles, ANGLES_RAD, np.array(fit.phase.value_per_sr))
     squares, sines = (found - true) ** 2, np.sin(angles)
@@ -127,7 +129,7 @@ def errors_of(fit: SlabFit, truth: dict[str, object]) -> dict[str, float]:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", ["mie-500nm", "two-lobe"])
 def test_cells_seen_near_the_beam_are_measured(name: str, tmp_path: Path) -> None:
-    # Issue's tolerances, by the rms over five seeds.
+    # The rms over five seeds must meet the tolerances.
     errors = []
     for seed in range(11, 16):
         truth = noisy_truth(name, tmp_path, seed)
@@ -147,8 +149,8 @@ def test_angles_that_no_camera_sees_are_flagged(tmp_path: Path) -> None:
         truth = noisy_truth("hg-paper-angles", tmp_path, seed)
         (fit,) = fit_slab(tmp_path, SlabOptions(seed=seed))
         errors.append(errors_of(fit, truth)["sigma_s"])
-        # Cameras and beams differ by 7.5 degrees in the medium at least; beyond 20 degrees all is seen. The seventh and
-        # eighth knot are next to that and may be determined by it.
+        # Cameras and beams differ by at least 7.5 degrees in the medium, and all angles beyond 20 degrees are observed.
+        # The seventh and eighth knot are next to the observed angles and may be determined by them.
         flagged = np.array(fit.phase.theta_deg)[~np.array(fit.phase.determined)]
         assert (flagged < 6).sum() >= 6
         assert not ((flagged > 20) & (flagged < 90)).any()

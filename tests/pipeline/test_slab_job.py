@@ -1,4 +1,4 @@
-"""A job of kind slab: from its options to results, asset and report, and what it refuses."""
+"""A job of kind slab: from its options to results, asset and report, and its refusals."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein, hg
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
 from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.kept import IMAGES, Kept, read_kept
 from services.fit.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
+from services.fit.slab.results.stored import IMAGES, StoredResult, read_result
 from services.fit.slab.results.tabphase import tabphase_values
 from services.fit.slab.schedule import WavelengthTask, run_wavelengths
-from services.fit.slab.solve.standing import Standing
+from services.fit.slab.solve.checkpoint import Checkpoint
 from services.fit.slab.stage import CHECKPOINT, export, run
 from services.fit.transport.platform import prepare_device
 from services.pipeline.stages import run_job, stages_of
 from tests.support.small_slab import description, write_folder
 
 TRUTHS = {532.0: (1.2, 0.6), 635.0: (0.8, 0.4)}
-"""Scattering per mm and mean cosine by wavelength, nm. All but the slow test have the first alone."""
+"""Scattering per mm and mean cosine by wavelength in nm. Only the slow test uses the second wavelength."""
 ABSORPTION_PER_MM = 0.05
 
 
 def write_cell(root: Path, *wavelengths_nm: float) -> Path:
-    """A cell's folder with two lights and two cameras, the first image of each wavelength held out, 1 % noise."""
+    """Write a cell's folder with two lights, two cameras and 1 % noise; each wavelength's first image is held out."""
     told, noise = description(wavelengths_nm=list(wavelengths_nm)), np.random.default_rng(1)
     shown = [(nm, image) for nm in wavelengths_nm for image in told["images"]]
     told["images"] = [{**image, "wavelength_nm": nm, "file": f"{nm:g}_{image['file']}"} for nm, image in shown]
@@ -59,7 +59,7 @@ def write_cell(root: Path, *wavelengths_nm: float) -> Path:
             half = image.reshape(rig.grid.rows, rig.grid.columns)
             whole = np.concatenate([half[::-1], half])
             np.save(root / entry.file, whole + 0.01 * np.sqrt(whole * whole.mean()) * noise.normal(size=whole.shape))
-    # The folder does not say the index; its through-beam does, as the cell has no glass.
+    # The folder does not state the index. It follows from the through-beam, as the cell has no glass.
     sine = described.cell.index_outside * np.sin(np.radians(told["lights"][1]["angle_deg"])) / told["cell"]["index"]
     peak_mm = told["cell"]["width_mm"] * sine / np.sqrt(1 - sine**2)
     told["through_beam"] = [{"light": told["lights"][1]["name"], "peak_x_mm": float(peak_mm), "se_mm": 1e-4}]
@@ -69,8 +69,8 @@ def write_cell(root: Path, *wavelengths_nm: float) -> Path:
 
 
 def require_truths(root: Path, *wavelengths_nm: float) -> None:
-    """Coefficients within 4.5 of their standard errors: 1 value in 100,000 is not, and errors are themselves known to
-    some per cent.
+    """Assert that coefficients are within 4.5 of their standard errors. One correct value in 100,000 is not; the
+    standard errors themselves are known to some per cent.
     """
     told = json.loads((root / "parameters.json").read_text())
     assert set(told) == {f"{nm:g}" for nm in wavelengths_nm}
@@ -84,19 +84,19 @@ def require_truths(root: Path, *wavelengths_nm: float) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One wavelength."""
+    """A cell's folder with one wavelength."""
     return write_cell(tmp_path_factory.mktemp("slab"), 532.0)
 
 
 @pytest.fixture(scope="module")
 def spec(folder: Path) -> JobSpec:
-    """A job of a fiftieth of the default's paths."""
+    """A job with a fiftieth of the default number of paths."""
     return JobSpec(kind="slab", capture=folder, effort=0.02, seed=3)
 
 
 @pytest.fixture(scope="module")
 def job(spec: JobSpec, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its folder when it has run."""
+    """Folder of the job after it has run."""
     root = tmp_path_factory.mktemp("job")
     run(spec, LocalContext(root))
     export(spec, LocalContext(root))
@@ -143,7 +143,7 @@ def test_the_table_is_in_the_order_of_mitsubas_cosines() -> None:
     cosines = np.linspace(-1, 1, len(tabphase_values(hg_values(0.6))))
     values = tabphase_values(hg_values(0.6))
     assert values[-1] == pytest.approx(hg_values(0.6)[0])
-    # Tents of 0.9 degrees instead of the formula: g and the norm are off by less than 1e-4.
+    # With tents of 0.9 degrees in place of the formula, g and the norm have errors of less than 1e-4.
     assert 2 * np.pi * np.trapezoid(values, cosines) == pytest.approx(1, abs=1e-3)
     assert 2 * np.pi * np.trapezoid(values * cosines, cosines) == pytest.approx(0.6, abs=1e-3)
 
@@ -158,8 +158,8 @@ def test_stock_mitsuba_loads_and_renders_the_asset(job: Path) -> None:
     scene = mi.load_file(str(asset / "slab_532.xml"), optimize=False)
     image = np.array(mi.render(scene, spp=4, seed=1))
     assert np.isfinite(image).all()
-    assert 0 < image[32, 32, 0] < 1.5  # in light of radiance 1 from all sides
-    # Forward is forward: what the plugin draws has the mean cosine that parameters.json tells.
+    assert 0 < image[32, 32, 0] < 1.5  # under light of radiance 1 from all directions
+    # The plug-in's samples have the mean cosine of parameters.json, so forward is not exchanged with backward.
     phase = mi.load_dict({"type": "tabphase", "values": (asset / "tabphase_532.txt").read_text()})
     interaction, count = dr.zeros(mi.MediumInteraction3f, 100_000), 100_000
     interaction.wi = mi.Vector3f(0, 0, 1)
@@ -173,20 +173,20 @@ def test_stock_mitsuba_loads_and_renders_the_asset(job: Path) -> None:
 
 
 def copied_checkpoint(job: Path, root: Path) -> Path:
-    """What an attempt left behind that was killed when its wavelength was done."""
+    """Copy the checkpoint of an attempt that was killed after its wavelength was done; returns the new folder."""
     shutil.copytree(job / CHECKPOINT, root / CHECKPOINT)
     return root
 
 
 def stored_fits(job: Path) -> list[dict[str, Any]]:
-    """As the fit published them."""
+    """The fits that the job published."""
     fits: list[dict[str, Any]] = json.loads((job / "fit" / "manifest.json").read_text())["record"]["fits"]
     return fits
 
 
 def test_a_new_attempt_takes_the_wavelengths_that_are_done(job: Path, spec: JobSpec, tmp_path: Path) -> None:
     again = run(spec, LocalContext(copied_checkpoint(job, tmp_path), attempt=2))
-    assert [json.loads(fit.model_dump_json()) for fit in again.fits] == stored_fits(job)  # their core-seconds too
+    assert [json.loads(fit.model_dump_json()) for fit in again.fits] == stored_fits(job)  # including core-seconds
 
 
 @pytest.mark.slow
@@ -210,7 +210,7 @@ def test_a_cancel_ends_the_fit_between_two_blocks(spread: bool, spec: JobSpec, t
 
 
 class ManyThreads(LocalExecutor):
-    """Says that it has workers for more than a wavelength, and keeps the names of what it ran."""
+    """An executor that claims workers for more than one wavelength, and records the names of its tasks."""
 
     def __init__(self) -> None:
         super().__init__(InProcessHost())
@@ -230,18 +230,18 @@ def test_blocks_on_many_workers_give_the_answer_of_one(job: Path, spec: JobSpec,
     task = WavelengthTask(spec.capture, 532.0, options, tmp_path / "532", tmp_path / CANCEL_FLAG)
     assert list(run_wavelengths(run_on, [task], workers=1)) == [task.place]
     assert len(set(run_on.ran)) == len(run_on.ran) > 100  # each block a task of its own
-    kept = read_kept(task.place)
-    assert kept is not None
+    result = read_result(task.place)
+    assert result is not None
     for name in ("parameters", "phase", "errors"):
-        assert json.loads(getattr(kept.fit, name).model_dump_json()) == stored_fits(job)[0][name]
+        assert json.loads(getattr(result.fit, name).model_dump_json()) == stored_fits(job)[0][name]
 
 
 def test_a_wavelength_that_was_cut_short_goes_on_where_it_stood(job: Path, spec: JobSpec, tmp_path: Path) -> None:
     class CutShortError(Exception):
         pass
 
-    def cut_short(_wavelength_nm: float, standing: Standing) -> None:
-        if standing.stage == 1:
+    def cut_short(_wavelength_nm: float, checkpoint: Checkpoint) -> None:
+        if checkpoint.stage == 1:
             raise CutShortError
 
     assert spec.capture is not None
@@ -249,16 +249,16 @@ def test_a_wavelength_that_was_cut_short_goes_on_where_it_stood(job: Path, spec:
     task = WavelengthTask(spec.capture, 532.0, options, tmp_path / "532", tmp_path / CANCEL_FLAG)
     first, second = ManyThreads(), ManyThreads()
     with pytest.raises(CutShortError):
-        list(run_wavelengths(first, [task], workers=1, told=cut_short))
-    stood: list[Standing] = []
-    list(run_wavelengths(second, [task], workers=1, told=lambda _, standing: stood.append(standing)))
-    # A fit from the start would tell of stage 0 first.
+        list(run_wavelengths(first, [task], workers=1, on_checkpoint=cut_short))
+    stored: list[Checkpoint] = []
+    list(run_wavelengths(second, [task], workers=1, on_checkpoint=lambda _, checkpoint: stored.append(checkpoint)))
+    # A fit from the start would report stage 0 first.
     assert first.ran
-    assert {standing.stage for standing in stood} == {1}
-    kept = read_kept(task.place)
-    assert kept is not None
+    assert {checkpoint.stage for checkpoint in stored} == {1}
+    result = read_result(task.place)
+    assert result is not None
     for name in ("parameters", "phase", "errors"):
-        assert json.loads(getattr(kept.fit, name).model_dump_json()) == stored_fits(job)[0][name]
+        assert json.loads(getattr(result.fit, name).model_dump_json()) == stored_fits(job)[0][name]
     assert {one.name for one in task.place.iterdir()} == {"fit.json", IMAGES}
 
 
@@ -267,7 +267,7 @@ def test_sums_too_large_to_travel_stay_on_their_worker(folder: Path, tmp_path: P
     told["pixels"] |= {"columns": 512, "rows": 512}
     root, run_on = write_folder(tmp_path / "cell", told, np.full((8, 8), 0.01)), ManyThreads()
     task = WavelengthTask(root, 532.0, SlabOptions(), tmp_path / "532", tmp_path / CANCEL_FLAG)
-    with pytest.raises(CaptureInputError, match="on the folder's grid"):  # as these images are smaller
+    with pytest.raises(CaptureInputError, match="on the folder's grid"):  # because these images are smaller
         list(run_wavelengths(run_on, [task], workers=1))
     assert run_on.ran == ["532"]
 
@@ -289,21 +289,21 @@ def test_a_wavelength_is_told_before_the_next_one_is_fitted(
             if event.kind == "progress":
                 order.append(f"told {event.data['wavelength_nm']:g} at {event.done}")
 
-    def kept(place: Path) -> Kept:
+    def stored_result(place: Path) -> StoredResult:
         wavelength_nm = float(place.name)
         place.mkdir(parents=True, exist_ok=True)
         (place / IMAGES).touch()
         fit = stored_like(wavelength_nm)
-        return Kept(of="", fit=fit)
+        return StoredResult(of="", fit=fit)
 
     monkeypatch.setattr("services.fit.slab.schedule.fit_wavelength", fit)
-    monkeypatch.setattr("services.fit.slab.results.kept.read_kept", kept)
+    monkeypatch.setattr("services.fit.slab.results.stored.read_result", stored_result)
     run(JobSpec(kind="slab", capture=root), Told(tmp_path / "job"))
     assert order == ["fitted 532", "told 532 at 0.5", "fitted 635", "told 635 at 1.0"]
 
 
 def stored_like(wavelength_nm: float) -> SlabFit:
-    """Of a fit that nobody made."""
+    """A stored fit with made-up values."""
     one = Quantity(value=1.0, se=0.1, unit="1/mm", determined=True)
     parameters = Parameters(sigma_t=one, sigma_s=one, sigma_a=one, sigma_s_reduced=one, g=one, index=one)
     phase = PhaseFunction(theta_deg=(), value_per_sr=(), se_per_sr=(), determined=())
@@ -335,10 +335,10 @@ def test_a_fault_of_the_last_wavelength_is_told_before_the_first_is_fitted(folde
 
 
 def test_a_job_by_a_dictionary_tells_of_its_atoms(job: Path, spec: JobSpec, tmp_path: Path) -> None:
-    # What is told is looked at here, and whether it is true in tests/unit/test_slab_dictionaries.py.
+    # This test checks which results are reported; tests/unit/test_slab_dictionaries.py checks their values.
     assert spec.capture is not None
     lobes = spec.model_copy(update={"dictionary": "hg", "effort": 0.01})
-    run(lobes, LocalContext(copied_checkpoint(job, tmp_path), attempt=2))  # what the tents left is not taken
+    run(lobes, LocalContext(copied_checkpoint(job, tmp_path), attempt=2))  # the tents' checkpoint is not used
     export(lobes, LocalContext(tmp_path, attempt=2))
     told = load_asset(tmp_path).parameters["532"]
     assert {name for name in told if name.startswith("atoms.")} == {f"atoms.g={g:g}" for g in COSINES}
@@ -385,7 +385,7 @@ def test_options_of_a_slab_are_read_again_as_they_were_stored(spec: JobSpec) -> 
 def test_wavelengths_are_fitted_on_two_workers_as_they_are_on_one(
     wavelengths_nm: tuple[float, ...], tmp_path: Path
 ) -> None:
-    # Two wavelengths run on a worker each, and the blocks of a single one on both.
+    # Two wavelengths run on one worker each, and the blocks of a single wavelength run on both.
     (cell := tmp_path / "cell").mkdir()
     write_cell(cell, *wavelengths_nm)
     asset = run_job(JobSpec(kind="slab", capture=cell, effort=0.02, workers=2), tmp_path / "two")

@@ -1,4 +1,4 @@
-"""A thick cell, whose fit begins far off along sigma_s at a constant sigma_s'."""
+"""A thick cell, whose fit starts far from the true sigma_s at nearly the true sigma_s'."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from services.fit.slab.solve.start import start
 from services.fit.slab.solve.uncertainty import slopes, uncertainty_of
 
 THICKNESS = 6.0
-"""sigma_t w, at a width of 1 mm."""
+"""Optical thickness sigma_t w, with a width w of 1 mm."""
 NOISE = 0.03
-"""Three times a measurement's, so that 1.6 million paths a light are as good as exact: their variance is a tenth of
-it."""
+"""Relative noise of the images, three times that of a measurement. The variance of renders with 1.6 million paths per
+light is a tenth of it, so they are practically exact."""
 
 
 def small_spheres() -> Material:
-    """Rayleigh's phase function times a forward one, as of spheres of a third of the wavelength; g is 0.32."""
+    """Material with Rayleigh's phase function times a forward one, as of spheres of a third of the wavelength; g is
+    0.32.
+    """
     cosines = np.cos(ANGLES_RAD)
     shape = (1 + cosines**2) * (1 + 0.8 * cosines)
     return Material(THICKNESS * shape / float(shape @ tent_solid_angles()), 0.0)
@@ -44,7 +46,8 @@ def test_a_fit_finds_its_way_from_a_start_that_is_far_off() -> None:
     assert guess.scattering_per_mm < 0.8 * true.scattering_per_mm
     solution = GaussNewton(rig, measured, 1, Budget().scaled(0.2), map, Knots()).solve(lambda: guess)
     found, uncertainty = solution.material, uncertainty_of(solution)
-    # Three standard errors, of which sigma_s has a few per cent by a fifth of the paths and three times the noise.
+    # The limits are three standard errors. That of sigma_s is a few per cent, with a fifth of the paths and three times
+    # the noise.
     for name, value, truth, largest in (
         ("sigma_s", found.scattering_per_mm, true.scattering_per_mm, 0.12),
         ("sigma_s_reduced", found.reduced_scattering_per_mm, true.reduced_scattering_per_mm, 0.03),

@@ -1,4 +1,4 @@
-"""A server tells how long its jobs will take once it has seen some, and says why when it cannot."""
+"""A server states time ranges for its jobs after it has run some, and otherwise the reason why it cannot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STAGES: tuple[StageName, ...] = ("prepare", "fit", "export")
 
 
 class HeldJob:
-    """Goes through its stages at once, or waits in the middle of the fit while ``goes_on`` is not set."""
+    """A job that runs its stages at once, or waits in the middle of the fit until ``goes_on`` is set."""
 
     def __init__(self) -> None:
         self.goes_on, self.is_in_fit = threading.Event(), threading.Event()

@@ -1,4 +1,4 @@
-"""The client and the command line upload a folder, whatever happens to the connection, and send nothing that the server
+"""The client and the command line upload a folder over broken connections, and send no files that the server already
 has.
 """
 
@@ -42,7 +42,7 @@ def server(data: Path) -> Iterator[httpx.Client]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A small capture with one array of several chunks, and files that are no part of one."""
+    """A small capture with one array of several chunks, and files that are not part of a capture."""
     folder = write_capture(tmp_path / "mine")
     np.save(folder / "large.npy", np.random.default_rng(1).integers(0, 255, (20, 2**20), dtype=np.uint8))
     (folder / "notes.txt").write_text("notes")

@@ -1,5 +1,5 @@
-"""A job whose fit did not converge succeeded and is told as what it is: by the API, in lists, and by the exit status of
-every command that awaits one.
+"""A job whose fit did not converge counts as succeeded, and the API, lists and the exit status of every waiting command
+say that it did not converge.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ GOOD, BAD = verdict(converged=True), verdict(converged=False)
 
 
 def run(spec: JobSpec, _folder: Path, events: EventAddress) -> None:
-    """In place of stages: seed 1 converges, 2 does not, 3 is of a version that did not judge, 4 of one that judged
-    otherwise.
+    """Stand-in for the stages: seed 1 converges, 2 does not, 3 is of a version without verdicts, 4 of a version with
+    another form of verdict.
     """
     good, bad = ({VERDICT: one.model_dump(mode="json")} for one in (GOOD, BAD))
     data: dict[str, Any] = {1: good, 2: bad, 3: {}, 4: {VERDICT: {"is_good": True}}}[spec.seed]
@@ -66,7 +66,7 @@ def dentine(*arguments: str) -> tuple[int, str, str]:
 
 def test_the_api_tells_of_each_job_that_succeeded_how_well_its_fit_went(server: httpx.Client) -> None:
     jobs = {seed: submitted(server, seed) for seed in (1, 2, 3, 4)}
-    for _ in range(2):  # read, and then as it was kept
+    for _ in range(2):  # first read from the events, then from the cache
         listed = {job["id"]: job for job in server.get("/v1/jobs?limit=4").json()["jobs"]}
         for seed, expected in ((1, GOOD), (2, BAD), (3, None), (4, None)):
             told = None if expected is None else json.loads(expected.model_dump_json())
@@ -90,7 +90,7 @@ def test_only_the_newest_fit_of_a_job_that_has_succeeded_counts(server: httpx.Cl
         job = submitted(client, 1)
         assert client.get(f"/v1/jobs/{job}").json()[VERDICT]["converged"] is False
         engine = open_database(settings.database_url)
-        with engine.begin() as connection:  # as if its masks were changed
+        with engine.begin() as connection:  # as after a change of its masks
             connection.exec_driver_sql("UPDATE job SET state = 'FAILED'")
         engine.dispose()
         assert client.get(f"/v1/jobs/{job}").json()[VERDICT] is None

@@ -1,4 +1,4 @@
-"""A server tells what its workers do, and that it cannot where their scheduler does not answer."""
+"""A server lists its workers and their tasks, and states that it cannot when the scheduler does not answer."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from tests.support.uploading import write_capture
 
 @pytest.fixture
 def cluster() -> Iterator[LocalCluster]:
-    # The worker lives in the tests' own process, which may hold more than the limit that is told: so it is not acted
-    # upon.
+    # The worker runs in the tests' own process, which may use more memory than the stated limit, so the limit is not
+    # enforced.
     unlimited = dict.fromkeys(
         (f"distributed.worker.memory.{act}" for act in ("target", "spill", "pause", "terminate")), False
     )
@@ -40,7 +40,7 @@ def cluster() -> Iterator[LocalCluster]:
     }
     as_if_alone = unlimited | {
         "distributed.worker.preload": []
-    }  # which every connection of a server leaves for its process
+    }  # settings that every connection of a server changes for its process
     with dask.config.set(as_if_alone), LocalCluster(**options, resources={"DOME": 1}) as cluster:
         yield cluster
 

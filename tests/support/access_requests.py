@@ -1,4 +1,4 @@
-"""What tests of access ask of a server that asks for tokens."""
+"""Requests and routes that tests of access control share, for a server that requires tokens."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def write_report(_spec: object, folder: Path, _events: object) -> None:
 
 
 def add_first(app: FastAPI, router: APIRouter) -> None:
-    """Include a router before the page, which takes whatever is left."""
+    """Include a router ahead of the dashboard's route, which matches every remaining path."""
     app.include_router(router)
     app.router.routes.insert(0, app.router.routes.pop())
 

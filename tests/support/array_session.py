@@ -1,4 +1,4 @@
-"""A whole calibration session from arrays, without images: what every step found, and ways to spoil it."""
+"""A whole calibration session from arrays, without images: the measurements of every step, and ways to spoil them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from services.calibrate.cameras.models import ModelChoice
 from services.calibrate.cameras.sightings import View
 from services.calibrate.colour.transform import fit_colour
 from services.calibrate.lights.intensity import WhitePhoto, WhiteSphere, fit_intensity, shading
-from services.calibrate.lights.mirror import Eye, highlight_points, nearest_point
+from services.calibrate.lights.mirror import PosedCamera, highlight_points, nearest_point
 from services.calibrate.lights.problem import SphereView
 from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.charts import ColourStep
@@ -32,12 +32,12 @@ N_LIGHTS = 6
 MIRROR_MM, WHITE_MM, REFLECTANCE = 22.0, 15.0, np.array([0.92, 0.9, 0.88])
 PLACES_MM = np.array([[-40.0, -25, -30], [40, 25, 30], [-40, 25, 30], [40, -25, -30]])
 LIST_SE_MM = 4.0
-"""Of a coordinate of the lights' list: a tape measure in a dome."""
+"""Standard error of a coordinate in the list of light positions, as measured with a tape in a dome."""
 
 
 @dataclass(frozen=True)
 class ArraySession:
-    """What the steps of a session found, with the arrays that they found it in."""
+    """Measurements of a calibration session, as the arrays that its steps read."""
 
     rig: Rig
     boards: tuple[View, ...]
@@ -50,7 +50,7 @@ class ArraySession:
 
     @property
     def folder(self) -> RawFolder:
-        """Its names."""
+        """A stand-in for the raw folder that gives the names of lights, board photographs, cameras and channels."""
         lights = [SimpleNamespace(name=f"L{n}") for n in range(N_LIGHTS)]
         camera = SimpleNamespace(full_counts=4095.0)
         return cast(
@@ -64,26 +64,28 @@ class ArraySession:
         )
 
     def cameras(self) -> CamerasStep:
-        """The bundle, begun at the truth."""
+        """Fit the bundle of the board photographs, starting at the true rig."""
         choices = {name: ModelChoice(lens, 0.1, {}) for name, lens in zip(NAMES, self.rig.lenses, strict=True)}
         return CamerasStep(NAMES, fit_bundle(self.boards, self.rig), choices, self.boards, ())
 
     def lights(self, cameras: CamerasStep) -> LightsStep:
-        """Positions by the cameras that boards gave."""
+        """Fit the lights' positions with the cameras that the boards gave."""
         names = [f"camera {NAMES[view.camera]}, s{view.place}" for view in self.mirrors]
         lights = [f"L{n}" for n in range(N_LIGHTS)]
-        return place_lights(self.mirrors, names, cameras.eyes, lights, cameras.camera_covariance, self.listed_mm)
+        return place_lights(
+            self.mirrors, names, cameras.posed_cameras, lights, cameras.camera_covariance, self.listed_mm
+        )
 
     def intensity(self, lights: LightsStep) -> IntensityStep:
-        """Intensities by the lights and cameras that highlights gave."""
+        """Fit the lights' intensities with the light positions and cameras that the highlights gave."""
         where = np.full((N_LIGHTS, 3), np.nan)
         where[lights.fit.lights] = lights.fit.positions_mm
         names = [f"L{n}" for n in range(N_LIGHTS)]
-        fit = fit_intensity(self.white, lights.fit.eyes, self.white_spheres, where, names)
+        fit = fit_intensity(self.white, lights.fit.cameras, self.white_spheres, where, names)
         return IntensityStep(fit, self.white, np.zeros(3))
 
     def colours(self) -> ColourStep:
-        """One camera's colours."""
+        """Fit the colour transform of one camera."""
         return ColourStep({"left": fit_colour(self.rgb, self.xyz, "left")}, {"left": self.rgb}, self.xyz, None)
 
 
@@ -106,22 +108,24 @@ def array_session(seed: int) -> ArraySession:
     """
     random = np.random.default_rng(seed)
     rig = true_rig(random, 8)
-    eyes = tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
-    aim = nearest_point(np.array([eye.centre_mm for eye in eyes]), np.array([eye.rotation[2] for eye in eyes]))
-    towards = np.mean([eye.centre_mm for eye in eyes], axis=0) - aim
+    cameras = tuple(PosedCamera(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
+    aim = nearest_point(
+        np.array([camera.centre_mm for camera in cameras]), np.array([camera.rotation[2] for camera in cameras])
+    )
+    towards = np.mean([camera.centre_mm for camera in cameras], axis=0) - aim
     lights = turned(dome_lights(N_LIGHTS, random), towards) + aim
     centres = turned(PLACES_MM, towards) + aim
     mirrors = tuple(
-        mirror_view(random, eye, camera, place, centre, lights)
+        mirror_view(random, camera, number, place, centre, lights)
         for place, centre in enumerate(centres)
-        for camera, eye in enumerate(eyes)
+        for number, camera in enumerate(cameras)
     )
     spheres = tuple(WhiteSphere(centre, WHITE_MM, REFLECTANCE) for centre in centres[:2])
     intensity = random.uniform(0.6, 1.4, (N_LIGHTS, 3))
     white = tuple(
-        white_photo(random, eye, camera, place, light, lights[light], intensity[light], sphere)
+        white_photo(random, camera, number, place, light, lights[light], intensity[light], sphere)
         for place, sphere in enumerate(spheres)
-        for camera, eye in enumerate(eyes)
+        for number, camera in enumerate(cameras)
         for light in range(N_LIGHTS)
     )
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
@@ -135,39 +139,39 @@ def array_session(seed: int) -> ArraySession:
 
 
 def mirror_view(
-    random: np.random.Generator, eye: Eye, camera: int, place: int, centre: Floats, lights: Floats
+    random: np.random.Generator, camera: PosedCamera, number: int, place: int, centre: Floats, lights: Floats
 ) -> SphereView:
-    """A mirror sphere with edges of 0.1 px and highlights of 0.05 px."""
-    edge, outward = outline_points(eye, centre, MIRROR_MM, 60)
+    """Draw a mirror sphere as one camera sees it, with errors of 0.1 px on its edge and of 0.05 px on highlights."""
+    edge, outward = outline_points(camera, centre, MIRROR_MM, 60)
     edge = edge + outward * (0.1 + random.normal(0, 0.1, (60, 1)))
-    points = highlight_points(eye.centre_mm, lights, centre, MIRROR_MM)
-    to_eye = (eye.centre_mm - points) / np.linalg.norm(eye.centre_mm - points, axis=1, keepdims=True)
-    seen = np.flatnonzero(((points - centre) / MIRROR_MM * to_eye).sum(axis=1) > STEEPEST)
+    points = highlight_points(camera.centre_mm, lights, centre, MIRROR_MM)
+    to_camera = (camera.centre_mm - points) / np.linalg.norm(camera.centre_mm - points, axis=1, keepdims=True)
+    seen = np.flatnonzero(((points - centre) / MIRROR_MM * to_camera).sum(axis=1) > STEEPEST)
     return SphereView(
-        camera, place, MIRROR_MM, edge, seen, eye.project(points[seen]) + random.normal(0, 0.05, (len(seen), 2))
+        number, place, MIRROR_MM, edge, seen, camera.project(points[seen]) + random.normal(0, 0.05, (len(seen), 2))
     )
 
 
 def white_photo(
     random: np.random.Generator,
-    eye: Eye,
-    camera: int,
+    camera: PosedCamera,
+    number: int,
     place: int,
     light: int,
     where: Floats,
     intensity: Floats,
     sphere: WhiteSphere,
 ) -> WhitePhoto:
-    """A white sphere under one light, on a grid of pixels with 1 % noise."""
-    aim = eye.project(sphere.centre_mm[None])[0]
+    """Draw a white sphere under one light, on a grid of pixels with 1 % noise."""
+    aim = camera.project(sphere.centre_mm[None])[0]
     grid = np.stack(np.meshgrid(*(np.arange(-100, 101, 12.5),) * 2), axis=-1).reshape(-1, 2) + aim
-    factor, _ = shading(eye, sphere, where, grid)
+    factor, _ = shading(camera, sphere, where, grid)
     clean = 1e6 * factor[:, None] * REFLECTANCE * intensity
-    return WhitePhoto(camera, place, light, grid, clean * (1 + random.normal(0, 0.01, clean.shape)))
+    return WhitePhoto(number, place, light, grid, clean * (1 + random.normal(0, 0.01, clean.shape)))
 
 
 def turned(points: Floats, away: Floats) -> Floats:
-    """Points about the origin whose z axis is turned to a direction."""
+    """Rotate points (N, 3) about the origin so that their z axis points along a direction (3,)."""
     z = away / np.linalg.norm(away)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -175,7 +179,7 @@ def turned(points: Floats, away: Floats) -> Floats:
 
 
 def exchanged(views: tuple[View, ...], one: int, two: int) -> tuple[View, ...]:
-    """Two photographs of boards under each other's entries."""
+    """Swap two board photographs, so that each stands under the other's camera, place and name."""
     first, second = views[one], views[two]
     swapped = list(views)
     swapped[one] = replace(second, camera=first.camera, place=first.place, name=first.name)

@@ -1,5 +1,5 @@
-"""A fit of blocks that last as long as its source says, spread over the workers as a real one's, and told in a file;
-the other stages are toys.
+"""A fit whose blocks last as long as a file in its capture's folder says. They are spread over the workers like the
+blocks of a real fit, and their times are written to a file. The other stages are those of ``toy_stages``.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from tests.support import toy_stages
 
 capture, prepare, export = toy_stages.capture, toy_stages.prepare, toy_stages.export
 BLOCKS = "blocks.json"
-"""In the folder of the source: block_s, blocks of a step, steps, pause_s between steps."""
+"""Name of the file in the capture's folder that gives the seconds of a block (``block_s``), the blocks of a step
+(``blocks``), the number of steps (``steps``) and the pause between steps in seconds (``pause_s``)."""
 TRACE = "trace.jsonl"
-"""In the same folder: start and end of every block, Unix time, and its worker."""
+"""Name of the file in the same folder that receives one line per block: start and end in Unix time, and the address of
+the worker."""
 ENGINE = "tests.support.broken_engine:BrokenEngine"
 
 
 def block(_host: object, lasts_s: float, *_earlier: object) -> tuple[float, float, str]:
-    """Hold a worker for a while."""
+    """Occupy a worker for a time; returns start and end in Unix time, and the worker's address."""
     from distributed import get_worker
 
     start_s = time.time()
@@ -33,7 +35,7 @@ def block(_host: object, lasts_s: float, *_earlier: object) -> tuple[float, floa
 
 
 def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Runs its steps until they are done or its source holds ``enough``."""
+    """Run the steps until all are done or the capture's folder holds a file ``enough``."""
     assert spec.capture is not None
     wanted = json.loads((spec.capture / BLOCKS).read_text())
     with (
@@ -53,6 +55,6 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 
 def read_trace(source: Path) -> list[tuple[float, float, str]]:
-    """The blocks that a fit has told."""
+    """Read start, end (Unix time) and worker of every block that a fit has written so far."""
     path = source / TRACE
     return [tuple(json.loads(line)) for line in path.read_text().splitlines()] if path.exists() else []

@@ -1,4 +1,4 @@
-"""Sessions of boards: drawn from known cameras with noise, or read from others' tables."""
+"""Photographs of calibration boards: drawn from known cameras with noise, or read from tables of other projects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.cameras.boards import corners_on_board
-from services.calibrate.cameras.bundle import Rig, draw
+from services.calibrate.cameras.bundle import Rig, project_corners
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import pose_matrix, pose_vector
 from services.calibrate.cameras.sightings import View, joined
@@ -22,7 +22,7 @@ SIZE = (1600, 1200)
 
 
 def charuco(squares: tuple[int, int], dictionary: str = "DICT_6X6_250", **others: object) -> Board:
-    """A ChArUco board of squares of 40 mm and markers of 20 mm, or another that has markers."""
+    """A ChArUco board with squares of 40 mm and markers of 20 mm; other fields replace these or choose another type."""
     told = {"type": "charuco", "square_mm": 40, "marker_mm": 20, **others}
     return Board.model_validate({"name": "plate", "squares": squares, "dictionary": dictionary, **told})
 
@@ -40,8 +40,8 @@ def looking(position_mm: NDArray[np.float64], target_mm: NDArray[np.float64]) ->
 
 
 def true_rig(random: np.random.Generator, n_places: int = 12, size: tuple[int, int] = SIZE) -> Rig:
-    """Three cameras, 450 mm away from boards that lie tilted about the place of the teeth; all sizes of image show as
-    much.
+    """A rig of three cameras, 450 mm away from boards that lie tilted about the place of the teeth. The focal length
+    scales with the image's size, so every size has the same field of view.
     """
     scale = size[0] / SIZE[0]
     lenses, cameras = [], []
@@ -65,7 +65,7 @@ def tilted_places(
     if towards is not None:
         turned[:3, :3] = towards
     for _ in range(n_places):
-        # Turned by π about x the plate faces the cameras; tilts of up to 35° tell focal length from distance.
+        # Turned by π about x the plate faces the cameras; tilts of up to 35° separate focal length from distance.
         turn = np.array([np.pi, 0, 0]) + random.uniform(-0.6, 0.6, 3)
         matrix = pose_matrix(np.concatenate([turn, np.zeros(3)]))
         matrix[:3, 3] = random.uniform(-25, 25, 3) - matrix[:3, :3] @ centre
@@ -76,7 +76,7 @@ def tilted_places(
 def in_first_frame(
     lenses: tuple[Lens, ...], cameras: Sequence[NDArray[np.float64]], places: Sequence[NDArray[np.float64]]
 ) -> Rig:
-    """A rig in the world of the board at place 0.
+    """Build a rig whose world frame is that of the board at place 0.
 
     Args:
         cameras: poses (6,) camera_from_world.
@@ -88,25 +88,27 @@ def in_first_frame(
 
 
 def photographed(rig: Rig, noise_px: float, random: np.random.Generator) -> list[View]:
-    """Every place from every camera, with normal errors of the corners; corners outside the image are missing."""
+    """Draw every board from every camera, with Gaussian errors on the corners. Corners outside the image are left out,
+    and so is a photograph with fewer than six corners.
+    """
     corners = corners_on_board(CHESSBOARD)
     ids = np.arange(len(corners))
     views = []
     for place in range(len(rig.places)):
         for camera in range(len(rig.lenses)):
             blank = View(camera, place, corners, np.zeros((len(corners), 2)), ids, f"camera {camera}, place {place}")
-            drawn = draw(rig, joined([blank]))
+            drawn = project_corners(rig, joined([blank]))
             inside = ((drawn > 0) & (drawn < np.array(rig.lenses[camera].size))).all(axis=1)
             seen = drawn + random.normal(0, noise_px, drawn.shape)
-            view = View(camera, place, corners, seen, ids, blank.name).kept(inside)
+            view = View(camera, place, corners, seen, ids, blank.name).selected(inside)
             if inside.sum() >= 6:
                 views.append(view)
     return views
 
 
 def table_views(path: Path) -> list[View]:
-    """Views of a table of ChArUco corners with metres and OpenCV's pixels; views of fewer than four corners are left
-    out.
+    """Read the views of a table of ChArUco corners, in metres and in OpenCV's pixel coordinates. Views with fewer than
+    four corners are left out.
     """
     rows = defaultdict(list)
     with path.open() as stream:

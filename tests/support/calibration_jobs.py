@@ -13,7 +13,7 @@ from services.pipeline.event_log import EventAddress
 
 
 def publish_calibration(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """What the stage of a calibration job leaves, without measuring anything."""
+    """Publish the files that the stage of a calibration job publishes, without measuring anything."""
     assert spec.capture is not None
     with events.open() as log:
         writer = StageWriter(folder, "asset", log.begin_stage("export"))

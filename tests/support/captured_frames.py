@@ -1,4 +1,4 @@
-"""What a capture by the simulated dome has left, and what the dome emits meanwhile."""
+"""The frames that a capture by the simulated dome has stored, and the dome's light outputs while it runs."""
 
 from __future__ import annotations
 

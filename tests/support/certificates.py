@@ -1,4 +1,4 @@
-"""Authorities and the folders of certificates that they sign, made by openssl."""
+"""Certificate authorities and folders with the certificates that they sign, made by openssl."""
 
 from __future__ import annotations
 

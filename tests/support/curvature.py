@@ -1,4 +1,4 @@
-"""Noise of a curvature as tests need it."""
+"""Noise of a curvature matrix, for tests of the solvers."""
 
 from __future__ import annotations
 

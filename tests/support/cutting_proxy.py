@@ -11,7 +11,7 @@ BLOCK_BYTES = 2**16
 
 
 class CuttingProxy:
-    """Forwards to one port; cuts count bytes over all connections together."""
+    """Forwards connections to one port and cuts them at given totals of bytes, summed over all connections."""
 
     def __init__(self, port: int, cuts_bytes: Sequence[int], answer_cuts_bytes: Sequence[int]) -> None:
         self._target, self._sent, self._answered = port, _Meter(cuts_bytes), _Meter(answer_cuts_bytes)
@@ -20,7 +20,7 @@ class CuttingProxy:
         self.address = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
 
     def accept(self) -> None:
-        """Forward until closed."""
+        """Accept and forward connections until the proxy is closed."""
         with suppress(OSError):
             while True:
                 near, _ = self._listener.accept()
@@ -30,7 +30,7 @@ class CuttingProxy:
                 threading.Thread(target=_pump, args=(far, near, self._answered), daemon=True).start()
 
     def close(self) -> None:
-        """Cut everything."""
+        """Stop listening and cut every open connection."""
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         for connection in self._open:
@@ -38,24 +38,24 @@ class CuttingProxy:
 
     @property
     def sent_bytes(self) -> int:
-        """What clients have sent through it."""
+        """Bytes that clients have sent through the proxy."""
         return self._sent.passed_bytes
 
     @property
     def cut_count(self) -> int:
-        """Cuts so far."""
+        """Number of cuts so far, in both directions together."""
         return self._sent.cut_count + self._answered.cut_count
 
 
 class _Meter:
-    """Counts what passes in one direction, and says where to cut it."""
+    """Counts the bytes that pass in one direction, and decides where to cut them."""
 
     def __init__(self, cuts_bytes: Sequence[int]) -> None:
         self._cuts, self._guard, self.passed_bytes = sorted(cuts_bytes, reverse=True), threading.Lock(), 0
         self.cut_count = 0
 
     def passing(self, block: bytes) -> tuple[bytes, bool]:
-        """What may still pass of a block, and whether the connection is cut after it."""
+        """Return the part of a block that may still pass, and whether the connection is cut after it."""
         with self._guard:
             self.passed_bytes += len(block)
             if not self._cuts or self.passed_bytes < self._cuts[-1]:
@@ -78,7 +78,7 @@ def _pump(source: socket.socket, sink: socket.socket, meter: _Meter) -> None:
 
 @contextmanager
 def cutting(port: int, cuts_bytes: Sequence[int] = (), answer_cuts_bytes: Sequence[int] = ()) -> Iterator[CuttingProxy]:
-    """A proxy for the time of the block; cuts after so many bytes from clients, and after so many from the server."""
+    """Run a proxy for the time of the block; it cuts after these totals of bytes from clients and from the server."""
     proxy = CuttingProxy(port, cuts_bytes, answer_cuts_bytes)
     thread = threading.Thread(target=proxy.accept)
     thread.start()

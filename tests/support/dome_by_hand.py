@@ -1,4 +1,4 @@
-"""A server with a dome, and what the dome emits."""
+"""A server with a dome, the dome's console without its process, and the lights that are lit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def settings_of(address: Address, data: Path, **more: Any) -> ServerSettings:
 
 
 class Jobs:
-    """In place of a job's stages: what a test says, nothing by default."""
+    """Stand-in for a job's stages that runs the function a test sets; by default it does nothing."""
 
     def __init__(self) -> None:
         self.run: Callable[[JobSpec, Path, EventAddress], object] = nothing
@@ -75,7 +75,7 @@ def rig(tmp_path: Path, **options: Any) -> dict[str, Any]:
 
 @contextmanager
 def console(address: Address, **limits: float) -> Iterator[Callable[..., DomeAnswer]]:
-    """The dome's process without a process around it."""
+    """Give the console of the dome's process, run inside the test instead of in a process of its own."""
     console = Console(*address, DomeSettings(watchdog_s=WATCHDOG_S, **limits))
     try:
         yield lambda **command: console.answer(DomeCommand(**{"number": 1} | command))
@@ -84,7 +84,7 @@ def console(address: Address, **limits: float) -> Iterator[Callable[..., DomeAns
 
 
 def capture(spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """The real capture, without a worker around it."""
+    """Run the real capture stage in the caller's process, without a worker."""
     with events.open() as log:
         attempt = log.begin_stage("capture")
         stage.run(spec, LocalContext(folder, attempt, lambda event: log.append(attempt, event)))

@@ -1,4 +1,4 @@
-"""A TCP proxy before a dome, whose connections fall silent or run out."""
+"""A TCP proxy in front of a dome, whose open connections can fall silent and which can refuse new ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Address = tuple[str, int]
 
 
 class Proxy:
-    """Forwards TCP connections, until told that those that exist fall silent without closing."""
+    """Forwards TCP connections. ``silence`` stops the data on the open connections without closing them."""
 
     def __init__(self, target: Address) -> None:
         self._target, self._silent, self.accepted = target, set[socket.socket](), list[socket.socket]()
@@ -19,11 +19,11 @@ class Proxy:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def silence(self) -> None:
-        """Let no more pass over the connections that exist."""
+        """Drop all further data of the open connections."""
         self._silent.update(self.accepted)
 
     def close(self) -> None:
-        """Refuse new connections; those that exist go on."""
+        """Refuse new connections; the open ones go on."""
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
 

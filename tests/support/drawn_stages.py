@@ -1,4 +1,4 @@
-"""Stages that take as long as a job's size and a drawn factor say, by the clock; nothing else happens in them."""
+"""Stages that only wait, for a time given by a job's size and a random factor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from services.core.store import StageWriter
 
 SECONDS_PER_SAMPLE = 0.02
 SPREAD = 0.25
-"""Standard deviation of the logarithm of the drawn factor."""
+"""Standard deviation of the logarithm of the random factor."""
 
 
 def _last(stage: StageName, folder: str, seconds: float, context: StageContext) -> AssetManifest:
@@ -28,16 +28,16 @@ def _last(stage: StageName, folder: str, seconds: float, context: StageContext) 
 
 
 def prepare(_spec: JobSpec, context: StageContext) -> AssetManifest:
-    """A fixed time."""
+    """Wait for a fixed time."""
     return _last("prepare", "prepared", 0.2, context)
 
 
 def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """A fixed time and one in proportion to the samples, drawn by the job's seed."""
+    """Wait for a fixed time and a time proportional to the samples, both times a factor drawn from the job's seed."""
     factor = random.Random(spec.seed).lognormvariate(0.0, SPREAD)
     return _last("fit", "fit", (0.3 + SECONDS_PER_SAMPLE * spec.samples_per_pixel) * factor, context)
 
 
 def export(_spec: JobSpec, context: StageContext) -> AssetManifest:
-    """A fixed time."""
+    """Wait for a fixed time."""
     return _last("export", "asset", 0.1, context)

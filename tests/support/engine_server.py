@@ -1,5 +1,5 @@
-"""``python -m tests.support.engine_server SETTINGS``: the real server with a fit that calls an engine, its worker's
-memory limited to a known figure.
+"""``python -m tests.support.engine_server SETTINGS``: the real server with a fit that calls an engine, and with a known
+memory limit for its worker.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MEMORY_BYTES = 1200 * MIB
 
 @contextmanager
 def engine_server(data: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
-    """Such a server as a process of its own."""
+    """Run this module's server as a process of its own for the time of the block."""
     with running_server(
         [sys.executable, "-m", "tests.support.engine_server", json.dumps({"data": str(data), "port": 0})]
     ) as running:
@@ -34,5 +34,5 @@ def engine_server(data: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[s
 if __name__ == "__main__":
     resource.setrlimit(
         resource.RLIMIT_RSS, (MEMORY_BYTES, MEMORY_BYTES)
-    )  # the system knows no such limit, Dask shares it out among the processors
+    )  # the kernel does not enforce this limit; Dask reads it and divides it among the processors
     main(ServerSettings.model_validate_json(sys.argv[1]), "tests.support.engine_stages")

@@ -1,5 +1,5 @@
-"""A fit that makes one call to an engine on the worker's rendering process, or none, as a file in the capture says; it
-publishes what a toy fit does.
+"""A fit that makes one engine call on the worker's rendering process, or none, as a file in the capture says. It then
+publishes the same record as the fit of ``toy_stages``.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ MIB = 2**20
 
 
 class LongEngine(Engine):
-    """The real engine, asked for an image that takes hours."""
+    """The real engine with a call that renders an image for hours."""
 
     def __init__(self, scene: SceneRecipe, threads: int | None = None) -> None:
         super().__init__(scene, threads)
 
     def render(self, started: str) -> None:
-        """Compile the kernel on a few paths, say in a file that it runs, and trace all of them."""
+        """Compile the kernel with 16 paths per pixel, write the process id to ``started``, then trace 2²⁶ per pixel."""
         view = whole_view(camera_at((0.2, 1, 0.1), size=64))
         self.images(TISSUE, view, seed=1, samples=16)
         Path(started).write_text(str(os.getpid()))
@@ -44,7 +44,7 @@ class LongEngine(Engine):
 
 
 def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Do what the capture's file ``call`` says."""
+    """Make the engine call that the capture's file ``call`` names."""
     assert spec.capture is not None
     call = (spec.capture / "call").read_text()
     if call == "none":
@@ -59,7 +59,7 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
         "crash": ("die", int(signal.SIGSEGV)),
         "render": ("render", str(spec.capture / "started")),
     }.get(call, ("answer", 1))
-    prefix = (  # as every fit has its own: Dask answers for a key that it still knows with the old result
+    prefix = (  # Every fit has its own prefix, because Dask answers a key that it still knows with the old result.
         f"{context.root.name}-{context.attempt}"
     )
     with executor(context.root / CANCEL_FLAG, REAL if call == "render" else BROKEN, prefix) as run_on:
@@ -68,5 +68,5 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 
 def ask(host: EngineHost, scene: StoredFile, method: str, *arguments: Any) -> None:
-    """A task of a fit."""
+    """Call a method of the engine, as a task of a fit does."""
     host.call(method, scene, *arguments)

@@ -1,5 +1,5 @@
-"""The reference tables of light that leaves a slab by direction and place, and of the half space, as layers and
-values.
+"""Reference tables of the light that leaves a slab by direction and by position, and of the half space. Each becomes a
+layer to simulate with its expected values.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ UNKNOWN = math.nan
 
 @dataclass(frozen=True)
 class ExitCase:
-    """One simulation's worth of reference.
+    """Reference values that one simulation gives.
 
-    Rows are those of ``Sums``, columns R and T; NaN where a table has no value.
+    ``values``, ``tolerance`` and ``reference_error`` have the rows of ``Sums`` and the columns R (reflected) and T
+    (transmitted); NaN where a table has no value.
     """
 
     name: str
     layer: Layer
     options: dict[str, Any]
-    """Of ``accumulate``."""
+    """Keyword arguments of ``accumulate``."""
     values: NDArray[np.float64]
     tolerance: NDArray[np.float64]
     reference_error: NDArray[np.float64] | float = 0.0
@@ -46,14 +47,16 @@ class ExitCase:
         return sums
 
     def scores(self, sums: Sums) -> NDArray[np.float64]:
-        """z of every value of the table, its own errors counted in."""
+        """z-score of every value of the table; the error is that of the simulation and of the table together."""
         known = ~np.isnan(self.values)
         error = np.hypot(sums.standard_error(), self.reference_error)
         return z_scores(sums.mean()[known], self.values[known], error[known])
 
 
 def angular_cases(relative_tolerance: float) -> list[ExitCase]:
-    """``angular_slab.csv``: pi times the radiance that leaves at a cosine, for one cosine of incidence each."""
+    """Read ``angular_slab.csv``: pi times the radiance that leaves at a cosine. One case per medium and cosine of
+    incidence.
+    """
     groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for row in rows_of("angular_slab.csv"):
         groups.setdefault(tuple(row[key] for key in ("a", "g", "tau", "mu_incident")), []).append(row)
@@ -72,8 +75,13 @@ def angular_cases(relative_tolerance: float) -> list[ExitCase]:
 
 
 def half_space_cases(tolerance: float, relative_tolerance: float, *albedos: str) -> list[ExitCase]:
-    """``hfunction.csv``: albedos of the isotropic half space, and H(1) by the radiance a H(1)^2 / (8 pi) straight back
-    from normal incidence.
+    """Read ``hfunction.csv``: reflected shares of an isotropic half space by single-scattering albedo a, and H(1),
+    compared by the radiance a H(1)^2 / (8 pi) that leaves along the normal under normal incidence.
+
+    Args:
+        tolerance: of reflected shares, absolute.
+        relative_tolerance: of the radiance.
+        albedos: rows of the table, as text.
     """
     cases = []
     for row in rows_of("hfunction.csv"):
@@ -93,8 +101,8 @@ def half_space_cases(tolerance: float, relative_tolerance: float, *albedos: str)
 
 
 def ring_case(tolerance: float) -> ExitCase:
-    """``pencil_beam_rings.csv``: sigma 5, albedo 0.99, g 0.8, 1 mm between smooth faces of index 1.33; totals by
-    adding-doubling beside it.
+    """Read ``pencil_beam_rings.csv``: sigma 5 per mm, albedo 0.99, g 0.8, 1 mm between smooth faces of index 1.33. The
+    totals in the first row come from adding-doubling.
     """
     rows = rows_of("pencil_beam_rings.csv")
     values = np.array([[0.300137, 0.554013], *([float(row["R_scattered"]), float(row["T_scattered"])] for row in rows)])

@@ -5,12 +5,13 @@ from dentin::
 
     I = c (1 - T) a_e^1.5 + T c^(1/2) a_d^1.5 (1 - exp(-s_d c^2)) + 0.05,   T = exp(-s_e d)
 
-with reduced scattering s and reduced albedo a, so reduced quantities are fixed by the images and nothing else is. A
-stain multiplies by a_t at the texel a pixel looks at, and by its mean over all texels of the tooth, for the way in.
-Noise is Gaussian, relative, falls with the samples and depends on seed and pixel alone.
+with reduced scattering s and reduced albedo a, so the images determine the reduced quantities and nothing else. A stain
+multiplies the image by its transmittance at the texel that a pixel shows (light that leaves), and by its mean over all
+texels of the tooth (light that enters). Noise is Gaussian and relative, falls with the samples and depends on seed,
+camera, light and pixel alone.
 """
 
-# ruff: noqa: ARG002 - signatures are those of what is replaced
+# ruff: noqa: ARG002 - signatures are those of the real engine
 from __future__ import annotations
 
 import time
@@ -28,19 +29,20 @@ from services.fit.transport.scene.recipe import JacobianEstimate, SceneRecipe, S
 Array = NDArray[np.float64]
 
 NOISE = 1.0
-"""Relative standard deviation of one path."""
+"""Standard deviation of the estimate from one path, relative to the pixel's value."""
 SCORE_NOISE = 1.0
 
 
 class FakeEngine:
-    """Same methods as the real engine."""
+    """Stand-in with the methods of the real engine."""
 
     directness = 0.0
-    """By how much the mean cosine adds to what enamel seems to scatter: media of equal reduced quantities then
-    differ."""
+    """Factor of enamel's mean cosine in its apparent scattering. Above zero, media of equal reduced quantities give
+    different images."""
     path_noise = NOISE
     shared_noise = 0.0
-    """Part of the noise's variance that all lights of a pixel share, as those of one walk do."""
+    """Share of the noise's variance that is common to all lights of a pixel, as when one random walk serves them
+    all."""
 
     def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
         self.recipe = recipe
@@ -83,8 +85,8 @@ class FakeEngine:
         return StainGradient((gradient,), (np.zeros_like(gradient),), samples)
 
     def _texels(self, view: View, stain: Stain) -> tuple[NDArray[np.int64], Array]:
-        # The middle of a face chosen by the pixel: neighbouring pixels look at faces far apart, which no smoothness
-        # explains away.
+        # Each pixel shows the centre of a face chosen by its coordinates. Neighbouring pixels show faces far apart, so
+        # smoothness cannot replace the data.
         uv = self.recipe.teeth[0].stain_uv
         assert uv is not None
         x, y = view.pixels.T
@@ -95,7 +97,7 @@ class FakeEngine:
         self, tissue: Tissue, view: View, *, bin_edges: NDArray[np.int64], samples: int, seed: int, batches: int = 1
     ) -> Array:
         image = self.images(tissue, view, samples=samples, seed=seed).mean
-        # Shares of the orders whose power series in the albedo follows the formula's mean image.
+        # Find the shares of the scattering orders whose power series in the albedo follows the formula's mean image.
         alphas = 1 - np.logspace(-4, -0.7, 40)
         whites = [replace(medium, alpha=1.0) for medium in (tissue.enamel, tissue.dentin)]
         white = self._formula(Tissue(*whites, tissue.shape), view)
@@ -139,7 +141,7 @@ class FakeEngine:
         return np.sqrt(1 - self.shared_noise) * own + np.sqrt(self.shared_noise) * shared if self.shared_noise else own
 
     def _numbers(self, view: View, seed: int, stream: int, *, by_light: bool) -> Array:
-        # A counter-based number per (seed, stream, light, pixel): block and order do not matter.
+        # Counter-based random numbers per (seed, stream, light, pixel), so that blocks and order do not matter.
         lights = np.arange(len(self.recipe.light_positions_mm), dtype=np.uint64)[:, None]
         place = lights if by_light else np.full_like(lights, 1000)
         pixel = (view.pixels[:, 0] + 4096 * view.pixels[:, 1]).astype(np.uint64)[None] + np.uint64(2**40) * place
@@ -162,23 +164,21 @@ def _uniform(z: NDArray[np.uint64]) -> Array:
 
 
 class DirectFakeEngine(FakeEngine):
-    """Similar media are not alike here, and the lights of a pixel share noise."""
+    """A fake engine in which media of equal reduced quantities differ, and the lights of a pixel share noise."""
 
     directness = 0.5
     shared_noise = 0.3
 
 
 class QuietFakeEngine(FakeEngine):
-    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that
-    counts.
-    """
+    """A fake engine with a hundredth of the variance, so that the errors of photographs and calibration dominate."""
 
     path_noise = 0.1 * NOISE
 
 
 class Slowly(FakeEngine):
-    """Takes long enough per pass that two workers overlap and a kill lands in mid-fit; the numbers are those of the
-    engine it is mixed with.
+    """Mixin that makes each pass long enough for two workers to overlap and for a kill to land in mid-fit. The numbers
+    are those of the engine that it is mixed with.
     """
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
@@ -193,4 +193,4 @@ class Slowly(FakeEngine):
 
 
 class SlowFakeEngine(Slowly):
-    """The fake engine, slowly."""
+    """The fake engine with longer passes."""

@@ -1,5 +1,5 @@
-"""The fake engine for a whole mouth: every pixel shows the tooth or the gums at its middle, and the wall brightens all
-of them.
+"""The fake engine for a whole mouth: every pixel shows the tooth or the gums at its centre, plus light from the mouth's
+wall.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class FakeMouthEngine(FakeEngine):
-    """As ``FakeEngine``, which it is for a single tooth."""
+    """Fake engine for a mouth; for a single tooth it gives the same images as ``FakeEngine``."""
 
     def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
         super().__init__(recipe, threads)
@@ -41,7 +41,7 @@ class FakeMouthEngine(FakeEngine):
         return np.asarray(np.where(shown < len(by_tooth), image, gums) + wall)
 
     def _shown(self, view: View) -> NDArray[np.int64]:
-        # Position of the tooth, or their number for whatever else there is.
+        # Index of the tooth that a pixel shows, or the number of teeth where it shows anything else.
         if self._rays is None:
             assert self.recipe.gums is not None
             self._rays = RayScene(*(tooth.outer for tooth in self.recipe.teeth), self.recipe.gums)
@@ -52,12 +52,12 @@ class FakeMouthEngine(FakeEngine):
 
 
 class SlowFakeMouthEngine(Slowly, FakeMouthEngine):
-    """The same, slowly."""
+    """The fake engine for a mouth with longer passes."""
 
 
 class QuietFakeMouthEngine(FakeMouthEngine):
-    """Renders of a hundredth of the variance, so that what photographs and calibration leave open is all that
-    counts.
+    """A fake engine for a mouth with a hundredth of the variance, so that the errors of photographs and calibration
+    dominate.
     """
 
     path_noise = 0.1 * NOISE

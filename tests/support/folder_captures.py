@@ -1,4 +1,4 @@
-"""A folder capture that is prepared whole, for tests to alter."""
+"""A small folder capture that preparation accepts, for tests to alter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ Tree = dict[str, Any]
 
 
 def write_folder(root: Path) -> Tree:
-    """A minimal capture: a ball, two cameras of different size, two lights, two channels."""
+    """Write a minimal capture: a ball, two cameras of different image size, two lights, two channels. Returns the
+    contents of its ``capture.json``.
+    """
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4)
     write_mesh(
         root / "teeth" / "11" / "outer.ply", Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))

@@ -1,8 +1,8 @@
-"""The numbers that the fit's parts gave for fixed seeds when their numerics were last raised;
+"""Reference results of the fit's parts for fixed seeds, stored when ``NUMERICS`` was last raised;
 ``python -m tests.support.golden_numerics`` stores them anew.
 
-Images and derivatives of the real engine on a small tooth with stains, and every result that a short fit records on the
-fake engine, which shows solvers and schedules.
+They are the images and derivatives of the real engine on a small tooth with stains, and every result that a short fit
+on the fake engine records, which covers solvers and schedules.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ FIT_OPTIONS = {
     "search_candidates": 500,
 }
 PASSING = frozenset({"begun", "seconds"})
-"""Recorded, but no numerics."""
+"""Keys of the journal that depend on the clock, and are therefore left out."""
 
 
 def renders() -> dict[str, NDArray[np.float32]]:
-    """Images and derivatives of the real engine, by boundary and kind."""
+    """Render images and derivatives with the real engine, by boundary and kind."""
     from services.fit.transport.engine import Engine
     from tests.support.render_once import Picture, picture
     from tests.support.stained_tooth import stained_recipe
@@ -54,10 +54,10 @@ def renders() -> dict[str, NDArray[np.float32]]:
 
 
 def fit_results(instrument: str) -> dict[str, NDArray[np.float64]]:
-    """Every number that a short fit records, by the key of its result.
+    """Run a short fit and return every number that it records, by the key of its result.
 
     Args:
-        instrument: the option; without the instrument's errors the numbers are those of the first numerics.
+        instrument: the option; "off" leaves out the instrument's errors and gives the numbers of the first numerics.
     """
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
@@ -73,7 +73,7 @@ def fit_results(instrument: str) -> dict[str, NDArray[np.float64]]:
 
 
 def measure() -> dict[str, NDArray[Any]]:
-    """All of them."""
+    """Compute all results that the file stores, by key."""
     return {**renders(), **fit_results("on"), **fit_results("off")}
 
 
@@ -91,7 +91,7 @@ def _numbers(value: Any) -> Iterator[float]:
 
 
 def main() -> None:
-    """Store what this tree gives, unless its number stands for other numbers already."""
+    """Store the results of this tree, unless the file already holds results for this value of ``NUMERICS``."""
     if STORED.exists() and int(np.load(STORED)["numerics"]) >= NUMERICS:
         sys.exit(f"{STORED} holds numerics {NUMERICS}; raise services.fit.execution.numerics.NUMERICS first.")
     np.savez_compressed(STORED, numerics=NUMERICS, **measure())  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""A server that asks for tokens, with one token of each scope."""
+"""A server that requires tokens, with one token of each scope."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def make_deed() -> AuditedAction:
 def make_token(
     data: Path, name: str, *scopes: Scope, database: str | None = None, group: str | None = DEFAULT_GROUP
 ) -> str:
-    """A new token on a data folder, as ``dentine token create --group`` makes it."""
+    """Create a token on a data folder, as ``dentine token create --group`` does."""
     engine = open_database(database or ServerSettings(data=data).database_url)
     try:
         upgrade(engine)
@@ -47,7 +47,7 @@ class Guarded:
     data: Path
 
     def ask(self, method: str, path: str, scope: Scope | None = None, **options: Any) -> httpx.Response:
-        """A request with the token of a scope, or without one; no cookie is kept from it."""
+        """Send a request with the token of a scope, or without a token; cookies of the answer are dropped."""
         headers = options.pop("headers", {}) | ({"Authorization": f"Bearer {self.tokens[scope]}"} if scope else {})
         answer = self.client.request(method, path, headers=headers, **options)
         self.client.cookies.clear()
@@ -55,7 +55,7 @@ class Guarded:
 
 
 def run_nothing(*_: object) -> None:
-    """A job that succeeds at once."""
+    """Run a job that succeeds at once."""
 
 
 @contextmanager

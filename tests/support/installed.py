@@ -1,6 +1,4 @@
-"""This project as a user installs it: a wheel, and virtual environments that hold it with some extras and nothing
-else.
-"""
+"""This project as a user installs it: a wheel, and virtual environments that hold only the wheel and some extras."""
 
 from __future__ import annotations
 
@@ -49,7 +47,7 @@ def build_wheel(folder: Path, added: Mapping[str, str] = MappingProxyType({})) -
 
 
 def install(wheel: Path, extras: Iterable[str], folder: Path) -> Path:
-    """Make a virtual environment with the wheel and what the extras bring; gives its folder of programs."""
+    """Make a virtual environment with the wheel and its extras; returns the environment's folder of programs."""
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
     chosen = ",".join(extras)
     command = [str(folder / "bin" / "pip"), "install", "--quiet", f"{wheel}[{chosen}]" if chosen else str(wheel)]
@@ -58,5 +56,5 @@ def install(wheel: Path, extras: Iterable[str], folder: Path) -> Path:
 
 
 def environment_without_this_tree(**settings: str) -> dict[str, str]:
-    """This process's variables without those by which Python finds modules elsewhere."""
+    """This process's environment without the variables that let Python find modules elsewhere, plus settings."""
     return {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "VIRTUAL_ENV"}} | settings

@@ -1,7 +1,7 @@
 """A jaw with known optics as stock Mitsuba renders it; ``tests/benchmarks/render_jaw_truth.py`` made the images.
 
-Its surfaces are those of the phantom jaw of one subject, which are built again; numbers stored with the images tell
-whether they are still the same. Sensor noise is added when the capture is written.
+Its surfaces are those of one subject's phantom jaw, which is built again when the images are read; moments stored with
+the images check that the surfaces are still the same. Sensor noise is added when the capture is written.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ STORED = Path(__file__).resolve().parents[1] / "data" / "truths-jaw" / "subject-
 SUBJECT, CHANNEL = 1, "green"
 PIXEL_MM, CAMERAS, LIGHTS, HELD_OUT = 1.0, 3, 7, 2
 NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002
-"""Sensor noise: of the value, and of the image's maximum."""
+"""Standard deviation of sensor noise as shares of the pixel's value and of the image's maximum."""
 NEIGHBOURS_PX = 2
-"""Half width of the square in which the renderer's noise is smoothed."""
+"""Half width in pixels of the square over which the renderer's variance is averaged."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class JawTruth:
     cameras: tuple[Camera, ...]
     lights: tuple[Light, ...]
     mean: tuple[NDArray[np.float64], ...]
-    """By camera, (L, H, W)."""
+    """Images (L, H, W) by camera."""
     variance: tuple[NDArray[np.float64], ...]
-    """Of the mean, from independent passes."""
+    """Variance (L, H, W) of the mean by camera, from independent passes."""
 
 
 def cameras(jaw: JawSurfaces) -> tuple[Camera, ...]:
@@ -53,7 +53,7 @@ def lights() -> tuple[Light, ...]:
 
 
 def pack(stored: Path, passes: list[NDArray[np.float64]], samples: int) -> None:
-    """Store images (P, L, H, W) of every camera, from P independent passes.
+    """Store the mean and standard error of images (P, L, H, W) of every camera, from P independent passes.
 
     Args:
         samples: paths per pixel of all passes together.
@@ -82,8 +82,8 @@ def read_jaw_truth(stored: Path = STORED) -> JawTruth:
 
 
 def by_engine(truth: JawTruth, samples: int) -> JawTruth:
-    """The same jaw as the project's own engine renders it, where the question is what a fit makes of photographs with
-    less noise than stock Mitsuba affords.
+    """Render the same jaw with the project's own engine, for tests of fits to images with less noise than stock Mitsuba
+    can render in the same time.
     """
     from services.fit.transport.engine import Engine
     from services.phantom.render import render_engine
@@ -97,12 +97,12 @@ def by_engine(truth: JawTruth, samples: int) -> JawTruth:
 def write_jaw_capture(folder: Path, truth: JawTruth, seed: int, *, dentin: bool = True) -> None:
     """Write the truth as a folder capture with sensor noise.
 
-    A pixel's variance file holds the sensor's variance and the renderer's, the latter as its neighbours have it: where
-    few bright paths are missed, value and spread both come out low, and weights by a pixel's own spread would pull a
-    fit down.
+    A pixel's stored variance is the sensor's variance plus the renderer's, averaged over the pixel's neighbours. Where
+    a pixel misses its few bright paths, its value and its own variance both come out low, so weights from its own
+    variance would bias a fit downwards.
 
     Args:
-        dentin: give its surfaces.
+        dentin: whether to write the surfaces of dentin.
     """
     random = np.random.default_rng(seed)
     entries, kept = [], held_out_lights(LIGHTS, HELD_OUT)
@@ -127,7 +127,7 @@ def write_jaw_capture(folder: Path, truth: JawTruth, seed: int, *, dentin: bool 
 
 
 def _of_neighbours(variance: NDArray[np.float64]) -> NDArray[np.float64]:
-    # Mean over the square around a pixel, itself and what is quite dark left out.
+    # Mean over the square around a pixel, without the pixel itself and without pixels of zero variance.
     from scipy.ndimage import uniform_filter
 
     width = 2 * NEIGHBOURS_PX + 1
@@ -140,6 +140,6 @@ def _of_neighbours(variance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _moments(jaw: JawSurfaces) -> NDArray[np.float64]:
-    # Volume and mean vertex of every surface, mm.
+    # Volume (mm³) and mean vertex (mm) of every surface.
     meshes = [mesh for tooth in jaw.teeth for mesh in (tooth.outer, tooth.dentin) if mesh is not None]
     return np.array([[mesh.signed_volume_mm3(), *mesh.vertices_mm.mean(axis=0)] for mesh in (*meshes, jaw.gums)])

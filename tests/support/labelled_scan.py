@@ -1,4 +1,4 @@
-"""A small labelled scan: steep bumps on a plate, as teeth in gums, and the file formats that scans come in."""
+"""A small labelled scan, steep bumps on a plate like teeth in gums, and writers of the file formats of scans."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PITCH_MM = 0.4
 CROWN_MM = 7.0
 RADIUS_MM = 3.6
 NECK_MM = 1.0
-"""Height above the plate from which on a bump is a tooth."""
+"""Height above the plate from which a bump is labelled as a tooth."""
 
 
 def bumps(places_mm: dict[int, tuple[float, float]]) -> LabelledScan:
@@ -36,7 +36,7 @@ def bumps(places_mm: dict[int, tuple[float, float]]) -> LabelledScan:
 
 
 def universal(fdi: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Universal numbers of upper teeth."""
+    """Convert FDI numbers of upper teeth to Universal numbers; 0 (gums) stays 0."""
     return np.where(fdi == 0, 0, np.where(fdi < 20, 19 - fdi, fdi - 12))
 
 
@@ -51,7 +51,9 @@ def write_vtp(
     joined: bool = False,
     byte_order: str = "LittleEndian",
 ) -> None:
-    """Write VTK PolyData in one of the ways that programs do; ``joined`` is one base64 stream of length and bytes."""
+    """Write VTK PolyData in one of the encodings that programs use; ``joined`` encodes header and data as one base64
+    stream.
+    """
     order = "<" if byte_order == "LittleEndian" else ">"
     width = {"UInt32": "u4", "UInt64": "u8"}[header_type]
     payload = b""
@@ -100,7 +102,7 @@ def write_vtp(
 
 
 def write_labelled_ply(path: Path, mesh: Mesh, labels: NDArray[np.int64]) -> None:
-    """An ascii PLY with a label per face."""
+    """Write an ASCII PLY file with a label per face."""
     lines = [
         "ply",
         "format ascii 1.0",

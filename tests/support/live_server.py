@@ -1,4 +1,4 @@
-"""A real HTTP server in a thread of the test, and as a process of its own."""
+"""A real HTTP server, in a thread of the test or as a process of its own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fastapi import FastAPI
 
 
 def connect(address: str) -> httpx.Client:
-    """A client of one server, whatever proxies the environment names."""
+    """A client of one server that ignores the proxies of the environment."""
     return httpx.Client(base_url=address, trust_env=False, timeout=60)
 
 
@@ -49,8 +49,8 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
 def toy_server(
     data: Path, log: IO[str] | None = None, stages: str = "tests.support.toy_stages", **settings: Any
 ) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
-    """The server with a module's stages as a process of its own, ended by SIGTERM unless the block ended it; ``log``
-    takes its standard error.
+    """Run the server with a module's stages as a process of its own. At the end of the block it gets SIGTERM unless it
+    has ended already; ``log`` receives its standard error.
     """
     chosen = json.dumps({"data": str(data), "port": 0} | settings)
     with running_server([sys.executable, "-m", "tests.support.toy_server", chosen, stages], log) as running:
@@ -64,7 +64,7 @@ def running_server(
     cwd: Path = Path(__file__).parents[2],
     environment: Mapping[str, str] | None = None,
 ) -> Iterator[tuple[httpx.Client, subprocess.Popen[str]]]:
-    """A server as a process of its own, which tells its address in its first line."""
+    """Run a server as a process of its own, which prints its address in its first line of output."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, cwd=cwd, env=environment) as process:
         try:
             assert process.stdout is not None

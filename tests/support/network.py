@@ -1,4 +1,4 @@
-"""Hosts of a network that a test can cut: namespaces on one bridge. Only the superuser makes them."""
+"""A network whose connections a test can cut: network namespaces on one bridge. Making them needs root."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ NOBODY = "02:00:00:00:00:ff"
 
 
 class Network:
-    """Hosts by name, each with one address; a cut is silent, as that of a cable is."""
+    """Hosts by name, each with one address. A cut drops packets silently, like an unplugged cable."""
 
     def __init__(self, hosts: Sequence[str]) -> None:
-        # Named and numbered by the process, so that several may be there at once.
+        # Names and addresses contain the process id, so that several networks can exist at once.
         self._bridge, numbers = f"dn{os.getpid()}", f"198.18.{os.getpid() % 256}"
         self._addresses = {host: f"{numbers}.{number}" for number, host in enumerate((HERE, *hosts), 1)}
 
@@ -40,31 +40,31 @@ class Network:
             _ip("-n", space, "link", "set", "lo", "up")
 
     def close(self) -> None:
-        """Remove them."""
+        """Remove the bridge and the hosts."""
         for host in self._addresses:
             if host != HERE:
                 _ip("netns", "delete", self._space(host), check=False)
         _ip("link", "delete", self._bridge, check=False)
 
     def address(self, host: str) -> str:
-        """Of one host."""
+        """IP address of one host."""
         return self._addresses[host]
 
     def inside(self, host: str) -> list[str]:
-        """What comes before a command that is to run on a host."""
+        """Prefix of a command line that makes it run on a host."""
         return (
             [] if host == HERE else ["nsenter", f"--net=/run/netns/{self._space(host)}"]
-        )  # not ip netns exec, which takes a view of the disks along
+        )  # not ip netns exec, which also changes the mounted file systems
 
     def cut(self, one: str, other: str) -> None:
-        """Let nothing through between two hosts, without a word to either: what they send goes to a hardware address
-        that nobody has.
+        """Drop all packets between two hosts without an error to either: their packets go to a hardware address that
+        nobody has.
         """
         self._misdirect(one, other)
         self._misdirect(other, one)
 
     def heal(self, one: str, other: str) -> None:
-        """Let everything through again."""
+        """Let packets between two hosts through again."""
         for near, far in ((one, other), (other, one)):
             _ip(*self._table(near), "neigh", "delete", self.address(far), "dev", self._device(near))
 
@@ -94,7 +94,7 @@ class Network:
 
 @contextmanager
 def network_of(*hosts: str) -> Iterator[Network]:
-    """A network for the time of the block. Skips where namespaces cannot be made."""
+    """Make a network for the time of the block. The test is skipped where namespaces cannot be made."""
     network = Network(hosts)
     try:
         try:

@@ -1,4 +1,6 @@
-"""The walk as teeth 2018 has it: the moving border changes transmittance (Eq. 32) but not scattering."""
+"""The walk with the border derivative of the teeth paper of 2018: the moving border changes transmittance (Eq. 32) but
+not scattering.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from services.fit.transport.platform import prepare_device
 
 
 def leave_out_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the scattering partner out of every border derivative for the rest of the test."""
+    """Leave the scattering term out of every border derivative for the rest of the test."""
     prepare_device()
     from services.fit.transport.paths import walk
 

@@ -1,4 +1,4 @@
-"""A history of jobs that nobody ran, so that a test knows what a server must expect."""
+"""A made-up history of finished jobs, so that a test knows which duration a server must forecast."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from services.pipeline.machine_class import machine_class
 
 
 def remember_runs(data: Path, capture: str, totals_s: Iterable[float]) -> None:
-    """As if jobs of this capture had taken so long, nearly all of it in the second half of the fit."""
+    """Store past runs of this capture with these total times, nearly all of it in the second half of the fit."""
     spec, engine = JobSpec(capture=Path(capture)), open_database(sqlite_url(data / DATABASE_FILE))
     size = size_of(spec)
     assert size is not None

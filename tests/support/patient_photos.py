@@ -1,8 +1,7 @@
-"""Five photographs of one patient with reference meshes of the same teeth: what is read of them, and clicks made by
-hand.
+"""Readers of five photographs of one patient and of reference meshes of the same teeth, with landmarks clicked by hand.
 
-Focal lengths and principal points are those that the data's authors fitted, for images 800 pixels wide. Clicks were
-made by looking at the photographs and at shaded meshes; labels of tooth edges and fitted poses were not used for them.
+Focal lengths and principal points are those that the data's authors fitted, for images 800 pixels wide. The landmarks
+were clicked by looking at the photographs and at shaded meshes, without the labels of tooth edges or fitted poses.
 """
 
 from __future__ import annotations
@@ -57,19 +56,19 @@ CLICKED_ON_MESHES = {
 
 
 def camera(view: str) -> Camera:
-    """The camera of a photograph, at the origin."""
+    """The camera of a photograph, with the identity as its pose."""
     focal, (cx, cy) = FOCAL_PX[view], PRINCIPAL_PX[view]
     K = ((focal, 0.0, cx), (0.0, focal, cy), (0.0, 0.0, 1.0))
     return Camera(name=view, size=SIZE, K=K, camera_from_world=STILL)
 
 
 def upper_teeth(root: Path) -> list[Mesh]:
-    """Reference meshes in their common frame."""
+    """Read the reference meshes of the upper teeth in their common frame."""
     return [read_mesh(root / "ref_mesh" / f"Ref_Mesh_Tag=0_FDI={fdi}.obj") for fdi in UPPER_TEETH]
 
 
 def clicks(view: str) -> list[Click]:
-    """Landmarks of a photograph."""
+    """Landmarks of a photograph, with pixels for an image 800 pixels wide."""
     scale = SIZE[0] / CLICKED_WIDTH
     return [
         Click(name, view, np.array(point), scale * np.array(pixel, dtype=np.float64))
@@ -78,7 +77,7 @@ def clicks(view: str) -> list[Click]:
 
 
 def photograph(root: Path, view: str) -> View:
-    """A photograph, 800 pixels wide."""
+    """Read a photograph and scale it to a width of 800 pixels."""
     import cv2
 
     image = cv2.imread(str(root / "image" / f"0-{NUMBER[view]}.png"))[..., ::-1]

@@ -13,7 +13,9 @@ TENT_SPACING_RAD = math.pi / 199
 
 
 def over_equal_angles(nodes: int, values: dict[int, float], floor: float = 0.0) -> PhaseTable:
-    """Equally spaced angles with these values at some nodes; negative indices count from behind."""
+    """A phase table at equally spaced angles with given values at some nodes and ``floor`` elsewhere. Negative indices
+    count from the end.
+    """
     column = np.full(nodes, floor)
     for node, value in values.items():
         column[node] = value
@@ -21,13 +23,13 @@ def over_equal_angles(nodes: int, values: dict[int, float], floor: float = 0.0) 
 
 
 def over_equal_cosines(values: NDArray[np.float64]) -> PhaseTable:
-    """Values from cos(theta) = 1 to -1, the nodes of Mitsuba's ``tabphase`` in the other order."""
+    """A phase table at equally spaced cosines from 1 to -1, the nodes of Mitsuba's ``tabphase`` in reverse order."""
     return PhaseTable(tuple(np.arccos(np.linspace(1, -1, len(values))).tolist()), tuple(values.tolist()))
 
 
 def henyey_greenstein(g: float, spacing: float) -> tuple[PhaseTable, float]:
-    """A lobe at nodes whose distances x = (1 - |g|)^2 / 2|g| + 1 - cos grow by ``spacing``, and how far its values may
-    be off, relatively.
+    """A table of the Henyey-Greenstein phase function and a bound of the relative error of its interpolated values. The
+    nodes x = (1 - |g|)^2 / 2|g| + 1 - cos grow geometrically, by ``spacing`` in log x.
 
     p ~ x^-1.5 is convex, so a chord lies above it, by at most p'' dx^2 / 8 = 15/32 (dx / x)^2 p; normalising takes at
     most as much away.
@@ -45,12 +47,12 @@ def henyey_greenstein(g: float, spacing: float) -> tuple[PhaseTable, float]:
 
 
 def density(table: PhaseTable, angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values at angles, linear in the cosine."""
+    """Values of the table at angles, interpolated linearly in the cosine."""
     return np.interp(haversine(angle_rad), haversine(np.array(table.angles_rad)), np.array(table.values))
 
 
 def cumulative(table: PhaseTable, angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of light scattered by less than an angle: trapezoids are exact for a linear density."""
+    """Share of light scattered by less than an angle. The trapezoidal rule is exact, because the density is linear."""
     nodes, values = haversine(np.array(table.angles_rad)), np.array(table.values)
     masses = np.concatenate([[0.0], np.cumsum(2 * math.pi * np.diff(nodes) * (values[1:] + values[:-1]))])
     x = haversine(angle_rad)

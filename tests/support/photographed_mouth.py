@@ -1,8 +1,7 @@
-"""A phantom jaw in front of three cameras, drawn with plain shading, and clicks on its landmarks: what registration is
-given.
+"""Input of a registration: a phantom jaw drawn with plain shading for three cameras, and clicks on its landmarks.
 
-The drawing shares the z-buffer with the registration but neither its outlines nor its search. Teeth are off-white with
-a dark line where they meet, gums are red, lips of another red hide a part, and every pixel carries noise.
+The drawing uses the registration's z-buffer but neither its outlines nor its search. Teeth are off-white with a dark
+line where they meet, gums are red, lips of another red hide a part, and every pixel has noise.
 """
 
 from __future__ import annotations
@@ -17,22 +16,22 @@ from services.anatomy.templates.jaw import Jaw, build_jaw
 from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View
 from services.calibrate.registration.pose import RigidPose
-from services.calibrate.registration.visible import seen_surfaces
+from services.calibrate.registration.visible import visible_surfaces
 from services.core.geometry import Camera, Mesh
 from services.phantom.dome_rig import dome_cameras
 
 TOOTH, GUMS, LIP, DARK = (0.80, 0.72, 0.58), (0.55, 0.25, 0.24), (0.45, 0.28, 0.27), (0.03, 0.02, 0.02)
 FINER = 2
-"""Pixels are drawn so many times finer and averaged."""
+"""Number of samples per pixel along each axis; their mean is the pixel's value."""
 NOISE = 0.01
 
 
 @dataclass(frozen=True)
 class Mouth:
-    """A jaw, its photographs, and where it truly is."""
+    """A jaw, its photographs, and its true pose."""
 
     teeth: tuple[Mesh, ...]
-    """In the scan's frame."""
+    """Outer surfaces in the scan's frame."""
     gums: Mesh
     fdi: tuple[int, ...]
     centre_mm: NDArray[np.float64]
@@ -42,11 +41,11 @@ class Mouth:
 
 
 def photographed_mouth(subject: int | None, seed: int, pixel_mm: float = 0.15, jaw: Jaw | None = None) -> Mouth:
-    """A subject's jaw seen by three cameras of the dome, from a pose of the scan that is drawn."""
+    """Draw a subject's jaw as three cameras of the dome see it, and move its meshes to a scan frame of random pose."""
     rng = np.random.default_rng(seed)
     jaw = build_jaw(subject) if jaw is None else jaw
     outers = tuple(tooth.outer for tooth in jaw.teeth)
-    # The rig's frame is the jaw's; the scan lies anywhere.
+    # The rig's frame is that of the jaw; the scan's frame is random.
     away = RigidPose(np.eye(3), np.zeros(3)).moved(
         np.concatenate([rng.uniform(-1, 1, 3), rng.uniform(-30, 30, 3)]), np.zeros(3)
     )
@@ -61,7 +60,11 @@ def photographed_mouth(subject: int | None, seed: int, pixel_mm: float = 0.15, j
 
 
 def clicks_on(mouth: Mouth, rng: np.random.Generator, sigma_mm: float = 0.3) -> list[Click]:
-    """The lowest point of every other front tooth and premolar, as each camera sees it, with an error."""
+    """Clicks on the tips of the first, third and fifth tooth of each quadrant in every camera.
+
+    Args:
+        sigma_mm: standard deviation of a click's error, at the tooth.
+    """
     found = []
     for fdi, mesh in zip(mouth.fdi, mouth.teeth, strict=True):
         if fdi % 10 not in (1, 3, 5):
@@ -75,11 +78,11 @@ def clicks_on(mouth: Mouth, rng: np.random.Generator, sigma_mm: float = 0.3) -> 
 
 
 def drawn(camera: Camera, teeth: Sequence[Mesh], gums: Mesh, rng: np.random.Generator) -> NDArray[np.float32]:
-    """A photograph (H, W, 3)."""
+    """Draw a photograph (H, W, 3) with shading, shadows between teeth, a lip and noise."""
     import cv2
 
     fine = _finer(camera)
-    label, depth = seen_surfaces(fine, [*teeth, gums])
+    label, depth = visible_surfaces(fine, [*teeth, gums])
     shown = cv2.GaussianBlur(
         np.where(np.isfinite(depth), depth, depth[np.isfinite(depth)].max()).astype(np.float32), (0, 0), 2
     )
@@ -87,13 +90,13 @@ def drawn(camera: Camera, teeth: Sequence[Mesh], gums: Mesh, rng: np.random.Gene
     shade = 1 / np.sqrt(1 + (slope / (depth.min() / fine.K[0][0])) ** 2)
     colours = np.array([DARK, *[TOOTH] * len(teeth), GUMS])
     image = colours[label + 1] * np.where(label >= 0, 0.25 + 0.75 * shade, 1.0)[..., None]
-    # A shadow where two teeth meet.
+    # Darken the image where two teeth meet.
     touching = np.zeros(label.shape, dtype=bool)
     for axis in (0, 1):
         one, two = np.roll(label, 1, axis), label
         touching |= (one != two) & (one >= 0) & (two >= 0) & (one < len(teeth)) & (two < len(teeth))
     image *= 1 - 0.5 * cv2.GaussianBlur(touching.astype(np.float32), (0, 0), 2.0)[..., None] * 2
-    # A lip over the lower edge on one side.
+    # Cover the image's lower edge with a lip.
     rows, columns = np.mgrid[0 : label.shape[0], 0 : label.shape[1]]
     lip = rows > label.shape[0] * (0.93 + 0.04 * np.cos(columns / label.shape[1] * 5 + rng.uniform(0, 6)))
     image[lip] = LIP

@@ -1,9 +1,9 @@
-"""Judging renders of one scene by two renderers, pixel by pixel.
+"""Comparison of two renderers' images of one scene, pixel by pixel.
 
-z-scores come from 16 batches a side, mapped through Student's t with Welch's degrees of freedom. The count beyond 3
-stays below its 99.9 % binomial quantile, |mean z| below 4 standard errors, and the rms within 0.9 to 1.1 (of few
-pixels: within what chi-square leaves with probability 1e-3). The lights of a pixel share its walks, so what counts as
-independent is a pixel.
+z-scores come from 16 batches of each renderer, mapped through Student's t with Welch's degrees of freedom. The number
+of |z| > 3 must stay below its 99.9 % binomial quantile, |mean z| below 4 standard errors, and the rms between 0.9 and
+1.1 (with few pixels: within the chi-square bounds that noise leaves with probability 1e-3). The lights of a pixel share
+its random walks, so the number of independent values is the number of pixels.
 """
 
 from __future__ import annotations
@@ -20,8 +20,15 @@ BATCHES = 16
 def pixel_scores(
     means: list[NDArray[np.float64]], variances: list[NDArray[np.float64]], block: int = 1
 ) -> NDArray[np.float64]:
-    """z of two sides' images (lights, H, W), summed over blocks of pixels, NaN where unlit; variances are of means over
-    BATCHES.
+    """z-scores of the difference between two renderers' images (lights, H, W), summed over blocks of pixels.
+
+    Args:
+        means: one image stack per renderer.
+        variances: variances of ``means``, each estimated from BATCHES batches.
+        block: edge length of a block in pixels.
+
+    Returns:
+        (lights, H // block, W // block), NaN where both variances are zero.
     """
     means = [sum_blocks(mean, block) for mean in means]
     squares = [sum_blocks(variance**2, block) for variance in variances]
@@ -40,7 +47,9 @@ def sum_blocks(images: NDArray[np.float64], block: int) -> NDArray[np.float64]:
 
 
 def require_same_pictures(scores: NDArray[np.float64], least: int) -> None:
-    """Assert that scores (lights, H, W) or (H, W) look like noise alone, and that there are at least so many."""
+    """Assert that scores (lights, H, W) or (H, W) are compatible with noise alone, and that at least ``least`` are
+    finite.
+    """
     z = scores[np.isfinite(scores)]
     by_pixel = scores.reshape(-1, scores.shape[-2] * scores.shape[-1]).T
     of_pixels = np.array([row[np.isfinite(row)].mean() for row in by_pixel if np.isfinite(row).any()])

@@ -1,4 +1,4 @@
-"""A Postgres server of the tests' own, on a socket in its data folder."""
+"""A temporary Postgres server for tests, reached by a socket in its own folder or as a host of a test's network."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ from services.pipeline.database import open_database
 from tests.support.network import Network
 
 USER = "postgres"
-"""Who runs the server where the tests run as root, which Postgres refuses."""
+"""System user that runs the server when the tests run as root, because Postgres refuses to run as root."""
 
 
 class PostgresServer:
-    """A server in a temporary folder that can be killed and started again. Skips where Postgres is not installed.
+    """A server in a temporary folder that can be killed and started again. The test is skipped where Postgres is not
+    installed.
 
     Args:
-        network: where it is the host ``database``; without one it is reached by its socket alone.
+        network: network in which the server is the host ``database``; None for a server with only a socket.
     """
 
     def __init__(self, network: Network | None = None) -> None:
@@ -49,16 +50,16 @@ class PostgresServer:
             rules.write("host all all all trust\n")
 
     def url(self, name: str) -> str:
-        """Of one of its databases."""
+        """URL of one of the server's databases."""
         return f"postgresql://{USER}@/{name}?host={self._address or self._folder}"
 
     def start(self) -> None:
-        """Start, after a kill too."""
+        """Start the server; also possible after ``kill``."""
         options = f"-c listen_addresses={self._address} -c unix_socket_directories={self._folder} -c fsync=off"
         self._run("pg_ctl", "--wait", "--log", str(self._folder / "log"), "--options", options, "start")
 
     def kill(self) -> None:
-        """Kill -9 the server and everything that it started."""
+        """Kill the server and all its child processes by SIGKILL."""
         main = psutil.Process(int((self._data / "postmaster.pid").read_text().split()[0]))
         for process in [main, *main.children(recursive=True)]:
             with suppress(psutil.NoSuchProcess):
@@ -66,14 +67,14 @@ class PostgresServer:
         psutil.wait_procs([main], timeout=30)
 
     def remove(self) -> None:
-        """Stop it and remove its folder."""
+        """Stop the server and remove its folder."""
         with suppress(subprocess.CalledProcessError):
             self._run("pg_ctl", "--wait", "--mode", "immediate", "stop")
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _run(self, program: str, *arguments: str) -> None:
         command, options = [str(self._programs / program), "--pgdata", str(self._data), *arguments], self._as_user
-        if self._inside:  # only the superuser enters a namespace
+        if self._inside:  # entering a network namespace needs root, so the user is changed inside it
             command, options = (
                 [*self._inside, "setpriv", "--reuid", USER, "--regid", USER, "--clear-groups", *command],
                 {},
@@ -83,7 +84,7 @@ class PostgresServer:
 
 @contextmanager
 def postgres_server(network: Network | None = None) -> Iterator[PostgresServer]:
-    """A running server, removed in the end."""
+    """Run a server for the time of the block, and remove it at the end."""
     server = PostgresServer(network)
     try:
         server.start()
@@ -93,7 +94,7 @@ def postgres_server(network: Network | None = None) -> Iterator[PostgresServer]:
 
 
 def new_database(server: PostgresServer, name: str) -> str:
-    """URL of an empty database on a server."""
+    """Create an empty database on a server; returns its URL."""
     engine = open_database(server.url("postgres"))
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         connection.execute(sql.text(f'CREATE DATABASE "{name}"'))

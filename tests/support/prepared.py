@@ -60,10 +60,16 @@ def write_prepared(
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
     Args:
-        engine: whose formula the photographs follow.
-        shadowed: share of every photograph that loses nine tenths of its light, which no medium explains either.
+        truth: parameters of the photographs.
+        noise: standard deviation of the sensor's noise, relative to the value.
+        held_out: held-out photographs as (camera, light).
+        masked: mask every pixel as a highlight.
+        dark: make every photograph black, apart from noise.
+        uneven: relative excess brightness of every second light's photographs, which no medium explains.
+        shadowed: share of every photograph's pixels that lose nine tenths of their light, which no medium explains
+            either.
         stain_uv: texture coordinates of the outer surface, for a truth with stains.
-        uneven: every second photograph is brighter by this share than the formula says, which no medium explains.
+        engine: fake engine whose formula the photographs follow.
     """
     writer = StageWriter(root, "prepared", 1)
     cameras, all_lights, rng = (camera("c0"), camera("c1")), lights(light_count), np.random.default_rng(seed)

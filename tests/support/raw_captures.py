@@ -1,4 +1,4 @@
-"""A folder capture photographed by a known sensor: the raw folder that a laboratory would have of it."""
+"""A raw folder, as a laboratory would record it, made from a folder capture by a known sensor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from tests.support.raw_folders import Tree, write_toml
 from tests.support.raw_sensor import Sensor
 
 FULL_AT = 0.8
-"""Share of full scale that the brightest pixel of all reaches in the longest exposure but one."""
+"""Share of the range above black that the brightest pixel of all images reaches in the reference exposure, which is the
+second longest (or the only one)."""
 
 
 def write_raw_capture(
@@ -34,9 +35,11 @@ def write_raw_capture(
     """Write ``raw.toml``, frames as .npy, ``calibration.json`` and ``teeth/``; returns the description's tree.
 
     Args:
-        source: folder capture whose images are the radiance that is seen.
-        exposures_s: of every light, from the shortest on.
-        tracking: frames with all lights on, spread among the lights. flats: frames of an even source.
+        source: folder capture whose images are the radiance that the sensor records.
+        exposures_s: exposure times of every light, ascending.
+        tracking: number of frames per camera with all lights on, spread among the lights.
+        flats: number of frames per camera of a uniform source.
+        blacks: number of black frames per camera and exposure.
     """
     rng = np.random.default_rng(seed)
     description = read_record(source / "capture.json", FolderCapture)

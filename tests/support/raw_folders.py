@@ -1,4 +1,4 @@
-"""A raw folder of counts that are known, for tests to alter."""
+"""A small raw folder with known counts, for tests to alter."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ BITS = 12
 
 
 def counts(seed: int, channels: int = 3) -> NDArray[np.uint16]:
-    """Counts of 12 bits, (16, 24, C)."""
+    """Random counts (16, 24, C) of a sensor of 12 bits."""
     return np.random.default_rng(seed).integers(64, 3000, (SIZE[1], SIZE[0], channels)).astype(np.uint16)
 
 
 def write_raw_folder(root: Path) -> Tree:
-    """Two cameras, two lights, a black frame and a lit one of each camera and light, a board, spheres, a chart and a
-    scan.
+    """Write a raw folder: two cameras and two lights, a black frame per camera and a frame per camera and light, a
+    board, spheres, a chart and a scan. Returns the contents of its ``raw.toml``.
     """
     cameras = [{"name": name, "size": list(SIZE), "bits": BITS} for name in ("left", "right")]
     lights = [
@@ -64,7 +64,7 @@ def write_raw_folder(root: Path) -> Tree:
 
 
 def write_toml(root: Path, tree: Tree) -> None:
-    """Write ``raw.toml``; values are inline below the first level."""
+    """Write ``raw.toml``; tables below the first level are written inline."""
     lines = [f"{key} = {inline(value)}" for key, value in tree.items() if not isinstance(value, list | dict)]
     for key, value in tree.items():
         if isinstance(value, dict):
@@ -76,7 +76,7 @@ def write_toml(root: Path, tree: Tree) -> None:
 
 
 def inline(value: object) -> str:
-    """A value as TOML writes it in a line."""
+    """Format a value as inline TOML."""
     if isinstance(value, str):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"')
         return f'"{escaped}"'

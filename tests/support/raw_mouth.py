@@ -1,4 +1,4 @@
-"""A raw folder as a laboratory has it: tracking frames of a phantom mouth, a scan in a frame of its own, clicked
+"""A raw folder as a laboratory records it: tracking frames of a phantom mouth, a scan in its own frame, and clicked
 landmarks.
 """
 
@@ -24,12 +24,12 @@ from tests.support.raw_folders import Tree, write_toml
 BLACK, FULL_SCALE = 64, 3000
 BITS = 12
 INTENSITY = 3e7
-"""Of the light, at which teeth are about half as bright as a white surface in their place."""
+"""Intensity of the light. With it, teeth are about half as bright as a white surface in their place."""
 
 
 @dataclass(frozen=True)
 class RawMouth:
-    """What the folder hides."""
+    """A raw folder and the true pose of its scan."""
 
     root: Path
     tree: Tree
@@ -40,15 +40,17 @@ class RawMouth:
 def write_raw_mouth(
     root: Path, subject: int | None = None, seed: int = 1, places: int = 3, *, is_labelled: bool = True
 ) -> RawMouth:
-    """Three cameras; the scan is of the teeth up to a place from the midline.
+    """Write a raw folder with three cameras.
 
-    Without labels it is an STL file, and each tooth that is not clicked in photographs has a landmark in the scan
-    alone.
+    Args:
+        places: the scan holds the teeth up to this place from the midline.
+        is_labelled: write the scan as a labelled PLY file. Otherwise it is an STL file, and each tooth without a click
+            in photographs has a landmark in the scan alone.
     """
     jaw = build_jaw(subject)
     mouth = photographed_mouth(subject, seed, 0.2, jaw)
     inverse = mouth.rig_from_scan.rotation.T
-    scan = scan_of(jaw, seed=seed, places=places)
+    scan = scan_of(jaw, seed=seed, teeth_a_side=places)
     vertices = (scan.mesh.vertices_mm - mouth.rig_from_scan.translation_mm) @ inverse.T
     if is_labelled:
         write_labelled_ply(root / "scan.ply", Mesh(vertices, scan.mesh.faces), scan.fdi)

@@ -1,5 +1,5 @@
-"""A camera that turns known radiance into counts: shot noise, read noise, black, rounding, mosaic, vignetting, a bent
-response.
+"""A camera that turns known radiance into counts, with shot noise, read noise, black level, rounding, mosaic, gains per
+pixel (vignetting) and a nonlinear response.
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor of known numbers.
+    """A sensor with known properties.
 
     Attributes:
-        counts_per_radiance: counts above black of radiance 1 at 1 s, one number a channel or for all.
-        bend: counts above black become s (1 + bend · s / full).
+        black: counts without light.
+        read_counts: standard deviation of read noise, counts.
+        counts_per_radiance: counts above black of radiance 1 at 1 s, one number per channel or for all.
+        mosaic: letters of the 2 x 2 colour filters, row by row, or ``none``.
+        bend: nonlinearity; counts s above black become s (1 + bend · s / full).
     """
 
     bits: int = 12
@@ -37,7 +40,7 @@ class Sensor:
     def counts(
         self, radiance: Array, exposure_s: float, rng: np.random.Generator, gain: float = 1.0
     ) -> NDArray[np.uint16]:
-        """Counts (H, W, C), or (H, W) of a mosaic, of an image (H, W, C)."""
+        """Convert an image of radiance (H, W, C) into counts (H, W, C), or (H, W) with a mosaic."""
         electrons = radiance * self.counts_per_radiance * exposure_s / self.counts_per_electron
         if self.mosaic != "none":
             electrons = taken_through(electrons, self.mosaic)
@@ -48,7 +51,7 @@ class Sensor:
 
 
 def taken_through(image: Array, mosaic: str) -> Array:
-    """What the colour filters of a mosaic let through of an image (H, W, 3)."""
+    """Apply the colour filters of a mosaic to an image (H, W, 3); returns (H, W)."""
     through = np.empty(image.shape[:2])
     for k, letter in enumerate(mosaic):
         through[k // 2 :: 2, k % 2 :: 2] = image[k // 2 :: 2, k % 2 :: 2, "RGB".index(letter)]
@@ -56,7 +59,7 @@ def taken_through(image: Array, mosaic: str) -> Array:
 
 
 def even(shape: tuple[int, ...], value: float) -> Array:
-    """An even source."""
+    """An image of a uniform source."""
     return np.full(shape, value)
 
 

@@ -1,4 +1,4 @@
-"""A receiver of webhooks in a thread of the test, which answers as it is told to."""
+"""A receiver of webhooks in a thread of the test, with answers that the test chooses."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 @dataclass
 class Receiver:
-    """What was received, and what to answer: ``answers`` one after the other, then 204; 0 hangs until ``let_go`` is
-    set.
+    """The requests received, and the status codes to answer with: ``answers`` in their order, then 204. A 0 holds the
+    request open, without an answer, until ``let_go`` is set.
     """
 
     url: str = ""
@@ -23,13 +23,13 @@ class Receiver:
     let_go: threading.Event = field(default_factory=threading.Event)
 
     def wait(self, count: int) -> list[tuple[dict[str, str], str]]:
-        """Headers, in small letters, and body of each request, once there are so many."""
+        """Wait for ``count`` requests; returns headers (names in lower case) and body of each request received."""
         wait_until(lambda: len(self.received) >= count)
         return self.received
 
 
 def wait_until(is_true: Callable[[], bool], limit_s: float = 60.0) -> None:
-    """Wait for something that must happen."""
+    """Wait until a condition holds, and fail after a time limit."""
     end = time.monotonic() + limit_s
     while not is_true():
         assert time.monotonic() < end, "it did not happen"
@@ -38,7 +38,7 @@ def wait_until(is_true: Callable[[], bool], limit_s: float = 60.0) -> None:
 
 @contextmanager
 def receiving(*answers: int, tls: ssl.SSLContext | None = None) -> Iterator[Receiver]:
-    """Receive on a free loopback port for the time of the block; with ``tls`` under the name localhost."""
+    """Receive on a free loopback port for the time of the block; with ``tls``, the URL's host is localhost."""
     receiver = Receiver(answers=list(answers))
 
     class Handler(BaseHTTPRequestHandler):
@@ -61,7 +61,7 @@ def receiving(*answers: int, tls: ssl.SSLContext | None = None) -> Iterator[Rece
             self.end_headers()
 
         def log_message(self, *_: object) -> None:
-            """Say nothing."""
+            """Write no log."""
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     receiver.url = f"http://127.0.0.1:{server.server_address[1]}"

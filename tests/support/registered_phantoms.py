@@ -1,11 +1,10 @@
-"""Virtual teeth photographed where their mesh is, or beside it, and the renders that a fit would compare.
+"""Test cases of the registration check: virtual teeth photographed in the place of their mesh or beside it, and the
+renders that a fit would compare.
 
-The registration check is judged on them.
-
-Every phantom is an incisor of a size, a pose, a camera, five lights and optics of its own; every other one stands in
-gums that its render lacks. A phantom has a render and photographs of three places: in its mesh's own, and beside it in
-two directions across the camera's line of sight. No fit is run: the render has media as a fit leaves them, some per
-cent off the truth.
+Every phantom is an incisor with its own size, pose, camera, five lights and optics; every second one stands in gums
+that its render lacks. A phantom has renders of its mesh's place, and photographs of three places: that of its mesh, and
+two that are offset perpendicular to the camera's line of sight. No fit is run: the media of the renders differ from the
+truth by the errors that a fit leaves.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Camera, Light, Mesh
 from services.fit.checks.evaluate import error_sums
-from services.fit.checks.offset import REACH_MM, Comparison
+from services.fit.checks.offset import MAX_OFFSET_MM, Comparison
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.scene.recipe import single_tooth
@@ -35,16 +34,16 @@ Array = NDArray[np.float64]
 CHANNEL = ("green",)
 LIGHTS = 5
 PHOTOGRAPH_PATHS = 2048
-"""Paths per pixel, which leave 2.5 % of noise in an image."""
+"""Paths per pixel of a photograph, which leave 2.5 % of noise."""
 RENDER_PATHS = (32, 128, 512)
-"""The same of each of the two renders that a fit compares, from a first look's to a patient fit's: up to 30 % of noise,
+"""Paths per pixel of each of the two renders that a fit compares, from a quick fit to a long one: up to 30 % of noise,
 with rare bright pixels."""
 LEFT_SCATTERING, LEFT_ABSORPTION = 0.1, 0.3
-"""Standard deviations of ln σs' and ln σa between the render's media and the photographs': what fits of few noisy
-images leave."""
+"""Standard deviations of the difference in ln σs' and ln σa between the render's media and the photographs' media, as
+large as the errors of fits to few noisy images."""
 ASSUMED, FLOOR = 0.01, 0.002
-"""Noise that is assumed of a capture that states none: fractions of the value and of the brightest pixel. The second is
-in all photographs."""
+"""Standard deviations of the noise that is assumed for a capture that states none, as fractions of the value and of the
+brightest pixel. All photographs have noise of the second kind."""
 
 
 @dataclass(frozen=True)
@@ -52,34 +51,34 @@ class Place:
     """Noise-free photographs of one place of the tooth."""
 
     images: Array
-    """(L, H, W)"""
+    """Radiance (L, H, W)."""
     variances: Array
     """Monte Carlo variance of ``images``."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """A sensor's noise, and what the capture says of it."""
+    """A sensor's noise, and the noise that the capture states."""
 
     share: float
-    """Standard deviation, fraction of the value or of the brightest pixel."""
+    """Standard deviation as a fraction of the value, or of the brightest pixel where ``is_constant``."""
     is_constant: bool
-    """Whether it is as large in the dark: a share of the brightest pixel of all images."""
+    """Whether the noise is the same in dark and bright pixels: a share of the brightest pixel of all images."""
     is_stated: bool
-    """Whether the capture states it; otherwise the default is assumed, 1 % of the value."""
+    """Whether the capture states the noise; otherwise the default is assumed, 1 % of the value."""
 
     def variance(self, images: Array) -> Array:
-        """Of each pixel (L, H, W)."""
+        """True variance of each pixel (L, H, W)."""
         brightest = float(images.max())
         return (self.share * (brightest if self.is_constant else images)) ** 2 + (FLOOR * brightest) ** 2 + 0 * images
 
     def stated_variance(self, images: Array) -> Array:
-        """What the check is told."""
+        """Variance (L, H, W) that the registration check receives."""
         return self.variance(images) if self.is_stated else (ASSUMED * images) ** 2 + (FLOOR * images.max()) ** 2
 
 
 class Photographed(NamedTuple):
-    """What the check gets."""
+    """Input of the registration check."""
 
     comparisons: list[Comparison]
     error: float
@@ -88,18 +87,18 @@ class Photographed(NamedTuple):
 
 @dataclass(frozen=True)
 class Phantom:
-    """One tooth before one camera."""
+    """One tooth in front of one camera."""
 
     pixels: NDArray[np.int64]
-    """(N, 2) that show the mesh."""
+    """Coordinates (N, 2), x and y, of the pixels that show the mesh."""
     pixel_mm: float
     renders: Array
-    """(2, L, H, W), two independent ones as in a fit's last evaluation; NaN where the mesh is not seen."""
+    """Two independent renders (2, L, H, W) as in a fit's last evaluation; NaN where the mesh is not visible."""
     in_place: Place
     beside: tuple[Place, ...]
 
     def photographed(self, place: Place, noise: Noise, rng: np.random.Generator) -> Photographed:
-        """Photographs of the brightest light and of the last, which is held out, with the noise drawn anew."""
+        """Photograph a place under the brightest light and under the last one, which is held out, with new noise."""
         shown = [int(np.argmax(place.images[:-1].sum(axis=(1, 2)))), LIGHTS - 1]
         images, (first, second) = place.images[shown], self.renders[:, shown]
         drawn, stated = (noise.variance(place.images)[shown], noise.stated_variance(place.images)[shown])
@@ -112,7 +111,7 @@ class Phantom:
 
 
 def rendered_phantom(seed: int, number: int, offset_mm: float = 1.0) -> Phantom:
-    """Render one phantom of a series; the same numbers give the same one."""
+    """Render one phantom of a series; the same seed and number give the same phantom."""
     rng, incisor = np.random.default_rng([seed, number]), build_incisor()
     paths, with_gums = RENDER_PATHS[number % len(RENDER_PATHS)], number % 2 == 1
     turn, size = Rotation.from_rotvec(np.radians(rng.uniform(-15, 15, 3))), rng.uniform(0.85, 1.15)
@@ -125,8 +124,8 @@ def rendered_phantom(seed: int, number: int, offset_mm: float = 1.0) -> Phantom:
     scene = _Scene(outer, gums if with_gums else None, lights, Engine(recipe))
 
     pixel_mm = rng.uniform(0.5, 0.8)
-    # As narrow as phantoms are framed, or as far as offsets are looked for.
-    margin_px = rng.choice([0, round(REACH_MM / pixel_mm)])
+    # The margin is none, as for other phantoms, or the reach of the search for offsets.
+    margin_px = rng.choice([0, round(MAX_OFFSET_MM / pixel_mm)])
     camera = _with_margin(dome_cameras(3, pixel_mm, (outer,))[rng.integers(3)], int(margin_px))
     truth = subject_tissues(int(rng.integers(2**31)), CHANNEL)["green"]
     media = Tissue(_isotropic(truth.enamel), _isotropic(truth.dentin))
@@ -150,19 +149,19 @@ class _Scene:
     engine: Engine
 
     def shows_tooth(self, camera: Camera) -> NDArray[np.bool_]:
-        """Pixels (H, W) that enamel fills as far as it is seen; the preparation masks those at gums."""
+        """Pixels (H, W) that visible enamel fills; the preparation masks those at the gums' edge."""
         surface = reflect(self.outer, self.gums, camera, self.lights[:1], CHANNEL, 1.0)
         return np.asarray(surface.enamel_pixels & (surface.enamel_share > 1 - 1e-9))
 
     def rendered(self, camera: Camera, tissue: Tissue, paths: int, seed: int) -> Place:
-        """All lights' images."""
+        """Render the images of all lights."""
         surface = reflect(self.outer, self.gums, camera, self.lights, CHANNEL, 1.0)
         mean, variance = render_engine(self.engine, tissue, camera, surface.enamel_pixels, paths, seed)
         return Place(mean * surface.enamel_share + surface.gums[..., 0], variance * surface.enamel_share**2)
 
 
 def _isotropic(medium: Medium) -> Medium:
-    # The same reduced scattering and absorption without a forward lobe: alike in images, with a quarter of the noise.
+    # The same reduced scattering and absorption with isotropic scattering: similar images with a quarter of the noise.
     scattering = medium.sigma * medium.alpha * (1 - medium.beta * medium.g1 - (1 - medium.beta) * medium.g2)
     extinction = scattering + medium.sigma * (1 - medium.alpha)
     return Medium(extinction, scattering / extinction, g1=0.0)
@@ -175,7 +174,7 @@ def _left(medium: Medium, rng: np.random.Generator) -> Medium:
 
 
 def _moved(camera: Camera, by_mm: Array) -> Camera:
-    # Across its line of sight, to the right and down: the tooth then lies as far to the left and up of where it was.
+    # Move the camera perpendicular to its line of sight, to the right and down; the tooth's image moves left and up.
     pose = np.array(camera.camera_from_world)
     pose[:2, 3] -= by_mm
     rows: Any = tuple(map(tuple, pose.tolist()))
@@ -183,7 +182,7 @@ def _moved(camera: Camera, by_mm: Array) -> Camera:
 
 
 def _with_margin(camera: Camera, margin_px: int) -> Camera:
-    # Photographs reach beyond the tooth, as far as offsets are looked for.
+    # Enlarge the image by a margin on every side.
     (fx, skew, cx), (_, fy, cy), last = camera.K
     width, height = camera.size
     K = ((fx, skew, cx + margin_px), (0.0, fy, cy + margin_px), last)

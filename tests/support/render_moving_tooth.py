@@ -1,4 +1,4 @@
-"""Render a moving tooth with stock Mitsuba: frames, and exactly what is specular in them.
+"""Render frames of a moving tooth with stock Mitsuba, with and without their specular part.
 
 Run as ``python -m tests.support.render_moving_tooth OUT.npz OPTIONS_JSON`` so that the Mitsuba variant of the calling
 process stays as it is.
@@ -19,8 +19,8 @@ DISTANCE_MM = 1000.0
 
 
 def tooth_mesh(rings: int = 96) -> tuple[FloatArray, NDArray[np.int32]]:
-    """A closed incisor-like surface, vertices (V, 3) in mm and outward faces: broad, tapered, with three faint vertical
-    ridges.
+    """A closed surface like an incisor's, broad and tapered with three faint vertical ridges: vertices (V, 3) in mm and
+    faces (F, 3) that face outwards.
     """
     polar = np.linspace(0, np.pi, rings + 1)[1:-1]
     azimuth = np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False)
@@ -54,8 +54,8 @@ def tooth_mesh(rings: int = 96) -> tuple[FloatArray, NDArray[np.int32]]:
 
 
 def tooth_colour(x: FloatArray, z: FloatArray) -> FloatArray:
-    """Diffuse reflectance (..., 3) over the front view in mm: yellowish, yellower towards the root, with the faint
-    stains a real tooth is tracked by.
+    """Diffuse reflectance (..., 3) by position in the front view in mm. It is yellowish, more so towards the root, with
+    faint stains as optical flow tracks them on a real tooth.
     """
     rng = np.random.default_rng(7)
     stain = np.zeros_like(x)
@@ -83,8 +83,8 @@ def camera_from_world(azimuth_deg: float, elevation_deg: float) -> FloatArray:
 
 
 def motion(time: float, amplitude_mm: float) -> FloatArray:
-    """World motion (4, 4) of the subject at a time in 0..1, identity at 0: breathing and a slow nod, smooth and not
-    periodic in the capture.
+    """Rigid motion (4, 4) of the subject at a time in 0..1, the identity at 0: breathing and a slow nod, smooth and
+    without a whole period during the capture.
     """
     shift = amplitude_mm * np.array([np.sin(2.6 * time), 0.5 * np.sin(1.9 * time), 0.8 * (1 - np.cos(3.1 * time)) / 2])
     nod = np.radians(0.9) * amplitude_mm * np.sin(2.2 * time)
@@ -97,7 +97,7 @@ def motion(time: float, amplitude_mm: float) -> FloatArray:
 
 
 def light_positions(count: int) -> FloatArray:
-    """``count`` lights (L, 3) in mm on the front half of a dome around the tooth."""
+    """Positions (L, 3) in mm of ``count`` lights on the front half of a dome around the tooth."""
     k = np.arange(count) + 0.5
     az = np.pi * (3 - 5**0.5) * np.arange(count)
     el = np.arccos(1 - 0.65 * k / count)
@@ -105,10 +105,11 @@ def light_positions(count: int) -> FloatArray:
 
 
 def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
-    """Frames in the order of ``options["frames"]``: a list of (light index or -1 for all on, time in 0..1).
+    """Render the frames of ``options["frames"]``, a list of (light index or -1 for all lights on, time in 0..1).
 
-    Returns total and diffuse radiance (camera, frame, y, x, 3) float32, the latter 0 in all-on frames, and everything
-    that describes the capture.
+    Returns:
+        ``total`` and ``diffuse`` radiance (camera, frame, y, x, 3) float32, the latter 0 in frames with all lights on,
+        and the arrays that describe the capture.
     """
     import mitsuba as mi
 
@@ -173,8 +174,8 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
         for light, time in options["frames"]:
             pose_now = motion(time, options["amplitude_mm"])
             for images, specular in ((total, 1.0), (diffuse, 0.0)):
-                # Light by light, since choosing one light per sample at random would add noise; what is specular
-                # matters in light frames alone
+                # Render light by light, because a random choice of the light per sample would add noise. The diffuse
+                # image is needed for frames of single lights alone.
                 image = np.zeros((height, width, 3), dtype=np.float32)
                 for k in [light] if light >= 0 else range(len(lights) if specular else 0):
                     lamp = {

@@ -20,19 +20,20 @@ TISSUE = Tissue(Medium(2, 0.95, 0.8, 0.6, -0.3), Medium(3, 0.8, 0.7, 0.6, -0.3),
 
 @dataclass(frozen=True)
 class Picture:
-    """What a scene gives for fixed seeds."""
+    """Results of the engine for a scene and fixed seeds, for L lights and N pixels."""
 
     image: NDArray[np.float64]
-    """(L, N)"""
+    """Radiance (L, N)."""
     variance: NDArray[np.float64]
     jacobian: NDArray[np.float64]
-    """(F, L, N)"""
+    """Derivatives (F, L, N) to the F parameters ``NAMES``."""
     orders: NDArray[np.float64]
-    """(K, L, N)"""
+    """Radiance (K, L, N) by K bins of scattering orders."""
     shape: NDArray[np.float64]
-    """Gradient of the images' sum to the dentin's shape, (M,)."""
+    """Gradient (M,) of the images' sum to the dentin's shape weights."""
     texels: NDArray[np.float64]
-    """The same to the texels of a stain; threads add to common slots, so its last bits depend on their order."""
+    """Gradient of the images' sum to the texels of a stain. Threads add to common slots, so its last bits depend on
+    their order."""
 
 
 def picture(engine: Engine) -> Picture:
@@ -49,7 +50,7 @@ def picture(engine: Engine) -> Picture:
 
 
 def render_into(connection: Connection, threads: int, boundary: Boundary) -> None:
-    """Send the number of threads in use, and ``picture`` of an engine built with so many."""
+    """Send Dr.Jit's number of threads, and the ``picture`` of an engine built with ``threads``."""
     import drjit as dr
 
     result = picture(Engine(stained_recipe(boundary), threads))

@@ -1,5 +1,5 @@
-"""A small tooth as a prepared stage: rendered once with many paths, then photographed as often as asked, each time with
-fresh sensor noise.
+"""A small tooth as a prepared stage: rendered once with many paths, then photographed any number of times, each time
+with new sensor noise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 ENAMEL_MM = 0.7
 HELD_OUT_LIGHT_MM = (300.0, 450.0, 250.0)
 NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002
-"""Standard deviation of the sensor's noise: a share of the value, and of the image's maximum."""
+"""Standard deviation of the sensor's noise as shares of the value and of the image's maximum."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class RenderedTooth:
     cameras: tuple[Camera, ...]
     recipe: SceneRecipe
     images: tuple[Array, ...]
-    """By camera, (L, H, W)."""
+    """Images (L, H, W) by camera."""
     variances: tuple[Array, ...]
-    """Monte Carlo variance of these."""
+    """Monte Carlo variances of ``images``."""
 
     def photograph(self, root: Path, seed: int) -> None:
-        """Publish ``prepared`` in ``root`` with the sensor's noise drawn anew."""
+        """Publish ``prepared`` in ``root`` with new sensor noise."""
         rng, writer = np.random.default_rng(seed), StageWriter(root, "prepared", 1)
         lights, (width, height) = len(self.recipe.light_positions_mm), self.cameras[0].size
         shape, axes = (len(self.cameras), lights, height, width), ("camera", "light", "y", "x")
@@ -80,7 +80,7 @@ class RenderedTooth:
 
 
 def rendered_tooth(tissue: Tissue, *, samples: int, seed: int, pixels: int = 10, views: int = 1) -> RenderedTooth:
-    """Render a tissue with so many paths per pixel and one or two cameras of ``pixels`` x ``pixels``."""
+    """Render a tissue with ``samples`` paths per pixel for one or two cameras of ``pixels`` x ``pixels``."""
     directions = ((0.2, 1.0, 0.1), (-1.0, 0.3, 0.2))[:views]
     cameras = tuple(camera_at(d, pixels).model_copy(update={"name": f"c{k}"}) for k, d in enumerate(directions))
     base = ellipsoid(SEMI_AXES_MM - ENAMEL_MM)

@@ -20,8 +20,11 @@ LEVEL, EXPOSURE_S = 0.5, 0.05
 
 @dataclass(frozen=True)
 class Rendered:
-    """Frames of a moving tooth: ``frames`` is (light index or -1 for all on, time); radiance (camera, frame, y, x,
-    channel).
+    """Frames of a moving tooth.
+
+    Attributes:
+        frames: (light index, or -1 for all lights on; time) of each frame.
+        radiance: (camera, frame, y, x, channel).
     """
 
     frames: tuple[tuple[int, float], ...]
@@ -43,8 +46,8 @@ def write_capture(
     floor: float = 0.002,
     peak: float | None = None,
 ) -> CaptureManifest:
-    """Publish ``root/capture``; radiance ``peak`` (default: the brightest under one light) sits at 0.7 of the range
-    above black.
+    """Publish ``root/capture``. Radiance ``peak`` (by default the brightest under one light) gets 0.7 of the counts
+    between black and full scale.
     """
     rng = np.random.default_rng(seed)
     full_scale, count_of = 2**bits - 1, len(rendered.lights)

@@ -1,4 +1,4 @@
-"""Executes every import that a role's code can reach, in a process that has only what the role is installed with.
+"""Execute every import that a role's code can reach, in a process that has only the packages of the role.
 
 ``python -m tests.support.role_imports ROLE`` prints as JSON each import that failed and the module that makes it.
 """
@@ -20,12 +20,12 @@ from types import ModuleType
 from tests.support.roles import ROLES, distributions, normal
 
 REGISTRY = "services.cli.app:build_app"
-"""Names every command, and calls none: what it imports is executed, but what those modules import when they are called
-is not theirs."""
+"""Function that registers every command and calls none. Its imports are executed but not followed, because a command's
+own imports belong to the roles that run it."""
 
 
 class Refusal(importlib.abc.MetaPathFinder):
-    """Refuses the packages that are installed here but not where the role runs."""
+    """Import finder that refuses the packages that are installed here but not where the role runs."""
 
     def __init__(self, extras: Iterable[str]) -> None:
         allowed = distributions(extras)
@@ -38,14 +38,16 @@ class Refusal(importlib.abc.MetaPathFinder):
     def find_spec(
         self, fullname: str, _path: Sequence[str] | None, _target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Raise for what is refused, and leave the rest to the other finders."""
+        """Raise for a refused package, and leave the others to the other finders."""
         if fullname.partition(".")[0] in self._refused:
             raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
         return None
 
 
 def reach(entries: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Pairs of a module of ours and what it imports at any place but for type checking, ours being followed."""
+    """Yield (module of this project, imported name) for every import at any place except those for type checking. The
+    project's own modules are followed.
+    """
     todo, seen = list(entries), set[str]()
     while todo:
         entry = todo.pop()
@@ -69,7 +71,9 @@ def _source(module: str) -> Path:
 
 
 def _of_function(tree: ast.Module, function: str, *, alone: bool) -> Iterator[ast.stmt]:
-    """The module's own imports, the function and, unless ``alone``, those of the module's functions that it names."""
+    """Yield the module's statements outside functions and classes, the function and, unless ``alone``, the functions of
+    the module that it names, directly or through others.
+    """
     functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
     yield from (node for node in tree.body if not isinstance(node, ast.FunctionDef | ast.ClassDef))
     named, todo = set[str](), [function]
@@ -125,7 +129,7 @@ def _is_module(name: str) -> bool:
 
 
 def failures(role: str) -> list[str]:
-    """A sentence for each import that the role's packages do not serve."""
+    """One sentence for each package that the role's code imports but the role does not install."""
     chosen = ROLES[role]
     imports = dict.fromkeys(reach(chosen.entries))
     sys.meta_path.insert(0, Refusal(chosen.extras))

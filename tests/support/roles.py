@@ -1,4 +1,4 @@
-"""What each part of the service is installed with, and where it enters the code."""
+"""The roles of the service: the extras that each is installed with, and the modules where it enters the code."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Role:
     """One part of the service.
 
     Attributes:
-        extras: of the package; what its machine or its image installs.
-        entries: ``module`` or ``module:function`` where it enters the code, also through a name in a string.
+        extras: extras of the package that its machine or its image installs.
+        entries: ``module`` or ``module:function`` where it enters the code, including names that stand in strings.
     """
 
     extras: tuple[str, ...]
@@ -63,8 +63,8 @@ ROLES: Mapping[str, Role] = {
 
 
 def distributions(extras: Iterable[str]) -> set[str]:
-    """Normal names of all that ``pip install dentine[extras]`` brings: this tree's own requirements, and theirs as they
-    are installed here.
+    """Normalised names of all distributions that ``pip install dentine[extras]`` installs: the requirements of this
+    tree and, as installed here, theirs.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     optional: dict[str, list[str]] = project["optional-dependencies"]
@@ -83,7 +83,7 @@ def distributions(extras: Iterable[str]) -> set[str]:
 
 
 def normal(name: str) -> str:
-    """A distribution's name as the package index compares it."""
+    """A distribution's normalised name, as package indexes compare names (PEP 503)."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -102,7 +102,7 @@ def _required_by(name: str, extra: str) -> Iterator[str]:
     try:
         requirements = importlib.metadata.requires(name) or ()
     except importlib.metadata.PackageNotFoundError:
-        return  # for another Python or another system
+        return  # a requirement of another Python version or another system
     for requirement in requirements:
         marker = _EXTRA_MARKER.search(requirement)
         if (marker[1] if marker else "") == extra:

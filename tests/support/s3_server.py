@@ -1,4 +1,4 @@
-"""An S3 server for tests, which counts what it is asked and can be told to refuse, to strike or to lose objects."""
+"""An S3 server for tests, which records its requests and can be made to refuse requests or to lose objects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BUCKET = "teeth"
 
 @dataclass(frozen=True)
 class Asked:
-    """One request and what became of it."""
+    """One request and its result."""
 
     method: str
     key: str
@@ -32,16 +32,17 @@ class Asked:
 
 class Quiet(WSGIRequestHandler):
     def log_request(self, *_: Any) -> None:
-        """Nothing on standard error."""
+        """Write no log."""
 
 
 @dataclass
 class S3Server:
-    """What was asked so far, oldest first.
+    """A running server and its requests.
 
     Attributes:
-        before: called with method and path before a request is done; what it returns, if anything, is the answer's
-            status instead.
+        asked: requests so far, oldest first.
+        before: function called with method and path before a request is carried out. If it returns a status, the
+            server answers with that status instead.
     """
 
     asked: list[Asked] = field(default_factory=list)
@@ -53,7 +54,12 @@ class S3Server:
         return f"http://127.0.0.1:{self.port}"
 
     def count(self, method: str, *, ending: str = "", found: bool | None = None) -> int:
-        """Requests for objects by method, listings excepted."""
+        """Number of requests for objects with a method; requests on the bucket itself, such as listings, do not count.
+
+        Args:
+            ending: end of the object's key.
+            found: count only requests that succeeded (True) or failed (False).
+        """
         return sum(
             one.method == method and one.key != "" and one.key.endswith(ending) and found in {None, one.status < 400}
             for one in self.asked
@@ -68,17 +74,17 @@ class S3Server:
         return {name: key.value for name, key in bucket.keys.items()}
 
     def remove(self, key: str) -> None:
-        """An object gets lost."""
+        """Delete an object, as if it were lost."""
         obstore.delete(S3Store(BUCKET, client_options={"allow_http": True}), key)
 
     def put(self, key: str, content: bytes) -> None:
-        """Somebody else writes an object."""
+        """Write an object, as if another program did."""
         obstore.put(S3Store(BUCKET, client_options={"allow_http": True}), key, content)
 
 
 @contextmanager
 def s3_server() -> Iterator[S3Server]:
-    """A server on loopback with an empty bucket."""
+    """Run a server on loopback with an empty bucket for the time of the block."""
     served, told = DomainDispatcherApplication(create_backend_app), S3Server()
 
     def application(environ: dict[str, Any], start_response: Any) -> Iterable[bytes]:
@@ -116,7 +122,7 @@ def s3_server() -> Iterator[S3Server]:
 
 
 def use(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
-    """Let this process and its children speak to a server, as the environment of a program for S3 says."""
+    """Set the environment variables that make this process and its children use a server."""
     for name, value in environment(endpoint).items():
         monkeypatch.setenv(name, value)
 

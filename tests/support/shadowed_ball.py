@@ -1,4 +1,4 @@
-"""A matt ball under a dome of lights, and other balls whose shadows on it a formula tells."""
+"""A matt ball under a dome of lights, and other balls whose shadows on it follow from a formula."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def ball(radius_mm: float, centre_mm: tuple[float, float, float] = (0, 0, 0)) ->
 
 
 def lights_mm(count: int) -> NDArray[np.float64]:
-    """Places (count, 3), mm, over the half of a dome that the camera stands in."""
+    """Positions (count, 3) in mm over the half of the dome on the camera's side."""
     k = np.arange(count) + 0.5
     cosine, turn = 1 - 0.8 * k / count, 2.4 * k
     sine = np.sqrt(1 - cosine**2)
@@ -34,7 +34,11 @@ def lights_mm(count: int) -> NDArray[np.float64]:
 
 
 def before_ball(light_mm: NDArray[np.float64], away_mm: float) -> tuple[float, float, float]:
-    """A place on the way from the light to the ball's side that camera and light both face."""
+    """A point on the line from the light to the part of the ball that faces both camera and light.
+
+    Args:
+        away_mm: distance from the ball's surface towards the light.
+    """
     towards = light_mm / np.linalg.norm(light_mm)
     middle = towards + np.array([0.0, 0.0, -1.0])
     x, y, z = (BALL_MM * middle / np.linalg.norm(middle) + away_mm * towards).tolist()
@@ -47,12 +51,12 @@ def behind_ball(
     centre_mm: tuple[float, float, float],
     radius_mm: float,
 ) -> NDArray[np.bool_]:
-    """Whether the straight way from each point to the light passes through a ball."""
+    """Whether the line segment from each point (..., 3) to the light (3,) passes through a ball."""
     way = light_mm - points_mm
     along = np.clip(((centre_mm - points_mm) * way).sum(-1) / (way * way).sum(-1), 0, 1)
     return np.asarray(np.linalg.norm(points_mm + along[..., None] * way - centre_mm, axis=-1) < radius_mm)
 
 
 def albedo(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of the ball, uneven so that one image alone tells nothing."""
+    """Albedo of the ball. It varies, so that a dark pixel in one image alone does not show a shadow."""
     return np.nan_to_num(0.3 + 0.2 * np.sin(points_mm[..., 0]) * np.cos(points_mm[..., 1]))

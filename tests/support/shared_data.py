@@ -1,4 +1,4 @@
-"""Where the reference data lie, if this machine has them; they are never part of the project."""
+"""Location of the reference data, where this machine has them; they are not part of the project."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The slab reference tables as layers and values."""
+"""The reference tables of slabs, as layers to simulate and expected values."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from tests.support.shared_data import shared_path
 
 SOURCES = ("normal", "diffuse")
 BOUNDARIES = {"none": "matched", "thin": "thin", "smooth": "smooth"}
-"""The tables' names, and the project's."""
+"""The project's name of a boundary by the tables' name."""
 COSTLY_DEPTH = 50
-"""Finite white slabs beyond this depth scatter hundreds of times per path: up to a minute each, and at the wider
-tolerance only."""
+"""Optical depth beyond which a finite white slab is costly: its paths scatter hundreds of times, so a case takes up to
+a minute and is run at the wider tolerance only."""
 
 
 @dataclass(frozen=True)
 class SlabCase:
-    """One simulation's worth of reference: layers under one source, with R and T as columns."""
+    """Reference values that one simulation gives: layers under one source, with the columns R and T."""
 
     name: str
     layers: tuple[Layer, ...]
@@ -30,18 +30,18 @@ class SlabCase:
     ior: float
     source: str
     names: tuple[str, ...]
-    """Of the derivatives."""
+    """Names of the parameters of the derivatives."""
     values: NDArray[np.float64]
-    """(1 + derivatives, 2): totals, then one row per derivative."""
+    """(1 + derivatives, 2): one row of totals, then one row per derivative."""
 
     def derivative_tolerance(self) -> NDArray[np.float64]:
-        """1 % of each derivative, or of 1e-3 of the largest one of the same case and source (derivatives, 2)."""
+        """Tolerance (derivatives, 2): 1 % of each derivative, or of 1e-3 of the case's largest one if that is more."""
         size = np.abs(self.values[1:])
         return 0.01 * np.maximum(size, 1e-3 * size.max())
 
 
 def is_costly(case: SlabCase) -> bool:
-    """Whether a slab is deep and white."""
+    """Whether a slab is finite and deeper than ``COSTLY_DEPTH``."""
     return COSTLY_DEPTH < case.layers[0].thickness_mm < np.inf
 
 
@@ -49,8 +49,8 @@ def simulate(case: SlabCase, shortfall: Callable[[Sums], float], seed: int, *, b
     """Trace until ``shortfall`` is at most 1; with derivatives where the case has any.
 
     Args:
-        border_terms_only: take the derivative to the border's depth from the two border terms, as a tooth does, not
-            from the extinction scores to which it is equal in a slab.
+        border_terms_only: compute the derivative to the border's depth from the two border terms, as in a tooth, not
+            from the extinction scores, which give the same value in a slab.
     """
     names, sums = accumulate(
         case.layers, shortfall, ior=case.ior, boundary=case.boundary, source=case.source, gradient=bool(case.names),
@@ -61,12 +61,14 @@ def simulate(case: SlabCase, shortfall: Callable[[Sums], float], seed: int, *, b
 
 
 def passes(count: int) -> Callable[[Sums], float]:
-    """A shortfall that ends after a number of passes, each four times as long as the one before, whatever the error."""
+    """A shortfall function that ends a simulation after ``count`` passes, whatever the error. Each pass is four times
+    as long as the one before.
+    """
     return lambda sums: 0.0 if sums.passes >= count else 10.0
 
 
 def total_cases() -> list[SlabCase]:
-    """``slab_totals.csv``: extinction 1 per mm, so the thickness is the optical depth."""
+    """Read ``slab_totals.csv``. Extinction is 1 per mm, so the thickness in mm is the optical depth."""
     cases = []
     for row in rows_of("slab_totals.csv"):
         ior = float(row["n"])
@@ -79,7 +81,7 @@ def total_cases() -> list[SlabCase]:
 
 
 def derivative_cases() -> list[SlabCase]:
-    """``slab_derivatives.csv``, in the order in which the simulation prints its derivatives."""
+    """Read ``slab_derivatives.csv``, in the order in which the simulation returns its derivatives."""
     groups: dict[str, list[dict[str, str]]] = {}
     for row in rows_of("slab_derivatives.csv"):
         groups.setdefault(row["case"], []).append(row)
@@ -90,7 +92,7 @@ def derivative_cases() -> list[SlabCase]:
             values = [[float(rows[0][f"{side}_{source}"]) for side in "RT"]] + [
                 [float(row[f"d{side}_{source}"]) for side in "RT"] for row in rows
             ]
-            # One layer of one lobe prints plain names; the order is the table's.
+            # With one layer and one lobe the simulation's names have no layer numbers; the order is the table's.
             names = ("sigma", "alpha", "g") if len(rows) == 3 else tuple(row["wrt"] for row in rows)
             cases.append(
                 SlabCase(
@@ -107,8 +109,8 @@ def derivative_cases() -> list[SlabCase]:
 
 
 def zero_cases() -> list[SlabCase]:
-    """``boundary_zero_test.csv``, lit uniformly, with the border at the table's middle depth; dR/dc, the last value, is
-    exactly zero.
+    """Read ``boundary_zero_test.csv``: slabs under uniform light, with the border at the table's middle depth. dR/dc,
+    the derivative to the border's depth, is exactly zero.
     """
     cases = []
     for row in rows_of("boundary_zero_test.csv"):
@@ -151,6 +153,6 @@ def _layer(row: dict[str, str], number: int) -> Layer:
 
 
 def rows_of(file: str) -> list[dict[str, str]]:
-    """Rows of a reference table."""
+    """Read the rows of a reference table."""
     with shared_path(f"reference/{file}").open(newline="") as stream:
         return list(csv.DictReader(stream))

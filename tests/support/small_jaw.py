@@ -1,5 +1,5 @@
-"""A small jaw as a prepared stage: round teeth in a row whose roots sit in gums, and a wall behind; photographs by the
-engine or by a formula.
+"""A small jaw as a prepared stage: a row of round teeth whose roots are in gums, with a wall behind. Photographs come
+from the engine or from a fake engine's formula.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.support.small_mouth import revolved
 from tests.support.small_tooth import camera_at
 
 FDI = (11, 12, 21, 22)
-"""In the order of a manifest, which is not that of the arch."""
+"""FDI numbers in the order of a manifest, which is not that of the arch."""
 PLACES_MM = {12: -9.3, 11: -3.1, 21: 3.1, 22: 9.3}
 TRUE_TEETH: Mapping[int, Tissue] = {
     11: Tissue(Medium(4.0, 0.995, g1=0.8), Medium(12.0, 0.985, g1=0.8)),
@@ -44,17 +44,17 @@ LIGHTS_MM = (
 )
 HELD_OUT_LIGHT = 3
 SIZE, SPAN_MM = 30, 30.0
-"""Pixels of 1 mm."""
+"""Image size in pixels and field of view in mm, so that pixels are 1 mm wide."""
 
 
 def cameras() -> tuple[Camera, ...]:
-    """From the front and from the patient's left."""
+    """Cameras in front of the patient and on the patient's left."""
     views = (camera_at((0.0, 1.0, 0.25), SIZE, SPAN_MM), camera_at((0.6, 1.0, 0.1), SIZE, SPAN_MM))
     return tuple(camera.model_copy(update={"name": f"c{k}"}) for k, camera in enumerate(views))
 
 
 def recipe(fdi: tuple[int, ...] = FDI, *, dentin: bool = True) -> SceneRecipe:
-    """The scene with its teeth in the order given."""
+    """The jaw's scene, with the teeth in the order given."""
 
     def tooth(number: int) -> ToothSurfaces:
         centre = (PLACES_MM[number], 0.0, 0.0)
@@ -71,12 +71,12 @@ def recipe(fdi: tuple[int, ...] = FDI, *, dentin: bool = True) -> SceneRecipe:
 
 
 def true_mouth(fdi: tuple[int, ...]) -> Mouth:
-    """What the photographs were made with."""
+    """The optics of the photographs, with the teeth in the order given."""
     return Mouth(tuple(TRUE_TEETH[number] for number in fdi), TRUE_GUMS, TRUE_REFLECTANCE)
 
 
 def seen(camera: Camera, scene: SceneRecipe) -> NDArray[np.int64]:
-    """(H, W): position of the tooth at each pixel's middle, then gums, then wall; -1 for nothing."""
+    """Labels (H, W) of the surface at each pixel's centre: the tooth's index, then gums, then wall; -1 for none."""
     assert scene.gums is not None
     assert scene.cavity is not None
     rays = RayScene(*(tooth.outer for tooth in scene.teeth), scene.gums, scene.cavity)
@@ -99,12 +99,12 @@ def write_prepared_jaw(
     """Publish ``prepared`` with two cameras and five lights, one of them held out.
 
     Args:
-        engine: who makes the photographs, as ``module:class``.
-        dentin: whether teeth have any.
-        shape: blend weights of every tooth, for an engine that knows them by a formula.
-        hidden: teeth that are masked in all images.
-        dark: teeth that are black in all photographs.
-        noise: of the sensor, relative.
+        engine: engine that makes the photographs, as ``module:class``.
+        dentin: whether teeth have dentin.
+        shape: blend weights of every tooth, for an engine whose formula uses them.
+        hidden: FDI numbers of teeth that are masked in all images.
+        dark: FDI numbers of teeth that are black in all photographs.
+        noise: relative standard deviation of the sensor's noise.
     """
     scene, rng = recipe(fdi, dentin=dentin), np.random.default_rng(seed)
     mouth = true_mouth(fdi)
@@ -150,7 +150,7 @@ def write_prepared_jaw(
 
 
 def jaw_spec(root: Path, **options: Any) -> JobSpec:
-    """A short fit of it."""
+    """The job of a short fit of the jaw."""
     defaults: dict[str, Any] = {
         "kind": "jaw", "boundary": "matched", "dentin": "known", "samples_per_pixel": 32, "max_samples_per_pixel": 256,
         "max_steps": 8, "search_candidates": 2000,

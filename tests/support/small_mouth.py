@@ -1,9 +1,9 @@
-"""A small mouth: a tooth with dentin whose root sits in gums, a tooth without that hangs free beside it, and a wall
+"""A small mouth: a tooth with dentin whose root is in gums, a tooth without dentin that hangs beside it, and a wall
 behind both.
 
 The first tooth is a solid of revolution with a ring of vertices in the plane where the gums' flat top cuts it. So the
-same media can be bounded by surfaces that do not overlap, which is what stock Mitsuba needs: the parts of the tooth
-above and below that plane, and a top with a hole.
+same media can also be bounded by surfaces that do not overlap, as stock Mitsuba needs them: the parts of the tooth
+above and below that plane, and a gums' top with a hole.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from tests.support.small_tooth import INTENSITY
 
 AROUND, ALONG = 48, 24
-"""Vertices around a solid of revolution and rows between its poles, even so that one row is the equator."""
+"""Vertices around a solid of revolution, and intervals between its poles; the latter is even so that one row of
+vertices is the equator."""
 GUMS_RADIUS_MM, GUMS_DEPTH_MM = 4.0, 3.0
 IOR, GUMS_IOR = 1.631, 1.33
 LIGHTS_MM = np.array([[100, 500, 300], [-500, 250, 50.0]])
@@ -71,9 +72,7 @@ FREE = revolved((1.6, 2.2), FREE_MM)
 
 
 def gums(hole_radius_mm: float = 0.0) -> Mesh:
-    """A cylinder with its top in the plane z = 0; with a hole, only its surface outside the tooth, which then is
-    open.
-    """
+    """A cylinder with its top in the plane z = 0. With a hole, it is the open surface that lies outside the tooth."""
     turn = 2 * np.pi * np.arange(AROUND) / AROUND
     ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
     top, low = GUMS_RADIUS_MM * ring, GUMS_RADIUS_MM * ring - [0, 0, GUMS_DEPTH_MM + 1.0]
@@ -97,13 +96,13 @@ def gums(hole_radius_mm: float = 0.0) -> Mesh:
 
 
 def wall() -> Mesh:
-    """A square behind the teeth, open."""
+    """An open rectangle behind the teeth."""
     corners = np.array([[-7.0, -3.2, -5], [9, -3.2, -5], [9, -3.2, 5], [-7, -3.2, 5]])
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
 
 
 def mouth_recipe(boundary: Boundary) -> SceneRecipe:
-    """The scene, whose solids overlap."""
+    """The mouth's scene for the engine, whose solids overlap."""
     known = DentinShape.known(CORE)
     teeth = (ToothSurfaces(ROOTED, known), ToothSurfaces(FREE))
     return SceneRecipe(
@@ -112,7 +111,7 @@ def mouth_recipe(boundary: Boundary) -> SceneRecipe:
 
 
 def stock_mouth(folder: Path, camera: Camera, light: int, boundary: Boundary, samples: int) -> dict[str, Any]:
-    """The same for stock Mitsuba, of surfaces that do not overlap."""
+    """The same scene for stock Mitsuba, made of surfaces that do not overlap."""
     height = ROOTED.vertices_mm[ROOTED.faces].mean(axis=1)[:, 2]
     parts = {
         "crown": Mesh(ROOTED.vertices_mm, ROOTED.faces[height > 0]),

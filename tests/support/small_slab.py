@@ -46,7 +46,7 @@ def small_rig(**changes: Any) -> Rig:
 
 
 def write_folder(root: Path, told: dict[str, Any], image: np.ndarray | None = None) -> Path:
-    """A folder with the same image in every file."""
+    """Write a slab folder with the same image in every file."""
     root.mkdir(parents=True, exist_ok=True)
     (root / "slab.json").write_text(json.dumps(told))
     pixels = np.full((8, 8), 0.01) if image is None else image

@@ -1,7 +1,7 @@
 """Database, scheduler, workers and API as processes of their own, each of which a test can kill and start again.
 
-As the superuser each may be a host of its own on a network that can be cut, and the store a disk of its own that can be
-full.
+With root rights, each process can also be a host of its own on a network that can be cut, and the store a disk of its
+own that can be full.
 """
 
 from __future__ import annotations
@@ -29,28 +29,30 @@ from tests.support.store_disk import StoreDisk, store_disk
 
 ROOT = Path(__file__).parents[2]
 DASK_TIMEOUTS = {"COMM__TIMEOUTS__TCP": "11s", "COMM__TIMEOUTS__CONNECT": "5s", "SCHEDULER__WORKER_TTL": "20s"}
-"""As tests wait for them; Dask's own are 30 s, 30 s and 5 min, and the first one's least is 11 s."""
+"""Timeouts of Dask, short because tests wait for them. Dask's defaults are 30 s, 30 s and 5 min; 11 s is the least that
+it accepts for the first."""
 RUNS_STAGES = f"{STAGES}={UNLIMITED}"
-"""What a worker is given that need not show that it can run stages, as the tests' stages need nothing."""
+"""Resource that lets a worker run stages. Workers here get it without the check that they can run stages, because the
+tests' stages need no packages."""
 PATIENCE_S = 300.0
-"""A bound for a machine that is busy with something else."""
+"""Time limit of every wait, long enough for a busy machine."""
 
 
 def free_port() -> int:
-    """A port of loopback that nobody listens on."""
+    """A loopback port that no process listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 class SmallSystem:
-    """One of each, two workers, of which one may reach the dome.
+    """A database, a scheduler, an API and two workers, one of which may reach the dome.
 
     Args:
-        has_rig_apart: the worker that reaches the dome only captures, and there is one more for the stages.
-        stages: module of what jobs run.
-        network: hosts that the scheduler, the workers and the database are; None for this one.
-        disk: where the data folder lies; None for an ordinary folder.
+        network: network whose hosts are the scheduler, the workers and the database; None to run all on this host.
+        disk: disk that holds the data folder; None for an ordinary folder.
+        has_rig_apart: the worker that reaches the dome only captures, and there is one more worker for the stages.
+        stages: module with the stages that jobs run.
     """
 
     def __init__(
@@ -134,14 +136,14 @@ class SmallSystem:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, *names: str) -> None:
-        """Start parts that are down, all by default, and wait for the API's answer."""
+        """Start the named parts that are down, by default all, and wait for the API's answer."""
         if "database" in names:
             self._postgres.start()
         self._launch(*(names or self._commands))
         self.wait_until(self._answers, "the API does not answer")
 
     def kill(self, name: str) -> None:
-        """Kill -9 a part and everything that it started."""
+        """Kill a part and all its child processes by SIGKILL."""
         if name == "database":
             self._postgres.kill()
             return
@@ -160,18 +162,18 @@ class SmallSystem:
         self.start(*names)
 
     def pids(self, name: str) -> set[int]:
-        """Processes of a part."""
+        """Process ids of a part and its child processes."""
         process = psutil.Process(self._processes[name].pid)
         return {process.pid, *(child.pid for child in process.children(recursive=True))}
 
     def close(self) -> None:
-        """End everything."""
+        """Kill all parts that still run."""
         for name, process in self._processes.items():
             if process.poll() is None:
                 self.kill(name)
 
     def step_clock(self, ahead_s: float) -> None:
-        """Set by how much the API's clock goes ahead of the true one."""
+        """Set the seconds by which the API's clock is ahead of the true one."""
         write_atomic(self._clock_step, str(ahead_s).encode())
 
     @property
@@ -183,7 +185,7 @@ class SmallSystem:
         return connect(self.address)
 
     def wait_until(self, condition: Callable[[], bool], complaint: str) -> None:
-        """Wait for ``condition()``, starting again what ended by itself, as an orchestrator does."""
+        """Wait for ``condition()``. Parts that ended by themselves are started again, as an orchestrator does."""
         deadline = time.monotonic() + PATIENCE_S
         while not condition():
             self._launch(*self._commands)
@@ -210,10 +212,11 @@ class SmallSystem:
 
 @contextmanager
 def small_system(folder: Path, *, on_hosts: bool = False, **options: Any) -> Iterator[SmallSystem]:
-    """A running system, ended with the block.
+    """Run a system for the time of the block.
 
     Args:
-        on_hosts: its parts are hosts on a network and its store is a disk; skips where this is not permitted.
+        on_hosts: make its parts hosts on a network and its store a disk; the test is skipped where this is not
+            permitted.
         options: see ``SmallSystem``.
     """
     from tests.support.postgres import postgres_server

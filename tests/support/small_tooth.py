@@ -43,7 +43,7 @@ def dentin_shape() -> DentinShape:
 def camera_at(
     direction: tuple[float, float, float], size: int = 8, span_mm: float = 9.0, distance_mm: float = CAMERA_DISTANCE_MM
 ) -> Camera:
-    """A camera that looks at the origin from a direction, ``span_mm`` across, z upwards in the image."""
+    """A camera that looks at the origin from a direction, with a field of view of ``span_mm`` there and z upwards."""
     backward = np.asarray(direction) / np.linalg.norm(direction)
     x = np.cross(-backward, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -57,7 +57,7 @@ def camera_at(
 
 
 def whole_view(camera: Camera, margin: int = 0) -> View:
-    """All pixels of a camera but a margin, row by row."""
+    """All pixels of a camera except a margin, row by row."""
     width, height = camera.size
     x, y = np.meshgrid(np.arange(margin, width - margin), np.arange(margin, height - margin))
     return View(camera, np.stack([x.ravel(), y.ravel()], axis=1).astype(np.int32))

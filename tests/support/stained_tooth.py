@@ -16,18 +16,18 @@ HEIGHT, WIDTH = 6, 8
 
 
 def texture_coordinates() -> NDArray[np.float64]:
-    """(V, 2): seen from the front, across and up."""
+    """Texture coordinates (V, 2) of the vertices, across and up in the front view."""
     vertices = ellipsoid(SEMI_AXES_MM).vertices_mm
     return 0.5 + 0.49 * vertices[:, [0, 2]] / SEMI_AXES_MM[[0, 2]]
 
 
 def stain(seed: int = 1, low: float = 0.3, high: float = 0.8) -> Stain:
-    """Random texels."""
+    """A stain with random transmittance in every texel."""
     return Stain(np.random.default_rng(seed).uniform(low, high, (HEIGHT, WIDTH)))
 
 
 def stained_recipe(boundary: Boundary) -> SceneRecipe:
-    """The scene."""
+    """The small tooth's scene with texture coordinates for stains."""
     (tooth,) = recipe(boundary).teeth
     return replace(
         recipe(boundary), teeth=(ToothSurfaces(tooth.outer, tooth.dentin, texture_coordinates()[tooth.outer.faces]),)

@@ -1,5 +1,5 @@
-"""``python -m tests.support.stepped_clock FILE MODULE ARGUMENTS``: a program whose clock goes ahead by as many seconds
-as a file says, or behind.
+"""``python -m tests.support.stepped_clock FILE MODULE ARGUMENTS``: run a program whose clock is ahead by the number of
+seconds in a file, or behind if it is negative.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def main(steps: Path, module: str, *arguments: str) -> None:
-    """Run the module; the file may change and need not be there."""
+    """Run the module; the file may change meanwhile, and the clock is true while the file is missing."""
     true_time = time.time
 
     def stepped() -> float:
@@ -20,7 +20,7 @@ def main(steps: Path, module: str, *arguments: str) -> None:
         except FileNotFoundError:
             return true_time()
 
-    time.time = stepped  # before the program imports anything that keeps it
+    time.time = stepped  # before the program imports modules that store a reference to it
     sys.argv = [module, *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 

@@ -1,4 +1,4 @@
-"""A disk of a test's own that can be full, read-only or frozen. Only the superuser mounts it."""
+"""A disk for one test that can be full, read-only or frozen. Mounting it needs root."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from pathlib import Path
 import pytest
 
 REST_BYTES, BLOCK_BYTES = 2**25, 4096
-"""What is filled block by block, as the file system takes some of its own."""
+"""Space that is filled block by block, because the file system uses an unknown part of it itself, and size of a
+block."""
 
 
 class StoreDisk:
-    """A file system in a file, mounted on a folder; next to nothing of its size is stored."""
+    """A file system in a sparse file, mounted on a folder; it takes hardly any space until it is written to."""
 
     def __init__(self, folder: Path, size_bytes: int) -> None:
         self.folder, self._image, self._size_bytes = folder, folder.with_suffix(".image"), size_bytes
 
     def open(self) -> None:
-        """Make and mount it."""
+        """Make and mount the file system."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with self._image.open("wb") as image:
             image.truncate(self._size_bytes)
@@ -29,13 +30,13 @@ class StoreDisk:
         _run("mount", "-o", "loop", str(self._image), str(self.folder))
 
     def close(self) -> None:
-        """Unmount and remove it."""
+        """Unmount and remove the file system."""
         _run("umount", "--lazy", str(self.folder), check=False)
         self._image.unlink(missing_ok=True)
 
     @contextmanager
     def full(self) -> Iterator[None]:
-        """Without a free block for the time of the block."""
+        """Leave no free disk block for the time of the ``with`` statement."""
         rest = self.folder / "rest"
         with self.almost_full(REST_BYTES):
             with rest.open("wb", buffering=0) as stream, suppress(OSError):
@@ -48,7 +49,7 @@ class StoreDisk:
 
     @contextmanager
     def almost_full(self, free_bytes: int) -> Iterator[None]:
-        """With so much free for the time of the block."""
+        """Leave ``free_bytes`` free for the time of the ``with`` statement."""
         filling = self.folder / "filling"
         _run("fallocate", "--length", str(shutil.disk_usage(self.folder).free - free_bytes), str(filling))
         try:
@@ -58,7 +59,7 @@ class StoreDisk:
 
     @contextmanager
     def frozen(self) -> Iterator[None]:
-        """Every write, and everything that would kill a writer, waits for the end of the block."""
+        """Make every write wait until the end of the ``with`` statement; a waiting writer cannot be killed either."""
         _run("fsfreeze", "--freeze", str(self.folder))
         try:
             yield
@@ -68,7 +69,7 @@ class StoreDisk:
 
 @contextmanager
 def read_only(folder: Path) -> Iterator[None]:
-    """A folder that takes no write for the time of the block, by whatever is not open yet."""
+    """Refuse writes below a folder for the time of the ``with`` statement, except to files that are open already."""
     _run("mount", "--bind", str(folder), str(folder))
     try:
         _run("mount", "-o", "remount,bind,ro", str(folder))
@@ -79,7 +80,7 @@ def read_only(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def store_disk(folder: Path, size_bytes: int = 24 * 2**30) -> Iterator[StoreDisk]:
-    """A disk on a folder for the time of the block. Skips where nothing can be mounted."""
+    """Mount a disk on a folder for the time of the ``with`` statement. The test is skipped where mounting fails."""
     disk = StoreDisk(folder, size_bytes)
     try:
         try:

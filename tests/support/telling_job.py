@@ -1,4 +1,4 @@
-"""A job without stages that leaves behind what a fit would: log lines, steps, previews, files."""
+"""A job without stages that leaves the same traces as a fit: log lines, steps, previews and files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STEPS = 20
 
 
 def tell(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
-    """Two attempts of a fit; the second one repeats the first one's last step."""
+    """Write the events of two attempts of a fit; the second attempt repeats the first one's last step."""
     (folder / "previews").mkdir(parents=True)
     with events.open() as log:
         prepare = log.begin_stage("prepare")

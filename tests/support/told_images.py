@@ -1,4 +1,4 @@
-"""Images that say whose they are: a place, a name, serial numbers."""
+"""Images with personal metadata: a place, a name, serial numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CAMERA, GPS, BODY_SERIAL, MAKE = 0x8769, 0x8825, 0xA431, 0x010F
 
 
 def exif() -> Any:
-    """Maker, serial number of the camera, and a place."""
+    """Exif data with a maker, the camera's serial number and a place."""
     tags = Image.Exif()
     tags[MAKE] = "Maker"
     tags.get_ifd(CAMERA)[BODY_SERIAL] = "0123456"
@@ -43,6 +43,6 @@ def told_png() -> bytes:
 
 
 def with_text(png: bytes, text: bytes) -> bytes:
-    """A PNG with a text after its header."""
+    """Insert a text chunk after a PNG's header."""
     text_part = struct.pack(">I4s", len(text), b"tEXt") + text + struct.pack(">I", zlib.crc32(b"tEXt" + text))
     return png[:33] + text_part + png[33:]

@@ -1,7 +1,7 @@
-"""``python -m tests.support.toy_server SETTINGS [MODULE]``: the real server with toy stages, or those of another
-module, so that a test can kill it.
+"""``python -m tests.support.toy_server SETTINGS [MODULE]``: the real server with the stages of ``toy_stages`` or of
+another module, as a process that a test can kill.
 
-Leases are short, as tests wait for them.
+Leases are short, because tests wait for them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Stages that publish tiny results, for tests of what surrounds stages.
+"""Stages that publish tiny results, for tests of the code around the stages.
 
-What they do is steered by files in the job's folder, or in ``steering`` below the folder that the job names, where
-there is one: it is there before the job and may be written whatever happens to the store. What they did is told in the
-same place.
+Files in the job's folder steer them. If the folder that the job names has a subfolder ``steering``, some of these files
+are read there instead: it exists before the job, and can be written whatever happens to the store. The stages record
+their progress in the same place.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _publish(stage: StageName, folder: str, spec: JobSpec, context: StageContext
 
 
 def _reach(spec: JobSpec, context: StageContext, stage: StageName, point: str) -> None:
-    # Says where it is and in which process, and waits there as long as it is told to.
+    # Writes the point reached and the process id to a file, and waits there while a file ``hold-…`` exists.
     steering = _steering(spec, context)
     write_atomic(steering / f"at-{stage}-{point}", str(os.getpid()).encode())
     while (steering / f"hold-{stage}-{point}").exists():
@@ -51,13 +51,13 @@ def _reach(spec: JobSpec, context: StageContext, stage: StageName, point: str) -
 
 
 def phantom(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Publishes a mouth."""
+    """Publish a phantom mouth."""
     _reach(spec, context, "phantom", "start")
     return _publish("phantom", "phantom", spec, context)
 
 
 def capture(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Lights a dome (a file) and darkens it on every exit; waits for ``hold-capture`` to go away."""
+    """Light a dome (create the file ``lit``) and darken it on every exit; wait while ``hold-capture`` exists."""
     _reach(spec, context, "capture", "start")
     lit = _steering(spec, context) / "lit"
     lit.touch()
@@ -75,7 +75,7 @@ def capture(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 
 def prepare(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Fails with a sentence while ``bad-input`` exists."""
+    """Fail with an error of the capture's input while ``bad-input`` exists."""
     _reach(spec, context, "prepare", "start")
     if (context.root / "bad-input").exists():
         raise CaptureInputError("Frame c0_l3.npy is missing from the capture; copy it there.")
@@ -83,8 +83,8 @@ def prepare(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 
 def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Checks the preparation, reports ten steps; ``kill-fit`` makes the first attempt kill its worker, ``always-kill``
-    each; ``deaf-fit`` ignores a cancel.
+    """Check the preparation and report ten steps. ``kill-fit`` makes the first attempt kill its worker,
+    ``always-kill`` every attempt; while ``deaf-fit`` exists, the fit ignores a cancel.
     """
     _reach(spec, context, "fit", "start")
     require_intact(context.root, "prepared")
@@ -112,14 +112,14 @@ def fit(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 
 def export(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Publishes an asset."""
+    """Publish an asset."""
     _reach(spec, context, "export", "start")
     (context.root / "report.html").write_text("<!doctype html><title>report</title>")
     return _publish("export", "asset", spec, context)
 
 
 def needy(_spec: JobSpec, _context: StageContext) -> AssetManifest:
-    """Needs a package that nobody has."""
+    """Import a package that does not exist."""
     import no_such_package
 
     return no_such_package.publish()

@@ -2,7 +2,7 @@
 them.
 
 A file holds one tooth: meshes, rig, optics, and per camera the images (L, H, W) with the standard error of each pixel.
-Sensor noise is added when read.
+Sensor noise is added when a capture is written.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from services.core.geometry import Mesh, teeth_folder
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "truths"
 SIDE_LIGHTS = ("l2", "l4", "l6")
-"""To hold out: 54, 75 and 94 degrees from the front, the last one grazing from the side; five lights between them
-remain."""
+"""Lights to hold out, at 54, 75 and 94 degrees from the front; the last one grazes the tooth from the side. Five lights
+between them remain for the fit."""
 
 
 @dataclass(frozen=True)
@@ -30,24 +30,24 @@ class Truth:
     """One tooth as stock Mitsuba renders it, without sensor noise."""
 
     description: dict[str, Any]
-    """As ``capture.json``."""
+    """Contents of ``capture.json``."""
     optics: dict[str, Any]
-    """As ``truth.json``."""
+    """Contents of ``truth.json``."""
     fdi: str
     meshes: dict[str, Mesh]
-    """``outer`` and, where the tooth has one, ``dentin``."""
+    """Surfaces: ``outer`` and, where the tooth has dentin, ``dentin``."""
     mean: dict[str, NDArray[np.float64]]
-    """By camera, (L, H, W)."""
+    """Images (L, H, W) by camera."""
     standard_error: dict[str, NDArray[np.float64]]
 
     def medium(self, part: str) -> dict[str, float]:
-        """The green channel's ``enamel`` or ``dentin``, reduced quantities included."""
+        """Optics of ``enamel`` or ``dentin`` in the green channel, including the reduced quantities."""
         values: dict[str, float] = self.optics["channels"]["green"][part]
         return values
 
 
 def names() -> tuple[str, ...]:
-    """Stored truths."""
+    """Names of the stored truths."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.npz")))
 
 
@@ -98,7 +98,7 @@ def write_capture(
 
     Args:
         tested_camera: mark its images as held out, and no others.
-        dentin: give its surface, where the tooth has one.
+        dentin: whether to write the surface of dentin, where the tooth has one.
     """
     truth, random = read(name), np.random.default_rng(seed)
     description = truth.description

@@ -1,4 +1,4 @@
-"""What a test of uploads can change about the server's world, and what it asks of the server."""
+"""The clock and the disk of a server as a test of uploads controls them, and requests that such tests share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ CONTENTS = {"capture.json": b"{}", "a.npy": CONTENT}
 
 
 class World:
-    """What the server cannot choose: time and the disk."""
+    """The server's clock and disk.
+
+    Attributes:
+        now_s: Unix time.
+        free_bytes: free space that the server is told.
+        room_bytes: bytes that can still be written; None for no limit.
+    """
 
     def __init__(self) -> None:
         self.now_s = 1e9
@@ -20,7 +26,7 @@ class World:
         self.room_bytes: int | None = None
 
     def write(self, descriptor: int, block: memoryview) -> int:
-        """Like os.write until the disk has no room left."""
+        """Write like ``os.write`` while there is room; with none left, raise ENOSPC."""
         if self.room_bytes is None:
             return os.write(descriptor, block)
         if self.room_bytes == 0:

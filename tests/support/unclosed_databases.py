@@ -1,7 +1,7 @@
-"""SQLite connections that nobody closed are told on every Python as 3.13 tells them, with the test that opened them.
+"""Warn about unclosed SQLite connections on every Python version as 3.13 does, and name the test that opened them.
 
-Before 3.13 the interpreter closes them silently when they are collected, so that a leak would be found only by those
-who have a newer one.
+Python versions before 3.13 close such connections silently when they are garbage-collected, so a leak would show only
+with a newer Python.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 
 class WatchedConnection(sqlite3.Connection):
-    """A connection that warns where it is collected before it was closed."""
+    """A connection that warns when it is garbage-collected without having been closed."""
 
     opened_in: str | None = None
     """The test that opened it; None where it could not be opened."""
@@ -36,6 +36,6 @@ class WatchedConnection(sqlite3.Connection):
 
 
 def watch_databases() -> None:
-    """Have all connections of this process watched from now on."""
+    """Replace ``sqlite3.connect``, so that all further connections of this process are watched."""
     connect = partial(sqlite3.connect, factory=WatchedConnection)
     sqlite3.connect = sqlite3.dbapi2.connect = connect  # type: ignore[assignment]

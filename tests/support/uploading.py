@@ -1,4 +1,4 @@
-"""Small captures to upload, and tus requests by hand."""
+"""Small captures to upload, and single requests of the tus protocol."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ TUS = {"Tus-Resumable": VERSION}
 
 
 def upgraded(path: Path) -> sql.Engine:
-    """A database file with all tables."""
+    """Open a database file with all tables."""
     engine = open_database(sqlite_url(path))
     upgrade(engine)
     return engine
 
 
 def write_capture(folder: Path, images: int = 2, seed: int = 0) -> Path:
-    """A folder capture of some random images, whole by its description."""
+    """Write a folder capture of random images that is complete by its description."""
     (folder / "teeth" / "11").mkdir(parents=True)
     rng = np.random.default_rng(seed)
     entries = []
@@ -48,31 +48,31 @@ def write_capture(folder: Path, images: int = 2, seed: int = 0) -> Path:
 
 
 def contents_of(folder: Path) -> dict[str, bytes]:
-    """Every file's content by its path."""
+    """Content of every file by its path relative to the folder."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
     }
 
 
 def entry(path: str, content: bytes) -> dict[str, Any]:
-    """A file of a manifest."""
+    """Entry of one file in an upload manifest."""
     return {"path": path, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def manifest_of(contents: dict[str, bytes]) -> dict[str, Any]:
-    """The manifest of these files."""
+    """Upload manifest of these files."""
     return {"files": [entry(path, content) for path, content in contents.items()]}
 
 
 def announce(client: httpx.Client, contents: dict[str, bytes], **more: Any) -> dict[str, Any]:
-    """Open a capture of these files."""
+    """Announce a capture of these files; returns the server's answer."""
     answer = client.post("/v1/captures", json=manifest_of(contents) | more)
     assert answer.status_code in {200, 201}, answer.text
     return answer.json()
 
 
 def create_upload(client: httpx.Client, capture: str, path: str, content: bytes) -> str:
-    """Create the upload of one file; returns where it is sent."""
+    """Create the upload of one file; returns its URL."""
     metadata = format_metadata({"capture": capture, "path": path})
     answer = client.post("/v1/uploads", headers=TUS | {"Upload-Length": str(len(content)), "Upload-Metadata": metadata})
     assert answer.status_code == 201, answer.text
@@ -80,19 +80,19 @@ def create_upload(client: httpx.Client, capture: str, path: str, content: bytes)
 
 
 def patch(client: httpx.Client, upload: str, offset: int, content: Any, **headers: str) -> httpx.Response:
-    """Send bytes."""
+    """Send bytes of an upload from an offset on."""
     return client.patch(
         upload, content=content, headers=TUS | {"Upload-Offset": str(offset), "Content-Type": CHUNK_TYPE} | headers
     )
 
 
 def offset_of(client: httpx.Client, upload: str) -> int:
-    """How far the server is."""
+    """Number of bytes of an upload that the server has stored."""
     return int(client.head(upload, headers=TUS).headers["upload-offset"])
 
 
 def checksum(content: bytes, algorithm: str = "sha256") -> str:
-    """Upload-Checksum of some bytes."""
+    """Value of the header Upload-Checksum for some bytes."""
     return f"{algorithm} {base64.b64encode(hashlib.new(algorithm, content).digest()).decode()}"
 
 

@@ -1,4 +1,6 @@
-"""A server's webhooks without the server: its database, a clock of its own, and lives of the sender."""
+"""A server's webhooks without the server: its database, a clock that the test sets, and the webhook sender, which can
+be started several times.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ ENTERED = ["QUEUED", "RUNNING", "SUCCEEDED"]
 
 
 class Service:
-    """A server's database with a clock of its own; ``sending`` is the life of one server process."""
+    """A server's database with a clock that the test sets; ``sending`` stands for the life of one server process."""
 
     def __init__(self, data: Path) -> None:
         self.repository = Repository(sqlite_url(data / "dentine.sqlite"))
@@ -73,7 +75,7 @@ class Service:
         return job.id
 
     def log(self, webhook: NewWebhook) -> list[Delivery]:
-        """Deliveries, oldest first."""
+        """Deliveries of a webhook, oldest first."""
         return self.deliveries.page(webhook.id, 1000)[::-1]
 
     def wait_for(self, webhook: NewWebhook, *states: str) -> list[Delivery]:
@@ -81,7 +83,7 @@ class Service:
         return self.log(webhook)
 
     def wait_for_tries(self, webhook: NewWebhook, count: int) -> Delivery:
-        """The only delivery, once it was tried so often."""
+        """Wait until the webhook's only delivery has ``count`` attempts, and return it."""
         wait_until(lambda: [len(delivery.attempts) for delivery in self.log(webhook)] == [count])
         return self.log(webhook)[0]
 

@@ -1,4 +1,4 @@
-"""Rate limits on a clock that the test moves."""
+"""Rate limits, on a clock that the test moves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import types
 import pytest
 
 from services.api.http import rate_limits as rates
-from services.api.http.rate_limits import Rates, network_of
+from services.api.http.rate_limits import RateLimits, network_of
 from services.core.settings import RateSettings
 
 
@@ -26,7 +26,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 @pytest.mark.attack("exhaustion", "requests without number")
 def test_reads_writes_and_refusals_are_counted_apart(clock: Clock) -> None:
-    limited = Rates(RateSettings(reads_per_10_s=3, writes_per_10_s=2, refusals_per_minute=1))
+    limited = RateLimits(RateSettings(reads_per_10_s=3, writes_per_10_s=2, refusals_per_minute=1))
     assert [limited.count("a", is_change=False) for _ in range(4)] == [0, 0, 0, 10]
     assert [limited.count("a", is_change=True) for _ in range(3)] == [0, 0, 10]
     assert [limited.count_refusal("a") for _ in range(2)] == [0, 60]
@@ -34,7 +34,7 @@ def test_reads_writes_and_refusals_are_counted_apart(clock: Clock) -> None:
 
 
 def test_the_window_moves(clock: Clock) -> None:
-    limited = Rates(RateSettings(reads_per_10_s=2))
+    limited = RateLimits(RateSettings(reads_per_10_s=2))
     assert limited.count("a", is_change=False) == 0
     clock.now_s += 6
     assert limited.count("a", is_change=False) == 0
@@ -46,7 +46,7 @@ def test_the_window_moves(clock: Clock) -> None:
 
 
 def test_whoever_waits_as_told_may_go_on(clock: Clock) -> None:
-    limited = Rates(RateSettings(writes_per_10_s=1))
+    limited = RateLimits(RateSettings(writes_per_10_s=1))
     limited.count("a", is_change=True)
     clock.now_s += 2.5
     clock.now_s += limited.count("a", is_change=True) + 0.01
@@ -54,17 +54,17 @@ def test_whoever_waits_as_told_may_go_on(clock: Clock) -> None:
 
 
 def test_a_wall_clock_that_steps_back_keeps_nobody_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    limited = Rates(RateSettings(writes_per_10_s=1))
+    limited = RateLimits(RateSettings(writes_per_10_s=1))
     limited.count("a", is_change=True)
     monkeypatch.setattr(time, "time", lambda: 0.0)
     assert 0 < limited.count("a", is_change=True) <= 10
 
 
 def test_an_address_is_told_of_once_a_minute(clock: Clock) -> None:
-    limited = Rates(RateSettings())
-    assert [limited.is_worth_telling("a") for _ in range(3)] == [True, False, False]
+    limited = RateLimits(RateSettings())
+    assert [limited.should_audit_refusal("a") for _ in range(3)] == [True, False, False]
     clock.now_s += 60.01
-    assert limited.is_worth_telling("a")
+    assert limited.should_audit_refusal("a")
 
 
 def test_those_who_stay_away_are_forgotten(clock: Clock) -> None:

@@ -1,4 +1,4 @@
-"""Without tokens the server stays on loopback."""
+"""A server without tokens listens on the loopback interface only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tokens: what is stored, who is let in, and when that ends."""
+"""Access tokens: what is stored, who is admitted, and when a token ends."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOON_S = 1_800_000_000.0
 
 
 class Clock:
-    """Unix time, and ticks that go on with it unless it steps."""
+    """Unix time, and a monotonic clock that advances with it unless the time is stepped."""
 
     def __init__(self) -> None:
         self.now_s, self.stepped_s = NOON_S, 0.0
@@ -194,7 +194,7 @@ def test_trust_ends_in_time_though_the_clock_steps_back(table: Tokens, clock: Cl
 def test_a_token_that_is_revoked_while_it_is_looked_up_is_not_trusted(
     table: Tokens, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The look-up has read its row and waits until the one who writes is done: he revokes.
+    # The look-up has read its row when the token is revoked.
     token = issue(table)
     monkeypatch.setattr(table, "_note_use", lambda _: table.revoke("rig-1", make_deed()))
     table.authenticate(token)
@@ -203,7 +203,7 @@ def test_a_token_that_is_revoked_while_it_is_looked_up_is_not_trusted(
 
 def test_an_id_never_passes_for_a_token(table: Tokens) -> None:
     found = table.authenticate(token := issue(table))
-    table.living(found.id)
+    table.authenticate_session(found.id)
     assert [one.id for one in (table.trusted(session_of=found.id), table.trusted(presented=token)) if one] == [
         found.id,
         found.id,
@@ -223,7 +223,7 @@ def test_a_name_has_one_living_token(table: Tokens, clock: Clock) -> None:
 
 
 def test_an_id_means_its_own_token_whatever_another_is_called(table: Tokens, engine: sql.Engine) -> None:
-    """As names were free once."""
+    """A name could once be any text, even another token's id."""
     issue(table, "first")
     meant = table.list()[0].id
     issue(table, "second")

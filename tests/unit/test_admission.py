@@ -1,4 +1,4 @@
-"""Which jobs wait for what, and which are refused."""
+"""When a job waits for disk, memory or workers, and which jobs are refused."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class World:
     def __init__(self) -> None:
         self.machine, self.now_s = Machine(free_disk_bytes=50 * GIB, disk_bytes=100 * GIB, memory_bytes=16 * GIB), 0.0
         self.lacking: dict[bool, str] = {}
-        """By whether it is to capture or to run other stages, why no worker can."""
-        self.admission = Admission(lambda: self.machine, lambda: self.now_s, lacks=self.lacking.get)
+        """Why no worker can run a stage; keys: whether the stage is a capture."""
+        self.admission = Admission(lambda: self.machine, lambda: self.now_s, missing_workers=self.lacking.get)
 
     def free(self, size: int) -> None:
         self.machine = Machine(size, self.machine.disk_bytes, self.machine.memory_bytes)
@@ -126,7 +126,7 @@ def test_nothing_is_remembered_of_jobs_that_wait_no_more(spec: JobSpec) -> None:
 def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> None:
     world = World()
     world.free(0)
-    world.admission.refuse_too_large(spec)  # it may wait
+    world.admission.refuse_too_large(spec)  # not refused: the job may wait
     with pytest.raises(
         JobTooLargeError, match=r"64 workers need about 96\.0 GiB of memory and there are 16\.0 GiB"
     ) as refusal:
@@ -140,16 +140,16 @@ def test_what_the_machine_never_has_is_refused_with_figures(spec: JobSpec) -> No
 def test_a_running_job_whose_workers_went_away_says_so_until_one_comes(spec: JobSpec) -> None:
     world = World()
     world.admission.start("fit", 1, spec)
-    world.admission.look_for_stalled()
+    world.admission.find_stalled()
     assert world.admission.stalled("fit") is None
     world.lacking[False] = "The scheduler has no workers; start some with dentine worker."
-    world.admission.look_for_stalled()
+    world.admission.find_stalled()
     assert (
         world.admission.stalled("fit")
         == "Waits for workers: The scheduler has no workers; start some with dentine worker."
     )
     world.lacking.clear()
-    world.admission.look_for_stalled()
+    world.admission.find_stalled()
     assert world.admission.stalled("fit") is None
 
 
@@ -157,6 +157,6 @@ def test_a_job_that_ended_waits_for_no_workers(spec: JobSpec) -> None:
     world = World()
     world.lacking[False] = "None."
     world.admission.start("fit", 1, spec)
-    world.admission.look_for_stalled()
+    world.admission.find_stalled()
     world.admission.end("fit")
     assert world.admission.stalled("fit") is None

@@ -1,4 +1,4 @@
-"""The dentin blend shape stays a solid inside the enamel for every weight."""
+"""The dentin blend shape: a closed solid inside the enamel for every weight."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from services.core.store import read_record
 from tests.support.shared_data import shared_path
 
 GRID_ERROR_MM = 0.02
-"""Trilinear depth between grid points 0.1 mm apart, at the sharpest edges of the scans."""
+"""Error of a depth interpolated trilinearly between grid points 0.1 mm apart, at the sharpest edges of the scans."""
 
 
 def scanned_incisor() -> tuple[Mesh, ToothFrame]:
@@ -63,7 +63,7 @@ def test_base_is_a_solid_a_tenth_of_a_millimetre_inside(case: Case) -> None:
     depth = SurfaceDistance(case.outer).closest(case.shape.base.vertices_mm)[1]
     assert np.median(depth) == pytest.approx(BASE_DEPTH_MM, abs=1e-3)
     assert depth.min() >= BASE_DEPTH_MM - 1e-3
-    # Only corners of concave creases go deeper.
+    # Only corners of concave creases are deeper.
     assert np.mean(depth > BASE_DEPTH_MM + 0.01) < 0.03
 
 
@@ -73,7 +73,7 @@ def test_every_weight_leaves_enamel_everywhere(case: Case, weights: tuple[float,
     assert case.smallest_depth_mm(weights) >= CLEARANCE_MM - GRID_ERROR_MM
     moved = Mesh(case.shape.vertices_mm(weights), case.shape.base.faces)
     moved.require_solid("dentin")
-    # Smoothness of the modes: hardly any triangle turns over, even where opposite walls have come close.
+    # The modes are smooth: hardly any triangle turns over, even where opposite walls have come close to each other.
     before, after = (
         trimesh.Trimesh(m.vertices_mm, m.faces, process=False).face_normals for m in (case.shape.base, moved)
     )
@@ -85,7 +85,7 @@ def test_each_mode_moves_along_its_axis_and_thickens_enamel(case: Case) -> None:
     for mode, axis in zip(case.shape.modes_mm, case.frame.axes[[1, 0, 2]], strict=True):
         along = np.outer(mode @ axis, axis)
         assert np.abs(along).max() > 0.3
-        # But for what is kept inside where the crown narrows.
+        # Exact except where the crown narrows and the dentin is kept inside.
         assert np.square(mode - along).sum() <= 0.1 * np.square(mode).sum()
     volumes = [
         Mesh(case.shape.vertices_mm(c), case.shape.base.faces).signed_volume_mm3()
@@ -109,7 +109,8 @@ def test_weights_make_enamel_thicken_with_the_root_of_height() -> None:
     shape = dentin_blend_shape(outer, crown=crown)
     depth = SurfaceDistance(outer).closest(shape.vertices_mm((1, 1, 0)))[1]
     height = shape.base.vertices_mm[:, 2] - (outer.vertices_mm[:, 2].max() - crown.crown_length_mm)
-    # The middle of the labial wall, where each side has room: the rule, less what smoothing takes. Nothing on the root.
+    # The middle of the labial wall, where each side has room: the depth is that of the rule, less what smoothing takes
+    # away. On the root nothing moves.
     wall = (
         (np.abs(shape.base.vertices_mm[:, 0]) < 1.5)
         & (shape.base.vertices_mm[:, 1] > 0)

@@ -1,4 +1,4 @@
-"""Distances and level sets against shapes with formulas."""
+"""Distances and level sets, compared with shapes for which there are formulas."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def box_depth(points: np.ndarray) -> np.ndarray:
 def test_closest_points_on_a_box_are_exact() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * [1.9, 2.9, 3.9]
     nearest, distance, faces = SurfaceDistance(BOX).closest(points)
-    # Of two nearly equal walls the proposal may take the farther: spacing squared over twice the distance.
+    # Where two walls are almost equally near, the search may take the farther one: an error of up to the squared
+    # spacing over twice the distance.
     np.testing.assert_allclose(distance, box_depth(points), atol=0.005)
     np.testing.assert_allclose(np.linalg.norm(points - nearest, axis=1), distance, atol=1e-12)
     assert faces.max() < len(BOX.faces)

@@ -1,4 +1,4 @@
-"""The canonical frame is found from shape and viewpoints, whatever the pose."""
+"""The canonical frame of a tooth is found from its shape and the viewpoints, in any pose."""
 
 from __future__ import annotations
 

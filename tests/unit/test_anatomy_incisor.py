@@ -1,4 +1,4 @@
-"""The procedural incisor: closed, nested, and of the dimensions it claims."""
+"""The procedural incisor: closed, with the dentin inside the enamel, and with the dimensions in its table."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_dentin_stays_inside_enamel_at_every_resolution(columns: int) -> None:
 def test_mesh_is_smooth_and_of_the_stated_size(incisor: Incisor) -> None:
     for mesh in (incisor.outer, incisor.dentin):
         assert 2000 <= len(mesh.faces) <= 6000
-        # A rounding of a quarter turn in five rows turns 18 degrees a row; a crease would turn 60 and more.
+        # A rounded edge of 90 degrees in five rows bends by 18 degrees in each row; a crease would be 60 and more.
         assert np.degrees(trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).face_adjacency_angles).max() < 35
     box = np.stack([incisor.outer.vertices_mm.min(axis=0), incisor.outer.vertices_mm.max(axis=0)])
     np.testing.assert_allclose(box.sum(axis=0), 0, atol=1e-9)
@@ -54,8 +54,8 @@ def test_dimensions_are_wheelers_averages(incisor: Incisor) -> None:
 
 
 def test_labial_enamel_follows_the_thickness_model(incisor: Incisor) -> None:
-    # Shortest distance is at most the thickness along the normal; the wall's curvature makes up to 0.05 mm of
-    # difference.
+    # The shortest distance is at most the thickness along the normal; the curvature of the wall makes a difference of
+    # up to 0.05 mm.
     distance = SurfaceDistance(incisor.dentin).closest(incisor.outer.vertices_mm)[1]
     height = incisor.outer.vertices_mm[:, 2] - cervix_height_mm()
     labial = (

@@ -1,5 +1,5 @@
-"""The phantom jaw: closed, nested, of the dimensions in the table, side by side without overlap, rooted in gums, and
-accepted by the engine.
+"""The phantom jaw: closed and nested surfaces, dimensions as in the table, teeth side by side without overlap, roots in
+the gums; the engine renders it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def jaw(request: pytest.FixtureRequest) -> Jaw:
 
 
 def heights_mm(tooth: JawTooth, mesh: Mesh) -> NDArray[np.float64]:
-    """Of a mesh's vertices above the tooth's cervical line."""
+    """Heights of a mesh's vertices above the tooth's cervical line."""
     return tooth.frame.canonical_from_world(mesh.vertices_mm)[:, 2] - tooth.cervix_mm
 
 
@@ -61,7 +61,7 @@ def depth_mm(surface: SurfaceDistance, points_mm: NDArray[np.float64]) -> NDArra
 
 
 def section_mm(tooth: JawTooth, height_mm: float) -> NDArray[np.float64]:
-    """Canonical x, y where the outer surface's edges cross a height above the cervical line."""
+    """Canonical x, y of the points where edges of the outer surface cross this height above the cervical line."""
     points = tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
     edges = tooth.outer.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     below, above = points[edges[:, 0]], points[edges[:, 1]]
@@ -90,7 +90,7 @@ def test_every_solid_bounds_a_medium(jaw: Jaw) -> None:
     for name, mesh in solids.items():
         mesh.require_solid(name)
         assert mesh.vertices_mm.dtype == np.float64
-        # Each edge once in each direction: no face is turned over.
+        # Every edge occurs once in each direction: no face is turned over.
         edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         assert len(np.unique(edges, axis=0)) == len(edges), name
 
@@ -100,8 +100,8 @@ def test_meshes_are_fine_even_and_smooth(average: Jaw) -> None:
         for mesh in (tooth.outer, tooth.dentin):
             assert len(mesh.faces) <= 6000
             surface = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-            # A rounding of a quarter turn in three rows turns 30 degrees a row, and the crown's slope adds to that on a
-            # cusp's flank.
+            # A rounded edge of 90 degrees in three rows bends by 30 degrees in each row; on the side of a cusp the
+            # slope of the crown is added.
             assert np.degrees(surface.face_adjacency_angles).max() < 50
             assert 0.3 <= np.median(surface.edges_unique_length) <= 0.5
 
@@ -114,7 +114,7 @@ def test_dentin_lies_inside_enamel(subject: Jaw) -> None:
 
 
 def test_enamel_is_thicker_towards_the_tip(average: Jaw) -> None:
-    # On a labial strip, as enamel is measured.
+    # On a labial strip, where enamel is measured.
     for tooth in average.teeth[:7]:
         canonical, height = tooth.frame.canonical_from_world(tooth.outer.vertices_mm), heights_mm(tooth, tooth.outer)
         strip = (np.abs(canonical[:, 0]) < 1.0) & (canonical[:, 1] > 0) & (height > 0)
@@ -122,7 +122,7 @@ def test_enamel_is_thicker_towards_the_tip(average: Jaw) -> None:
         share = height[strip] / upper_tooth(tooth.fdi % 10).crown_length_mm
         low, middle, high = (float(np.median(thickness[np.abs(share - at) < 0.08])) for at in (0.15, 0.45, 0.75))
         assert 0.3 < low < middle < high < 1.5, tooth.fdi
-        # And the other way round: no part of the surface is without cover.
+        # And from outside: there is enamel below every part of the surface.
         assert thickness.min() > 0.3, tooth.fdi
 
 
@@ -139,8 +139,8 @@ def test_enamel_of_the_central_incisor_follows_the_labial_model(average: Jaw) ->
 
 @pytest.mark.parametrize("fdi", FDI)
 def test_crowns_have_the_dimensions_of_the_table(average: Jaw, fdi: int) -> None:
-    # Widest diameters and length are met; the narrowing towards the tongue, set at the widest place, changes the
-    # sections at the cervix by up to 1.5 %.
+    # The widest diameters and the length are exact; the narrowing towards the tongue, defined at the widest place,
+    # changes the sections at the cervix by up to 1.5 %.
     tooth, d = average.tooth(fdi), upper_tooth(fdi % 10)
     canonical = tooth.frame.canonical_from_world(tooth.outer.vertices_mm)
     crown = canonical[canonical[:, 2] >= tooth.cervix_mm]
@@ -179,9 +179,9 @@ def test_the_table_is_the_references() -> None:
 
 
 def test_neighbours_all_but_touch_and_never_overlap(subject: Jaw) -> None:
-    # Teeth are moved until a vertex is within 0.005 mm of the gap; from the other tooth's vertices the distance differs
-    # by what faces of 0.45 mm cut off crowns that bend with 3 mm or more, 0.45² / (8 x 3) = 0.008 mm; sizes vary by 5
-    # %.
+    # Teeth are moved until the distance of a vertex is within 0.005 mm of the gap. Measured from the other tooth's
+    # vertices, the distance differs by what faces of 0.45 mm cut off from crowns whose radius of curvature is 3 mm or
+    # more, 0.45² / (8 x 3) = 0.008 mm. Sizes vary by 5 %.
     surfaces = [SurfaceDistance(tooth.outer) for tooth in subject.teeth]
     for (one, one_surface), (other, other_surface) in pairwise(zip(subject.teeth, surfaces, strict=True)):
         for still, near in ((one_surface, other), (other_surface, one)):
@@ -195,8 +195,8 @@ def test_the_average_is_symmetric(average: Jaw) -> None:
         right, left = average.tooth(10 + place), average.tooth(20 + place)
         np.testing.assert_array_equal(left.outer.vertices_mm, mirror * right.outer.vertices_mm)
         np.testing.assert_array_equal(left.dentin.vertices_mm, mirror * right.dentin.vertices_mm)
-    # The gums' vertices are not paired, their surface is: a mirrored vertex is off it by what its faces cut off bends
-    # of 0.6 mm radius at most.
+    # The gums' surface is symmetric, its vertices are not: a mirrored vertex is off the surface by at most what its
+    # faces cut off from bends of 0.6 mm radius.
     points = mirror * average.gums.vertices_mm[::7]
     assert SurfaceDistance(average.gums).closest(points)[1].max() < 0.6**2 / (8 * 0.6)
 
@@ -237,7 +237,7 @@ def test_frames_turn_canonical_axes_into_the_jaws(jaw: Jaw) -> None:
         np.testing.assert_allclose(canonical.min(axis=0) + canonical.max(axis=0), 0, atol=1e-9)
         # Buccal points away from a place in the middle of the mouth, mesial forward or to the midline.
         x, buccal, occlusal = pose[:3, :3].T
-        # Askew by at most so much about two axes.
+        # Tilted by at most this much about two axes.
         assert occlusal[2] >= np.cos(np.radians(TILT_SPREAD_DEG)) ** 2
         assert buccal @ (pose[:3, 3] - [0, -10, pose[2, 3]]) > 0
         to_midline = -np.sign(pose[0, 3])
@@ -289,6 +289,6 @@ def test_the_engine_takes_the_whole_jaw(subject: Jaw) -> None:
         Mouth((tissue,) * len(teeth), Medium(9.0, 0.9, g1=0.8), 0.2), View(camera, pixels), samples=16, seed=1
     )
     assert np.isfinite(images.mean).all()
-    # By the first light, from the front, teeth are brighter than gums that absorb thirty times as much.
+    # Under the first light, from the front, teeth are brighter than gums, which absorb thirty times as much.
     assert images.mean[0, :3].min() > 0
     assert images.mean[0, :3].mean() > images.mean[0, 3:].mean()

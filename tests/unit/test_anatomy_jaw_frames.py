@@ -1,4 +1,4 @@
-"""Canonical frames are found by FDI numbers and shapes, of one tooth and of a jaw, whole or in part, in any pose."""
+"""Canonical frames are found from FDI numbers and shapes: for one tooth or a jaw, whole or in part, in any pose."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from services.anatomy.frame import ToothFrame
-from services.anatomy.jaw_frames import jaw_frames, number_told, tooth_frame
-from services.anatomy.templates.average_arch import arch_from_middles, nominal_places
+from services.anatomy.jaw_frames import fdi_mismatch_note, jaw_frames, tooth_frame
+from services.anatomy.templates.average_arch import arch_from_middles, nominal_positions
 from services.anatomy.templates.crown import build_tooth
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import Jaw, build_jaw
@@ -25,12 +25,12 @@ SHIFT_MM = np.array([40.0, -7.0, 300.0])
 ALL = (*range(11, 18), *range(21, 28))
 FRONT_CAMERA_MM = np.array([[0.0, 400.0, 60.0]])
 LEAN_DEG = 20.0
-"""Of a real tooth's axis off the arch's normal, but for last molars and upper front teeth, which lean up to 30
-degrees."""
+"""Largest angle between a real tooth's axis and the arch's normal, except for last molars and upper front teeth, which
+lean by up to 30 degrees."""
 
 
 def angles_deg(found: Axes, true: Axes) -> Axes:
-    """Between the rows of two sets of axes."""
+    """Angles between the rows of two sets of axes."""
     return np.asarray(np.degrees(np.arccos(np.clip((found * true).sum(axis=-1), -1, 1))))
 
 
@@ -39,7 +39,7 @@ def moved(mesh: Mesh, turn: Axes) -> Mesh:
 
 
 def errors_deg(frames: tuple[ToothFrame, ...], true: list[Axes], turn: Axes) -> Axes:
-    """(N, 3): of each tooth's axes, found in a moved world."""
+    """Errors (N, 3) of each tooth's axes, found in a moved world."""
     return angles_deg(np.array([frame.axes @ turn for frame in frames]), np.array(true))
 
 
@@ -55,8 +55,9 @@ def phantom_errors_deg(jaw: Jaw, numbers: tuple[int, ...], seed: int) -> Axes:
     return errors_deg(frames, [jaw.tooth(number).frame.axes for number in numbers], turn)
 
 
-# Phantom teeth are sized and turned averages, so that what is left is the sampling's: 1 degree of the occlusal axis and
-# 5 of the others were measured over 3 subjects and 9 choices of teeth, 5 at a canine, which is almost round.
+# Phantom teeth are scaled and turned averages, so the only error left is that of the sampling: 1 degree for the
+# occlusal axis and 5 for the others were measured over 3 subjects and 9 choices of teeth; 5 at a canine, which is
+# almost round.
 PHANTOM_BOUNDS_DEG = np.array([8.0, 8.0, 3.0])
 
 
@@ -68,11 +69,11 @@ def test_a_phantom_jaw_is_known_whole_or_in_part_in_any_pose(subject: Jaw, numbe
 
 def test_a_tooth_with_another_kinds_number_is_told(subject: Jaw) -> None:
     premolar, incisor = subject.tooth(24), subject.tooth(11)
-    sentence = number_told(Tooth(11, premolar.outer))
+    sentence = fdi_mismatch_note(Tooth(11, premolar.outer))
     assert sentence.startswith(
         "Tooth 11 is shaped like a first premolar and not like a central incisor; give its right FDI number"
     )
-    assert number_told(Tooth(24, premolar.outer)) == number_told(Tooth(11, incisor.outer)) == ""
+    assert fdi_mismatch_note(Tooth(24, premolar.outer)) == fdi_mismatch_note(Tooth(11, incisor.outer)) == ""
 
 
 @pytest.mark.slow
@@ -110,14 +111,15 @@ def test_every_single_tooth_of_other_proportions_is_known(fdi: int) -> None:
 
 
 def real_axes(numbers: list[int], meshes: list[Mesh]) -> list[Axes]:
-    # Of the scanned crowns, which lie with y up and z to the front: upright, and out of the line of their middles.
+    # True axes of the scanned crowns, which have y up and z to the front: upright, and outwards across the line of
+    # their middles.
     middles = np.array([(mesh.vertices_mm.min(axis=0) + mesh.vertices_mm.max(axis=0)) / 2 for mesh in meshes])
     found = []
     for number, middle in zip(numbers, middles, strict=True):
         up = np.array([0.0, -1.0 if number < 30 else 1.0, 0.0])
         own = [k for k, other in enumerate(numbers) if (other < 30) == (number < 30)]
-        # The arch as a parabola z(x) is steep at the sides; a circle's centre in its depth serves all places to about
-        # 15 degrees.
+        # As a parabola z(x), the arch is steep at the sides; the direction from one centre deep in the arch is right
+        # to about 15 degrees everywhere.
         outward = middle - np.array([0.0, middle[1], middles[own, 2].min()])
         buccal = outward - (outward @ up) * up
         buccal /= np.linalg.norm(buccal)
@@ -153,14 +155,14 @@ def test_a_whole_real_incisor_is_seen_by_its_landmarks() -> None:
 
 
 def test_an_arch_of_middles_is_turned_onto_the_average() -> None:
-    nominal, axes = nominal_places((17, 14, 11, 23, 26))
+    nominal, axes = nominal_positions((17, 14, 11, 23, 26))
     turn = Rotation.random(random_state=4).as_matrix()
     np.testing.assert_allclose(
         arch_from_middles((17, 14, 11, 23, 26), nominal @ turn.T + SHIFT_MM) @ turn, np.eye(3), atol=1e-9
     )
     np.testing.assert_allclose(np.linalg.det(axes), 1)
-    # Lower teeth point up, so that their arch frame has x on the patient's right: the place of 36 is that of 16.
-    np.testing.assert_array_equal(nominal_places((36,))[0], nominal_places((16,))[0])
+    # Lower teeth point up, so x of their arch frame is to the patient's right: the place of 36 equals that of 16.
+    np.testing.assert_array_equal(nominal_positions((36,))[0], nominal_positions((16,))[0])
 
 
 def test_a_number_that_no_tooth_has_is_refused(subject: Jaw) -> None:

@@ -1,4 +1,4 @@
-"""The virtual mouth is a folder capture like any other."""
+"""The virtual mouth is a capture folder like any other."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_highlights_are_what_the_images_have_more(tmp_path: Path) -> None:
     layer = np.stack([np.load(tmp_path / "glossy/highlights" / entry.file) for entry in capture.images])
     np.testing.assert_allclose(images(tmp_path / "glossy") - images(tmp_path / "matte"), layer, atol=1e-6)
     assert layer.max() > 0.1
-    # The reflection has the light's colour, whatever the tooth's.
+    # The reflection has the light's colour, whatever the colour of the tooth.
     first = layer[0][layer[0].min(axis=-1) > 1e-3]
     np.testing.assert_allclose(first[:, 2] / first[:, 0], 0.9, rtol=1e-4)
 
@@ -89,7 +89,7 @@ def test_both_renderers_see_the_same_tooth(tmp_path: Path) -> None:
         noise = sum(np.load(tmp_path / name / str(entry.variance_file)).astype(float) for name in ("engine", "mitsuba"))
         halves = np.array_split(np.arange(first.shape[0]), 2)
         scores += [(first[half] - second[half]).sum() / np.sqrt(noise[half].sum()) for half in halves]
-    # Four values from 16 batches a side: |z| <= 4.5 fails one correct run in 2,000 at most.
+    # Four values from 16 batches on each side: |z| <= 4.5 fails at most one correct run in 2,000.
     assert len(scores) == 4
     assert np.abs(scores).max() <= 4.5
 

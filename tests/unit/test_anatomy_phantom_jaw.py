@@ -102,7 +102,7 @@ def test_a_scanned_jaw_is_the_same_by_both_renderers(tmp_path: Path) -> None:
         images = read_record(out / "capture.json", FolderCapture).images
         brightness.append([np.load(out / entry.file).astype(float).sum() for entry in images])
         noise.append([np.load(out / str(entry.variance_file)).astype(float).sum() for entry in images])
-    # Two values from 16 batches a side: |z| <= 4.5 fails one correct run in 4,000 at most.
+    # Two values from 16 batches on each side: |z| <= 4.5 fails at most one correct run in 4,000.
     scores = (np.array(brightness[0]) - brightness[1]) / np.sqrt(np.sum(noise, axis=0))
     assert np.abs(scores).max() <= 4.5
     assert (np.sqrt(np.sum(noise, axis=0)) < 0.03 * np.array(brightness[0])).all()
@@ -114,7 +114,7 @@ def test_a_scanned_jaw_is_the_same_by_both_renderers(tmp_path: Path) -> None:
     assert not (tmp_path / "engine" / "cavity.ply").exists()
     for tooth in read_teeth(tmp_path / "engine"):
         assert tooth.dentin is not None
-        # B0 lies 0.1 mm deep, and what the weights add is at most as much of the way to 2 mm.
+        # B0 is 0.1 mm deep; the weights add at most this share of the way to 2 mm.
         depths = SurfaceDistance(tooth.outer).closest(tooth.dentin.vertices_mm)[1]
         assert 0.04 < depths.min() < depths.max() < 0.1 + SCAN_DENTIN[1] * 1.9 + 0.05
 

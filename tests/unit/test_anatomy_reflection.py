@@ -1,4 +1,4 @@
-"""The enamel's reflection against Mitsuba's rough dielectric, and energy."""
+"""The enamel's reflection: compared with Mitsuba's rough dielectric, and its energy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NORMAL = np.array([0.0, 0.0, 1.0])
 
 
 def hemisphere(count: int, seed: int) -> np.ndarray:
-    """Uniform directions about the normal."""
+    """Uniform directions on the hemisphere about the normal."""
     random = np.random.default_rng(seed)
     cosine, turn = random.uniform(0.02, 1, count), random.uniform(0, 2 * np.pi, count)
     sine = np.sqrt(1 - cosine**2)
@@ -80,7 +80,7 @@ def test_gums_hide_the_root_and_scatter_diffusely() -> None:
 
 
 def test_a_light_that_no_visible_point_faces_reflects_nothing() -> None:
-    # Such as a grazing light and a tooth of which the gums leave little to see: no shadow ray is left to trace.
+    # As with a grazing light and a tooth that the gums almost cover: no shadow ray remains to be traced.
     incisor, (camera,), (light,) = (
         build_incisor(),
         dome_cameras(1, 1.0, (build_incisor().outer,)),

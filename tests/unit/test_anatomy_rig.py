@@ -1,4 +1,4 @@
-"""The dome sees and lights the tooth as a capture needs it."""
+"""The virtual dome: its cameras and lights see and light the tooth as a capture requires."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_cameras_frame_the_tooth_at_the_pixel_size_asked_for(count: int, pixel_m
         margin = np.stack([pixels.min(axis=0), np.array(camera.size) - pixels.max(axis=0)])
         assert (margin >= 2).all()
         assert (margin <= 3.01).all()
-        # 13.5 mm of tooth, seen at up to 10 degrees from the side of its axis and 1 % nearer or farther.
+        # 13.5 mm of tooth, seen up to 10 degrees away from square to its axis and 1 % nearer or farther.
         assert np.ptp(pixels[:, 1]) * pixel_mm == pytest.approx(13.5, abs=0.9)
         # The incisal edge hangs down in the picture.
         assert pixels[outer.vertices_mm[:, 2].argmax(), 1] > pixels[outer.vertices_mm[:, 2].argmin(), 1]

@@ -1,4 +1,4 @@
-"""Labelled scans as they are read, and what is refused in them."""
+"""How labelled scans are read, and which are refused."""
 
 from __future__ import annotations
 

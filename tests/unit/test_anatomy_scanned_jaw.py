@@ -1,4 +1,4 @@
-"""Solids from labelled scans: small ones made here, and a real upper arch."""
+"""Solids made from labelled scans: small scans made here, and a real upper arch."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def test_bumps_become_solids_in_gums(pair: ScannedJaw) -> None:
     assert [tooth.fdi for tooth in pair.teeth] == [11, 21]
     for tooth in pair.teeth:
         require_tidy(tooth.outer, f"tooth {tooth.fdi}")
-        # From the bump's top to the root's end, below where the label begins, which triangles and smoothing know to
-        # about a triangle.
+        # From the top of the bump to the end of the root, which begins where the label begins; triangles and smoothing
+        # shift that by up to about one triangle.
         height = np.ptp(tooth.outer.vertices_mm[:, 2])
         assert height == pytest.approx(CROWN_MM - NECK_MM + STUB_MM, abs=1.5 * PITCH_MM)
     require_tidy(pair.gums, "gums", (2.0, 200.0))
@@ -126,7 +126,7 @@ def test_neighbours_bend_the_arch() -> None:
 
 
 def test_a_moved_scan_gives_the_same_jaw() -> None:
-    # Uneven points, so that no choice hangs on rounding, such as that of the shorter of two equal diagonals.
+    # Uneven points, so that no choice depends on rounding, such as the choice between two equal diagonals.
     points = PAIR.mesh.vertices_mm + np.random.default_rng(3).normal(scale=0.02, size=PAIR.mesh.vertices_mm.shape)
     pair = jaw_from_scan(replace(PAIR, mesh=Mesh(points, PAIR.mesh.faces)))
     turn, shift = Rotation.from_rotvec([0.7, -1.9, 0.4]).as_matrix(), np.array([150.0, -80.0, 420.0])
@@ -225,8 +225,8 @@ def test_a_real_arch_becomes_solids(arch: LabelledScan, jaw: ScannedJaw) -> None
     for tooth in jaw.teeth:
         require_tidy(tooth.outer, f"tooth {tooth.fdi}")
     require_tidy(jaw.gums, "gums", (2.0, 200.0))
-    # The crowns' areas as the data's description gives them, to its digits; root and contacts' walls add half to one
-    # and a half times as much.
+    # The areas of the crowns as in the description of the data, to its digits; root and walls at contacts add half to
+    # one and a half times as much.
     for tooth in jaw.teeth:
         crown = areas_mm2(Mesh(arch.mesh.vertices_mm, arch.mesh.faces[arch.fdi == tooth.fdi])).sum()
         assert 158.5 <= crown <= 272.5
@@ -245,7 +245,7 @@ def test_real_crowns_and_gingiva_are_the_scan(
         away = own[cKDTree(vertices[np.intersect1d(own, others)]).query(vertices[own])[0] > 1.0]
         assert len(away) > 300
         assert SurfaceDistance(tooth.outer).closest(vertices[away])[1].max() < 0.05
-    # The gums keep the gingiva but for faces at edges of more than two, and for the borders' smoothing.
+    # The gums keep the gingiva, except for faces at edges with more than two faces and for the smoothed borders.
     gingiva = np.unique(faces[whole & (arch.fdi == 0)])
     inner = np.setdiff1d(gingiva, faces[arch.fdi > 0])
     off = gums_distance.closest(vertices[gingiva])[1]
@@ -263,7 +263,7 @@ def test_landmarks_lie_on_the_real_incisor(jaw: ScannedJaw) -> None:
             if not line.startswith("#")
         ]
     )
-    # The data's description: 0.16 to 0.28 mm from points of the label, so not farther from its surface.
+    # By the description of the data, 0.16 to 0.28 mm from points of the label, so not farther from its surface.
     assert points.shape == (4, 3)
     assert SurfaceDistance(jaw.teeth[0].outer).closest(in_arch(jaw, points))[1].max() < 0.28
 
@@ -286,7 +286,7 @@ def test_real_frames_follow_the_arch(jaw: ScannedJaw) -> None:
         assert np.linalg.det(frame.axes) == pytest.approx(1)
         assert frame.axes[2, 2] >= np.cos(np.radians(STEEPEST_TILT_DEG)) - 1e-12
         middle = frame.world_from_canonical(np.zeros((1, 3)))[0]
-        # Away from a point inside the arch; the scan's teeth lie 20 mm and more from it.
+        # Away from a point inside the arch; the teeth of the scan are 20 mm and more from it.
         assert frame.axes[1] @ (middle - np.array([0.0, -5.0, middle[2]])) > 10
     sides = {
         tooth.fdi: frame.world_from_canonical(np.zeros((1, 3)))[0, 0]
@@ -296,8 +296,9 @@ def test_real_frames_follow_the_arch(jaw: ScannedJaw) -> None:
 
 
 def test_matched_frames_agree_with_the_cervical_lines(jaw: ScannedJaw) -> None:
-    # Two ways that share no data but the arch's order: crowns' shapes, and the line where they leave the gums. Neither
-    # knows a tooth to better than some degrees; 7 of the occlusal axis and 7 of the buccal one were measured.
+    # Two methods that share only the order along the arch: the shapes of the crowns, and the line where the crowns
+    # emerge from the gums. Neither is exact to better than some degrees; differences of 7 degrees for the occlusal and
+    # 7 for the buccal axis were measured.
     chosen = [k for k, tooth in enumerate(jaw.teeth) if tooth.fdi in (14, 15, 16, 17)]
     matched = jaw_frames([jaw.teeth[k] for k in chosen], np.zeros((1, 3)))
     for frame, k in zip(matched, chosen, strict=True):
@@ -316,8 +317,8 @@ def test_real_teeth_show_their_outside(jaw: ScannedJaw) -> None:
         seen += np.count_nonzero(hits.hit)
         inverted += np.count_nonzero(hits.hit & (hits.normals @ direction > 0))
     assert seen > 50_000
-    # Where the borders of two touching teeth cross over, a root's wall may begin folded: 7 rays were measured, and
-    # several times as many without the strips at contacts.
+    # Where the borders of two touching teeth cross each other, the wall of a root may begin with a fold: 7 such rays
+    # were measured, and several times as many without the strips at contacts.
     assert inverted < 20
 
 

@@ -1,5 +1,5 @@
-"""Solids that overlap become surfaces that do not: nothing is lost, nothing is double, and cut edges are shared bit by
-bit.
+"""Overlapping solids become surfaces that do not overlap: nothing is lost, nothing is there twice, and surfaces share
+their cut edges bit by bit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def ball(radius_mm: float, x_mm: float = 0.0) -> Mesh:
 
 
 def block(*extents_mm: float) -> Mesh:
-    """With its top in the plane z = 0."""
+    """A box with its top in the plane z = 0."""
     box = trimesh.creation.box(extents_mm)
     return Mesh(np.asarray(box.vertices) - np.array([0, 0, extents_mm[2] / 2]), np.asarray(box.faces, dtype=np.int32))
 
@@ -38,7 +38,7 @@ def area(mesh: Mesh) -> float:
 
 
 def joined(*meshes: Mesh) -> Mesh:
-    """One mesh whose corners are the same where their coordinates are, bit by bit."""
+    """One mesh in which vertices with the same coordinates, bit by bit, are one vertex."""
     first = np.cumsum([0] + [len(mesh.vertices_mm) for mesh in meshes])
     faces = np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, first, strict=False)])
     vertices, index = np.unique(np.concatenate([mesh.vertices_mm for mesh in meshes]), axis=0, return_inverse=True)
@@ -59,10 +59,11 @@ def test_crown_and_root_meet_the_gums_without_a_gap() -> None:
     (crown,), (root,) = parts.crowns, parts.roots
     assert area(crown) + area(root) == pytest.approx(area(tooth), rel=1e-12)
     assert middles(crown)[:, 2].min() > 0 > middles(root)[:, 2].max()
-    # Each medium is closed by its own surfaces: the tooth, what air touches, and the gums with the root's hollow.
+    # Each of these is a closed surface: the tooth, everything that touches air, and the gums with the hollow of the
+    # root.
     for solid in (joined(crown, root), joined(crown, parts.gums), joined(parts.gums, flipped(root))):
         solid.require_solid("of the cut parts")
-    # The lid of the root's hollow lies in the plane z = 0, where it adds nothing to a volume about the origin.
+    # The lid of the hollow is in the plane z = 0, where it adds nothing to a volume computed from the origin.
     hollowed = joined(parts.gums, flipped(root)).signed_volume_mm3()
     assert hollowed == pytest.approx(GUMS.signed_volume_mm3() - root.signed_volume_mm3(), rel=1e-9)
     assert parts.contacts == {}
@@ -81,7 +82,7 @@ def test_of_two_teeth_the_first_keeps_its_surface_where_they_overlap() -> None:
     shared = parts.contacts[0, 1]
     # The cap of a sphere cut 0.1 mm from its end, 2 pi r h; the polyhedron's is smaller by what its edges cut off.
     assert area(shared) == pytest.approx(2 * np.pi * RADIUS_MM * 0.1, rel=0.3)
-    # The three parts are the first tooth again; the second one's are the surface of what the first leaves of it.
+    # The three parts together are the first tooth; those of the second are the surface of the second without the first.
     first = joined(parts.crowns[0], parts.roots[0], shared)
     assert area(first) == pytest.approx(area(teeth[0].outer), rel=1e-9)
     assert first.signed_volume_mm3() == pytest.approx(teeth[0].outer.signed_volume_mm3(), rel=1e-9)

@@ -1,4 +1,4 @@
-"""Painted stains: plausible, repeatable, and in the pictures of a phantom."""
+"""Painted stains: plausible, repeatable, and visible in the images of a phantom."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from services.anatomy.templates.incisor import build_incisor
-from services.fit.export.stains import kept_stains
+from services.fit.export.stains import read_stains
 from services.fit.inputs.stain_uv import stain_layout
 from services.phantom.stain_paint import STRENGTH, painted_depth, painted_stains
 from services.phantom.tooth import write_phantom
@@ -39,10 +39,10 @@ def test_a_phantom_shows_its_stains(tmp_path: Path) -> None:
         write_phantom(out, pixel_mm=2.0, cameras=1, lights=2, samples=256, seed=3, stains=stains)
         totals[stains] = sum(float(np.load(out / f"c0_l{k}.npy").sum()) for k in range(2))
         assert json.loads((out / "truth.json").read_text())["stains"] is stains
-    kept = kept_stains(tmp_path / "True")
+    kept = read_stains(tmp_path / "True")
     assert kept is not None
-    assert kept_stains(tmp_path / "False") is None
-    # Light crosses the surface twice, though not at mean places: within a factor of two of twice the mean depth.
+    assert read_stains(tmp_path / "False") is None
+    # Light crosses the surface twice, though not at average places: within a factor of two of twice the mean depth.
     dimmed = np.log(totals[False] / totals[True])
     texture = kept.textures["green"].transmittance
     depth = float(-np.log(texture[texture < 1]).mean())

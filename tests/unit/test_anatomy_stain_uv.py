@@ -1,4 +1,6 @@
-"""Charts of stains: complete, not overlapping, the same every time, and neighbours are neighbours on the surface."""
+"""Texture charts of stains: complete, without overlap, the same every time; neighbouring texels are neighbours on the
+surface.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,14 @@ import trimesh
 
 from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Mesh
-from services.fit.inputs.stain_uv import REACH, TEXEL_MM, StainLayout, bilinear_texels, stain_layout, texel_edge_mm
+from services.fit.inputs.stain_uv import (
+    NEIGHBOUR_DISTANCE,
+    TEXEL_MM,
+    StainLayout,
+    bilinear_texels,
+    stain_layout,
+    texel_edge_mm,
+)
 
 TEXEL = 0.75
 
@@ -24,7 +33,7 @@ def layout(mesh: Mesh) -> StainLayout:
 
 
 def looked_up(mesh: Mesh, layout: StainLayout, count: int = 20_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    # Random places on the surface, the texels read there, and their weights.
+    # Random places on the surface, the texels used there, and their weights.
     rng = np.random.default_rng(1)
     face = rng.integers(0, len(mesh.faces), count)
     weights = rng.dirichlet(np.ones(3), count)
@@ -38,8 +47,8 @@ def looked_up(mesh: Mesh, layout: StainLayout, count: int = 20_000) -> tuple[np.
 def test_every_place_reads_texels_of_its_own(mesh: Mesh, layout: StainLayout) -> None:
     places, texels, shares = looked_up(mesh, layout)
     assert (texels[shares > 1e-3] >= 0).all()
-    # A texel colours what lies within about its own edge; one shared by two charts would have its middle between them,
-    # far from both.
+    # A texel colours points within about its own edge length; a texel shared by two charts would have its middle
+    # between them, far from both.
     distance = np.linalg.norm(places[:, None] - layout.points_mm[texels], axis=2)
     assert distance[(texels >= 0) & (shares > 0.05)].max() < 2.5 * TEXEL
 
@@ -48,7 +57,7 @@ def test_texels_cover_the_surface_at_about_the_size_asked(mesh: Mesh, layout: St
     corners = mesh.vertices_mm[mesh.faces]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     assert layout.area_mm2.sum() == pytest.approx(area)
-    # Texels inside a chart carry an edge squared, but for the chart's distortion.
+    # Texels inside a chart cover their edge squared, except for the distortion of the chart.
     assert np.percentile(layout.area_mm2, 80) == pytest.approx(TEXEL**2, rel=0.2)
 
 
@@ -64,7 +73,7 @@ def test_neighbours_join_the_whole_surface_across_seams(layout: StainLayout) -> 
 
     a, b = layout.neighbours.T
     count = len(layout.points_mm)
-    assert np.linalg.norm(layout.points_mm[a] - layout.points_mm[b], axis=1).max() <= REACH * TEXEL
+    assert np.linalg.norm(layout.points_mm[a] - layout.points_mm[b], axis=1).max() <= NEIGHBOUR_DISTANCE * TEXEL
     assert connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count)))[0] == 1
 
 

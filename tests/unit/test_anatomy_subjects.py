@@ -1,4 +1,4 @@
-"""Random subjects repeat, stay within the spread they are drawn from, and are yellow."""
+"""Random subjects are repeatable, stay within the spread they are drawn from, and have yellow teeth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Enamel thickness against published figures of a real tooth."""
+"""Enamel thickness, compared with published figures of a real tooth."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ def test_errors_of_weights_become_errors_of_thickness() -> None:
     ball = sphere(3.5)
     shape = DentinShape(ball, -0.4 * sphere(1.0).vertices_mm[None])
     found = uncertain_thickness(sphere(4.0).vertices_mm, shape, np.array([0.3]), np.array([[0.05**2]]))
-    # Of the faceted balls: 642 vertices each, radii short by at most 0.5 % between them.
+    # Tolerances for the faceted balls: 642 vertices each, with radii up to 0.5 % too short between vertices.
     np.testing.assert_allclose(found.values_mm, 0.62, atol=0.02)
     np.testing.assert_allclose(found.errors_mm, 0.02, rtol=0.02)
     assert abs(found.mean_error_mm - 0.02) < 4e-4
 
 
 def test_errors_against_many_drawn_shapes() -> None:
-    # Two modes, correlated weights: 400 draws know a standard deviation to 3.5 %; 4 of these, and the second order of a
-    # spread of 0.05.
+    # Two modes with correlated weights: 400 draws give a standard deviation to 3.5 %. The tolerance is 4 times that,
+    # plus the second order of a spread of 0.05.
     shape, points = dentin_shape(), ellipsoid(SEMI_AXES_MM).vertices_mm[::40]
     weights, covariance = np.array([0.5, 0.4]), np.array([[0.0025, -0.001], [-0.001, 0.002]])
     found = uncertain_thickness(points, shape, weights, covariance)
@@ -88,13 +88,14 @@ def test_a_camera_sees_thickness_and_its_error_at_the_same_pixels() -> None:
     assert found is not None
     assert found.errors_mm is not None
     np.testing.assert_array_equal(np.isfinite(found.image_mm), np.isfinite(found.errors_mm))
-    # As above, and where a ray meets a flat face of the ball instead of a vertex.
+    # As above; here a ray may also meet a flat face of the ball instead of a vertex.
     np.testing.assert_allclose(found.image_mm[np.isfinite(found.image_mm)], 0.62, atol=0.03)
     np.testing.assert_allclose(found.errors_mm[np.isfinite(found.errors_mm)], 0.02, rtol=0.03)
     assert found.mean.se == pytest.approx(0.02, rel=0.03)
     assert found.mean.determined
 
-    # Known, it is the plain image; assumed, the same one, which determines nothing; of another place nothing is seen.
+    # With known dentin it is the plain image; with assumed dentin the same image, marked as not determined; elsewhere
+    # there is nothing to see.
     inside = Mesh(shape.vertices_mm((0.3,)), ball.faces)
     for dentin, weights, is_known in ((DentinShape.known(inside), (), True), (shape, (0.3,), False)):
         plain = thickness_map(outer, dentin, weights, None, camera)

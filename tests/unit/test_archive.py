@@ -1,5 +1,5 @@
-"""The streamed zip is a correct zip: checked by the reader of the standard library, by ``unzip``, past zip64's limit,
-and for memory.
+"""The streamed zip file is correct: checked with the standard library's reader and with ``unzip``, beyond the limit
+where zip64 begins, and for memory.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def test_no_files_make_an_empty_zip(tmp_path: Path) -> None:
 
 
 def test_large_files_and_offsets_are_zip64(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the limit of the format lowered in the writer, so that the reader must find its way by zip64's records."""
+    """The writer's limit is lowered, so that the reader needs the zip64 records."""
     names = write(tmp_path, a=os.urandom(5000), b=os.urandom(100))
     target = tmp_path / "all.zip"
     with monkeypatch.context() as lowered:

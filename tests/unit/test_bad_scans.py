@@ -1,5 +1,5 @@
-"""Scans and landmarks that cannot be used end in a sentence that names what is wrong and what to do, each in its own
-words.
+"""A scan or landmark that cannot be used ends in a sentence that names the fault and what to do; each fault has its own
+sentence.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def truncated(folder: Path) -> LabelledScan:
 
 
 def huge(folder: Path) -> LabelledScan:
-    # A binary STL file of five million triangles, whose bytes are never read nor take room on the disk.
+    # A binary STL file of five million triangles; its bytes are never read and take no room on the disk.
     path = folder / "scan.stl"
     with path.open("wb") as file:
         file.write(bytes(80) + np.uint32(5_000_000).tobytes())

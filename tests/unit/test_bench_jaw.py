@@ -1,5 +1,5 @@
-"""The jaw's benchmark: parameters become the mouth they name, errors are relative to the truth, rows are kept as they
-come.
+"""The jaw benchmark: parameters become the mouth they describe, errors are relative to the truth, and each row is kept
+as soon as it is there.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from services.bench.fits.jaw import Judge, mouth_of, picture, tooth_off
+from services.bench.fits.jaw import ErrorRecorder, mouth_of, picture, relative_errors
 from services.fit.checks.evaluate import ErrorSums
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
@@ -22,7 +22,7 @@ TRUTH = Mouth(
 
 
 def parameters(mouth: Mouth, parts: tuple[str, ...]) -> dict[str, float]:
-    """As a fit reports them, with what it derives."""
+    """The parameters of a mouth as a fit reports them, including derived ones."""
     values = {
         f"{part}.{leaf}": float(getattr(mouth.medium(part), leaf))
         for part in parts
@@ -39,7 +39,7 @@ def test_a_fits_parameters_are_a_mouth() -> None:
 def test_errors_are_relative_and_those_of_absorption() -> None:
     true = Tissue(Medium(4.0, 0.99), Medium(10.0, 0.95))
     found = Tissue(Medium(4.4, 0.99), Medium(10.0, 0.96))
-    off = tooth_off(found, true)
+    off = relative_errors(found, true)
     assert off["enamel.sigma_s_reduced"] == pytest.approx(0.1)
     assert off["enamel.alpha_reduced"] == pytest.approx(0.0)
     # With g = 0 alpha' is alpha.
@@ -48,7 +48,7 @@ def test_errors_are_relative_and_those_of_absorption() -> None:
 
 @dataclass(frozen=True)
 class FixedErrors:
-    """In place of a prepared jaw: equal errors for everyone."""
+    """Replaces a prepared jaw: the same errors for every solver."""
 
     observations: Any
 
@@ -59,12 +59,12 @@ class FixedErrors:
 def test_rows_are_kept_and_drawn() -> None:
     kept: list[list[dict[str, Any]]] = []
     teeth = SimpleNamespace(teeth=tuple(SimpleNamespace(fdi=fdi) for fdi in (11, 12)))
-    judge = Judge(FixedErrors(teeth), TRUTH, kept.append, samples=16)  # type: ignore[arg-type]
+    recorder = ErrorRecorder(FixedErrors(teeth), TRUTH, kept.append, samples=16)  # type: ignore[arg-type]
     moved = TRUTH.with_values({"0.enamel.sigma": 5.0})
     for seconds, stage in ((1.0, "start.0"), (2.0, "joint"), (3.0, "joint"), (4.0, "final")):
-        judge.row(seconds, moved, stage, step=int(seconds))
+        recorder.record(seconds, moved, stage, step=int(seconds))
     assert [len(rows) for rows in kept] == [1, 2, 3, 4]
-    row = judge.rows[-1]
+    row = recorder.rows[-1]
     assert (row.error, row.fitted_error) == pytest.approx((0.3, 0.2))
     assert row.off["11"]["enamel.sigma_s_reduced"] == pytest.approx(0.25)
     assert row.off["12"]["enamel.sigma_s_reduced"] == 0.0

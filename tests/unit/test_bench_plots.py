@@ -1,5 +1,5 @@
-"""Pictures of benchmarks: every point is in its panel, the peer's ratio beside its name, and a missing drawing library
-costs only the picture.
+"""Plots of benchmarks: every point is in its panel, the ratio is beside the peer's name, and a missing drawing library
+costs only the plot.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROWS: list[dict[str, Any]] = [
 
 
 def points(axes: Any) -> dict[str, list[tuple[float, float]]]:
-    """By label, those with a marker."""
+    """The points of lines with markers, by label."""
     return {
         line.get_label(): sorted(map(tuple, line.get_xydata().tolist()))
         for line in axes.get_lines()

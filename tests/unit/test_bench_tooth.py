@@ -1,5 +1,5 @@
-"""The race of tooth fits: ratios are of times to one error, bounds are marked as such, and rows are kept as they
-come.
+"""The race of tooth fits: ratios compare times to the same error, bounds are marked as bounds, and each row is kept as
+soon as it is there.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from services.bench.fits.tooth import PEER, Judge, ToothRow, picture, summary
+from services.bench.fits.tooth import PEER, ErrorRecorder, ToothRow, picture, summary
 from services.bench.fits.tooth_capture import tissue_of
 from services.fit.checks.evaluate import ErrorSums
 from services.fit.optics.parameters import Medium, Tissue
@@ -68,7 +68,7 @@ def test_picture_shows_every_rate_and_the_bound() -> None:
 
 @dataclass(frozen=True)
 class FixedErrors:
-    """In place of a prepared tooth: equal errors for everyone."""
+    """Replaces a prepared tooth: the same errors for every solver."""
 
     def errors(self, tissue: Tissue, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:  # noqa: ARG002
         return ErrorSums(0.04, 1.0, 0.0, 1e-12), ErrorSums(0.09, 1.0, 0.0, 1e-12)
@@ -76,10 +76,10 @@ class FixedErrors:
 
 def test_rows_are_kept_as_they_come() -> None:
     kept: list[list[dict[str, Any]]] = []
-    judge = Judge(FixedErrors(), kept.append, samples=16)  # type: ignore[arg-type]
+    recorder = ErrorRecorder(FixedErrors(), kept.append, samples=16)  # type: ignore[arg-type]
     tissue = Tissue(Medium(4.0, 0.99, g1=0.5), Medium(8.0, 0.98))
-    judge.row("dentine", 1.0, tissue, "start")
-    judge.row("dentine", 2.0, tissue, "final")
+    recorder.record("dentine", 1.0, tissue, "start")
+    recorder.record("dentine", 2.0, tissue, "final")
     assert [len(rows) for rows in kept] == [1, 2]
     assert kept[1][1]["error"] == pytest.approx(0.3)
     assert kept[1][1]["fitted_error"] == pytest.approx(0.2)

@@ -1,4 +1,4 @@
-"""What a body in JSON may hold before it is parsed."""
+"""Limits on JSON request bodies, checked before they are parsed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.live_server import serving
 
 
 def manifest_of(files: int, path: str = "images/camera-1/light-{:05d}.png") -> bytes:
-    """A manifest of so many files, without spaces."""
+    """A manifest of this many files, without spaces."""
     return json.dumps(
         {"files": [{"path": path.format(number), "bytes": 1, "sha256": "0" * 64} for number in range(files)]},
         separators=(",", ":"),

@@ -1,4 +1,4 @@
-"""Mistakes in a calibration session are found by name, and a good session is accused of nothing."""
+"""Mistakes in a calibration session are found and named; a good session gives no false alarm."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_good_session_is_accused_of_nothing(
 
 @pytest.mark.slow
 def test_twenty_good_sessions_are_accused_of_nothing() -> None:
-    """Other seeds than any that a threshold was chosen by."""
+    """The seeds differ from those with which the thresholds were chosen."""
     for seed in range(200, 220):
         session = array_session(seed)
         cameras = session.cameras()
@@ -61,7 +61,7 @@ def test_twenty_good_sessions_are_accused_of_nothing() -> None:
 
 
 def image_of(board: Board) -> np.ndarray:
-    """The board, with a margin, at 12 pixels a square's tenth."""
+    """The board with a margin; a tenth of a square is 12 pixels."""
     columns, rows = board.squares
     drawn = opencv_board(board).generateImage((100 * columns, 100 * rows))
     return np.pad(drawn, 60, constant_values=255)
@@ -198,7 +198,7 @@ def test_a_list_that_is_wrong(good, cameras, lights, spoil, sentence) -> None:  
 
 
 def test_a_list_of_a_left_handed_frame(good: ArraySession, cameras: CamerasStep, lights: LightsStep) -> None:
-    """Twelve lights, as the six of the session may lie near one plane, whose mirror image is the same."""
+    """Twelve lights, as the six of the session may be almost in one plane, which is its own mirror image."""
     random = np.random.default_rng(5)
     true = dome_lights(12, random)
     listed = true + random.normal(0, 4, true.shape)
@@ -211,7 +211,7 @@ def test_a_list_of_a_left_handed_frame(good: ArraySession, cameras: CamerasStep,
 
 
 def test_a_white_sphere_under_another_light(good: ArraySession, cameras: CamerasStep, lights: LightsStep) -> None:
-    # The two lights that are nearest to each other: others leave the side dark on which the named one shines.
+    # The two lights nearest to each other: with any others, the side on which the named light shines would be dark.
     where = lights.fit.positions_mm
     apart = np.linalg.norm(where[:, None] - where, axis=2) + 1e9 * np.eye(N_LIGHTS)
     one, two = (int(n) for n in np.unravel_index(int(apart.argmin()), apart.shape))
@@ -222,7 +222,7 @@ def test_a_white_sphere_under_another_light(good: ArraySession, cameras: Cameras
     )
     spoiled = replace(good, white=tuple(white))
     told = told_of(spoiled, cameras, lights, spoiled.intensity(lights))
-    # Of the two one may lie within the scatter that the other leaves.
+    # One of the two may be within the scatter that the other causes.
     assert told
     assert {sentence.partition(" is ")[0] for sentence in told} <= {
         f"The white sphere under light L{n} in camera left" for n in (one, two)
@@ -238,7 +238,7 @@ def test_a_white_sphere_of_a_wrong_exposure(good: ArraySession, cameras: Cameras
     spoiled = replace(good, white=white)
     told = told_of(spoiled, cameras, lights, spoiled.intensity(lights))
     assert [one.partition(":")[0] for one in told] == ["The white sphere under light L1 in camera middle is +100 % off"]
-    # The wrong photograph is left out, so it does no harm: lights are as without it to their own ± of 0.06 %.
+    # The wrong photograph is left out and does no harm: lights are the same as without it, to their own ± of 0.06 %.
     found, without = (np.log(one.intensity(lights).fit.intensity) for one in (spoiled, good))
     assert np.abs(found - without).max() < 6e-4
 

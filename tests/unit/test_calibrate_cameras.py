@@ -1,4 +1,4 @@
-"""Lenses and rigs from boards: against finite differences, known truth, and others' recordings."""
+"""Lenses and rigs from boards: compared with finite differences, with known truth, and with recordings by others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.calibrate.cameras.boards import corners_on_board, detect
-from services.calibrate.cameras.bundle import Rig, draw, fit_bundle, jacobian, layout_of
+from services.calibrate.cameras.bundle import Rig, fit_bundle, jacobian, layout_of, project_corners
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.models import choose_lens, fit_lens, held_out_squares, of_one_camera
 from services.calibrate.cameras.projection import image_grid, projection_covariance, projection_sigma
@@ -24,7 +24,7 @@ from tests.support.shared_data import shared_path
 
 CORNERS_OF_A_RECORDING = "calibration/{}/CHARUCO/xy_CHARUCO.csv"
 STEREO_BOARDS = Path("/usr/share/doc/opencv-doc/examples/data")
-"""Where Debian's package opencv-doc puts them."""
+"""Where Debian's package opencv-doc puts its stereo boards."""
 
 
 def test_derivatives_of_drawn_corners_are_those_of_finite_differences() -> None:
@@ -39,8 +39,9 @@ def test_derivatives_of_drawn_corners_are_those_of_finite_differences() -> None:
         for sign in (-1, 1):
             moved = values.copy()
             moved[column] += sign * step
-            sides.append(draw(layout.unpack(moved, rig), corners).ravel())
-        # Central differences leave step² times the third derivative, and rounding over the step: 1e-13 · 2000 ÷ 1e-6.
+            sides.append(project_corners(layout.unpack(moved, rig), corners).ravel())
+        # Error of central differences: step² times the third derivative, and rounding over the step, 1e-13 · 2000 ÷
+        # 1e-6.
         assert exact[:, column] == pytest.approx((sides[1] - sides[0]) / (2 * step), rel=1e-6, abs=1e-3)
 
 
@@ -58,7 +59,7 @@ def test_errors_of_a_rig_are_as_large_as_its_covariance_says() -> None:
         random = np.random.default_rng(seed)
         rig = true_rig(random, n_places=8)
         views = photographed(rig, 0.1, random)
-        # The start is far off in what the boards must tell.
+        # The start is far from the truth in the values that the boards must determine.
         lenses = [
             Lens(SIZE, lens.values * np.where(np.arange(8) < 2, 1.02, np.where(np.arange(8) < 4, 1.01, 0)))
             for lens in rig.lenses
@@ -87,7 +88,7 @@ def test_bad_corners_are_named_and_do_no_harm() -> None:
 
 
 def test_what_a_lens_draws_wrong_is_as_large_as_its_uncertainty_says() -> None:
-    """Errors of projection after the boards' own mean move, over 12 sessions and 20 pixels that share a lens."""
+    """Errors of projection less the mean motion of the boards, over 12 sessions and 20 pixels of one lens."""
     ratios = []
     for seed in range(12):
         random = np.random.default_rng(100 + seed)
@@ -104,7 +105,8 @@ def test_what_a_lens_draws_wrong_is_as_large_as_its_uncertainty_says() -> None:
             seen.append((pose_matrix(fit.rig.cameras[0]) @ pose_matrix(found) @ on_board)[:3].T)
         off = fit.rig.lenses[0].project(np.mean(seen, axis=0)) - grid
         ratios.append(np.linalg.norm(off, axis=1) / projection_sigma(fit, 0, grid, 450 * 1.02))
-    # A length of two coordinates over the worse one's σ: between 1 and √2 in rms; 12 sessions tell it to some 15 %.
+    # The length of a vector of two coordinates over the larger σ: between 1 and √2 in rms, known to some 15 % from 12
+    # sessions.
     assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.65
 
 
@@ -149,7 +151,7 @@ def test_boards_in_photographs_are_found_and_calibrate_a_camera() -> None:
         assert (len(found.markers), len(found.ids)) == (17, 24)
         views.append(View(0, number, found.corners_mm, found.pixels, found.ids, f"img_0{number}"))
     fit = fit_lens(views, (640, 480), "radial-tangential-5", "camera")
-    # Upstream's principal point is of pixel centres at integers.
+    # In the published principal point, pixel centres are at integers.
     assert fit.rms_px() == pytest.approx(0.1878, abs=1e-3)
     assert fit.rig.lenses[0].values[:4] == pytest.approx([457.3, 461.3, 317.7, 276.1], abs=0.2)
     hidden = detect(cv2.imread(str(folder / "chocclusion_original.jpg"), cv2.IMREAD_GRAYSCALE), board)

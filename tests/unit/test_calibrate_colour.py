@@ -1,4 +1,4 @@
-"""Colour matrices: against colour-science, OpenCV's own, and photographs of charts."""
+"""Colour matrices, compared with colour-science, with OpenCV's own, and with photographs of charts."""
 
 from __future__ import annotations
 

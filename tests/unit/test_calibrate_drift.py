@@ -1,4 +1,4 @@
-"""Two calibrations compared: what chance explains is not told as a change."""
+"""Comparing two calibrations: what chance explains is not reported as a change."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ POSITION_SE_MM, GAIN_SE, FOCAL_SE = 1.5, 0.003, 2e-4
 
 
 def drawn(seed: int, moved_mm: NDArray[np.float64] | float = 0.0, dimmed: float = 0.0) -> Calibration:
-    """A calibration with normal errors, in a world of its own."""
+    """A calibration with normally distributed errors, in its own world frame."""
     random = np.random.default_rng(seed)
     turn, shift = rotation_matrix(random.normal(size=3)), random.normal(0, 100, 3)
     places = (LIGHTS + moved_mm + random.normal(0, POSITION_SE_MM, LIGHTS.shape)) @ turn.T + shift
@@ -34,7 +34,9 @@ def drawn(seed: int, moved_mm: NDArray[np.float64] | float = 0.0, dimmed: float 
 
 
 def test_changes_of_a_still_rig_are_as_large_as_their_errors() -> None:
-    """Fifty comparisons of 14 quantities: rms has a standard error of 0.03, more as the lights share their middle."""
+    """Fifty comparisons of 14 quantities: their rms has a standard error of 0.03, or more, as the lights share a
+    middle.
+    """
     scores = [one.change / one.se for seed in range(50) for one in changes(drawn(2 * seed), drawn(2 * seed + 1))]
     assert len(scores) == 50 * 14
     assert 0.9 < np.sqrt(np.mean(np.square(scores))) < 1.1

@@ -1,4 +1,4 @@
-"""What a calibration's judgement advises, and that it never advises what cannot help."""
+"""What the judgement of a calibration advises; it never advises what cannot help."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from services.core.raw.records import RawFolder
 from tests.support.board_sessions import photographed, true_rig
 
 NAMES = ("light side", "middle", "right")
-"""The first camera's name holds a word that is no reason to photograph spheres."""
+"""The first camera's name contains the word light, which must not cause advice to photograph spheres."""
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def folder(*channels: str) -> RawFolder:
 
 
 def lights() -> LightsStep:
-    """A light that is well known; nothing else of the fit is asked."""
+    """One light that is well known; nothing else of the fit is used."""
     fit = SimpleNamespace(
         lights=np.array([0]), covariance=0.01 * np.eye(3), positions_mm=np.zeros((1, 3)), edge_shifts_px=(), outliers=()
     )

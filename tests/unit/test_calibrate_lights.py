@@ -1,4 +1,4 @@
-"""Lights from highlights on mirror spheres: the law of reflection, known truth, and a measured rig's positions."""
+"""Lights from highlights on mirror spheres: the law of reflection, known truth, and the positions of a measured rig."""
 
 from __future__ import annotations
 
@@ -10,35 +10,41 @@ import pytest
 from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import pose_matrix
 from services.calibrate.lights.listed import align_list, swapped_names
-from services.calibrate.lights.mirror import Eye, highlight_points, mirrored_rays, outline_errors, sphere_from_outline
+from services.calibrate.lights.mirror import (
+    PosedCamera,
+    highlight_points,
+    mirrored_rays,
+    outline_errors,
+    sphere_from_outline,
+)
 from services.calibrate.lights.positions import LightsFit, fit_lights
 from services.core.errors import CaptureInputError
 from tests.support.shared_data import shared_path
-from tests.support.sphere_sessions import SphereSession, dome_lights, outline_points, sphere_session, three_eyes
+from tests.support.sphere_sessions import SphereSession, dome_lights, outline_points, sphere_session, three_cameras
 
 NAMES = [f"L{number}" for number in range(60)]
 
 
 def test_highlights_obey_the_law_of_reflection() -> None:
-    eye, centre = three_eyes()[0], np.array([10.0, -20, 5])
+    camera, centre = three_cameras()[0], np.array([10.0, -20, 5])
     lights = dome_lights(40, np.random.default_rng(0))
-    points = highlight_points(eye.centre_mm, lights, centre, 25.0)
+    points = highlight_points(camera.centre_mm, lights, centre, 25.0)
     normals = (points - centre) / 25.0
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=1e-12)
     halves = sum(
-        (aim - points) / np.linalg.norm(aim - points, axis=1, keepdims=True) for aim in (lights, eye.centre_mm[None])
+        (aim - points) / np.linalg.norm(aim - points, axis=1, keepdims=True) for aim in (lights, camera.centre_mm[None])
     )
     assert np.cross(halves, normals) == pytest.approx(0, abs=1e-12)
-    seen, rays = mirrored_rays(eye, eye.project(points), centre, 25.0)
+    seen, rays = mirrored_rays(camera, camera.project(points), centre, 25.0)
     assert seen == pytest.approx(points, abs=1e-6)
     assert np.cross(lights - seen, rays) / 1000 == pytest.approx(0, abs=1e-6)
 
 
 def test_a_sphere_is_where_its_outline_says() -> None:
-    eye, centre = three_eyes()[2], np.array([-40.0, 30, 20])
-    edge, _ = outline_points(eye, centre, 25.0, 40)
-    assert sphere_from_outline(eye, edge, 25.0) == pytest.approx(centre, abs=1e-6)
-    assert outline_errors(eye, edge, centre, 25.0) == pytest.approx(0, abs=1e-6)
+    camera, centre = three_cameras()[2], np.array([-40.0, 30, 20])
+    edge, _ = outline_points(camera, centre, 25.0, 40)
+    assert sphere_from_outline(camera, edge, 25.0) == pytest.approx(centre, abs=1e-6)
+    assert outline_errors(camera, edge, centre, 25.0) == pytest.approx(0, abs=1e-6)
 
 
 def whitened(fit: LightsFit, session: SphereSession) -> np.ndarray:
@@ -56,7 +62,7 @@ def test_errors_of_lights_are_as_large_as_their_covariance_says() -> None:
     for seed in range(2):
         random = np.random.default_rng(seed)
         session = sphere_session(random, dome_lights(12, random))
-        fit = fit_lights(session.views, session.eyes, NAMES)
+        fit = fit_lights(session.views, session.cameras, NAMES)
         assert fit.outliers == ()
         pooled.append(whitened(fit, session))
     assert 0.8 < np.sqrt(np.mean(np.square(pooled))) < 1.25
@@ -71,7 +77,9 @@ def test_errors_of_cameras_reach_the_lights() -> None:
         session = sphere_session(random, dome_lights(8, random), highlight_px=0.005, edge_px=0.02)
         scale = np.tile(np.concatenate([np.full(8, 1e-9), np.full(3, 5e-5), np.full(3, 0.02)]), 3)
         off = random.normal(0, scale).reshape(3, 14)
-        believed = [Eye(eye.lens, eye.pose + one[8:]) for eye, one in zip(session.eyes, off, strict=True)]
+        believed = [
+            PosedCamera(camera.lens, camera.pose + one[8:]) for camera, one in zip(session.cameras, off, strict=True)
+        ]
         pooled.append(whitened(fit_lights(session.views, believed, NAMES, np.diag(scale**2)), session))
     assert 0.8 < np.sqrt(np.mean(np.square(pooled))) < 1.25
 
@@ -82,9 +90,9 @@ def test_a_highlight_of_something_else_is_named() -> None:
     wrong = session.views[5].highlights_px.copy()
     wrong[2] += [4.0, -3.0]
     views = [*session.views[:5], replace(session.views[5], highlights_px=wrong), *session.views[6:]]
-    fit = fit_lights(views, session.eyes, NAMES)
+    fit = fit_lights(views, session.cameras, NAMES)
     assert [(one.camera, one.place, one.light) for one in fit.outliers] == [(2, 1, session.views[5].lights[2])]
-    assert 4.5 < fit.outliers[0].off_px < 5.5
+    assert 4.5 < fit.outliers[0].residual_px < 5.5
 
 
 def test_a_light_that_shows_once_is_named() -> None:
@@ -95,7 +103,7 @@ def test_a_light_that_shows_once_is_named() -> None:
         others = view.lights != session.views[0].lights[0]
         views.append(replace(view, lights=view.lights[others], highlights_px=view.highlights_px[others]))
     with pytest.raises(CaptureInputError, match=f"Light L{session.views[0].lights[0]} shows on a mirror sphere only"):
-        fit_lights(views, session.eyes, NAMES)
+        fit_lights(views, session.cameras, NAMES)
 
 
 def test_lights_of_a_measured_rig_are_found_again() -> None:
@@ -107,22 +115,22 @@ def test_lights_of_a_measured_rig_are_found_again() -> None:
     K = np.asarray(loadmat(folder / "camera.mat")["K"], dtype=np.float64)
     lights = lights if lights.shape[1] == 3 else lights.T
     assert lights.shape == (8, 3)
-    # The rig has one camera; its lens is given to three here, as lights take two directions to be found.
+    # The rig has one camera; here three cameras have its lens, as a light is found only from two directions or more.
     lens = Lens((2592, 1944), np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
     random = np.random.default_rng(1)
     # The rig's lights surround its camera, so its frame is moved to where the virtual cameras look from.
     turn = pose_matrix(np.array([np.pi, 0, 0, 0, 0, 450.0]))
     moved = lights @ turn[:3, :3].T + turn[:3, 3]
     session = sphere_session(random, moved, highlight_px=0.05, radius_mm=15.0)
-    eyes = [Eye(lens, eye.pose) for eye in session.eyes]
+    cameras = [PosedCamera(lens, camera.pose) for camera in session.cameras]
     views = []
     for view in session.views:
-        eye, centre = eyes[view.camera], session.centres_mm[view.place]
-        edge, _ = outline_points(eye, centre, 15.0, 60)
-        points = highlight_points(eye.centre_mm, moved[view.lights], centre, 15.0)
-        found = eye.project(points) + random.normal(0, 0.05, (len(points), 2))
+        camera, centre = cameras[view.camera], session.centres_mm[view.place]
+        edge, _ = outline_points(camera, centre, 15.0, 60)
+        points = highlight_points(camera.centre_mm, moved[view.lights], centre, 15.0)
+        found = camera.project(points) + random.normal(0, 0.05, (len(points), 2))
         views.append(replace(view, outline_px=edge + random.normal(0, 0.1, edge.shape), highlights_px=found))
-    fit = fit_lights(views, eyes, NAMES)
+    fit = fit_lights(views, cameras, NAMES)
     off = np.linalg.norm(fit.positions_mm - moved, axis=1)
     assert np.sqrt(np.mean(off**2)) < 2.0
     assert 0.7 < np.sqrt(np.mean(whitened(fit, replace(session, lights_mm=moved)) ** 2)) < 1.35
@@ -138,9 +146,9 @@ def test_a_list_is_laid_over_the_lights_and_swapped_names_are_found() -> None:
     found[5] = np.nan
     aligned = align_list(listed, found)
     assert aligned is not None
-    # 18 good lights of 2 mm: the motion is known to about 2 ÷ √18 in place.
+    # 18 good lights with errors of 2 mm: the shift is known to about 2 ÷ √18 mm.
     assert np.linalg.norm(aligned.positions_mm - lights, axis=1).max() < 10
     assert aligned.outliers == (3, 8)
     assert swapped_names(found, aligned) == [(3, 8), (8, 3)]
-    assert np.isnan(aligned.off_mm[5])
+    assert np.isnan(aligned.distances_mm[5])
     assert align_list(listed[:3], found[:3]) is None

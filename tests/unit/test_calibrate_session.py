@@ -1,4 +1,4 @@
-"""A raw folder of calibration frames whose truth is known, from its files to the record and its report."""
+"""A raw folder of calibration frames whose truth is known: from its files to the record and the report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from services.calibrate.cameras.printing import board_pdf, board_rectangles
-from services.calibrate.session.flats import fall_of_light, relative_square
+from services.calibrate.session.flats import measure_vignetting, relative_square
 from services.calibrate.session.judge import judge
 from services.calibrate.session.photos import Channels, Photos, black_of
 from services.calibrate.session.record import uncertainty_of
@@ -59,9 +59,10 @@ def test_cameras_are_where_they_were(made: tuple[Path, Calibration], session: Se
     truth, fit = made[1], session.cameras.fit
     for number, camera in enumerate(truth.cameras):
         assert fit.rms_px(number) < 0.12
-        # Points around the teeth are drawn where the true camera draws them, within four times the largest ±.
+        # Points around the teeth are projected to where the true camera shows them, within four times the largest ±.
         points = np.random.default_rng(0).uniform(-20, 20, (50, 3)) + np.array([31.5, 24.5, 0.0])
-        off = np.linalg.norm(session.cameras.eyes[number].project(points) - Lens(camera).seen(points), axis=1)
+        fitted = session.cameras.posed_cameras[number]
+        off = np.linalg.norm(fitted.project(points) - Lens(camera).project(points), axis=1)
         assert off.max() < 0.4
 
 
@@ -90,7 +91,7 @@ def test_the_record_is_one_that_jobs_read(made: tuple[Path, Calibration], sessio
     assert record.uncertainty is not None
     names = record.uncertainty.names
     assert {"camera.c0.rx", "camera.c1.cy", "light.L3.z", "light_gain.L2.blue"} <= set(names)
-    # Gains and positions err together: a light that is believed nearer comes out dimmer.
+    # Errors of gains and positions are correlated: a light that is believed nearer is found dimmer.
     gains, places = names.index("light_gain.L0.red"), names.index("light.L0.x")
     assert np.abs(record.uncertainty.matrix[gains, places : places + 3]).max() > 0
     # The white standard's 1 % is the same in all channels, and the gain of the photographs is known no better.
@@ -111,7 +112,7 @@ def test_the_record_is_one_that_jobs_read(made: tuple[Path, Calibration], sessio
 def with_lights(session: Session, root: Path, folder: RawFolder) -> LightsStep:
     photos = Photos(root, folder)
     cameras = session.cameras
-    found = find_lights(photos, cameras.eyes, cameras.camera_covariance, cameras.distance_mm)
+    found = find_lights(photos, cameras.posed_cameras, cameras.camera_covariance, cameras.distance_mm)
     assert found is not None
     return found
 
@@ -223,7 +224,7 @@ def test_the_command_writes_a_board(tmp_path: Path) -> None:
 
 
 class EvenPhotos:
-    """Photographs of an even source through a lens that darkens its corners, in place of files."""
+    """Photographs of an even source through a lens with dark corners; replaces files."""
 
     def __init__(self, fall: tuple[float, float, float], saturated: bool = False) -> None:
         size, principal = (400, 300), np.array([205.0, 148.0])
@@ -242,7 +243,7 @@ class EvenPhotos:
 
 def test_the_fall_of_light_is_that_of_the_lens() -> None:
     true, q = (-0.35, 0.08, -0.02), np.linspace(0, 1, 20)
-    a, b, c = fall_of_light(cast("Photos", EvenPhotos(true)), "c0", np.array([205.0, 148.0])) or (0, 0, 0)
+    a, b, c = measure_vignetting(cast("Photos", EvenPhotos(true)), "c0", np.array([205.0, 148.0])) or (0, 0, 0)
     found, expected = (1 + q * (k[0] + q * (k[1] + q * k[2])) for k in ((a, b, c), true))
     # A cell of 8 x 8 pixels with 1 % noise has 0.13 %, and some 1,800 of them share four numbers.
     assert found == pytest.approx(expected, rel=2e-3)
@@ -254,7 +255,7 @@ def test_the_fall_of_light_is_that_of_the_lens() -> None:
 )
 def test_a_bad_flat_field_is_named(fall: tuple[float, float, float], saturated: bool, named: str) -> None:
     with pytest.raises(CaptureInputError, match=named):
-        fall_of_light(cast("Photos", EvenPhotos(fall, saturated)), "c0", np.array([205.0, 148.0]))
+        measure_vignetting(cast("Photos", EvenPhotos(fall, saturated)), "c0", np.array([205.0, 148.0]))
 
 
 def test_black_frames_tell_their_noise_without_the_sensors_pattern() -> None:
@@ -265,7 +266,7 @@ def test_black_frames_tell_their_noise_without_the_sensors_pattern() -> None:
     # 14,400 values, four degrees of freedom each: the standard error of the noise is 2 / √(2 · 57,600) = 0.006.
     assert black.noise == pytest.approx(2, abs=0.03)
     assert black.counts == pytest.approx(np.mean(frames), abs=1e-3)
-    # One frame cannot tell pattern from noise, so both are told.
+    # One frame cannot separate the fixed pattern from noise, so their sum is reported.
     assert black_of(iter(frames[:1])).noise == pytest.approx(104**0.5, rel=0.03)
 
 

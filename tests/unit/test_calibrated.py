@@ -1,4 +1,4 @@
-"""What a calibration says of cameras and lights beside where they are."""
+"""What a calibration holds about cameras and lights besides their positions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def calibration(camera: dict[str, Any], **more: Any) -> Calibration:
 
 
 def test_an_earlier_calibration_is_stored_as_before() -> None:
-    # A stored calibration's name is the digest of its text, which further fields must not change.
+    # The name of a stored calibration is the digest of its text, which new fields must not change.
     stored = json.loads(calibration({}).model_dump_json())
     assert stored.keys() == {"units", "channels", "cameras", "lights", "uncertainty"}
     assert stored["cameras"][0].keys() == CAMERA.keys()
@@ -54,7 +54,7 @@ def test_all_that_is_measured_is_kept() -> None:
     made = calibration(camera, **more)
     require_consistent(made, "It")
     assert Calibration.model_validate_json(made.model_dump_json()) == made
-    assert made.cameras[0].fall_of_light(0.5) == pytest.approx(1 - 0.3 * 0.5 + 0.1 * 0.25)
+    assert made.cameras[0].vignetting_factor(0.5) == pytest.approx(1 - 0.3 * 0.5 + 0.1 * 0.25)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A raw folder among the captures that a server takes: its description is looked at before it is accepted."""
+"""A raw folder as a capture on a server: its description is checked before the capture is accepted."""
 
 from __future__ import annotations
 

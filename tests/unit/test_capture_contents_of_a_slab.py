@@ -1,6 +1,4 @@
-"""A slab's folder among the captures that a server takes: what its description declares is looked at before it is
-accepted.
-"""
+"""A slab folder as a capture on a server: its description is checked before the capture is accepted."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ from tests.support.small_slab import description
 
 
 def fault(root: Path, told: dict[str, Any], names: frozenset[str] | None = None) -> str | None:
-    """What is wrong with a description among some files, by default with all that it names."""
+    """What is wrong with a description beside these files; by default all files that it names are there."""
     path = root / "slab.json"
     path.write_text(json.dumps(told))
     return content_fault(

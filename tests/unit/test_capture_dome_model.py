@@ -1,4 +1,4 @@
-"""The simulated controller must be as safe as a real one, else tests against it prove nothing."""
+"""The simulated controller: it must be as safe as a real one, or tests that use it prove nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which paths a capture may have: what is accepted can be laid out below a folder without surprise, on any file
+"""Which paths the files of a capture may have: every accepted set can be written below a folder safely, on any file
 system.
 """
 

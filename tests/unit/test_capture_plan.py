@@ -101,7 +101,7 @@ def test_a_dose_of_which_the_preflight_leaves_too_little_is_refused_before_any_l
     write_mouth(tmp_path, lights)
     generous = rig(mouth=tmp_path, tracking_every=every, level=0.5, exposure_s=0.1, settle_s=0.0)
     plan = PlannedRig.read(generous).plan
-    # The last light has the most: without tracking frames the preflight's whole frame is its.
+    # The last light has the largest dose: without tracking frames, the preflight's whole frame counts for it.
     planned_s, glimpsed_s = (
         sum(frame.level * frame.on_s for frame in frames if frame.light in {lights - 1, None})
         for frames in (plan, preflight_frames(plan))

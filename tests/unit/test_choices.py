@@ -1,4 +1,4 @@
-"""A name that is not known passes for no other."""
+"""An unknown name is never taken for a known one."""
 
 from __future__ import annotations
 

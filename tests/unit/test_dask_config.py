@@ -1,4 +1,4 @@
-"""Dask's own commands are told the same as workers that a server starts."""
+"""Dask's own commands get the same settings as workers that a server starts."""
 
 import json
 import os

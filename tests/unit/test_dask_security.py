@@ -1,4 +1,4 @@
-"""A TLS connection that breaks takes no other of its thread with it."""
+"""A TLS connection that breaks does not disturb the other connections of its thread."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from services.pipeline.dask_security import LastingSecurity, LastingSocket
 
 
 class Link:
-    """Both ends of a connection in one thread, as a server with workers of its own has them."""
+    """Both ends of a connection in one thread, as on a server with its own workers."""
 
     def __init__(self, security: LastingSecurity, stack: ExitStack) -> None:
         near, far = socket.socketpair()
@@ -46,7 +46,7 @@ def links(security: LastingSecurity) -> Iterator[list[Link]]:
 
 def test_a_connection_whose_peer_went_away_leaves_the_others(links: list[Link]) -> None:
     broken, healthy = links
-    # Dask closes a connection so: without a word of TLS.
+    # This is how Dask closes a connection: without the closing message of TLS.
     broken.client.shutdown(socket.SHUT_RDWR)
     with suppress(OSError):
         assert broken.server.recv(1) == b""

@@ -1,4 +1,4 @@
-"""A database and its data folder belong together."""
+"""A server starts only with a database and a data folder that belong together."""
 
 from __future__ import annotations
 

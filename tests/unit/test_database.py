@@ -1,4 +1,4 @@
-"""What a database that does not answer looks like to whoever asks it."""
+"""Errors of a database that does not answer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import sqlalchemy as sql
 
-from services.pipeline.database import Query, open_database, patiently, sqlite_url, writing
+from services.pipeline.database import Query, open_database, retry_while_lost, sqlite_url, writing
 
 
 def test_a_file_that_cannot_be_opened_is_an_error_that_is_waited_out(tmp_path: Path) -> None:
@@ -23,12 +23,12 @@ def test_a_file_that_cannot_be_opened_is_an_error_that_is_waited_out(tmp_path: P
         next(tries)()
         return query.rows(engine)
 
-    assert patiently(ask) == [(1,)]
+    assert retry_while_lost(ask) == [(1,)]
     engine.dispose()
 
 
 def test_a_writer_gives_up_on_one_of_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.pipeline.database.TURN_S", 0.01)
+    monkeypatch.setattr("services.pipeline.database.WRITER_WAIT_S", 0.01)
     engine = open_database(sqlite_url(tmp_path / "some.sqlite"))
     with writing(engine), pytest.raises(sql.exc.OperationalError, match="have not ended"), writing(engine):
         pass

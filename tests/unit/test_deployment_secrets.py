@@ -1,4 +1,6 @@
-"""What a composed system's parts know of each other: made once, renewed in time, and never spread."""
+"""The secrets that the parts of a composed system share: made once, renewed in time, and readable only to those who
+need them.
+"""
 
 from __future__ import annotations
 

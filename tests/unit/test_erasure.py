@@ -1,4 +1,4 @@
-"""Removing a job's folder, also when the removal is cut short."""
+"""Removing a job's folder, also when the removal is interrupted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tone curve, colour maps and PNG bytes."""
+"""Tone curve, colour maps and the bytes of PNG files."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ def test_residual_colours_have_a_sign_and_a_neutral_zero() -> None:
     assert picture[0, 0, 2] > picture[0, 0, 0]
     assert picture[0, 4, 0] > picture[0, 4, 2]
     assert tuple(picture[0, 5]) == MASKED
-    # Both arms darken away from zero, so that size reads without colour.
+    # Both arms get darker away from zero, so that magnitudes can be read without colour.
     steps = [luminance(colour) for colour in colour_map(np.linspace(0, 1, 9), DIVERGING)]
     assert steps[:5] == sorted(steps[:5])
     assert steps[4:] == sorted(steps[4:], reverse=True)
 
 
 def test_both_arms_differ_for_missing_cones() -> None:
-    # Red-blind and green-blind observers confuse what differs in red minus green only: the arms differ in blue minus
-    # yellow.
+    # Red-blind and green-blind observers confuse colours that differ only in red minus green, so the arms differ in
+    # blue minus yellow.
     ends = colour_map(np.array([0.1, 0.9]), DIVERGING).astype(float)
     yellowness = ends[:, :2].mean(axis=1) - ends[:, 2]
     assert yellowness[1] - yellowness[0] > 150

@@ -1,4 +1,4 @@
-"""The report tells the truth first, and opens alone."""
+"""The report states the most important result first, and opens without any other file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The XML says what the dictionary says, and names its parameters."""
+"""The scene's XML holds the same as the dictionary, and names its parameters."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Figures: panels lie where they should, captures of a case hold what it says, and what cannot be drawn is refused in a
-sentence.
+"""Figures for the paper: panels are in their places, the capture of a case holds what the case describes, and what
+cannot be drawn is refused in a sentence.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from services.bench.figures import cases
-from services.bench.figures.__main__ import FIGURES, chosen_figures, keep, main
+from services.bench.figures.__main__ import FIGURES, chosen_figures, main, write_figure
 from services.bench.figures.ambient import QUANTITIES, Row, sentence, table
 from services.bench.figures.cases import Capture, Case, fingerprint, run_dentine, write_photographs
 from services.bench.figures.drawings import Drawn
@@ -120,7 +120,7 @@ def test_an_unknown_figure_is_refused_before_anything_is_rendered(
 
 def test_a_figure_joins_the_page_of_those_that_are_there(tmp_path: Path) -> None:
     for name in ("fig10", "fig8"):
-        keep(tmp_path, name, Drawn(plain((9, 9, 9), 2, 2), f"{name}: below 5 % & <fine>."))
+        write_figure(tmp_path, name, Drawn(plain((9, 9, 9), 2, 2), f"{name}: below 5 % & <fine>."))
     page = (tmp_path / "index.html").read_text()
     assert re.findall(r'src="(\w+)\.png"', page) == ["fig8", "fig10"]
     assert "below 5 % &amp; &lt;fine&gt;." in page

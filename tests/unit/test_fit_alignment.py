@@ -1,4 +1,4 @@
-"""Offsets between photographs and meshes: found where there is one, silent where something else is wrong."""
+"""Offsets between photographs and meshes: found where there is one, and not reported where something else is wrong."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Tooth
 from services.core.records import MaskBit, PreparedManifest
 from services.core.store import create_array
-from services.fit.checks.alignment import Offset, clearest_offset, offsets_told
+from services.fit.checks.alignment import Offset, clearest_offset, offset_sentences
 from services.fit.checks.evaluate import ErrorSums, Evaluation
 from services.fit.execution.blocks import PixelParts
 from services.fit.inputs.observations import Observations, ViewStack
@@ -40,7 +40,7 @@ def compare(
     """Offset and sentences for one camera and one light.
 
     Args:
-        neighbour: brightness of whatever stands beside the tooth.
+        neighbour: brightness beside the tooth.
         tooth: 0 for the left half of the ball, 1 for the right one.
     """
     pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 400.0), (0.0, 0.0, 0.0, 1.0))
@@ -86,7 +86,7 @@ def compare(
         ),
     )
     evaluation = Evaluation(ErrorSums(), ErrorSums(), {("c0", 0): (pixels, render[y, x])})
-    told = offsets_told(
+    told = offset_sentences(
         {"green": evaluation}, {"green": 0.3}, observations, {"green": views}, "the mesh of tooth 11", tooth
     )
     return clearest_offset(evaluation, observations, views, "green", tooth), told
@@ -96,7 +96,7 @@ def compare(
 def test_an_offset_is_found_with_its_direction_and_told(tmp_path: Path, right_mm: float, down_mm: float) -> None:
     offset, told = compare(tmp_path, ball(right_mm / PIXEL_MM, down_mm / PIXEL_MM), ball())
     assert offset is not None
-    # Half a pixel either way: the photograph's noise moves the minimum by less.
+    # Within half a pixel: the noise of the photograph moves the minimum by less.
     assert offset.right_mm == pytest.approx(right_mm, abs=0.5 * PIXEL_MM)
     assert offset.down_mm == pytest.approx(down_mm, abs=0.5 * PIXEL_MM)
     (sentence,) = told
@@ -141,7 +141,7 @@ def test_other_faults_are_not_called_an_offset(
 
 
 def test_a_dim_photograph_in_place_is_not_said_to_lie_elsewhere(tmp_path: Path) -> None:
-    # Beside the tooth is noise alone, which its own variance explains as well as the render explains the tooth.
+    # Beside the tooth there is only noise; its variance explains it as well as the render explains the tooth.
     for seed in range(12):
         assert compare(tmp_path / str(seed), 0.06 * ball(), ball(exponent=0.7), noise=0.05, seed=seed) == (None, [])
 

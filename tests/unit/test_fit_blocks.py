@@ -1,6 +1,4 @@
-"""A block asks for the lights under which it has something to compare, and for no other; scenes keep what they are
-stored with.
-"""
+"""A block of the fit renders only the lights under which it compares something; a stored scene reads back whole."""
 
 from __future__ import annotations
 

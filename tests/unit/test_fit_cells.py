@@ -1,5 +1,5 @@
-"""Cells in which losses are compared: squares of the coarse grid, alike at every resolution, never across parts, never
-too few.
+"""Cells in which losses are compared: squares of the coarse grid, the same at every resolution, never across two teeth,
+never too few.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def test_a_finer_image_has_the_same_cells_with_more_pixels_in_each() -> None:
 
 
 def test_few_pixels_have_smaller_cells() -> None:
-    # Of 96 pixels squares of four leave 24; of a dozen, and of one, every pixel stands alone.
+    # 96 pixels make 24 squares of four; of twelve pixels, and of one, every pixel is its own cell.
     assert len(np.unique(comparison_cells(view(12, 8), 600))) == MIN_CELLS
     assert len(np.unique(comparison_cells(view(4, 3), 600))) == 12
     np.testing.assert_array_equal(comparison_cells(view(1, 1), 600), [0])

@@ -1,4 +1,4 @@
-"""The unbounded domain: round trips, derivatives, extremes, and similar media."""
+"""The unbounded parameters of a fit: conversion there and back, derivatives, extremes, and similar media."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_a_cosine_changes_neither_reduced_quantity_and_comes_back() -> None:
     assert (moved.sigma_s_reduced, moved.alpha_reduced) == pytest.approx(
         (tissue.enamel.sigma_s_reduced, tissue.enamel.alpha_reduced)
     )
-    # The other coordinates are those of the medium at the cosine that is held where none is fitted.
+    # The other coordinates are those of the similar medium at the cosine that is used where none is fitted.
     assert x[0] == pytest.approx(math.log(similar_medium(tissue.enamel, HELD_G).sigma))
 
 

@@ -1,4 +1,4 @@
-"""What the driver takes from an uncertainty for the report."""
+"""What the driver takes from the uncertainty for its report."""
 
 from __future__ import annotations
 

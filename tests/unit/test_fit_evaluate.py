@@ -1,4 +1,4 @@
-"""Image error with both noises taken out."""
+"""The image error, with the noise of photographs and of renders removed."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def test_error_is_unbiased_by_either_noise(truth_error: float) -> None:
 
 
 def test_lights_of_a_pixel_err_together() -> None:
-    # Twelve lights whose noise is one and the same. The variance over 2000 draws is known to 3 %, its heavy tails to
-    # three times that.
+    # Twelve lights with the very same noise. A variance over 2000 draws is known to 3 %, or to three times that with
+    # heavy tails.
     rng, reference = np.random.default_rng(3), np.full((12, 60), 1.0)
     draws = []
     for _ in range(2000):

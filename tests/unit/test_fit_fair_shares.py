@@ -1,4 +1,4 @@
-"""Fits that share workers get equal worker time, whoever has the longer blocks, or what their weights say."""
+"""Fits that share workers get equal worker time, or shares by weight, however long their blocks are."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from typing import Any
 
 import pytest
 
-from services.fit.execution.fair_shares import BOARD, FADING_S, TELL_S, Board, Share
+from services.fit.execution.fair_shares import DECAY_S, LEVELS_KEY, PUBLISH_INTERVAL_S, PublishedLevels, Share
 
 WORKERS, AHEAD, BLOCKS, PAUSE_S = 2, 4, 12, 0.5
 
 
 class Replay:
-    """Fits of steps of blocks on workers that take the ready task of the highest priority, in simulated time."""
+    """Simulates fits on workers in simulated time: a fit has steps, a step has blocks, and a worker takes the ready
+    block with the highest priority.
+    """
 
     def __init__(self, block_s: Sequence[float], weights: Sequence[float]) -> None:
         self.now_s, self._free, self._ready, self._events = (
@@ -29,7 +31,7 @@ class Replay:
         self.used_s = [0.0 for _ in block_s]
 
     def run(self, until_s: float) -> list[float]:
-        """Shares of the workers' time."""
+        """Each fit's share of the workers' time."""
         for fit in range(len(self._block_s)):
             self._fill(fit)
         while self.now_s < until_s:
@@ -82,15 +84,15 @@ def test_use_fades_and_what_is_under_way_counts() -> None:
     share = Share(clock=lambda: now_s)
     assert [share.begin(), share.begin()] == [0, 0]  # nothing is known of how long its tasks take
     share.end(10.0)
-    assert share.begin() == pytest.approx(-20.0)  # what was used, and as much for the one that has not ended
+    assert share.begin() == pytest.approx(-20.0)  # the time used, and as much again for the task that has not ended
     share.end(10.0, tasks=2)
     assert share.begin() == pytest.approx(-20.0)
-    now_s = FADING_S
+    now_s = DECAY_S
     assert share.begin() == pytest.approx(-20.0 / 2.718281828 - 20.0 / 3)
 
 
 class Metadata:
-    """What a scheduler keeps for its clients."""
+    """The metadata that a scheduler keeps for its clients."""
 
     def __init__(self) -> None:
         self.kept: dict[str, dict[str, Any]] = {}
@@ -105,23 +107,23 @@ class Metadata:
 def test_a_newcomer_begins_at_the_lowest_level_of_those_under_way() -> None:
     now_s, scheduler = 1000.0, Metadata()
 
-    def joined(name: str, used_s: float = 0.0, weight: float = 1.0) -> tuple[Board, Share]:
+    def joined(name: str, used_s: float = 0.0, weight: float = 1.0) -> tuple[PublishedLevels, Share]:
         share = Share(weight, lambda: now_s)
-        board = Board(scheduler, name, share, lambda: now_s)
+        board = PublishedLevels(scheduler, name, share, lambda: now_s)
         board.join()
         share.begin_at(used_s or share.level)
         return board, share
 
     first, _ = joined("first", used_s=60.0)
-    now_s += TELL_S
-    first.tell()
+    now_s += PUBLISH_INTERVAL_S
+    first.publish()
     _, heavy = joined("heavy", weight=4.0)
-    assert heavy.level == pytest.approx(60.0 * 2.718281828 ** (-TELL_S / FADING_S))
-    now_s += TELL_S
+    assert heavy.level == pytest.approx(60.0 * 2.718281828 ** (-PUBLISH_INTERVAL_S / DECAY_S))
+    now_s += PUBLISH_INTERVAL_S
     _, third = joined("third")
     assert third.level == pytest.approx(heavy.level)
     first.leave()
-    assert scheduler.kept[BOARD]["first"] is None
-    now_s += FADING_S
+    assert scheduler.kept[LEVELS_KEY]["first"] is None
+    now_s += DECAY_S
     _, late = joined("late")
     assert late.level == 0.0, "who has told nothing for so long is not under way"

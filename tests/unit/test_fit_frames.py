@@ -1,4 +1,4 @@
-"""Photographs of the wrong light, exchanged ones and odd ones are named; good ones are not."""
+"""Photographs of the wrong light, exchanged photographs and odd ones are named; good ones are not."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.checks.evaluate import FrameSums, frame_sums
-from services.fit.checks.frames import WrongFrame, frames_told, wrong_frames
+from services.fit.checks.frames import WrongFrame, report_frames, wrong_frames
 
 LIGHTS = tuple(f"l{k}" for k in range(6))
 
@@ -45,7 +45,7 @@ def test_errors_are_those_of_every_pair() -> None:
 
 
 def test_good_photographs_are_not_named() -> None:
-    # As many as a rule of one false name in 20 captures needs to be judged by, and more.
+    # More than enough captures to test the rule, at most one false alarm in 20 captures.
     assert not [frame for seed in range(200) for frame in named(sums_of(*scene(seed, off=0.08), seed))]
 
 
@@ -89,8 +89,8 @@ def test_single_photographs_are_not_blamed_for_a_misplaced_mesh() -> None:
     photos[[0, 3]] = photos[[3, 0]]
     lights = {"green": LIGHTS}
     sums = {"green": {"c0": sums_of(render, photos)}}
-    assert {frame.light for frame in frames_told(sums, lights)[1]} == {"l0", "l2"}
-    (left,) = frames_told(sums, lights, is_placed=False)[1]
+    assert {frame.light for frame in report_frames(sums, lights)[1]} == {"l0", "l2"}
+    (left,) = report_frames(sums, lights, is_placed=False)[1]
     assert (left.light, left.other, left.exchanged) == ("l0", "l3", True)
 
 
@@ -98,7 +98,7 @@ def test_what_several_cameras_show_is_told_once() -> None:
     render, photos = scene(5)
     photos[[1, 4]] = photos[[4, 1]]
     sums = {"green": {"c0": sums_of(render, photos), "c1": sums_of(render, photos, seed=2)}, "red": {}}
-    (told,), frames = frames_told(sums, {"green": LIGHTS, "red": LIGHTS})
+    (told,), frames = report_frames(sums, {"green": LIGHTS, "red": LIGHTS})
     assert told.startswith("The photographs of cameras c0 and c1 under lights l1 and l4 seem exchanged")
     assert len(frames) == 1
 

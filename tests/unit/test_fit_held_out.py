@@ -1,4 +1,4 @@
-"""Which images a fit keeps to test itself with: by light, by camera, and both."""
+"""Which images a fit keeps back to test itself: by light, by camera, and both."""
 
 from __future__ import annotations
 

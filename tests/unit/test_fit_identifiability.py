@@ -1,4 +1,4 @@
-"""What a capture tells is said in plain words, with numbers, and never more than is known."""
+"""Sentences about what a capture determines: plain words with numbers, and never more than is known."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.core.results import Correlation, Estimate
-from services.fit.checks.identifiability import correlation, told
+from services.fit.checks.identifiability import correlation, determined_sentences
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty
 
@@ -29,7 +29,7 @@ def correlated(value: float, first: int = 0, second: int = 1) -> Correlation:
 
 
 def test_known_and_unknown_are_told_with_unit_and_error() -> None:
-    text = told({"green": table()}, {"green": correlated(0.3)})
+    text = determined_sentences({"green": table()}, {"green": correlated(0.3)})
     assert (
         text
         == "This capture tells enamel scattering (0.900 ± 0.050 per mm), dentin scattering (2.40 ± 0.12 per mm) and"
@@ -38,7 +38,7 @@ def test_known_and_unknown_are_told_with_unit_and_error() -> None:
 
 
 def test_a_large_error_is_not_knowledge() -> None:
-    assert "but not enamel absorption or dentin absorption" in told(
+    assert "but not enamel absorption or dentin absorption" in determined_sentences(
         {"green": table(**{"dentin.sigma_a": estimate(0.03, 0.02)})}, {}
     ).replace(" (anything up to 0.05 per mm fits)", "")
 
@@ -54,12 +54,14 @@ def test_a_large_error_is_not_knowledge() -> None:
 )
 def test_what_looks_alike_is_named_with_its_direction(pair: tuple[int, int], value: float, expected: str) -> None:
     # The coordinate of alpha is -log10(1 - alpha): it falls when absorption grows.
-    assert f"{expected} would look almost the same." in told({"green": table()}, {"green": correlated(value, *pair)})
+    assert f"{expected} would look almost the same." in determined_sentences(
+        {"green": table()}, {"green": correlated(value, *pair)}
+    )
 
 
 def test_channels_that_tell_the_same_share_a_sentence() -> None:
     whole = table(**{"enamel.sigma_a": estimate(0.01, 0.001)})
-    text = told({"red": table(), "green": table(), "blue": whole}, {})
+    text = determined_sentences({"red": table(), "green": table(), "blue": whole}, {})
     assert text.count("this capture tells") == 2
     assert text.startswith(
         "In red and green this capture tells enamel scattering (red 0.900 ± 0.050 per mm, green 0.900 ± 0.050 per mm)"
@@ -69,7 +71,9 @@ def test_channels_that_tell_the_same_share_a_sentence() -> None:
 
 def test_a_tooth_of_which_nothing_is_known_says_so() -> None:
     nothing = {name: estimate(1.0, None, determined=False) for name in table()}
-    assert told({"green": nothing}, {}).startswith("This capture does not tell enamel scattering (anything fits)")
+    assert determined_sentences({"green": nothing}, {}).startswith(
+        "This capture does not tell enamel scattering (anything fits)"
+    )
 
 
 def test_correlation_is_that_of_the_covariance() -> None:

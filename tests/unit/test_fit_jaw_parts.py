@@ -1,4 +1,6 @@
-"""Pieces of a jaw's fit: starts, neighbours along the arch, the wall's colour, the domain of a mouth."""
+"""Parts of a jaw's fit: starting values, neighbours along the arch, the reflectance of the mouth's wall, and the
+parameters of a mouth.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,9 @@ from services.core.geometry import Mesh, Tooth
 from services.core.records import JobSpec
 from services.fit.execution.closing import _with_cosine
 from services.fit.jaw.driver import jaw_dentins
-from services.fit.jaw.neighbours import Neighbours, arch_place
+from services.fit.jaw.neighbours import Neighbours, arch_position
 from services.fit.jaw.schedule import JawSchedule
-from services.fit.jaw.starts import MIN_TOOTH_PIXELS, ToothStart, start_mouth, start_tooth, typical
+from services.fit.jaw.starts import MIN_TOOTH_PIXELS, ToothStart, median_tissue, start_mouth, start_tooth
 from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tissue
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
@@ -86,11 +88,11 @@ def test_others_follow_the_median_of_the_front_teeth() -> None:
     assert mouth.teeth[3].enamel.sigma == pytest.approx(4.0)
     assert mouth.teeth[2].enamel.sigma == pytest.approx(100.0)
     assert mouth.reflectance == pytest.approx(half_space_reflectance(Medium(8.0, 0.96, g1=0.8)))
-    assert typical([starts[2]], [tissue(5.0)]).enamel.sigma == pytest.approx(5.0)
-    # Whatever their cosines, what the others take has the same reduced scattering and absorption.
+    assert median_tissue([starts[2]], [tissue(5.0)]).enamel.sigma == pytest.approx(5.0)
+    # Whatever their cosines, the value for the other teeth has the same reduced scattering and absorption.
     turned = similar_tissue(tissue(5.0), 0.5)
     for part in ("enamel", "dentin"):
-        other, own = typical([starts[2]], [turned]).medium(part), turned.medium(part)
+        other, own = median_tissue([starts[2]], [turned]).medium(part), turned.medium(part)
         assert (other.g1, other.sigma_s_reduced, other.alpha_reduced) == pytest.approx(
             (0.8, own.sigma_s_reduced, own.alpha_reduced)
         )
@@ -99,9 +101,9 @@ def test_others_follow_the_median_of_the_front_teeth() -> None:
 
 
 def test_neighbours_are_those_along_the_arch() -> None:
-    assert sorted((11, 17, 21, 27, 12), key=arch_place) == [17, 12, 11, 21, 27]
-    assert sorted((31, 41, 48, 38), key=arch_place) == [48, 41, 31, 38]
-    assert sorted((51, 61, 71, 81), key=arch_place) == [51, 81, 61, 71]
+    assert sorted((11, 17, 21, 27, 12), key=arch_position) == [17, 12, 11, 21, 27]
+    assert sorted((31, 41, 48, 38), key=arch_position) == [48, 41, 31, 38]
+    assert sorted((51, 61, 71, 81), key=arch_position) == [51, 81, 61, 71]
     names = [f"{k}.enamel.sigma" for k in range(4)] + ["gums.sigma", "cavity.reflectance"]
     domain = Domain(tuple(Coordinate((name,)) for name in names))
     # Teeth 11, 12, 21, 22 in a manifest's order stand as 12, 11, 21, 22.
@@ -111,7 +113,7 @@ def test_neighbours_are_those_along_the_arch() -> None:
         (0, 2, 3, 4, 5),
         (2, 3, 4, 5),
     )
-    # One jaw after the other: 11 stands between 12 and 21, whatever bites on it.
+    # The jaws are treated separately: 11 is between 12 and 21, whatever bites on it.
     both = (12, 11, 21, 42, 41, 31)
     assert [both[k] for k in Neighbours.of(both).beside(both.index(11))] == [12, 11, 21]
 
@@ -184,7 +186,8 @@ def test_a_molars_dentin_lies_as_its_cusps_do_whatever_the_cameras_see() -> None
     height = solid.outer.vertices_mm[:, 2]
     points = solid.outer.vertices_mm[height > height.max() - upper_tooth(6).crown_length_mm / 2][::7]
     found, true = (SurfaceDistance(surface).closest(points)[1] for surface in (dentin, solid.dentin))
-    # At weights that nobody fitted: 0.13 was measured with the true frame, 0.7 to 0.9 with one that lies on its side.
+    # At weights that were not fitted: 0.13 was measured with the true frame, 0.7 to 0.9 with a frame that lies on its
+    # side.
     assert np.abs(found - true).mean() < 0.2
 
     assert jaw_dentins(teeth, (camera,), spec.model_copy(update={"dentin": "none"})) == [None, None]
@@ -194,7 +197,7 @@ def test_steps_of_a_jaw_are_told_by_fdi_numbers_and_not_by_places_in_a_list() ->
     schedule = object.__new__(JawSchedule)
     schedule.teeth = [ToothStart(fdi, "fitted", "", 100, tissue(4.0)) for fdi in (21, 12)]
     names = ("0.enamel.sigma", "1.shape.0", "gums.sigma", "cavity.reflectance")
-    assert [schedule._told_name(name) for name in names] == [
+    assert [schedule._reported_name(name) for name in names] == [
         "21.enamel.sigma",
         "12.shape.0",
         "gums.sigma",

@@ -1,4 +1,4 @@
-"""The journal: continued by its own fit, set aside for any other."""
+"""The journal of a fit: continued by the same fit, set aside by any other."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ HEAD = b'{"format": 2, "fingerprint": "a"}\n'
 
 
 def test_a_fit_continues_its_own_journal(tmp_path: Path) -> None:
-    Journal(tmp_path / "journal.json", "a").once("x", lambda: 0.1 + 0.2)
+    Journal(tmp_path / "journal.json", "a").get_or_compute("x", lambda: 0.1 + 0.2)
     again = Journal(tmp_path / "journal.json", "a")
     assert (again.resumed, again.set_aside) == (1, None)
-    assert again.once("x", lambda: pytest.fail("computed twice")) == (0.1 + 0.2, False)
+    assert again.get_or_compute("x", lambda: pytest.fail("computed twice")) == (0.1 + 0.2, False)
 
 
 def test_a_journal_of_another_fit_is_neither_continued_nor_lost(tmp_path: Path) -> None:
@@ -27,7 +27,7 @@ def test_a_journal_of_another_fit_is_neither_continued_nor_lost(tmp_path: Path) 
     for owner in ("a", "b", "c"):
         journal = Journal(path, owner)
         assert journal.resumed == 0
-        assert journal.once("x", partial(str, owner)) == (owner, True)
+        assert journal.get_or_compute("x", partial(str, owner)) == (owner, True)
         kept += [] if journal.set_aside is None else [read_entries(journal.set_aside)["x"]]
     assert kept == ["a", "b"]
     assert sorted(p.name for p in tmp_path.iterdir()) == [
@@ -60,7 +60,7 @@ def test_what_is_damaged_or_of_another_version_is_kept_as_it_was(tmp_path: Path,
 
 def test_an_attempt_without_the_right_to_write_moves_nothing(tmp_path: Path) -> None:
     path = tmp_path / "journal.json"
-    Journal(path, "a").once("x", lambda: 1)
+    Journal(path, "a").get_or_compute("x", lambda: 1)
 
     def refuse() -> None:
         raise FencedError("Overtaken.")
@@ -73,10 +73,10 @@ def test_an_attempt_without_the_right_to_write_moves_nothing(tmp_path: Path) -> 
 def test_a_result_is_appended_and_what_was_written_before_stays(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     journal = Journal(path, "a")
-    journal.once("x", lambda: "x" * 100)
+    journal.get_or_compute("x", lambda: "x" * 100)
     before, file = path.read_bytes(), path.stat().st_ino
     for key in ("y", "z"):
-        journal.once(key, lambda: [0.1])
+        journal.get_or_compute(key, lambda: [0.1])
     assert path.stat().st_ino == file, "the journal was written anew"
     assert path.read_bytes() == before + b'{"key": "y", "value": [0.1]}\n{"key": "z", "value": [0.1]}\n'
 
@@ -85,13 +85,13 @@ def test_a_line_that_was_cut_short_is_computed_again(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     journal = Journal(path, "a")
     for key in ("x", "y"):
-        journal.once(key, lambda key=key: key)  # type: ignore[misc]
+        journal.get_or_compute(key, lambda key=key: key)  # type: ignore[misc]
     whole = path.read_bytes()
     for cut in range(1, len(b'{"key": "y", "value": "y"}\n')):
         path.write_bytes(whole[:-cut])
         again = Journal(path, "a")
         assert (again.resumed, again.set_aside) == (1, None)
-        assert again.once("y", lambda: "y") == ("y", True)
+        assert again.get_or_compute("y", lambda: "y") == ("y", True)
         assert path.read_bytes() == whole
 
 
@@ -100,7 +100,7 @@ def test_a_result_that_the_disk_does_not_take_leaves_a_journal_that_goes_on(
 ) -> None:
     path = tmp_path / "journal.jsonl"
     journal = Journal(path, "a")
-    journal.once("x", lambda: 1)
+    journal.get_or_compute("x", lambda: 1)
 
     def half(journal: Journal, line: bytes) -> None:
         with journal.path.open("ab") as stream:
@@ -110,19 +110,19 @@ def test_a_result_that_the_disk_does_not_take_leaves_a_journal_that_goes_on(
     with monkeypatch.context() as full:
         full.setattr(Journal, "_append", half)
         with pytest.raises(OSError, match="No space"):
-            journal.once("y", lambda: 2)
-    assert journal.once("z", lambda: 3) == (3, True)
+            journal.get_or_compute("y", lambda: 2)
+    assert journal.get_or_compute("z", lambda: 3) == (3, True)
     assert read_entries(path) == {"x": 1, "z": 3}
 
 
 def test_an_attempt_that_was_overtaken_writes_into_nobodys_journal(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     older = Journal(path, "a")
-    older.once("x", lambda: 1)
+    older.get_or_compute("x", lambda: 1)
     newer = Journal(path, "a")
-    newer.once("y", lambda: 2)
+    newer.get_or_compute("y", lambda: 2)
     with pytest.raises(FencedError, match="taken over"):
-        older.once("z", lambda: 3)
+        older.get_or_compute("z", lambda: 3)
     assert read_entries(path) == {"x": 1, "y": 2}
 
 
@@ -130,10 +130,10 @@ def test_a_journal_of_the_first_format_is_continued(tmp_path: Path) -> None:
     first = tmp_path / "journal.json"
     first.write_text(json.dumps({"format": 1, "fingerprint": "a", "entries": {"x": [0.1 + 0.2], "y": None}}))
     journal = Journal(tmp_path / "journal.jsonl", "a")
-    assert journal.once("x", lambda: pytest.fail("computed twice")) == ([0.1 + 0.2], False)
+    assert journal.get_or_compute("x", lambda: pytest.fail("computed twice")) == ([0.1 + 0.2], False)
     assert journal.resumed == 2
     assert first.exists(), "nothing was added yet, and an older version may still go on with it"
-    journal.once("z", lambda: 1)
+    journal.get_or_compute("z", lambda: 1)
     assert read_entries(tmp_path / "journal.jsonl") == {"x": [0.1 + 0.2], "y": None, "z": 1}
     assert not first.exists()
     first.write_text(json.dumps({"format": 1, "fingerprint": "b", "entries": {}}))

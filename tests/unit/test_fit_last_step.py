@@ -1,4 +1,4 @@
-"""The step after the closing measurement: promise and comparison made up here, to see which steps are taken."""
+"""The step after the closing measurement: which steps are taken, for made-up promises and comparisons."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FakeModel:
     def step(self, _part_count: int) -> np.ndarray:
         return np.array([WHOLE])
 
-    def promise(self, step: np.ndarray) -> tuple[float, float]:
+    def predicted_change(self, step: np.ndarray) -> tuple[float, float]:
         share = float(step[0]) / WHOLE
         return self.promised * (2 * share - share**2), 0.0
 
@@ -34,7 +34,7 @@ class FakeModel:
 
 @dataclass
 class FakeProblem:
-    """Compares to a change of the whole step ± 359, along a parabola of the slope at its start."""
+    """Compares the loss: the whole step gives ``change`` ± 359; the parabola begins with ``slope``."""
 
     change: float
     slope: float = -2000.0
@@ -48,28 +48,29 @@ class FakeProblem:
 
 
 def taken(problem: Any, part_count: int, **model: float) -> float:
-    """The step that is taken as a share of the whole."""
+    """The length of the step taken, as a share of the whole step."""
     fake: Any = FakeModel(**model)
     return float(last_step(problem, np.zeros(1), fake, part_count, 64)[0]) / WHOLE
 
 
 def test_many_teeth_are_wrong_independently() -> None:
-    # By hand: of one tooth the promise is -1000 ± 500, with the comparison 100 ± 359 that makes -274 ± 292; of fourteen
-    # -1000 ± 134, together -866 ± 125.
+    # By hand: for one tooth the promise is -1000 ± 500, which together with the comparison 100 ± 359 gives -274 ± 292;
+    # for fourteen teeth it is -1000 ± 134, together -866 ± 125.
     assert taken(FakeProblem(100.0), part_count=1) == 0
     assert taken(FakeProblem(100.0), part_count=14) == pytest.approx(1)
 
 
 def test_a_step_that_is_contradicted_is_tried_at_the_parabolas_least() -> None:
-    # 1300 is 3.4 of its standard errors. With slope -2000 and 300 at the whole the parabola is least at 2000 / 4600,
-    # -435 ± 156 for -681 ± 91 promised.
+    # The difference of 1300 is 3.4 standard errors. With a slope of -2000 and 300 at the whole step, the parabola is
+    # lowest at 2000 / 4600, with -435 ± 156 where -681 ± 91 was promised.
     problem = FakeProblem(300.0)
     assert taken(problem, part_count=14) == pytest.approx(2000 / 4600)
     assert len(problem.asked) == CLOSING_TRIALS
 
 
 def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
-    # With a slope of its own upwards the shorter step, 2000 / 6200 of the whole, is worse by 639, 5.5 standard errors.
+    # The measured slope points upwards: the shorter step, 2000 / 6200 of the whole, is worse by 639, 5.5 standard
+    # errors.
     problem = FakeProblem(1100.0, slope=2400.0)
     assert taken(problem, part_count=14) == 0
     assert len(problem.asked) == CLOSING_TRIALS

@@ -1,4 +1,4 @@
-"""Squares of pixels averaged to one: their means, their variances, and the camera that sees them."""
+"""Reducing images by averaging squares of pixels: the means, the variances, and the camera of the reduced image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERA = Camera(
 
 
 def test_a_square_is_where_its_middle_was() -> None:
-    """Rays through a reduced pixel's centre and through its square's centre are the same; centres are at
+    """The ray through a reduced pixel's centre is the ray through its square's centre; pixel centres are at
     half-integers.
     """
     small = reduced_camera(CAMERA, 3)
@@ -42,7 +42,7 @@ def test_means_of_squares_and_what_is_left_over() -> None:
 
 
 def test_variance_is_that_of_the_mean(tmp_path: Path) -> None:
-    """Of 2,000 squares of independent noise: the mean square of z is 1 within 5 standard errors, 1e-6 false alarms."""
+    """2,000 squares of independent noise: the mean square of z is 1 within 5 standard errors, 1e-6 false alarms."""
     rng, shape, step = np.random.default_rng(3), (1, 1, 120, 150, 1), 3
     spread = rng.uniform(0.5, 2, shape).astype(np.float32)
     values = {"radiance": spread * rng.standard_normal(shape).astype(np.float32), "variance": spread**2}

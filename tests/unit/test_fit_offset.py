@@ -1,6 +1,6 @@
-"""The registration check's two rates and its ±, on shaded balls whose noise is drawn many times.
+"""The registration check: its two error rates and its ±, on shaded balls whose noise is drawn many times.
 
-Rates of rendered teeth are told by ``python -m tests.benchmarks.registration``.
+``python -m tests.benchmarks.registration`` measures the rates on rendered teeth.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.checks.alignment import told_offset
-from services.fit.checks.offset import Comparison, FoundOffset, Slide, best_offset
+from services.fit.checks.alignment import reported_offset
+from services.fit.checks.offset import Comparison, FoundOffset, ShiftedRender, best_offset
 
 Array = NDArray[np.float64]
 SIZE, PIXEL_MM, RADIUS_PX = 40, 0.5, 9.0
 
 
 def ball(rng: np.random.Generator, offset_px: tuple[float, float] = (0.0, 0.0)) -> tuple[Array, Array]:
-    """A ball of its own shading as its render has it, and photographed beside that render, black around."""
+    """A shaded ball before black: the render, and a photograph in which the ball is moved by ``offset_px``."""
     light, exponent = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.7, 1.3)
 
     def image(right: float, down: float) -> Array:
@@ -38,25 +38,25 @@ def compared(
     stated: float | None = None,
     spread: float = 0.0,
 ) -> Comparison:
-    """A photograph with constant noise beside a render with noise of its own."""
+    """A photograph with constant noise, compared with a render that has its own noise."""
     seen = render > 0
     noisy = np.where(seen, render + spread * rng.standard_normal(render.shape), np.nan)
-    known = np.abs(spread * rng.standard_normal(render.shape))  # as two renders tell it: with one degree of freedom
+    known = np.abs(spread * rng.standard_normal(render.shape))  # as from two renders: with one degree of freedom
     variance = np.full(photo.shape, (noise if stated is None else stated) ** 2)
     return Comparison(photo + noise * rng.standard_normal(photo.shape), variance, noisy, known)
 
 
 def pixels(render: Array) -> NDArray[np.int64]:
-    """Of the ball."""
+    """The pixels of the ball."""
     return np.argwhere(render > 0)[:, ::-1].astype(np.int64)
 
 
 def draws(count: int, offset_px: tuple[float, float], noise: float, spread: float = 0.0) -> list[FoundOffset]:
-    """Offsets found in so many draws of noise on one ball."""
+    """Offsets found in this many draws of noise on one ball."""
     render, photo = ball(np.random.default_rng(1), offset_px)
     rngs = [np.random.default_rng([2, k]) for k in range(count)]
     images = [compared(render, photo, noise, rng, spread=spread) for rng in rngs]
-    found = [best_offset(Slide([image], pixels(render)), PIXEL_MM) for image in images]
+    found = [best_offset(ShiftedRender([image], pixels(render)), PIXEL_MM) for image in images]
     return [one for one in found if one is not None]
 
 
@@ -72,9 +72,10 @@ def test_the_stated_error_is_the_scatter_over_draws_of_noise(noise: float, sprea
 
 
 def test_few_are_accused_in_place_and_most_are_found_a_millimetre_beside() -> None:
-    """40 balls each, noise of 1 to 10 % of the brightest pixel, half of it understated.
+    """40 balls each, with noise of 1 to 10 % of the brightest pixel, half of it understated.
 
-    The check may accuse 2 of 100 in place and miss 5 of 100 (the benchmark's limits): of 40 with fixed seeds, 1 and 2.
+    By the benchmark's limits the check may report 2 of 100 balls that are in place and miss 5 of 100 that are not; of
+    40 balls with fixed seeds, 1 and 2.
     """
     accused = found = 0
     for number in range(40):
@@ -85,7 +86,7 @@ def test_few_are_accused_in_place_and_most_are_found_a_millimetre_beside() -> No
         for offset_px in ((0.0, 0.0), beside):
             pairs = [ball(np.random.default_rng([4, number, light]), offset_px) for light in range(2)]
             images = [compared(render, photo, noise, rng, stated, spread=0.05) for render, photo in pairs]
-            told = told_offset("c0", images, pixels(pairs[0][0]), PIXEL_MM) is not None
+            told = reported_offset("c0", images, pixels(pairs[0][0]), PIXEL_MM) is not None
             accused, found = (accused + told, found) if offset_px == (0.0, 0.0) else (accused, found + told)
     assert accused <= 1
     assert found >= 38
@@ -99,5 +100,5 @@ def test_a_rare_bright_path_in_the_render_is_not_taken_for_an_offset() -> None:
         one = compared(render, 0.3 * photo, 0.05, rng)
         y, x = pixels(render)[rng.integers(len(pixels(render)))][::-1]
         one.render[y, x], one.spread[y, x] = 20.0, 19.0  # in one of two renders alone
-        accused += told_offset("c0", [one], pixels(render), PIXEL_MM) is not None
+        accused += reported_offset("c0", [one], pixels(render), PIXEL_MM) is not None
     assert accused == 0

@@ -1,4 +1,4 @@
-"""How a job's options enter the name of its checkpoints and the report of its fit."""
+"""How a job's options enter the names of its checkpoints and the report of its fit."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from services.fit.instrument.moves import Move
 from services.fit.stage import describe_options
 
 CAPTURE = Path("/captures/anna")
-# Digests of the code before any option was added to those of version 0.1, "numerics" and "engine" standing for the
-# names of both.
+# Digests made by the code before any option was added to those of version 0.1; "numerics" and "engine" stand for the
+# names of the two.
 DEFAULTS = "e33e4fc488397004ade7c2cdd7597ecd3f3abfabb456bad41b5432e95fe798e5"
 CHANGED = "b324cf722b393bbd186c58817ac47d75250a935e80cb1d6f3df350ab132599a0"
 OPTIONS = {"max_steps": 4, "loss": "robust", "held": {"enamel.sigma": 4.5}}

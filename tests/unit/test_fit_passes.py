@@ -1,5 +1,5 @@
-"""How a stage's images are differentiated: which columns are scores and which differences, over what reach, at what
-share of the paths.
+"""How a stage's images are differentiated: which columns are scores and which are differences, over what reach, and
+with what share of the paths.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 
 from services.core.geometry import Camera
 from services.fit.execution.blocks import BlockTask, PixelParts, StoredFile
-from services.fit.execution.derivatives import REACH, SCORES_SHARE, Differentiation
+from services.fit.execution.derivatives import DIFFERENCE_STEPS, SCORES_DIVISOR, Differentiation
 from services.fit.execution.passes import StackProblem
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Coordinate, Domain, natural_derivative, to_dual
@@ -97,7 +97,7 @@ def test_a_wide_difference_is_the_derivative_where_images_are_linear() -> None:
     np.testing.assert_allclose(found[1:4], true[1:4], rtol=1e-3, atol=1e-6)
     # tanh bends by 40 % over the reach of a cosine, yet its column is the derivative.
     assert found[4] == pytest.approx(true[4], rel=1e-9)
-    wide = (np.tanh(x[4]) - np.tanh(x[4] - REACH["cosine"].below)) / REACH["cosine"].below
+    wide = (np.tanh(x[4]) - np.tanh(x[4] - DIFFERENCE_STEPS["cosine"].below)) / DIFFERENCE_STEPS["cosine"].below
     assert abs(wide / natural_derivative("cosine", float(x[4])) - 1) > 0.3
 
 
@@ -109,9 +109,9 @@ def test_every_column_gets_its_share_of_the_paths_and_a_common_image_is_rendered
     counted = {one: engine.asked.count(one) for one in engine.asked}
     # Two ends for each sigma; for two cosines one end each and the image itself.
     assert counted == {
-        ("images", 1024 // REACH["sigma"].share): 4,
-        ("images", 1024 // REACH["cosine"].share): 3,
-        ("jacobian", 1024 // SCORES_SHARE): 1,
+        ("images", 1024 // DIFFERENCE_STEPS["sigma"].path_divisor): 4,
+        ("images", 1024 // DIFFERENCE_STEPS["cosine"].path_divisor): 3,
+        ("jacobian", 1024 // SCORES_DIVISOR): 1,
     }
     assert how.parameters == ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")
     assert len(x) == 5
@@ -120,7 +120,7 @@ def test_every_column_gets_its_share_of_the_paths_and_a_common_image_is_rendered
 def test_in_exact_media_extinction_has_scores() -> None:
     domain = Domain(tuple(Coordinate((name,)) for name in ("enamel.sigma", "enamel.alpha")))
     how = problem(TISSUE, domain, None).jacobian_media(domain.x_of(TISSUE))[2]
-    assert (how.secants, how.share) == ((), 1)
+    assert (how.secants, how.path_divisor) == ((), 1)
 
 
 class Teeth(Linear):
@@ -155,8 +155,8 @@ def test_teeth_that_stand_apart_are_moved_at_once_and_told_apart() -> None:
     task = BlockTask(NOWHERE, 0, NOWHERE, "step", similar, 1024)
     (rows,) = how.render(engine, task, VIEW, seeds=(1,), parts=PixelParts(places, places))
 
-    # Three colours of two cosines, one end each, and the image itself; what is beyond the neighbours is nobody's.
-    assert engine.asked == [("images", 1024 // REACH["cosine"].share)] * 7
+    # Three colours of two cosines, one end each, and the image itself; changes beyond the neighbours are not counted.
+    assert engine.asked == [("images", 1024 // DIFFERENCE_STEPS["cosine"].path_divisor)] * 7
     beside = np.abs(places[:, None] - places) <= 1
     slope = 3 * natural_derivative("cosine", float(x[1]))
     np.testing.assert_allclose(
@@ -177,7 +177,7 @@ def test_a_secant_keeps_inside_the_bounds() -> None:
 
 def test_the_closing_measurement_takes_slopes_of_the_images_own_media() -> None:
     engine, x = Linear(), DOMAIN.x_of(TISSUE)
-    slopes = problem().slopes(x)
+    slopes = problem().exact_differentiation(x)
     assert slopes.parameters == ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")
     np.testing.assert_allclose(
         rendered(slopes, TISSUE, engine), [slope(x, k, engine) for k in range(5)], rtol=1e-4, atol=1e-6

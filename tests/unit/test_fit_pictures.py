@@ -1,4 +1,4 @@
-"""Pictures of a fit: pixel lists back into images."""
+"""Pictures of a fit: lists of pixels become images again."""
 
 from __future__ import annotations
 

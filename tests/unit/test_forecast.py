@@ -1,4 +1,4 @@
-"""Ranges of time: as wide as what is known allows, and holding the truth as often as they say."""
+"""Forecast ranges of time: as wide as the known cases require, and holding the truth as often as they claim."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Curves of a fit are thinned evenly, keep their ends, and take a repeated step from the later attempt."""
+"""The curves of a fit are thinned evenly and keep their ends; a repeated step is taken from the later attempt."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.api.jobs.history import Histories, History, read_history
+from services.api.jobs.history import History, HistoryCache, read_history
 from services.core.stage import StageEvent
 from services.pipeline.event_log import EventLog, event_table, folder_events
 
@@ -56,7 +56,7 @@ def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatc
     monkeypatch.setattr(
         "services.api.jobs.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked)
     )
-    histories = Histories(max_bytes=2000)
+    histories = HistoryCache(max_bytes=2000)
     for number in range(3):
         log.append(1, step(number))
         for _ in range(2):
@@ -65,11 +65,11 @@ def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatc
     for points in range(3, 30):
         histories.read(log, points)
     histories.read(log, 500)
-    assert len(reads) == 3 + 27 + 1  # the others have pushed it out
+    assert len(reads) == 3 + 27 + 1  # the other reads have pushed it out of the cache
 
 
 def test_names_of_channels_that_nothing_is_known_of_count_as_what_they_take(log: EventLog) -> None:
-    histories = Histories(max_bytes=100_000)
+    histories = HistoryCache(max_bytes=100_000)
     for number in range(1000):
         histories.read(log, 500, f"{number:0100}")
     assert len(histories._kept) < 120

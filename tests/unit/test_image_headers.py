@@ -1,4 +1,6 @@
-"""What images declare, against writers of their formats, and headers that lie or break."""
+"""What the headers of images declare: checked with files of independent writers, and with headers that lie or are
+damaged.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ LIMITS = UploadLimits(largest_image_bytes=10_000)
 
 
 def exr(*parts: dict[str, tuple[str, bytes]]) -> bytes:
-    """The head of an OpenEXR file with these attributes."""
+    """The header of an OpenEXR file with these attributes."""
     head = struct.pack("<II", 20000630, 2 | (0x1000 if len(parts) > 1 else 0))
     for part in parts:
         head += (

@@ -1,4 +1,4 @@
-"""What images say beside their pixels, against writers of their formats, and that pictures made here say nothing."""
+"""Metadata in images: found in files of independent writers; pictures made here have none."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ def test_metadata_of_a_second_image_in_a_tiff_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.attack("uploads", "a TIFF of many long directories")
 def test_a_small_tiff_of_many_long_directories_is_refused_before_all_are_read(tmp_path: Path) -> None:
-    # 300 directories of 65,535 entries each, one two bytes after the other: twenty million entries in 0.8 MB.
+    # 300 directories of 65,535 entries each, each beginning two bytes after the one before: twenty million entries in
+    # 0.8 MB.
     many, most = 300, 2**16 - 1
     list_at = 8 + 2 + 12 + 4
     first = list_at + 4 * many

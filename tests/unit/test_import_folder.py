@@ -1,4 +1,4 @@
-"""A folder of named photographs becomes a raw folder, and what it lacks is said."""
+"""A folder of named photographs becomes a raw folder; what is missing is reported."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_where_a_board_or_sphere_lay(file: str, place: str | None) -> None:
 
 @pytest.fixture
 def photographs(tmp_path: Path) -> Path:
-    """Two cameras of 12 bits: one in the high bits of 16, as colour; one a mosaic in the low ones."""
+    """Two cameras of 12 bits: one writes colour in the high bits of 16, the other a mosaic in the low bits."""
     for camera, shift in (("left", 4), ("right", 0)):
         (tmp_path / camera).mkdir()
         for k, name in enumerate(("black_10ms", "L1_10ms", "L1_40ms", "L2_10ms", "L2_40ms", "all_10ms")):
@@ -143,7 +143,7 @@ def test_a_folder_without_photographs(tmp_path: Path) -> None:
 
 
 def test_tracking_frames_in_one_block_are_told(tmp_path: Path) -> None:
-    """Names do not tell that these were taken between the lights, so motion would be interpolated to where there is
+    """The names do not show that these were taken between the lights, so motion would be interpolated where there is
     none.
     """
     for name in ("black", "L1", "L2", "L3", "all0", "all1", "all2", "all3"):

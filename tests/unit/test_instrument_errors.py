@@ -1,5 +1,5 @@
-"""The instrument's errors as coordinates: what a calibration states of them, their columns, and the covariance that
-they leave to the tissue.
+"""The instrument's errors as unknowns of the fit: what a calibration states about them, their columns, and the
+covariance of the tissue with them.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
 from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
-from services.fit.instrument.columns import columns, photographed
 from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, errors_of
 from services.fit.instrument.moves import by_scene, move_covariance, rigid, write_moves
+from services.fit.instrument.photographs import error_derivatives, photographed
 from services.fit.instrument.sentences import assumed_names, instrument_sentences
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.optics.parameters import Medium, Tissue
@@ -56,18 +56,18 @@ def test_columns_are_the_derivatives_of_what_the_instrument_takes() -> None:
         random.uniform(0.2, 1.0, (2, 5)),
         dict(zip(NAMES, (0.01, -0.02, 0.03, 0.004), strict=True)),
     )
-    for name, column in zip(NAMES, columns(image, whole, NAMES), strict=True):
+    for name, column in zip(NAMES, error_derivatives(image, whole, NAMES), strict=True):
         high, low = (photographed(image, whole, at | {name: at[name] + step}) for step in (1e-3, -1e-3))
-        # Exactly linear, so but for rounding.
+        # Exactly linear, so equal except for rounding.
         np.testing.assert_allclose((high - low).reshape(-1) / 2e-3, column, rtol=1e-9, atol=1e-12)
     gains = np.array([[1.0 + 0.01 - 0.02], [1.0 + 0.01 + 0.03]])
     np.testing.assert_allclose(photographed(image, whole, at), gains * image + 0.004 * 1.3, rtol=1e-12)
-    assert not columns(image, whole, ("gain.red", "flare.c1.green")).any()
+    assert not error_derivatives(image, whole, ("gain.red", "flare.c1.green")).any()
 
 
 def test_a_gain_is_not_pulled_by_noise_of_photographs_or_renders() -> None:
-    # The slope to a gain at the truth, over many draws of both noises, in its own standard errors: each alone would
-    # pull it by sqrt(M) of the photographs'.
+    # The slope by a gain at the truth, over many draws of both kinds of noise, in its standard errors: either kind
+    # alone would shift it by sqrt(M) of the photographs'.
     random, image, found = np.random.default_rng(2), np.full(400, 0.7), []
     for _ in range(200):
         photograph = image + 0.01 * random.standard_normal(400)
@@ -212,7 +212,7 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
 def test_an_error_that_the_calibration_states_is_not_told_as_assumed() -> None:
     stated = CalibrationUncertainty(names=("gain.green", "light_gain.b"), covariance=((1e-4, 0.0), (0.0, 1e-4)))
     errors = {"green": errors_of("green", ("a", "b"), ("c0",), stated)}
-    # No move was measured, so what was assumed of moves is in no ±.
+    # No move was measured, so the assumptions about moves are not in any ±.
     names = assumed_names(errors, ())
     assert names == ("light_gain.a", "flare.c0.green")
     (told,) = instrument_sentences(JobSpec.model_validate({"capture": "c"}), errors, {}, names, stated)
@@ -232,11 +232,11 @@ def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path
     points, twist = ball.vertices_mm[:5], np.zeros(6)
     for move in moves:
         moved = stored.light_positions_mm[move.first : move.first + 2]
-        seen, depth = move.seen_by(camera("c0")).project(points)
+        seen, depth = move.moved_camera(camera("c0")).project(points)
         if move.body == "dome":
             np.testing.assert_allclose(seen, camera("c0").project(points)[0], atol=1e-9)
             continue
-        # Where the moved tooth's points appear, and how far they are from the lights.
+        # The moved tooth's points must appear at the same pixels and be at the same distances from the lights.
         back = np.array(move.camera_move)
         there = points @ back[:3, :3].T + back[:3, 3]
         np.testing.assert_allclose(seen, camera("c0").project(there)[0], atol=1e-9)
@@ -259,13 +259,13 @@ def test_knowing_an_error_better_beforehand_is_worth_what_a_fit_with_that_prior_
     domain = Domain(DOMAIN.coordinates, errors)
     expected = uncertainty(domain, domain.x_of(TISSUE), found).covariance
     np.testing.assert_allclose(covariance_if_known(known, "gain"), expected, rtol=1e-6, atol=1e-15)
-    # A step that was left is no calibration's.
+    # A better calibration does not shorten the distance to the minimum where a fit ended early.
     left = replace(known, parts=known.parts | {"unfinished": np.eye(6)})
     np.testing.assert_allclose(covariance_if_known(left, "gain"), expected + np.eye(6), rtol=1e-6, atol=1e-15)
 
 
 def test_says_which_measurement_of_the_instrument_would_help_most() -> None:
-    # One measurement that a gain alone keeps from telling the extinction: half the gain's ± is half of everything.
+    # Only the gain limits how well this one measurement gives the extinction: half the gain's ± halves every ±.
     extinction, gain = Coordinate(("enamel.sigma",)), InstrumentErrors(("gain.green",), ((1e-4,),))
     for errors, expected in (
         (gain, "Measuring the gain to 0.5 % would cut the error of enamel scattering from 10 % to 5.0 %."),
@@ -293,7 +293,7 @@ def test_parts_of_the_prior_add_up_where_kinds_go_together() -> None:
 
 
 def test_a_gain_that_goes_with_a_light_is_known_twice_as_well_when_it_is_said_so() -> None:
-    # Photographs of no weight: what is known of the gain is its prior, which is divided as stated.
+    # The photographs have no weight: only the prior determines the gain, and it is divided as stated.
     random, count = np.random.default_rng(9), 6
     rows = [random.standard_normal((count, 20)) for _ in range(2)]
     found = normal_equations(*rows, np.zeros(20), np.zeros(20), np.full(20, 1e6), np.full(20, 1e-12), exact=4)

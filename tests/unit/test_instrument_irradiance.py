@@ -1,4 +1,4 @@
-"""What is wrong with the lights' brightness where the teeth are, of intensities and distances that err together."""
+"""Errors of the lights' brightness at the teeth, where errors of intensities and of distances are correlated."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Light
-from services.fit.instrument.irradiance import DRIFT, at_the_teeth
+from services.fit.instrument.irradiance import DRIFT, uncertainty_at_teeth
 
 CHANNELS = ("red",)
 LIGHTS = tuple(
@@ -22,20 +22,20 @@ PLACES_MM = np.array([light.position_mm for light in LIGHTS])
 INTENSITY = np.array([light.intensity[0] for light in LIGHTS])
 TEETH_MM = np.zeros(3)
 MEASURED = 0.003
-"""Scatter of one light on the white sphere, relative."""
+"""Relative scatter of one light's brightness on the white sphere."""
 NAMES = ("gain.red", *(f"light_gain.{light.name}.red" for light in LIGHTS))
 NAMES += tuple(f"light.{light.name}.{axis}" for light in LIGHTS for axis in "xyz")
 
 
 def calibrated(rng: np.random.Generator, off_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """One calibration by a white sphere where the teeth are: errors of NAMES (10,), and relative ones of photographs
-    over renders (3,).
+    """One calibration with a white sphere at the place of the teeth: errors of NAMES (10,), and relative errors of
+    photographs over renders (3,).
 
-    Lights are taken to be beside where they are, most along the line of sight; what the sphere shows is kept by
-    intensities and by the radiance per count, whose gauge is that the mean intensity is 1.
+    Lights are believed to be away from where they are, mostly along the line of sight. Intensities and the radiance per
+    count still agree with what the sphere shows; the gauge is that the mean intensity is 1.
     """
     away = PLACES_MM / np.linalg.norm(PLACES_MM, axis=1, keepdims=True)
-    # All lights err alike in part, as where the spheres stood is one thing for all of them.
+    # The lights' errors are equal in part, as all of them depend on where the spheres were.
     off = off_mm * (rng.normal(size=(3, 1)) + rng.normal()) * away + rng.normal(0, 2, (3, 3))
     seen = INTENSITY / (PLACES_MM**2).sum(axis=1) * np.exp(rng.normal(0, MEASURED, 3))
     relative = seen * ((PLACES_MM + off) ** 2).sum(axis=1)
@@ -57,13 +57,13 @@ def drawn(off_mm: float) -> tuple[CalibrationUncertainty, np.ndarray]:
 @pytest.mark.parametrize("off_mm", [2.0, 15.0])
 def test_gains_are_those_of_photographs_over_renders(off_mm: float) -> None:
     stated, photographs = drawn(off_mm)
-    found = at_the_teeth(stated, LIGHTS, CHANNELS, TEETH_MM)
+    found = uncertainty_at_teeth(stated, LIGHTS, CHANNELS, TEETH_MM)
     assert found is not None
-    # What all lights share is the gain's, not a light's; here, by no derivative but whole calibrations, it is the
-    # sphere's own scatter.
+    # An error that all lights share belongs to the gain, not to a light. The expected values come from whole
+    # calibrations, not from derivatives: the scatter on the sphere.
     apart = photographs - photographs @ (INTENSITY / INTENSITY.sum())[:, None]
     expected = np.cov(apart.T) + DRIFT**2 * np.eye(3)
-    # Squares of 1.5 % of a distance are left out, and 8,000 draws tell a variance to 1.6 %.
+    # Squares of 1.5 % of a distance are left out, and 8,000 draws give a variance to 1.6 %.
     np.testing.assert_allclose(np.diag(found.matrix)[1:4], np.diag(expected), rtol=0.12)
     assert np.sqrt(np.diag(found.matrix)[1:4]).max() < 1.3 * MEASURED
     if off_mm > 10:
@@ -74,7 +74,7 @@ def test_gains_are_those_of_photographs_over_renders(off_mm: float) -> None:
 
 def test_without_every_lights_place_all_stays_as_it_is() -> None:
     stated, _ = drawn(5.0)
-    assert at_the_teeth(stated, LIGHTS[:2], CHANNELS, TEETH_MM) == stated
+    assert uncertainty_at_teeth(stated, LIGHTS[:2], CHANNELS, TEETH_MM) == stated
     short = CalibrationUncertainty(names=NAMES[:4], covariance=tuple(map(tuple, stated.matrix[:4, :4].tolist())))
-    assert at_the_teeth(short, LIGHTS, CHANNELS, TEETH_MM) == short
-    assert at_the_teeth(None, LIGHTS, CHANNELS, TEETH_MM) is None
+    assert uncertainty_at_teeth(short, LIGHTS, CHANNELS, TEETH_MM) == short
+    assert uncertainty_at_teeth(None, LIGHTS, CHANNELS, TEETH_MM) is None

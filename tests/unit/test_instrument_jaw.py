@@ -11,8 +11,8 @@ from services.core.geometry import Light
 from services.core.records import JobSpec, PreparedManifest
 from services.fit.execution.blocks import Block, BlockInstrument
 from services.fit.instrument.capture import MAX_JAW_LIGHTS, instrument_of
-from services.fit.instrument.columns import columns, photographed
 from services.fit.instrument.errors import errors_of
+from services.fit.instrument.photographs import error_derivatives, photographed
 from services.fit.instrument.sentences import instrument_sentences
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty, uncertainty
@@ -30,7 +30,7 @@ TRUE_ERRORS = {"gain.green": 0.02, "light_gain.b": -0.01, "flare.c0.green": 0.00
 
 
 def domain_of(teeth: tuple[int, ...]) -> Domain:
-    """Scattering and absorption of some teeth's enamel, and the instrument."""
+    """Unknowns: scattering and absorption of the enamel of these teeth, and the instrument's errors."""
     return Domain(tuple(Coordinate((f"{k}.enamel.{kind}",)) for k in teeth for kind in ("sigma", "alpha")), ERRORS)
 
 
@@ -44,7 +44,7 @@ def tooth_block(image: Array) -> Block:
 
 
 def equations_of(teeth: tuple[int, ...], domain: Domain, random: np.random.Generator) -> tuple[NormalEquations, Array]:
-    """Equations about the truth of teeth whose images follow two numbers each, and where their minimum lies."""
+    """Normal equations at the truth, for teeth whose images depend on two numbers each, and where their minimum is."""
     total, size = None, len(domain.names)
     for place, k in enumerate(teeth):
         own = np.random.default_rng([11, k])
@@ -52,7 +52,7 @@ def equations_of(teeth: tuple[int, ...], domain: Domain, random: np.random.Gener
         block = tooth_block(image)
         rows = np.zeros((size, 2 * PIXELS))
         rows[2 * place : 2 * place + 2] = slopes
-        rows[domain.tissue_count :] = columns(image, block, domain.errors.names)
+        rows[domain.tissue_count :] = error_derivatives(image, block, domain.errors.names)
         noise = NOISE * random.standard_normal(2 * PIXELS)
         residual = image.reshape(-1) - photographed(image, block, TRUE_ERRORS).reshape(-1) - noise
         regions = [(range(2 * place, 2 * place + 2), np.ones(2 * PIXELS, dtype=bool))]
@@ -66,7 +66,7 @@ def equations_of(teeth: tuple[int, ...], domain: Domain, random: np.random.Gener
 def solved(teeth: tuple[int, ...]) -> tuple[Uncertainty, Array]:
     domain = domain_of(teeth)
     found, step = equations_of(teeth, domain, np.random.default_rng([5, *teeth]))
-    # At the minimum; noise as stated, so that no ± is larger for residuals that happen to be.
+    # At the minimum, with the noise as stated, so that no ± becomes larger through residuals that happen to be large.
     there = replace(found, gradient=found.gradient + found.hessian @ step, squares=0.0)
     return uncertainty(domain, step, there), step
 
@@ -77,7 +77,7 @@ def test_teeth_that_share_a_gain_are_known_at_least_as_well_as_alone() -> None:
     for k in range(TEETH):
         alone = np.sqrt(np.diag(solved((k,))[0].covariance))
         own, errors = whole[2 * k : 2 * k + 2], whole[2 * TEETH :]
-        # More measurements with what they share: less variance, exactly, as derivatives have no noise here.
+        # More measurements that share unknowns mean less variance, exactly, as derivatives have no noise here.
         assert (own <= alone[:2] * (1 + 1e-9)).all(), (k, own, alone)
         assert (errors <= alone[2:] * (1 + 1e-9)).all(), (k, errors, alone)
         assert own.sum() < 0.99 * alone[:2].sum()
@@ -89,7 +89,7 @@ def test_a_gain_that_is_two_percent_off_comes_back_within_its_error() -> None:
     for name, true in TRUE_ERRORS.items():
         one = found[name]
         assert one.se is not None
-        # A posterior of two prior ± off the mean: 2 of its own for what the prior pulls, and noise.
+        # The truth is two ± of the prior away from its mean; the bound allows 2 ± for the pull of the prior, and noise.
         assert abs(one.value - true) < 2.5 * one.se, (name, one)
     assert abs(found["gain.green"].value - 0.02) < abs(found["gain.green"].value)
 

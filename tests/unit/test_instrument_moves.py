@@ -1,4 +1,6 @@
-"""How wrong a dome's place is where the calibration states its lights' places, and how bright moved lights are."""
+"""The error of a dome's position where the calibration states the positions of its lights, and how the brightness of
+moved lights changes.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,7 @@ def test_a_dome_whose_lights_are_all_placed_moves_by_what_their_errors_share() -
     np.testing.assert_allclose(covariance[6:, 6:], root @ root.T, rtol=1e-4, atol=1e-7)
     assert assumed == ("teeth",)
 
-    # Errors of single lights leave a dome of five lights what they are over the root of five.
+    # Independent errors of single lights give a dome of five lights an error smaller by the root of five.
     apart, _ = move_covariance(stated(PLACED, SINGLE_MM**2 * np.eye(len(PLACED))), LIGHTS)
     np.testing.assert_allclose(np.sqrt(np.diag(apart)[9:]), SINGLE_MM / np.sqrt(len(LIGHTS)), rtol=1e-9)
 
@@ -71,7 +73,7 @@ def test_a_move_of_the_dome_that_is_named_counts_besides_its_lights() -> None:
 
 
 def brighter_by_moves_of_the_dome(folder: Path, names: tuple[str, ...]) -> float:
-    """How much brighter any move of the dome makes a light at the teeth, at most, relative; each moves some light."""
+    """Largest relative change of a light's brightness at the teeth by any move of the dome; each moves some light."""
     ball = sphere(4.0)
     manifest = PreparedManifest(
         channels=("green",), cameras=(camera("c0"),), lights=LIGHTS, held_out=(), fdi=(11,), dentin_known=(),
@@ -93,6 +95,6 @@ def brighter_by_moves_of_the_dome(folder: Path, names: tuple[str, ...]) -> float
 
 def test_lights_whose_gains_know_their_distances_move_without_growing_brighter(tmp_path: Path) -> None:
     assert brighter_by_moves_of_the_dome(tmp_path, PLACED + GAINS) < 1e-9
-    # Gains that the calibration does not state know no distance, so the move has to: two ± of a shift, 0.09 mm of a
-    # metre, are 2e-4.
+    # Where the calibration states no gains, only the move changes the distances: two ± of a shift, 0.09 mm at a metre,
+    # are 2e-4.
     assert brighter_by_moves_of_the_dome(tmp_path, PLACED) > 1e-4

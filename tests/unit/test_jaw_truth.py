@@ -32,7 +32,7 @@ SPREAD = 0.05
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Uniform images of brightness 1, and half of it from row 6, with noise in every pass; two rows are dark."""
+    """Images of brightness 1, and of half that from row 6, with noise in every pass; two rows are dark."""
     random = np.random.default_rng(2)
     path = tmp_path_factory.mktemp("truth") / "deep" / "jaw.npz"
     shape = (PASSES, LIGHTS, *SIZE)
@@ -98,6 +98,6 @@ def test_a_pixels_own_noise_does_not_set_its_weight() -> None:
     smoothed = _of_neighbours(variance)
     assert smoothed[0, 4, 4] == pytest.approx(4.0)
     assert smoothed[0, 4, 3] == pytest.approx((23 * 4 + 100) / 24)
-    # Two rows of lit neighbours and what is dark left out.
+    # The mean of two rows of lit neighbours, without the dark ones.
     assert smoothed[0, 2, 0] == pytest.approx(4.0)
     assert smoothed[0, 1, 0] == pytest.approx(4.0)

@@ -1,4 +1,4 @@
-"""What a server does with jobs that do not run."""
+"""How a server treats jobs that are not running yet, or that it must stop."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_why_a_job_waits_is_told_as_an_event_once_and_without_the_servers_folder
         for reason in (*reasons[:2], *reasons):
             service._admission._reasons[job.id] = reason
             monkeypatch.setattr(service._admission, "begin_round", lambda _: None)
-            service._runner._start_what_may()
+            service._runner._start_admitted()
             assert str(data) not in (service.waits_for(job) or "")
         told = [event.message for event in service.repository.events_of(job.id).read(kind="log")]
         assert told == ["Waits for disk: The disk was full at jobs/x; free some space."]

@@ -1,4 +1,4 @@
-"""What the comparison of a virtual laboratory says of calibration, pose and media, on files that are made up."""
+"""What the comparison of a virtual laboratory reports about calibration, pose and media, on made-up files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The virtual laboratory's optics: its lens, its sensor, its highlights, its scan, and the file that describes them."""
+"""The virtual laboratory's optics: lens, sensor, highlights, scan, and the file that describes them."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ def test_a_lens_and_its_inverse_agree() -> None:
     points = np.random.default_rng(0).uniform(-25, 25, (200, 3))
     pinhole = Camera.project(RIG.cameras[0], points)[0]
     # OpenCV iterates the inverse to 1e-9 of a focal length of a thousand pixels.
-    np.testing.assert_allclose(lens.undistorted(lens.seen(points)), pinhole, atol=1e-4)
-    assert np.abs(lens.seen(points) - pinhole).max() > 0.1
+    np.testing.assert_allclose(lens.undistorted(lens.project(points)), pinhole, atol=1e-4)
+    assert np.abs(lens.project(points) - pinhole).max() > 0.1
 
 
 def test_a_rig_is_off_its_plan_and_keeps_the_gauge() -> None:
     np.testing.assert_allclose(np.mean([light.intensity for light in RIG.lights], axis=0), 1, rtol=1e-12)
     for camera in RIG.cameras:
         pixel, depth = camera.project(np.zeros((1, 3)))
-        # Whoever mounts a camera aims it, so the teeth stand at its principal point.
+        # A camera is aimed when it is mounted, so the teeth are at its principal point.
         np.testing.assert_allclose(pixel[0], [camera.K[0][2], camera.K[1][2]], atol=1e-6)
         assert 1.0 < abs(depth[0] - CAMERA_MM) + abs(camera.K[0][0] * SIZE.pixel_mm - CAMERA_MM) < 60.0
 
@@ -73,12 +73,12 @@ def test_a_session_is_a_raw_folder_and_its_highlights_obey_the_law_of_reflection
     folder = read_raw_folder(tmp_path)
     assert [frame.kind for frame in folder.frame] == ["mirror-sphere", "board"]
 
-    # The calibration's own solution of Alhazen's problem is by other means.
+    # The calibration solves Alhazen's problem by another method.
     camera = RIG.cameras[1]
     pose = np.array(camera.camera_from_world)
     eye = -pose[:3, :3].T @ pose[:3, 3]
     spot = highlight_points(eye, np.array([RIG.lights[2].position_mm]), session.centres_mm[4], MIRROR_MM)
-    pixel = Lens(camera).seen(spot)[0]
+    pixel = Lens(camera).project(spot)[0]
     counts = read_counts(tmp_path, folder, folder.frame[0]).astype(float) - sensor.black
     scale = np.array(camera.radiance_per_count) / (0.02 * WHITE_RADIANCE)
     light = counts * scale[[[0, 1], [1, 2]]][np.ix_(np.arange(120) % 2, np.arange(160) % 2)]
@@ -102,7 +102,8 @@ def test_a_scan_is_open_at_the_neck_and_as_noisy_as_said(mouth: LabMouth) -> Non
 
     outer = mouth.fitted.outer
     distance = closest_point(Trimesh(outer.vertices_mm, outer.faces, process=False), world)[1]
-    # Of noise in three directions a surface keeps the one across it; some hundred vertices tell it to a tenth.
+    # Of noise in three directions, only the part across the surface changes it; some hundred vertices give it to a
+    # tenth.
     assert np.sqrt((distance**2).mean()) == pytest.approx(SCAN_NOISE_MM, rel=0.2)
 
 
@@ -114,7 +115,7 @@ def test_the_measured_tooth_has_a_whole_root_that_holds_its_dentin(mouth: LabMou
     assert rooted.dentin is not None
     for mesh in (rooted.outer, rooted.dentin):
         mesh.require_solid("of the measured tooth")
-    # 13 mm from the cervical line in place of 4, along an axis that leans by some degrees.
+    # 13 mm from the cervical line instead of 4, along an axis that leans by some degrees.
     longer = np.ptp(rooted.outer.vertices_mm[:, 2]) - np.ptp(stub.vertices_mm[:, 2])
     assert 8.5 < longer < 9.5
     below = rooted.outer.vertices_mm[:, 2] > 0
@@ -124,8 +125,8 @@ def test_the_measured_tooth_has_a_whole_root_that_holds_its_dentin(mouth: LabMou
 
 
 def test_a_scans_root_is_as_wide_below_the_gums_as_the_one_it_does_not_see(mouth: LabMouth) -> None:
-    # Light comes down it to the crown: a root that narrowed evenly was 10 % too narrow 2 mm below the gums' crest, at
-    # -2.4 mm.
+    # Light comes through the root to the crown. A root that narrowed evenly would be 10 % too narrow 2 mm below the
+    # crest of the gums, at -2.4 mm.
     jaw = jaw_from_scan(mouth.scan, "whole")
     world_from_arch = mouth.world_from_scan @ np.linalg.inv(jaw.arch_from_scan)
     made = next(tooth.outer for tooth in jaw.teeth if tooth.fdi == FITTED)

@@ -1,4 +1,4 @@
-"""Properties of the job's state machine over every sequence of triggers."""
+"""Properties of the job's state machine that hold for every sequence of triggers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Log lines are written by a thread of their own, so that a reader that stalls keeps nobody waiting."""
+"""Log lines are written by a separate thread, so that nobody waits for a reader that stalls."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STALL_S = 2.0
 
 
 class Stalled(io.StringIO):
-    """Stands for a pipe or a disk that takes nothing for a while."""
+    """Replaces a pipe or a disk that accepts nothing for a while."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -78,12 +78,13 @@ def test_lines_that_find_no_room_are_counted_and_told(stalled: Stalled) -> None:
 
 
 def test_what_logs_in_the_midst_of_a_write_does_not_wait_for_itself() -> None:
-    # The garbage collector may run within a write, and what it ends may log in the same thread: asyncio's tasks do.
+    # The garbage collector may run during a write, and what it deletes may log in the same thread, as asyncio's tasks
+    # do.
     stream = QueuedStream(io.StringIO(), max_waiting_lines=0)
     assert isinstance(stream._lines, queue.SimpleQueue), "the only queue whose put lets its own thread in again"
 
     def log() -> None:
-        with stream._counting:  # as the write holds it that finds no room
+        with stream._count_lock:  # as the write holds it that finds no room
             stream.write("Within.\n")
 
     thread = threading.Thread(target=log, daemon=True)

@@ -1,4 +1,4 @@
-"""Masks as PNG: every byte is counted however it is packed, and little of it is in memory at once."""
+"""Masks as PNG: every byte counts, however it is packed, and little of it is in memory at once."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def camera(side: int) -> Camera:
 
 
 def png(side: int, *packed: bytes) -> bytes:
-    """A grey PNG whose pixels are packed in these parts."""
+    """A grey PNG whose compressed pixels are in these parts."""
     parts = [
         (b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0)),
         *((b"IDAT", part) for part in packed),

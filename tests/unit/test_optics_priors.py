@@ -1,5 +1,5 @@
-"""Priors of the fit: the literature's table is the reference's, its centres are what a fit of it would report, and the
-schedule takes what the job asks.
+"""Priors of the fit: the literature's table equals the reference file, the centres are the values a fit of it would
+give, and the schedule takes the prior that the job chose.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def test_a_fits_coordinates_carry_the_chosen_prior() -> None:
     table = literature()
     for k, name in enumerate(("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")):
         assert (means[k], precision[k]) == pytest.approx((table[name][0], table[name][1] ** -2))
-    # Weak: sigma is free, and what both media share keeps the prior that is theirs both; of the literature's two there
-    # is none.
+    # Weak prior: sigma is free, and a value that both media share keeps the prior that is the same for both. The
+    # literature's priors of the two differ, so a shared value has none.
     assert list(media_domain(("enamel",), ("sigma", "alpha")).prior[1]) == [0.0, WEAK["enamel.alpha"][1] ** -2]
     assert list(shared_domain().prior[1]) == [0.0, 1.0]
     assert list(shared_domain(literature()).prior[1]) == [0.0, 0.0]

@@ -1,4 +1,4 @@
-"""``dentine options`` prints what a job's file may say, as such a file."""
+"""``dentine options`` prints all options of a job file, in the form of such a file."""
 
 from __future__ import annotations
 

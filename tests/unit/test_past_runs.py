@@ -1,4 +1,4 @@
-"""What is learned from a job's events, and what a position in a job is compared with."""
+"""What is learned from the events of earlier jobs, and which of them a running job is compared with."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_tenths_end_with_the_stage() -> None:
 
 
 def past(factor: float) -> PastRun:
-    """A run that takes 10 s to prepare and 100 s to fit, evenly, all times a factor."""
+    """A run that takes 10 s to prepare and 100 s to fit, at an even pace; all times are multiplied by the factor."""
     reached = {"prepare": (1.0, *[10.0] * 9), "fit": tuple(10.0 + 10.0 * k for k in range(10))}
     scaled = {stage: tuple(factor * one for one in times) for stage, times in reached.items()}
     return PastRun(
@@ -161,7 +161,7 @@ def test_without_enough_or_alike_runs_there_is_a_reason_and_no_range() -> None:
 
 def test_ranges_follow_each_other() -> None:
     first, second = TimeRange(low_s=1, high_s=3, past_jobs=9), TimeRange(low_s=10, high_s=20, past_jobs=7)
-    assert second.after([first], [], places=1) == TimeRange(low_s=11, high_s=23, past_jobs=7)
+    assert second.after([first], [], slots=1) == TimeRange(low_s=11, high_s=23, past_jobs=7)
 
 
 def test_a_range_begins_when_a_place_is_free() -> None:
@@ -169,15 +169,15 @@ def test_a_range_begins_when_a_place_is_free() -> None:
         return TimeRange(low_s=low_s, high_s=high_s, past_jobs=5)
 
     short, long, last = lasting(1, 2), lasting(10, 20), lasting(100, 200)
-    assert last.after([long], [], places=2) == last  # the second place is free
-    assert last.after([short, long], [], places=2) == lasting(101, 202)
-    assert last.after([short, long], [long], places=2) == lasting(
+    assert last.after([long], [], slots=2) == last  # the second place is free
+    assert last.after([short, long], [], slots=2) == lasting(101, 202)
+    assert last.after([short, long], [long], slots=2) == lasting(
         110, 220
     )  # the one ahead takes the first free place, for 11 to 22 s
-    assert last.after([short, short, long], [], places=2) == lasting(
+    assert last.after([short, short, long], [], slots=2) == lasting(
         101, 202
     )  # one of them captures beside two in their places
-    assert last.after([], [long, short], places=1) == lasting(111, 222)
+    assert last.after([], [long, short], slots=1) == lasting(111, 222)
 
 
 def test_runs_beside_others_are_compared_by_how_many_there_were() -> None:

@@ -1,4 +1,4 @@
-"""Lips and retractor of a virtual jaw: solid, before the teeth, and open enough to see them."""
+"""Lips and retractor of a virtual jaw: solid, in front of the teeth, and open enough to see them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def lips(teeth: list[Mesh]) -> Mesh:
 
 
 def test_they_are_solids_that_face_outwards(lips: Mesh) -> None:
-    """A ring of round section has the volume 2 π² R r² of its middle line's length; half of it bounds any mistake of
-    side.
+    """A ring of round section with this middle line has the volume 2 π² R r²; a surface that faces inwards would have
+    the opposite sign.
     """
     edges = lips.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
     count = len(lips.vertices_mm)

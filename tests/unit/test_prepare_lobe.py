@@ -1,4 +1,4 @@
-"""How far reflections reach, told from profiles that are known."""
+"""How far reflections reach from the mirror direction, found from known profiles."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def ggx(angle_deg: np.ndarray, roughness: float) -> np.ndarray:
 
 
 def angles() -> np.ndarray:
-    """Those of normals spread evenly over the sphere."""
+    """Angles of normals that are spread evenly over the sphere."""
     low = np.cos(np.radians(PROFILE_DEG - 0.01))
     return np.degrees(np.arccos(np.random.default_rng(1).uniform(low, 1, PIXELS)))
 
@@ -41,8 +41,8 @@ def angles() -> np.ndarray:
 @pytest.mark.parametrize("roughness", [0.1, 0.15, 0.2])
 @pytest.mark.parametrize("learned_from", [0.0, 0.02])
 def test_half_angle_is_where_the_lobe_falls_below_what_is_tolerated(roughness: float, learned_from: float) -> None:
-    """To a degree of the profile and half a step of the roughness, 5.5 % of the angle: ± 2 degrees at 13 to 28, also
-    where the diffuse colour was learned from pixels that reflect a fiftieth of their light."""
+    """Exact to one degree of the profile and half a step of the roughness, 5.5 % of the angle: ± 2 degrees at 13 to 28,
+    also where the diffuse colour was learned from pixels that reflect a fiftieth of their light."""
     angle = angles()
     lobe = 0.8 * ggx(angle, roughness)
     fine = np.arange(0, 90, 0.01)
@@ -60,8 +60,8 @@ def test_a_broad_lobe_is_cut_at_the_widest() -> None:
 
 @pytest.mark.parametrize("wrong_shading", [0.0, 0.05, -0.1])
 def test_errors_of_the_shading_are_no_lobe(wrong_shading: float) -> None:
-    """Flat light that a quadratic misjudges at the mirror direction by less than a reflection brings, and far more
-    where it turns away.
+    """The light is flat. At the mirror direction a quadratic fit is wrong by less than a reflection adds, and by far
+    more where the surface turns away.
     """
     angle = angles()
     error = wrong_shading * np.cos(np.radians(3 * angle)) + np.maximum(angle - 42, 0) * 0.1
@@ -74,7 +74,7 @@ def test_too_few_angles_tell_nothing() -> None:
 
 
 def test_pixels_without_an_estimate_tell_nothing() -> None:
-    """A few dim pixels of a tooth at a jaw's end, of which neither colour nor shading was learned."""
+    """A few dim pixels of a tooth at the end of a jaw, for which neither colour nor shading was learned."""
     profile, angle = LobeProfile(), angles().astype(np.float32)
     none = np.zeros_like(angle)
     profile.add(np.cos(np.radians(angle)), none + np.float32(1e-10), none, none)
@@ -82,7 +82,7 @@ def test_pixels_without_an_estimate_tell_nothing() -> None:
 
 
 def test_light_far_from_the_mirror_direction_tells_nothing() -> None:
-    """Beyond 30 degrees the narrow distributions are zero in every digit."""
+    """Beyond 30 degrees, the narrow distributions are zero in every digit."""
     angle = angles()
     angle = angle[angle > 30]
     assert half_angle_deg(np.zeros(len(angle)), np.ones(len(angle)), angle) == 0

@@ -1,4 +1,4 @@
-"""Projection against an analytic sphere and, on the scanned incisor, against trimesh's ray tracer."""
+"""Projection, compared with an analytic sphere and, on the scanned incisor, with trimesh's ray tracer."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def test_surface_points_project_back_to_their_pixels() -> None:
 
 @pytest.mark.parametrize(("camera", "hit", "whole"), [(0, 395, 367), (1, 406, 380), (2, 403, 370)])
 def test_incisor_pixels(camera: int, hit: int, whole: int) -> None:
-    """Counts are those of trimesh's ray tracer on the same pixel centres and corners; the images are stock Mitsuba's
-    own witness.
+    """The counts are those of trimesh's ray tracer on the same pixel centres and corners; the images, rendered by
+    stock Mitsuba, confirm them.
     """
     folder = shared_path("data/tooth-ur1-truth")
     description = read_record(folder / "capture.json", FolderCapture)

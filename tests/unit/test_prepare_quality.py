@@ -1,4 +1,4 @@
-"""What a preparation says of its images, in numbers and on a page."""
+"""What a preparation reports about its images, in numbers and on a page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_pixels_are_counted_by_stop_with_their_noise() -> None:
     chosen[0] = False
     radiance[1, 0] = 2 * 0.75
     counts, noise = by_stop(radiance, variance, chosen)
-    # The first row is not looked at, and one pixel of the second is as bright as that; the last three share a stop
+    # The first row is not counted, and one pixel of the second is as bright as that; the last three share a stop
     assert counts == (1, 49, *[50] * (STOPS - 3), 150)
     # Three channels of independent noise
     assert noise[2] == pytest.approx(0.1 / np.sqrt(3))

@@ -1,4 +1,4 @@
-"""Counts to radiance, checked against the sensor model they were drawn from."""
+"""From counts to radiance, checked with the sensor model that the counts are drawn from."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_merge_of_two_exposures_is_better_than_either_and_survives_saturation() 
     truth[:, :50] = 2000.0  # beyond both
     black = np.full(truth.shape, BLACK, dtype=np.float32)
     merged, single = Merge(), {}
-    exact = 10**9  # black frames averaged, so that the zero carries no noise of its own
+    exact = 10**9  # number of averaged black frames, so that the black level has no noise
     for exposure_s in (0.05, 0.025):
         seen = Radiometry(black, exact, manifest()).radiance(expose(truth, frame(exposure_s), rng), frame(exposure_s))
         merged.add(*seen)

@@ -1,4 +1,4 @@
-"""What becomes of a moved frame's pixels whose samples reach beyond its border."""
+"""Pixels of a moved frame whose samples reach beyond its border are not valid."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WINDOW = Window(0, SHAPE[0], 0, SHAPE[1])
 
 
 class Shifted:
-    """In place of a measured motion: every pixel moved by the same."""
+    """Replaces a measured motion: every pixel is moved by the same vector."""
 
     window = WINDOW
 
@@ -41,11 +41,11 @@ class Shifted:
     def move(self) -> Displacement:
         return Displacement(np.zeros(0), float(np.linalg.norm(self._shift)), 0.0)
 
-    def places(self, _: Displacement, rows: slice) -> np.ndarray:
+    def positions(self, _: Displacement, rows: slice) -> np.ndarray:
         y, x = np.mgrid[rows, : SHAPE[1]].astype(np.float32)
         return np.stack([x + self._shift[0], y + self._shift[1]])
 
-    def stored(self, _: Displacement) -> np.ndarray:
+    def stored_field(self, _: Displacement) -> np.ndarray:
         return np.broadcast_to(self._shift, (*SHAPE, 2))
 
 

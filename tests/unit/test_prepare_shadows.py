@@ -1,11 +1,11 @@
-"""Shadows of what no scan shows, against spheres whose shadows are known by a formula."""
+"""Shadows of objects that no scan shows, compared with spheres whose shadows follow from a formula."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from services.preprocess.masking.shadows import expected_irradiance, reached_by, shadow_confidence
+from services.preprocess.masking.shadows import expected_irradiance, is_unoccluded, shadow_confidence
 from services.preprocess.projection import Footprint, project
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 
@@ -23,10 +23,10 @@ def test_a_known_ball_shades_what_lies_behind_it(view: Footprint) -> None:
     radius = 2.0
     for light in lights_mm(6):
         place, centre = tuple(light.tolist()), before_ball(light, 9.0)
-        reached = reached_by(points, view.normal, place, [ball(BALL_MM), ball(radius, centre)])
+        reached = is_unoccluded(points, view.normal, place, [ball(BALL_MM), ball(radius, centre)])
         facing = view.covered & (expected_irradiance(points, view.normal, place, None) > 0.1e-6)
-        # An edge may lie a pixel of the light's view (0.25 mm) beside the formula's; inner and outer balls allow for
-        # that and the mesh's sagitta
+        # An edge may be off the formula's by one pixel of the light's view (0.25 mm); the smaller and the larger ball
+        # allow for that and for the sagitta of the mesh
         surely, never = (behind_ball(points, light, centre, radius + margin) for margin in (-0.5, 0.5))
         assert (facing & surely).sum() > 50
         assert not reached[facing & surely].any()
@@ -35,8 +35,8 @@ def test_a_known_ball_shades_what_lies_behind_it(view: Footprint) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_shadows_of_an_unknown_ball_are_found_and_lit_pixels_are_left(view: Footprint, seed: int) -> None:
-    """A matt ball of uneven albedo: 90 % of the shadow found at 3 % of false ones are what a capture asks for, without
-    light that spreads inside.
+    """A matt ball of uneven albedo, without light that spreads inside: a capture requires that 90 % of the shadow is
+    found, with 3 % of false finds.
     """
     rng = np.random.default_rng(seed)
     points = view.points_mm(CAMERA, slice(None)).astype(np.float64)

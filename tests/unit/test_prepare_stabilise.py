@@ -1,4 +1,4 @@
-"""Alignment under known warps of real photographs, and interpolation in time."""
+"""Alignment of real photographs under known warps, and interpolation in time."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def view_of(seen: Footprint) -> View:
 
 
 def warped_photograph(path: Path, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A photograph, the same moved by up to 6 px under other light with sensor noise on both, and the true
-    displacement.
+    """A photograph, the same moved by up to 6 px and under other light, and the true displacement; both have sensor
+    noise.
     """
     photograph = (cv2.imread(str(path)).astype(np.float32) / 255) ** 2.2
     linear = photograph.mean(axis=-1)
@@ -55,7 +55,7 @@ def warped_photograph(path: Path, seed: int) -> tuple[np.ndarray, np.ndarray, np
     u, v = (x - width / 2) / (width / 2), (y - height / 2) / (width / 2)
     gain = np.exp(0.5 * u + 0.4 * v + 0.3 * np.sin(5 * u + 2) * np.cos(4 * v))
 
-    # Made at twice the size, so that interpolation leaves no trace at the size used
+    # Made at twice the size, so that no trace of interpolation is left at the final size
     rng = np.random.default_rng(seed)
     half = [
         cv2.resize(image.astype(np.float32), (width // 2, height // 2), interpolation=cv2.INTER_AREA)
@@ -80,8 +80,8 @@ def test_known_warp_of_an_intraoral_photograph_under_changed_light(view: int) ->
 
 
 def test_parallax_of_a_real_stereo_pair() -> None:
-    """With the true relief given, displacement follows it; a median of 0.42 px is what dense flow (DIS medium) reaches
-    on this pair.
+    """With the true relief given, the displacement follows it; dense flow (DIS medium) reaches a median error of
+    0.42 px on this pair.
     """
     folder = shared_path("data/flow-pairs")
     left, right = (
@@ -91,7 +91,7 @@ def test_parallax_of_a_real_stereo_pair() -> None:
     with np.load(folder / "motorcycle_disp.npz") as stored:
         disparity = stored[stored.files[0]]
     known = np.isfinite(disparity) & (disparity > 0)
-    # Displacement by a sideways step is inverse depth, so disparity itself stands for the relief
+    # The displacement by a sideways step is inverse to depth, so the disparity itself serves as the relief
     flow = SurfaceFlow(footprint(known, np.where(known, disparity, 0)), [0])
     found = flow.field(Aligner(flow, left, "texture").solve(right))
     assert (

@@ -1,4 +1,4 @@
-"""Which teeth of a capture are prepared, and which only stand in the way."""
+"""Which teeth of a capture are prepared, and which only hide or shadow them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def write_ball(path: Path, centre_mm: tuple[float, float, float]) -> None:
 
 @pytest.fixture
 def two_teeth(tmp_path: Path) -> Path:
-    """Tooth 21 stands half before tooth 11, nearer to the camera."""
+    """Two teeth; 21 is nearer to the camera and hides half of 11."""
     write_ball(tmp_path / "teeth" / "11" / "outer.ply", (0, 0, 0))
     write_ball(tmp_path / "teeth" / "21" / "outer.ply", (4, 0, -10))
     return tmp_path
@@ -38,19 +38,19 @@ def two_teeth(tmp_path: Path) -> Path:
 def test_the_tooth_that_is_named_is_seen_alone_behind_the_others(two_teeth: Path) -> None:
     both, one = read_subject(two_teeth, whole=False), read_subject(two_teeth, whole=False, fdi=11)
     assert [tooth.fdi for tooth in one.teeth] == [11]
-    seen = both.seen_by(CAMERA).mesh
-    np.testing.assert_array_equal(one.seen_by(CAMERA).mesh == 0, seen == 0)
-    # The other one hides a part of it, so that part is no tooth here.
+    seen = both.footprint_in(CAMERA).mesh
+    np.testing.assert_array_equal(one.footprint_in(CAMERA).mesh == 0, seen == 0)
+    # The other tooth hides a part of it; that part does not count as tooth.
     assert (seen == 1).sum() > 100
-    assert not ((one.seen_by(CAMERA).mesh >= 0) & (seen == 1)).any()
+    assert not ((one.footprint_in(CAMERA).mesh >= 0) & (seen == 1)).any()
 
 
 def test_others_and_gums_are_in_the_way(two_teeth: Path) -> None:
     write_ball(two_teeth / "gums.ply", (0, 6, 0))
     subject = read_subject(two_teeth, whole=False, fdi=11)
-    ways = [mesh.vertices_mm.mean(axis=0) for mesh in subject.in_the_way]
+    ways = [mesh.vertices_mm.mean(axis=0) for mesh in subject.occluders]
     np.testing.assert_allclose(ways, [(4, 0, -10), (0, 6, 0)], atol=1e-3)
-    assert len(read_mesh(two_teeth / "gums.ply").faces) == len(subject.in_the_way[1].faces)
+    assert len(read_mesh(two_teeth / "gums.ply").faces) == len(subject.occluders[1].faces)
 
 
 def test_a_tooth_that_is_not_there_is_refused(two_teeth: Path) -> None:

@@ -1,4 +1,6 @@
-"""An error's status is that of its kind or of the nearest kind above it, in whatever order the table lists them."""
+"""The HTTP status of an error is that of its class or of the nearest class above it, in whatever order the table lists
+them.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,7 @@ def test_the_order_of_the_table_does_not_matter(order: object, monkeypatch: pyte
     assert len(KINDS) > 50
     monkeypatch.setattr(problems, "_STATUS", dict(order(list(_STATUS.items()))))  # type: ignore[operator]
     for kind in KINDS:
-        # The tree has no kind with two parents, so the nearest one above is the first listed one on the way to the
-        # root.
+        # No class has two parents, so the nearest one above is the first listed one on the way to the root.
         above = kind
         while above not in _STATUS:
             (above,) = above.__bases__

@@ -1,4 +1,4 @@
-"""What a job's progress says in one line of text."""
+"""A job's progress as one line of text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``import dentine``: light, and each name leads to what it says."""
+"""``import dentine`` loads little, and each of its names leads to what it promises."""
 
 from __future__ import annotations
 

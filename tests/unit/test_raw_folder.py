@@ -1,4 +1,4 @@
-"""``raw.toml``: what is read, and the sentence for what cannot be."""
+"""``raw.toml``: what is read, and the sentence for what cannot be read."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_all_of_a_description_is_read(tmp_path: Path) -> None:
     assert [camera.full_counts for camera in folder.camera] == [4095.0, 4095.0]
     assert [frame.file for frame in folder.frames_of("right", "light")] == ["right_L1.npy", "right_L2.npy"]
     assert folder.frame[1].label == "camera left, light L1"
-    assert [frame.thing for frame in folder.frame[-4:]] == ["flat", "ball", "egg", "macbeth"]
+    assert [frame.target for frame in folder.frame[-4:]] == ["flat", "ball", "egg", "macbeth"]
     assert folder.landmark[0].pixels[0].xy_px == (3.5, 4.5)
     assert folder.scan is not None
     assert folder.frame[1].level == 0.5

@@ -1,4 +1,6 @@
-"""Counts of raw frames by the library of each format, written by another one where there is one."""
+"""Counts of raw frames, read with the library of each format; an independent library writes the files where there is
+one.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +33,7 @@ def write_exr(path: Path, values: Any) -> None:
 
 
 def write_dng(path: Path, values: Any, pattern: tuple[int, ...] = (0, 1, 1, 2)) -> None:
-    """A DNG by a writer that has nothing to do with the reader: Adobe's tags (DNG 1.4, chapter 4) in a TIFF by
-    tifffile.
-    """
+    """Writes a DNG independently of the reader: Adobe's tags (DNG 1.4, chapter 4) in a TIFF by tifffile."""
     one, zero = (1, 1), (0, 1)
     identity = (*one, *zero, *zero, *zero, *one, *zero, *zero, *zero, *one)
     tags = (
@@ -73,7 +73,7 @@ WRITERS: dict[str, tuple[str, Write]] = {
 
 
 def folder_with(root: Path, file: str, write: Write, values: Any, **camera: Any) -> Tree:
-    """A raw folder whose second frame is one file."""
+    """A raw folder whose second frame is this file."""
     tree = write_raw_folder(root)
     write(root / file, values)
     tree["frame"][1]["file"] = file

@@ -1,4 +1,6 @@
-"""What the frames of a camera tell is measured once a preparation, and taken from there by all of its blocks."""
+"""What is measured from the frames of a camera is measured once for each preparation, and then used by all of its
+blocks.
+"""
 
 from __future__ import annotations
 

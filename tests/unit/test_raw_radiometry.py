@@ -1,4 +1,4 @@
-"""Radiometry of raw frames against a sensor whose numbers are known."""
+"""Radiometry of raw frames of a sensor whose numbers are known."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RAMP = np.broadcast_to(np.linspace(100, 3300, SHAPE[1])[None, :, None], SHAPE)
 def signal(
     sensor: Sensor, seed: int, radiance: np.ndarray = RAMP, exposure_s: float = 1.0, gain: float = 1.0
 ) -> np.ndarray:
-    """Counts above black, NaN where full."""
+    """Counts above black, NaN where the sensor is full."""
     counts = sensor.counts(radiance, exposure_s, np.random.default_rng(seed), gain).astype(np.float32)
     return np.where(counts < sensor.full, counts - np.float32(sensor.black), np.nan).astype(np.float32)
 
@@ -34,8 +34,8 @@ def signal(
 def test_photon_transfer_finds_gain_and_read_noise_to_two_per_cent(
     read: float, per_electron: float, gain: float
 ) -> None:
-    """100,000 pixels a pair leave 0.45 % of a variance open, and four pairs half of that, so 2 % is nine standard
-    errors.
+    """A variance from 100,000 pixels in each pair is known to 0.45 %, from four pairs to half of that, so 2 % is nine
+    standard errors.
     """
     sensor = Sensor(read_counts=read, counts_per_electron=per_electron)
     dark = [signal(sensor, k, 0 * RAMP, gain=gain) for k in range(5)]
@@ -70,8 +70,8 @@ def exposure(sensor: Sensor, radiance: np.ndarray, exposure_s: float, seed: int)
 def test_merged_exposures_are_unbiased_and_as_uncertain_as_they_say() -> None:
     """100,000 pixels from near read noise to beyond full scale of the longest exposure.
 
-    In each of 20 levels of 5,000 pixels the mean lies within 5 of its standard errors of the truth (1e-5 false alarms
-    in all), and the scatter within 5 standard errors, 10 %, of the mean variance that is told.
+    In each of 20 levels of 5,000 pixels, the mean is within 5 standard errors of the truth (1e-5 false alarms in all),
+    and the scatter is within 5 standard errors, 10 %, of the mean stated variance.
     """
     sensor, radiance = Sensor(), np.broadcast_to(np.geomspace(2, 12_000, SHAPE[1])[None, :, None], SHAPE)
     exposures = [exposure(sensor, radiance, seconds, k) for k, seconds in enumerate((0.2, 1.0, 5.0))]
@@ -95,7 +95,7 @@ def test_what_is_full_in_every_exposure_is_lost() -> None:
 
 
 def test_a_bent_response_is_found_and_straightened() -> None:
-    """A sensor that loses 6 % at full scale; straightened exposures agree to 0.3 %, a twentieth of that."""
+    """The sensor loses 6 % at full scale; corrected exposures agree to 0.3 %, a twentieth of that."""
     sensor = Sensor(bend=-0.06, black=0.0)
     ladder = [signal(sensor, k, RAMP, seconds) for k, seconds in enumerate((0.125, 0.25, 0.5, 1.0))]
     series = [Series(a, b, 2.0) for a, b in pairwise(ladder)]
@@ -117,17 +117,18 @@ def test_a_linear_camera_is_left_as_it_is() -> None:
 
 @pytest.mark.parametrize("mosaic", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_demosaicing_keeps_what_is_linear_in_place(mosaic: str) -> None:
-    """The filters are exact where every channel is a plane, whatever its level, away from the border."""
+    """Away from the border the filters are exact where every channel is a plane, whatever its level."""
     y, x = np.mgrid[0:20, 0:30].astype(float)
     image = np.stack([50 + x, 200 + 2 * y, 100 + x - y], axis=-1)
     found = demosaic(taken_through(image, mosaic).astype(np.float32), mosaic)
-    # Scaling the channels to one mean leaves their slopes unequal, which the filters' second differences do not see.
+    # Scaled to the same mean, the channels still have unequal slopes, to which the filters' second differences are
+    # blind.
     np.testing.assert_allclose(found[4:-4, 4:-4], image[4:-4, 4:-4], rtol=2e-5)
 
 
 def test_sums_over_a_demosaiced_image_have_the_error_that_they_say() -> None:
-    """400 draws of noise: the variance of a sum over 40 x 40 pixels is known to 7 %, so a ratio within 0.75 to 1.3 is 4
-    standard errors.
+    """With 400 draws of noise the variance of a sum over 40 x 40 pixels is known to 7 %, so a ratio from 0.75 to 1.3 is
+    within 4 standard errors.
     """
     rng, variance = np.random.default_rng(4), np.full((60, 60), 9.0, dtype=np.float32)
     told = demosaic_variance(variance, "GRBG")[10:50, 10:50].sum(axis=(0, 1))
@@ -145,9 +146,9 @@ def camera(**more: object) -> CalibratedCamera:
 
 
 def test_one_resampling_takes_distortion_and_fall_of_light_out() -> None:
-    """A scene that is known at every direction is drawn through the lens by OpenCV's own projection, and comes back.
+    """A scene known in every direction is drawn through the lens with OpenCV's own projection, and recovered.
 
-    Linear interpolation of a wave of 40 pixels leaves its curvature times 1/8: 0.3 % of the wave.
+    Linear interpolation of a wave of 40 pixels has an error of its curvature times 1/8: 0.3 % of the wave.
     """
     import cv2
 
@@ -163,20 +164,20 @@ def test_one_resampling_takes_distortion_and_fall_of_light_out() -> None:
     pinhole = cv2.undistortPoints(np.stack([x, y], axis=-1).reshape(-1, 1, 2), K, np.array(distortion), None, None, K)
     pinhole = np.asarray(pinhole).reshape(120, 160, 2)
     q = ((x - K[0, 2]) ** 2 + (y - K[1, 2]) ** 2) / (80**2 + 60**2)
-    fall = 1 + vignetting[0] * q + vignetting[1] * q**2
-    photograph = (scene(pinhole[..., 0], pinhole[..., 1]) * fall).astype(np.float32)
+    relative_brightness = 1 + vignetting[0] * q + vignetting[1] * q**2
+    photograph = (scene(pinhole[..., 0], pinhole[..., 1]) * relative_brightness).astype(np.float32)
 
     # A window of the image, and a subject that has moved by 3 and -2 pixels in it
     window, moved = Window(20, 100, 30, 130), np.array([3.0, -2.0], dtype=np.float32)
     lens = Lens(lens_camera, lens_camera.vignetting or (0.0, 0.0, 0.0))
     sampler = Sampler(lens, window)
     own_y, own_x = np.mgrid[5:75, 5:95].astype(np.float32)
-    places = sampler.places(np.stack([own_x, own_y]) + moved[:, None, None])
-    dimmed = lens.fall(places[0], places[1])
+    positions = sampler.positions(np.stack([own_x, own_y]) + moved[:, None, None])
+    dimmed = lens.relative_brightness(positions[0], positions[1])
     assert dimmed is not None
-    found = sampler.sampled(photograph[sampler.region.rows, sampler.region.columns, None], places)[..., 0] / dimmed
+    found = sampler.sampled(photograph[sampler.region.rows, sampler.region.columns, None], positions)[..., 0] / dimmed
     np.testing.assert_allclose(found, scene(own_x + 30.5 + 3, own_y + 20.5 - 2), atol=0.35)
-    assert not sampler.beyond(places).any()
+    assert not sampler.beyond(positions).any()
     assert sampler.beyond(np.full((2, 1, 1), -1, dtype=np.float32)).all()
 
 
@@ -186,6 +187,6 @@ def test_the_fall_of_light_is_fitted_to_a_flat_frame() -> None:
     q = ((x - 83.0) ** 2 + (y - 58.0) ** 2) / (80**2 + 60**2)
     flat = (1000 * (1 + told[0] * q + told[1] * q**2 + told[2] * q**3))[..., None].astype(np.float32)
     a, b, c = fitted_vignetting(camera(), flat)
-    fall = 1 + q * (a + q * (b + q * c))
-    # Single precision and eighth pixels: the curve, not its coefficients, is what is known.
-    np.testing.assert_allclose(fall, flat[..., 0] / 1000, rtol=1e-4)
+    relative_brightness = 1 + q * (a + q * (b + q * c))
+    # Single precision and every eighth pixel: the curve is determined, its coefficients are not.
+    np.testing.assert_allclose(relative_brightness, flat[..., 0] / 1000, rtol=1e-4)

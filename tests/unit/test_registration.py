@@ -1,4 +1,4 @@
-"""Where a scan stands in the rig: derivatives, landmarks with wrong clicks, outlines of known shapes, a phantom and a
+"""Where a scan is in the rig: derivatives, landmarks with wrong clicks, outlines of known shapes, a phantom and a
 patient.
 """
 
@@ -75,9 +75,9 @@ def test_landmarks_give_the_pose_and_honest_errors() -> None:
         np.testing.assert_allclose(exact.pose.matrix, truth.matrix, atol=1e-6)
         found = pose_from_landmarks(CAMERAS, drawn_clicks(rng, truth, CLICK_MM), CENTRE)
         twist = found.pose.twist_to(truth, found.pose.apply(CENTRE[None])[0])
-        # Whitened, as errors of a turn and a move go together.
+        # Whitened, as errors of rotation and shift are correlated.
         scores.append(np.linalg.solve(np.linalg.cholesky(found.covariance), twist))
-    # 72 values; the range that such a number allows by chance (0.7 to 1.35 from 32 on).
+    # 72 values; this is the range by chance (0.7 to 1.35 holds from 32 values on).
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.35
 
 
@@ -99,7 +99,7 @@ def test_wrong_clicks_are_left_out_and_named() -> None:
 def test_exchanged_landmarks_are_refused() -> None:
     rng = np.random.default_rng(9)
     clicks = drawn_clicks(rng, drawn_pose(rng), 0.1)
-    # Tooth for tooth: each landmark has the pixels of the one two places further.
+    # Clicks of other teeth: each landmark has the pixels of the one two places further.
     points = np.roll([one.point_mm for one in clicks][::3], 2, axis=0)
     shifted = [Click(one.name, one.camera, points[k // 3], one.pixel) for k, one in enumerate(clicks)]
     with pytest.raises(
@@ -138,18 +138,18 @@ def test_a_spheres_outline_is_where_geometry_has_it() -> None:
 def test_outlines_bring_a_phantom_within_the_target() -> None:
     mouth = photographed_mouth(None, 1)
     start = pose_from_landmarks(mouth.cameras, clicks_on(mouth, np.random.default_rng(1)), mouth.centre_mm)
-    # A camera that sees no tooth at all changes nothing and is told.
+    # A camera that sees no tooth changes nothing and is reported.
     views = (*mouth.views, turned_away(mouth.views[0]))
     found = pose_from_outlines(views, mouth.teeth, [mouth.gums], start, mouth.centre_mm)
     assert found.left_out[-1] == "camera away, which sees no tooth at this pose"
     assert set(found.residual_px) == set(mouth.cameras)
     centre = mouth.rig_from_scan.apply(mouth.centre_mm[None])[0]
     twist = found.pose.twist_to(mouth.rig_from_scan, centre)
-    # The target of the design: 0.2 mm alone cost 3 to 5 % of an image.
+    # The target of the design: an error of 0.2 mm alone would change an image by 3 to 5 %.
     assert np.linalg.norm(twist[3:]) < 0.05
     assert np.degrees(np.linalg.norm(twist[:3])) < 0.1
     assert (np.sqrt(np.diag(found.covariance))[3:] < 0.05).all()
-    # From clicks alone it is not reached.
+    # Clicks alone do not reach it.
     assert np.linalg.norm(start.pose.twist_to(mouth.rig_from_scan, centre)[3:]) > 0.05
 
 
@@ -166,7 +166,7 @@ def test_a_tooth_is_told_from_gums_by_any_number_of_channels(channels: int) -> N
     colour = np.where(tooth[..., None], np.linspace(0.8, 0.6, channels), np.linspace(0.5, 0.2, channels))
     image = (colour * (1 + rng.normal(0, 0.02, colour.shape))).astype(np.float32)
     likeness = learn_appearance(image, tooth).likeness
-    # Colours 15 standard deviations of the noise apart; pixels beside the outline are smoothed over it.
+    # The colours differ by 15 standard deviations of the noise; pixels beside the outline are smoothed across it.
     assert likeness[25:55, 30:60].min() > 0.9
     assert likeness[:15].max() < 0.1
 

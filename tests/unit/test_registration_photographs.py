@@ -1,4 +1,4 @@
-"""Clicks lie where photographs show them, also where those were made smaller or come from a mosaic."""
+"""Clicks are at the right place in the photographs, also where these were reduced or come from a mosaic."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SPOT_PX = (61.3, 23.8)
 
 
 def write_spot(root: Path, mosaic: str) -> Calibration:
-    """One camera whose photograph is dark but for a round spot on which a landmark was clicked."""
+    """One camera whose photograph is dark except for a round spot, on which a landmark was clicked."""
     y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
     spot = 64 + 3000 * np.exp(-((x - SPOT_PX[0]) ** 2 + (y - SPOT_PX[1]) ** 2) / (2 * 4.0**2))
     counts = spot if mosaic != "none" else np.repeat(spot[..., None], 3, axis=2)
@@ -62,8 +62,8 @@ def test_a_click_is_where_its_photograph_shows_it(
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]] + 0.5
     weight = np.where(image > 0.02 * image.max(), image, 0)
     seen = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
-    # The colours of a mosaic lie up to half a pixel beside each other, which its mean halves; a pixel cut off at 2 %
-    # adds hundredths.
+    # The colours of a mosaic are up to half a pixel apart, which the mean halves; a pixel cut off at 2 % adds
+    # hundredths.
     np.testing.assert_allclose(click.pixel, seen, atol=0.1)
     (one,) = (camera for camera in calibration.cameras)
     assert views["c0"].camera.K[0][0] == pytest.approx(one.K[0][0] * image.shape[1] / SIZE[0])

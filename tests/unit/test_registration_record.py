@@ -1,4 +1,4 @@
-"""The ± of a registered pose goes to those who use its teeth, beside the calibration's own."""
+"""The ± of a registered pose is passed on to all who use its teeth, together with the calibration's own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jobs in the database, SQLite and Postgres alike: leases, fencing, deletion, and what an older version stored."""
+"""Jobs in the database, with SQLite and with Postgres: leases, fencing, deletion, and what an older version stored."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from services.api.webhooks import tables as webhook_tables
 from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import FencedError, SettingsError
 from services.core.records import JobSpec
-from services.pipeline.database import Query, metadata, open_database, patiently, sqlite_url, writing
+from services.pipeline.database import Query, metadata, open_database, retry_while_lost, sqlite_url, writing
 from services.pipeline.event_log import event_table
 from tests.support.postgres import PostgresServer, new_database, postgres_server
 
@@ -97,7 +97,7 @@ def test_what_is_not_renewed_is_lost_and_its_holder_has_no_say_any_more(reposito
     clock.now_s += 50
     assert repository.lose_expired() == []
     clock.now_s += 20
-    assert repository.lose_expired([old]) == []  # the holder itself knows better than a clock
+    assert repository.lose_expired([old]) == []  # a runner that names its lease still holds it, whatever the clock says
     assert repository.lose_expired() == [job.id]
     new = repository.lease(job.id, "b", 60)
     assert not repository.renew(old, 60)
@@ -117,13 +117,13 @@ def test_a_lease_from_before_the_clock_stepped_back_is_not_waited_for(repository
     clock.now_s -= 3600
     assert repository.lose_expired(length_s=60) == [job.id]
     repository.lease(job.id, "alive", 60)
-    clock.now_s -= 59  # no more than servers may differ by
+    clock.now_s -= 59  # as much as clocks of servers may differ
     assert repository.lose_expired(length_s=60) == []
 
 
 def test_a_server_that_stopped_working_on_a_job_loses_it_like_any_other(repository: Repository, clock: Clock) -> None:
-    # What it holds is told by the lease it works under now, not by its name: a runner that broke off must not keep its
-    # job for ever.
+    # The lease that the runner works under now decides what it holds, not its name: a runner that stopped half way must
+    # not keep its job for ever.
     broken, current = (repository.lease(repository.create(SPEC, None).job.id, "a", 60) for _ in range(2))
     clock.now_s += 70
     assert repository.lose_expired([current]) == [broken.job.id]
@@ -204,7 +204,7 @@ def test_a_filter_may_name_its_states_any_number_of_times(repository: Repository
 
 
 def test_events_become_visible_in_the_order_of_their_ids(opened: Callable[[], Repository]) -> None:
-    # A reader that asks for what is newer than the last id it saw must miss none, however many write.
+    # A reader that asks for events newer than the last id it saw must miss none, however many write.
     repositories = [opened() for _ in range(4)]
     seen: list[int] = []
     done = threading.Event()
@@ -297,11 +297,11 @@ def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(
         tries.append(1)
         with writing(silent) as connection:
             if len(tries) == 1:
-                with writing(other):  # not before the server has ended the silent one's transaction
+                with writing(other):  # possible only after the server has ended the silent transaction
                     pass
             return int(connection.scalar(sql.select(1)) or 0)
 
-    assert patiently(write) == 1
+    assert retry_while_lost(write) == 1
     assert len(tries) == 2
     for engine in (silent, other):
         engine.dispose()
@@ -310,7 +310,7 @@ def test_a_client_that_falls_silent_in_a_transaction_keeps_no_lock(
 def test_writers_of_one_process_take_turns_before_they_ask_sqlite(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.pipeline.database.BUSY_MS", 0)  # so that whoever asks out of turn is refused at once
+    monkeypatch.setattr("services.pipeline.database.BUSY_MS", 0)  # a writer that is not first is refused at once
     engine = open_database(sqlite_url(tmp_path / "jobs.sqlite"))
     upgrade(engine)
     written: list[bool] = []

@@ -1,4 +1,4 @@
-"""Scans of every format, with labels beside them, in other units, damaged, and with whole roots."""
+"""Scans in every format: with labels beside them, in other units, damaged, and with whole roots."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import trimesh
 
 from services.anatomy.scans.scan import LabelledScan, read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
-from services.anatomy.scans.units import LIKELY, MM_PER_UNIT, Unit, neighbour_ratio
+from services.anatomy.scans.units import MM_PER_UNIT, PLAUSIBLE_RATIO, Unit, neighbour_ratio
 from services.anatomy.templates.dimensions import root_length_mm
 from services.core.errors import CaptureInputError, MeshError
 from services.core.files import scans
@@ -30,7 +30,7 @@ def exported(path: Path, mesh: Mesh = SCAN.mesh) -> Path:
 
 
 def vertex_labels() -> np.ndarray:
-    # A vertex is of a tooth where any of its triangles is, so the border may move by a triangle.
+    # A vertex belongs to a tooth if any of its triangles does, so the border may move by a triangle.
     labels = np.zeros(len(SCAN.mesh.vertices_mm), dtype=np.int64)
     for tooth in SCAN.teeth:
         labels[SCAN.mesh.faces[SCAN.fdi == tooth]] = tooth
@@ -43,7 +43,7 @@ def test_a_label_a_triangle_may_lie_in_a_file_beside_the_scan(tmp_path: Path, su
     np.savetxt(tmp_path / "labels.txt", SCAN.fdi, fmt="%d")
     scan = read_scan(path, "fdi", "labels.txt")
     np.testing.assert_array_equal(scan.fdi, SCAN.fdi)
-    # trimesh's own welding is the other count of vertices.
+    # trimesh merges vertices independently and must count as many.
     assert len(scan.mesh.vertices_mm) == len(trimesh.load_mesh(path).vertices) == len(SCAN.mesh.vertices_mm)
     assert scan.doubled_vertices == (3 * len(SCAN.fdi) - len(SCAN.mesh.vertices_mm) if suffix == "stl" else 0)
     corners = scan.mesh.vertices_mm[scan.mesh.faces]
@@ -155,9 +155,9 @@ def test_a_real_arch_is_in_millimetres_and_trimesh_counts_its_points_alike(tmp_p
     middles = [scan.mesh.vertices_mm[scan.mesh.faces[scan.fdi == n]].mean(axis=(0, 1)) for n in scan.teeth]
     ratio = neighbour_ratio(scan.teeth, np.array(middles))
     assert ratio is not None
-    assert LIKELY[0] < ratio < LIKELY[1]
+    assert PLAUSIBLE_RATIO[0] < ratio < PLAUSIBLE_RATIO[1]
     np.save(tmp_path / "labels.npy", scan.fdi)
     again = read_scan(exported(tmp_path / "scan.stl", scan.mesh), "either", "labels.npy")
-    # The data's own description, and trimesh's welding, count as many.
+    # The description of the data, and trimesh's merging, give the same number.
     assert len(again.mesh.vertices_mm) == len(trimesh.load_mesh(tmp_path / "scan.stl").vertices) == 50_643
     np.testing.assert_array_equal(again.fdi, scan.fdi)

@@ -1,4 +1,4 @@
-"""Which S3 stores a server lets jobs name, and that a deleted job leaves nothing there."""
+"""Which S3 stores a server lets jobs name; a deleted job leaves nothing in them."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_setting_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_deleted_is_gone_there_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was published, and what an attempt has left; while the server does not answer nothing is forgotten."""
+    """Published results and remains of an attempt are deleted; while the store does not answer, they stay noted."""
     (tmp_path / "capture").mkdir()
     write_folder(tmp_path / "capture")
 

@@ -1,4 +1,4 @@
-"""What a cell's images can tell at best."""
+"""The smallest error that a cell's images allow."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def bounds() -> dict[float, Bound]:
 def test_noise_that_is_ten_times_as_large_tells_less_but_not_less_than_the_prior(bounds: dict[float, Bound]) -> None:
     slope = slopes(MATERIAL)["sigma_s_reduced"]
     small, large = (bounds[noise].of(slope) for noise in (0.01, 0.1))
-    # A bound grows at most with the noise, and less where a prior helps.
+    # A bound grows at most in proportion to the noise, and less where a prior helps.
     assert 3 * small < large < 10.5 * small
 
 
@@ -29,7 +29,7 @@ def test_what_the_prior_moves_belongs_to_the_bound(bounds: dict[float, Bound]) -
     bound = bounds[0.01]
     slope = slopes(MATERIAL)["g"]
     assert bound.of(slope) == pytest.approx(np.hypot(bound.uncertainty.standard_error(slope), slope @ bound.bias))
-    # Logarithms of HG bend at the forward peak, which a smoothness prior flattens.
+    # The logarithm of HG bends at the forward peak, which a smoothness prior flattens.
     assert (np.exp(bound.bias[:1]) < 1).all()
 
 
@@ -42,5 +42,5 @@ def test_variance_beside_the_shot_noise_widens_the_bound(bounds: dict[float, Bou
 
 def test_the_phase_functions_bound_is_smallest_where_cameras_look(bounds: dict[float, Bound]) -> None:
     share = bounds[0.01].of_phase(MATERIAL) / MATERIAL.phase_per_sr
-    # Cameras and beams of the small cell differ by about 2, 10, 150 and 170 degrees in the medium; none looks across.
+    # In the small cell's medium, cameras are at angles of about 2, 10, 150 and 170 degrees to beams; none looks across.
     assert share[5:15].max() < share[90:110].min()

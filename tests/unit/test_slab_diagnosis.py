@@ -1,6 +1,4 @@
-"""What is said of a cell's images before a fit: each fault is told with its number and remedy, and good images say
-nothing.
-"""
+"""Faults that are reported in a cell's images before a fit: each with its number and remedy; good images give none."""
 
 from __future__ import annotations
 

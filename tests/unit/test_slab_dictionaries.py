@@ -1,4 +1,4 @@
-"""Dictionaries of a slab's fit: their phase functions, derivatives by their weights, what they give back, and what is
+"""Dictionaries for a slab's fit: phase functions, derivatives by the weights, known mixtures found again, and what is
 refused.
 """
 
@@ -30,8 +30,8 @@ from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
 from services.fit.slab.model.single import single_scattering
 from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.kept import fingerprint
 from services.fit.slab.results.result import SlabFit
+from services.fit.slab.results.stored import fingerprint
 from services.fit.slab.solve.mixture import Mixture, Mixtures, unit_atoms
 from services.fit.slab.solve.normal import derivative_rows
 from services.fit.slab.solve.weights import smoothed_variance
@@ -65,7 +65,7 @@ def dictionary_named(name: str, root: Path) -> tuple[ChosenDictionary, Mixtures]
 
 
 def write_truth(root: Path, material: Mixture) -> Path:
-    """A cell of a material, 1 % noise; variances hold the walk's own noise too."""
+    """A cell with this material and 1 % noise; the variances include the walk's own noise."""
     told, noise = description(), np.random.default_rng(5)
     told["images"] = [image | {"variance_file": f"var_{image['file']}"} for image in told["images"]]
     folder = SlabFolder.model_validate(told)
@@ -77,7 +77,7 @@ def write_truth(root: Path, material: Mixture) -> Path:
         whole, of_whole = (mirrored(one.reshape(rig.grid.rows, rig.grid.columns)) for one in (image, variance))
         shot = 0.01**2 * whole * whole.mean()
         np.save(root / entry.file, whole + np.sqrt(shot) * noise.normal(size=whole.shape))
-        # Both halves have the walk's noise in common, and are taken for independent.
+        # Both halves share the walk's noise, but are treated as independent.
         np.save(root / str(entry.variance_file), shot + 2 * of_whole)
     return root
 
@@ -96,7 +96,7 @@ def test_every_dictionary_is_made_of_phase_functions(tmp_path: Path) -> None:
 
 
 def test_spheres_scatter_as_the_reference_says() -> None:
-    # Printed to 5e-5. A mean cosine by tents of 0.9 degrees is off by up to 1e-3 where the peak is 10 degrees wide.
+    # Printed to 5e-5. A mean cosine from tents of 0.9 degrees is off by up to 1e-3 where the peak is 10 degrees wide.
     with shared_path("reference/mie_dispersions.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for row in rows:
@@ -123,7 +123,8 @@ def test_small_spheres_scatter_as_rayleigh_said() -> None:
 
 @pytest.mark.parametrize("name", ["hg", "mie", "table"])
 def test_derivatives_by_weights_agree_with_differences(name: str, tmp_path: Path) -> None:
-    # Order one is by quadrature, so that differences are exact but for their own third order, 1e-6 of 2e-3 squared.
+    # Single scattering is computed by quadrature, so differences are exact except for their third order, 1e-6 of 2e-3
+    # squared.
     _, mix = dictionary_named(name, write_table(tmp_path))
     rig, rng = small_rig(), np.random.default_rng(3)
     x = np.append(rng.random(mix.atoms.shape[1]) / mix.atoms.shape[1], 0.1)
@@ -136,8 +137,8 @@ def test_derivatives_by_weights_agree_with_differences(name: str, tmp_path: Path
 
 
 def test_derivatives_of_all_orders_by_weights_agree_with_differences() -> None:
-    # Of all light that the cameras see, within 5 standard errors: 6e-7 by chance. The same streams on both sides of a
-    # difference leave little of their noise.
+    # For all light that the cameras see, within 5 standard errors: 6e-7 by chance. The same random streams on both
+    # sides of a difference cancel most of their noise.
     mix, rig = Mixtures(unit_atoms(np.stack([hg_values(g) for g in (-0.3, 0.8)], axis=1))), small_rig()
     x, step = np.array([0.5, 1.5, 0.1]), 0.05
 
@@ -160,7 +161,7 @@ Fitted = Callable[[str, dict[int, float], float], tuple[SlabFit, Mixture, Chosen
 
 @pytest.fixture
 def fitted(tmp_path: Path) -> Fitted:
-    """Fits a cell whose material is a mix of a dictionary's own atoms."""
+    """Fits a cell whose material is a mixture of the dictionary's own atoms."""
 
     def fit(name: str, parts: dict[int, float], effort: float) -> tuple[SlabFit, Mixture, ChosenDictionary]:
         dictionary, mix = dictionary_named(name, write_table(tmp_path))
@@ -175,7 +176,7 @@ def fitted(tmp_path: Path) -> Fitted:
 
 @pytest.mark.parametrize(
     ("name", "parts", "effort"),
-    # Light from the largest spheres is hardly told from what was not scattered, which takes more paths.
+    # Light from the largest spheres is hard to separate from light that was not scattered, which needs more paths.
     [("hg", {4: 0.3, 10: 0.9}, 0.02), ("mie", {45: 1.2}, 0.1), ("table", {0: 0.2, 1: 0.4, 2: 0.6}, 0.02)],
 )
 def test_a_mix_of_a_dictionary_is_found(
@@ -187,7 +188,7 @@ def test_a_mix_of_a_dictionary_is_found(
 ) -> None:
     found, truth, dictionary = fitted(name, parts, effort)
     told, sigma_s, g = found.parameters, truth.scattering_per_mm, truth.mean_cosine
-    # Within 4.5 of the stated standard errors, which themselves are at most 10 % of the values.
+    # Within 4.5 of the stated standard errors, which are at most 10 % of the values.
     for got, true in ((told.sigma_s, sigma_s), (told.sigma_s_reduced, sigma_s * (1 - g))):
         assert abs(got.value - true) <= 4.5 * got.se
         assert got.se <= 0.1 * true
@@ -199,7 +200,7 @@ def test_a_mix_of_a_dictionary_is_found(
         assert abs(got.value - parts.get(k, 0.0)) <= 4.5 * got.se
     assert not any("nearest mix" in note for note in found.notes)
 
-    # All of it can be read as any other estimate.
+    # All of these can be read like any other estimate.
     write_results((found,), tmp_path)
     written = json.loads((tmp_path / "parameters.json").read_text())["532"]
     assert {f"atoms.{atom}" for atom in dictionary.names} <= written.keys()

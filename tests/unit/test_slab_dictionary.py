@@ -1,4 +1,4 @@
-"""The dictionary's numbers, mixtures, and the faces of a cell."""
+"""The dictionary's numbers, its mixtures, and the faces of a cell."""
 
 from __future__ import annotations
 
@@ -47,7 +47,8 @@ def test_hg_keeps_its_numbers() -> None:
     material = henyey_greenstein(1.5, 0.8, 0.1)
     assert material.scattering_per_mm == pytest.approx(1.5)
     assert material.extinction_per_mm == pytest.approx(1.6)
-    # Straight lines between knots, convex beside the peak, add a little light there.
+    # Straight lines between knots are above the curve where it is convex, beside the peak, and add a little light
+    # there.
     assert material.mean_cosine == pytest.approx(0.8, abs=2e-4)
     with pytest.raises(ValueError, match="exceeds the dictionary"):
         Material(material.scattering * 200, 0).weights()

@@ -1,4 +1,6 @@
-"""Derivatives of earlier renders in a slab's normal equations, on images and derivatives whose noise is known."""
+"""Reusing derivatives of earlier renders in a slab's normal equations, with images and derivatives whose noise is
+known.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,16 @@ from services.fit.slab.solve.weights import independent_weights
 MATERIAL = henyey_greenstein(5.0, 0.5, 0.1)
 IMAGES, PIXELS, COUNT = 2, 20, 6
 SEEN = 3
-"""Unknowns that the images tell of; derivatives by all others are zero."""
+"""Unknowns that the images depend on; derivatives by all others are zero."""
 NOISE_OF_DERIVATIVES = 8.0
-"""Of a batch, where the derivatives themselves are about one: their mean over a render is three times noise."""
+"""Noise of the derivatives in one batch. The derivatives are about one; noise of the mean over a render is three times
+that."""
 KEPT = 5 * COUNT
 DRAWS, FEW_DRAWS = 100, 25
 
 SIGNAL = np.random.default_rng(1).standard_normal((IMAGES, PIXELS, SEEN))
 RESIDUAL = SIGNAL @ np.array([0.3, -0.2, 0.5]) + np.random.default_rng(2).standard_normal((IMAGES, PIXELS))
-"""Of images without the paths' noise: what is left of the way, and a measurement's noise of one."""
+"""Residuals of images without noise of the paths: the distance still to go, and measurement noise of one."""
 NO_SINGLE = np.zeros((IMAGES, PIXELS)), np.zeros((IMAGES, PIXELS, UNKNOWNS))
 
 
@@ -42,7 +45,7 @@ def equations(
 ) -> NormalEquations:
     images = RESIDUAL + rng.standard_normal((COUNT, IMAGES, PIXELS))
     weights = independent_weights(np.ones((IMAGES, PIXELS)), np.zeros((IMAGES, PIXELS)))
-    # With ways of zero, sums of shares are the derivatives themselves.
+    # Where path lengths are zero, sums of shares are the derivatives themselves.
     return normal_equations(
         Batches(images, noisy_rows(rng, COUNT), *NO_SINGLE),
         MATERIAL,
@@ -54,7 +57,7 @@ def equations(
 
 
 def sums(rows: np.ndarray) -> DerivativeSums:
-    """Of batches (B, images, pixels, UNKNOWNS), by weights of one."""
+    """Derivative sums of batches (B, images, pixels, UNKNOWNS), with weights of one."""
     flat = rows.reshape(len(rows), IMAGES * PIXELS, UNKNOWNS)
     parts = flat[: len(rows) // 2], flat[len(rows) // 2 :]
     own = np.stack([np.einsum("bnu,bnv->uv", part[..., :SEEN], part[..., :SEEN]) for part in parts])
@@ -64,7 +67,12 @@ def sums(rows: np.ndarray) -> DerivativeSums:
 
 
 def drawn(*, anew: bool, kept: bool = True) -> list[NormalEquations]:
-    """Many times; with earlier derivatives that are drawn anew each time, or the same."""
+    """Many draws of the normal equations.
+
+    Args:
+        anew: draw the earlier derivatives anew each time instead of using the same ones.
+        kept: use earlier derivatives at all.
+    """
     rng = np.random.default_rng(7)
     same = sums(noisy_rows(rng, KEPT))
     found = []
@@ -89,9 +97,9 @@ def test_the_gradients_noise_is_what_it_is_said_to_be() -> None:
     found = drawn(anew=False)
     spread = np.std([one.gradient[:SEEN] for one in found], axis=0)
     told = np.sqrt(np.mean([np.diag(one.gradient_noise)[:SEEN] for one in found], axis=0))
-    # A spread of 100 draws is known to 7 %, and terms of pairs, which the estimate leaves out, add a few per cent.
+    # The spread of 100 draws is known to 7 %; terms of pairs, which the estimate omits, add a few per cent.
     np.testing.assert_allclose(told, spread, rtol=0.3)
-    # The derivatives' noise in earlier renders meets the measurements' the same way in all batches.
+    # Noise of the earlier derivatives combines with the measurements' noise in the same way in all batches.
     pooled = noisy_rows(np.random.default_rng(7), KEPT).sum(axis=0)[..., :SEEN] / (KEPT + COUNT) + SIGNAL * COUNT / (
         KEPT + COUNT
     )
@@ -104,8 +112,8 @@ def test_earlier_derivatives_lower_the_noise_of_the_gradient() -> None:
     with_them, without = (
         np.std([one.gradient[:SEEN] for one in drawn(anew=True, kept=kept)], axis=0) for kept in (True, False)
     )
-    # Noise of J is nine times its square and falls by KEPT / COUNT + 1 = 6; the images' own noise meets the signal as
-    # before.
+    # The squared noise of J is nine times the square of J and falls by KEPT / COUNT + 1 = 6; noise of the images
+    # combines with the signal as before.
     assert (with_them < 0.6 * without).all()
 
 
@@ -116,7 +124,8 @@ def test_the_matrix_is_as_if_all_batches_were_of_one_render() -> None:
     found = equations(np.random.default_rng(6), sums(kept))
     later.standard_normal((COUNT, IMAGES, PIXELS))
     every = np.concatenate([kept, noisy_rows(later, COUNT)]).reshape(KEPT + COUNT, -1, UNKNOWNS)[..., :SEEN]
-    # The same sum over pairs of different batches, one pair at a time; and noise is the spread of single batches.
+    # The same sum, computed over pairs of different batches one pair at a time; the noise is the spread of single
+    # batches.
     total, count = every.sum(axis=0), len(every)
     pairs = sum(one.T @ (total - one) for one in every) / (count * (count - 1))
     np.testing.assert_allclose(found.matrix[:SEEN, :SEEN], pairs, rtol=1e-9)
@@ -144,8 +153,8 @@ def test_residuals_of_renders_before_join_without_bias_and_with_less_noise() -> 
     true = np.einsum("ipu,ip->u", SIGNAL, RESIDUAL)
     joined, single = (np.stack([one.gradient[:SEEN] for one in each]) for each in (found, alone))
     assert np.abs((joined.mean(axis=0) - true) / (joined.std(axis=0) / np.sqrt(FEW_DRAWS))).max() < 4
-    # Twice the batches halve the variance, or more where products of two noises matter; three of 25 draws are known to
-    # 20 %.
+    # Twice as many batches halve the variance, or do more where products of two kinds of noise matter; three of 25
+    # draws are known to 20 %.
     assert joined.var(axis=0).sum() < 0.75 * single.var(axis=0).sum()
 
 

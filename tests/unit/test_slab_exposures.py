@@ -1,6 +1,4 @@
-"""Stacks of exposures in a slab's folder, by a camera whose numbers are known: what is read of them, and what is
-refused.
-"""
+"""Stacks of exposures in a slab folder, from a camera whose numbers are known: what is read, and what is refused."""
 
 from __future__ import annotations
 
@@ -19,13 +17,13 @@ from services.core.slab.folder import read_folder
 from services.fit.slab.images import read_images
 from services.fit.slab.model.rig import rig_of
 from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.kept import fingerprint
+from services.fit.slab.results.stored import fingerprint
 from tests.support.raw_sensor import Sensor
 from tests.support.small_slab import WAVELENGTH_NM, description
 
 EDGE = 48
 POWER = 250.0
-"""What the camera would count of the whole beam: exposures are divided by it."""
+"""Counts per s that the whole beam would give; exposures are divided by it."""
 TIMES_S = (0.05, 0.4, 3.2)
 SENSOR = Sensor()
 """12 bits; full at 4095 counts, with 64 of black."""
@@ -33,15 +31,15 @@ EXPOSURE = {"exposure_s": 1.0, "bits": 12}
 
 
 def radiance() -> np.ndarray:
-    """From 2 to 20,000 counts per s above black, so that the longest exposure is full near the middle and the shortest
-    dark beside it.
+    """From 2 to 20,000 counts per s above black: the longest exposure is full near the middle, and the shortest is dark
+    away from it.
     """
     x, y = np.meshgrid(*2 * [np.linspace(-4, 4, EDGE)])
     return np.asarray(2 + 20_000 * np.exp(-2 * np.hypot(x, y)))
 
 
 def write_stack(root: Path, *, blacks: int = 4, change: Callable[[dict[str, Any]], object] = lambda _: None) -> Path:
-    """A folder of two cameras and two lights in three exposures, and black frames."""
+    """Writes a folder of two cameras and two lights in three exposures, with black frames."""
     told, rng, noise = description(), np.random.default_rng(3), radiance()[..., None]
     told["pixels"] |= {"columns": EDGE, "rows": EDGE}
     told["beam"]["power"] = POWER
@@ -68,11 +66,12 @@ def test_exposures_become_one_image_with_the_noise_that_it_has(tmp_path: Path) -
     assert measured.names == ("f0 under l0", "b0 under l0", "f0 under l1", "b0 under l1")
     true = radiance()[EDGE // 2 :].ravel() / POWER  # symmetric in y, as the fold expects
     z = (measured.values - true) / np.sqrt(measured.variances)
-    # 4,608 values: the rms of as many normal ones is 1 within 0.011, and the measured noise model is known to 2 %.
+    # 4,608 values: the rms of as many normally distributed ones is 1 within 0.011; the measured noise model is known to
+    # 2 %.
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=0.05)
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
-    # The brightest pixels are seen by the shortest exposure alone, the dark ones by the longest better than by it: 64
-    # times the light.
+    # Only the shortest exposure shows the brightest pixels; the longest, with 64 times the light, shows the dark ones
+    # better.
     dark = true * POWER < 5
     alone = np.sqrt((2.0**2 + 0.5 * true * POWER * TIMES_S[0]) / 2) / TIMES_S[0] / POWER
     assert (np.sqrt(measured.variances[0])[dark] < 0.05 * alone[dark]).all()
@@ -84,7 +83,7 @@ def test_pixels_that_are_full_in_all_exposures_count_for_nothing(tmp_path: Path)
     measured = read_images(root, read_folder(root), WAVELENGTH_NM)
     lost = np.isinf(measured.variances[0])
     bright = radiance()[EDGE // 2 :].ravel() * TIMES_S[0] > 300 - SENSOR.black
-    # Noise decides of pixels within a few of its standard deviations.
+    # Noise decides about pixels within a few standard deviations of the limit.
     assert abs(int(lost.sum()) - int(bright.sum())) <= 4
     assert lost.any()
     assert np.isfinite(measured.values).all()
@@ -99,7 +98,7 @@ def test_without_noise_that_frames_tell_it_is_assumed(tmp_path: Path) -> None:
 
 
 def test_a_beam_on_a_few_pixels_is_light(tmp_path: Path) -> None:
-    """Nine pixels of 2,304: the spread over the image is then that of the light and not of the noise."""
+    """Nine pixels of 2,304 are lit: the spread over the image is then that of the light, not of the noise."""
     root, rng, lit = write_stack(tmp_path), np.random.default_rng(8), np.zeros((EDGE, EDGE, 1))
     lit[23:26, 23:26] = 3000
     for number, time_s in enumerate(TIMES_S):

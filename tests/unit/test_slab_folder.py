@@ -1,4 +1,4 @@
-"""Slab folders: what is read, and the sentence for what cannot be."""
+"""Slab folders: what is read, and the sentence for what cannot be read."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_pixel_that_is_not_finite_counts_for_nothing(tmp_path: Path) -> None:
     image[4, 2], image[0, 0], image[7, 0] = np.nan, np.inf, np.nan
     root = write_folder(tmp_path, description(), image)
     measured = read_images(root, read_folder(root), WAVELENGTH_NM)
-    # One half of the first is left, nothing of the second.
+    # Of the first folded pixel one half is valid, of the second nothing.
     assert measured.variances[0, 2] == pytest.approx(2 * measured.variances[0, 3])
     assert np.isinf(measured.variances[0, 24])
     assert np.isfinite(measured.values).all()

@@ -1,4 +1,4 @@
-"""A slab answers what the walk asks of any geometry, also of features that layers lack."""
+"""A slab offers the walk all that any geometry offers, also for features that layers lack."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What to measure next: a sample that is too thick is to be diluted, one that is too thin concentrated."""
+"""Advice on the next measurement: dilute a sample that is too thick, concentrate one that is too thin."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_camera_beside_the_beam_is_tried_where_none_looks_there() -> None:
         camera["angle_deg"] = 60.0
     folder = SlabFolder.model_validate(told)
     material = henyey_greenstein(1.0, 0.6, 0.0)
-    (beside,) = [one for one in candidates(folder, WAVELENGTH_NM, material) if "beside the beam" in one.words]
+    (beside,) = [one for one in candidates(folder, WAVELENGTH_NM, material) if "beside the beam" in one.description]
     angle = abs(beside.folder.cameras[-1].angle_deg - folder.lights[0].angle_deg)
     assert angle == pytest.approx(BESIDE_DEG)
     assert len(rig_of(beside.folder, WAVELENGTH_NM).lights) == len({image.light for image in folder.images})

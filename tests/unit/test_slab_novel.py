@@ -1,4 +1,4 @@
-"""What a slab's fit says of cells that it has not seen, and that noise does not count as an error of it."""
+"""How a slab's fit is judged on cells that it has not seen; noise does not count as its error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from services.bench.slab.recovery import squared_share
 def test_noise_of_batches_is_not_taken_for_a_difference() -> None:
     noise = np.random.default_rng(1).normal(size=(16, 4000))
     squared, spread = squared_share(0.1 + noise, 4000.0)
-    # Noise of ten times the difference: its own square would make this a hundred times as large. Three standard errors.
+    # The noise is ten times the difference; its square would make this a hundred times as large. Three standard errors.
     assert abs(squared - 0.01) < 3 * spread < 0.01
 
 

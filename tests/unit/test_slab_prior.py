@@ -1,4 +1,4 @@
-"""The smoothness prior of a slab's phase function: what it draws a medium by that bends sharply at few angles."""
+"""The smoothness prior of a slab's phase function, for a medium whose phase function bends sharply at few angles."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.prior import Quadratic, precision, second_differences, widened
 
 TROUGH = KNOTS // 3
-"""Knot of a trough between two rings, three knots wide: ln f bends there by 100 per rad2 and more."""
+"""Knot of a trough between two rings, three knots wide; ln f bends there by 100 per rad2 and more."""
 SHARP = Material(
     henyey_greenstein(1.0, 0.5, 0.0).scattering * np.exp(-0.3 * np.exp(-0.5 * ((np.arange(KNOTS) - TROUGH) / 3) ** 2)),
     0.0,
 )
 CURVATURE = 30.0
-"""Of each knot's ln f by the images: one knot alone is known to 18 %."""
+"""Curvature that the images give each knot's ln f: one knot alone is known to 18 %."""
 
 
 def drawn(scale: float | np.ndarray) -> float:
-    """What the prior moves ln f in the trough by."""
+    """How far the prior moves ln f in the trough."""
     x, prior = Knots().unknowns(SHARP), precision(scale)
     return float(-(np.linalg.solve(prior + CURVATURE * np.eye(KNOTS + 1), prior @ x))[TROUGH])
 
 
 def test_a_trough_that_is_seen_is_filled_less_where_the_prior_follows_it() -> None:
-    # No random numbers here: 0.21 and 0.11, of a trough that is 0.3 deep.
+    # There are no random numbers here: 0.21 and 0.11, for a trough that is 0.3 deep.
     assert drawn(10.0) > 0.2
     assert drawn(widened(10.0, SHARP)) < 0.6 * drawn(10.0)
 
@@ -33,7 +33,7 @@ def test_a_trough_that_is_seen_is_filled_less_where_the_prior_follows_it() -> No
 def test_a_scale_follows_a_medium_where_it_bends_and_nowhere_else() -> None:
     scale, bends = widened(10.0, SHARP), np.abs(second_differences() @ np.log(SHARP.scattering))
     assert bends[TROUGH] > 100
-    # 60 degrees from the pole the share of the bends that counts is 0.98.
+    # 60 degrees from the pole, a share of 0.98 of the bends counts.
     assert scale[TROUGH] > 0.97 * bends[TROUGH]
     assert scale[TROUGH + 40 :].max() < 11
 
@@ -45,7 +45,7 @@ def test_a_peak_where_no_camera_looks_is_not_followed() -> None:
 
 
 def test_evidence_is_asked_for_sharp_scales_at_the_end_alone() -> None:
-    # Images that fix ln f everywhere, and show the trough.
+    # The images determine ln f everywhere and show the trough.
     x, nothing = Knots().unknowns(SHARP), np.zeros((KNOTS + 1, KNOTS + 1))
     matrix = 1e4 * np.eye(KNOTS + 1)
     quadratic = Quadratic(matrix, -matrix @ x, nothing, np.zeros(KNOTS + 1), nothing)

@@ -1,4 +1,4 @@
-"""The benchmark of a slab's two solvers: what its rows say of a solution, and what it refuses."""
+"""The benchmark of a slab's two solvers: what its rows state about a solution, and what it refuses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from services.fit.slab.model.dictionary import Material, henyey_greenstein
 def test_a_row_tells_how_far_a_solution_is_from_the_truth() -> None:
     truth = Truth("HG 0.8", near_beam_folder(), 1.0, 0.03, PHASES["HG 0.8"])
     exact = compared(truth, truth.material(), "dentine", "", 1.0)
-    # Tents of 0.9 degrees instead of the formula, which is normalised on steps of 0.5 degrees.
+    # The solution has tents of 0.9 degrees instead of the formula, which is normalised in steps of 0.5 degrees.
     assert exact.error < 2e-3
     assert exact.scattering_error < 1e-12
     true = truth.material()

@@ -1,4 +1,4 @@
-"""The race of a slab's solver with stock Mitsuba: derivatives by what Adam moves, and what its rows say."""
+"""The race of a slab's solver with stock Mitsuba: derivatives by the numbers that Adam moves, and what rows state."""
 
 from __future__ import annotations
 
@@ -29,6 +29,6 @@ def row(peer: str, seconds: float, error: float, scattering_error: float) -> dic
 def test_the_race_is_judged_where_stock_came_nearest_and_by_both_errors() -> None:
     ours = [row("dentine", 2.0, 0.02, 0.03), row("dentine", 5.0, 0.01, 0.004)]
     assert times_faster([*ours, row(STOCK, 100.0, 0.03, 0.04), row(STOCK, 10.0, 0.3, 0.4)]) == pytest.approx(50)
-    # Sigma_s came out nearer, so that the longer run of the default is the one that is as near.
+    # Stock's sigma_s is nearer to the truth, so only the longer run of the default solver is as near.
     assert times_faster([*ours, row(STOCK, 100.0, 0.03, 0.005)]) == pytest.approx(20)
     assert times_faster([*ours, row(STOCK, 100.0, 0.001, 0.005)]) is None

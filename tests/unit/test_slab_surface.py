@@ -1,4 +1,4 @@
-"""The error of images over mixtures of three phase functions: what counts as another minimum."""
+"""The image error over mixtures of three phase functions: what counts as a second minimum."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STEPS = 5
 
 
 def rows(squared: dict[tuple[int, int, int], float], spread: float = 1e-6) -> list[dict[str, Any]]:
-    """A surface that rises from the mixture (2, 2, 1) by the squared distance, but where told otherwise."""
+    """A surface that rises from the mixture (2, 2, 1) with the squared distance, except where ``squared`` sets it."""
     lowest = np.array([2, 2, 1])
     return [
         {
@@ -39,6 +39,6 @@ def test_a_second_hollow_is_found_unless_noise_explains_it() -> None:
 def test_a_mixture_of_phase_functions_keeps_extinction_and_mixes_cosines() -> None:
     material = mixture_of((0.5, 0.25, 0.25), 3.0)
     assert material.extinction_per_mm == pytest.approx(3.0)
-    # Knots 0.9 degrees apart make HG 0.8 a little blunter.
+    # With knots 0.9 degrees apart, HG 0.8 becomes a little blunter.
     expected = 0.5 * COSINES[0] + 0.25 * COSINES[1] + 0.25 * COSINES[2]
     assert material.mean_cosine == pytest.approx(expected, abs=1e-3)

@@ -1,5 +1,5 @@
-"""The index of refraction from the through-beam: back from shifts that Snell's law gives, and refused where they belong
-to none.
+"""The index of refraction from the beam through the cell: found again from shifts that Snell's law gives, and refused
+where no index gives such shifts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GLASS = {"index": 1.52, "thickness_mm": 1.2}
 
 
 def peak_mm(index: float, angle_deg: float, glass: dict[str, float] | None) -> float:
-    """Where a beam leaves, by the forward model's own faces."""
+    """Where a beam leaves the cell, computed with the forward model's own faces."""
     faces = Interface(index, 1.0, *((glass["index"], glass["thickness_mm"]) if glass else ()))
     sine = faces.inside_sine(angle_deg)
     return WIDTH_MM * sine / math.sqrt(1 - sine**2) + 2 * faces.glass_shift_mm(sine)
@@ -31,7 +31,7 @@ def peak_mm(index: float, angle_deg: float, glass: dict[str, float] | None) -> f
 def folder(
     shifts_mm: dict[str, float], se_mm: float = 0.002, glass: dict[str, float] | None = None, **beam: Any
 ) -> SlabFolder:
-    """A cell of unknown index with these peaks."""
+    """A folder of a cell of unknown index with these peaks."""
     cell = {"width_mm": WIDTH_MM, "index": None, "glass": glass}
     lights = [{"name": name, "side": "front", "angle_deg": angle} for name, angle in LIGHTS.items()]
     beams = [{"light": name, "peak_x_mm": shift, "se_mm": se_mm} | beam for name, shift in shifts_mm.items()]

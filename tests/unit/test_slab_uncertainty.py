@@ -1,4 +1,6 @@
-"""± of a slab's fit: by the gradient's noise as it was seen, and by what is left of the way where a fit ended short."""
+"""The ± of a slab's fit: from the observed noise of the gradient, and from the distance to the minimum where a fit
+ended early.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,8 @@ from services.fit.slab.solve.uncertainty import uncertainty_of
 
 MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)
 CURVATURE = 1e4
-"""Of every unknown, so strong that no prior matters: an unknown's variance is that of its gradient over the square of
-this."""
+"""Curvature of every unknown, so large that no prior matters: an unknown's variance is that of its gradient over the
+square of this."""
 
 
 def solution(short: np.ndarray, rendering: float) -> Solution:
@@ -29,12 +31,12 @@ def solution(short: np.ndarray, rendering: float) -> Solution:
     quadratic = Quadratic(matrix, -matrix @ (x + short), nothing, np.zeros(UNKNOWNS), nothing)
     return Solution(
         MATERIAL, quadratic, rendering * matrix, 30.0, used=1, steps=1, converged=True, paths=1, coordinates=Knots(),
-        misfit=0.0, misfit_se=0.0, data_noise=matrix, thick=True, unsure=np.zeros(UNKNOWNS),
+        misfit=0.0, misfit_se=0.0, data_noise=matrix, is_thick=True, matrix_error_gradient=np.zeros(UNKNOWNS),
     )  # fmt: skip
 
 
 def standard_error(one: Solution) -> float:
-    """Of the mean of ln f, of which smoothness says nothing."""
+    """Standard error of the mean of ln f, which the smoothness prior does not affect."""
     return uncertainty_of(one).standard_error(np.append(np.full(KNOTS, 1 / KNOTS), 0.0))
 
 
@@ -45,14 +47,14 @@ def test_noise_of_the_paths_widens_the_errors() -> None:
 
 
 def test_a_way_that_is_left_counts_as_error() -> None:
-    # All of ln f is 5 % short: sigma_s is as well.
+    # All of ln f is 5 % short, so sigma_s is as well.
     short = np.append(np.full(KNOTS, 0.05), 0.0)
     assert standard_error(solution(short, 0.0)) == pytest.approx(0.05, rel=0.1)
 
 
 def test_a_way_that_noise_explains_does_not() -> None:
-    # Each unknown off by one of its own standard errors, as noise leaves it: 200 of them, so the square of their length
-    # is known to 10 %.
+    # Each unknown is off by one standard error, as noise makes it; with 200 unknowns the square of the length is known
+    # to 10 %.
     short = np.random.default_rng(1).standard_normal(UNKNOWNS) * 1e-2
     short[-1] = 0.0
     still = standard_error(solution(np.zeros(UNKNOWNS), 0.0))

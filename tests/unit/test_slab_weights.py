@@ -1,5 +1,5 @@
-"""Weights of a slab's images: what cameras of one light share of the paths' noise is known, and tells nothing
-thrice.
+"""Weights of a slab's images: cameras of one light share noise of the paths, and shared noise is not counted as
+independent.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ GROUPS = (np.array([0, 2]), np.array([1, 3]))
 
 
 def noise(seed: int) -> list[np.ndarray]:
-    # Covariances (pixels, 2, 2) of two lights, each of three paths that both cameras see alike and a little that they
-    # do not.
+    # Covariances (pixels, 2, 2) for each of two lights: nine tenths of the variance are shared by both cameras.
     rng = np.random.default_rng(seed)
     alike = rng.uniform(1, 2, (2, 6, 1, 1))
     return [one * np.array([[1.0, 0.9], [0.9, 1.0]]) for one in alike]
@@ -52,7 +51,7 @@ def test_a_value_without_a_variance_weighs_nothing_and_takes_nothing_from_the_ot
     assert int(weights.used.sum()) == 23
     whitened = weights.whitened(np.ones((1, 4, 6)))[0]
     assert whitened[2, 4] == 0
-    # The other camera's value there is weighed by itself.
+    # The other camera's value there is weighted as if alone.
     assert whitened[0, 4] ** 2 == pytest.approx(1 / (0.2 + noise(6)[0][4, 0, 0]))
 
 
@@ -63,8 +62,8 @@ def test_independent_weights_are_inverse_variances() -> None:
 
 
 def test_the_covariance_of_batches_is_that_of_their_mean() -> None:
-    # 4,000 batches of noise that two cameras share by half. A corner's mean counts pixels by 4, 2, 2 and 1 ninths, as
-    # 3.2 equal ones: a variance of 13,000 draws is known to 1.2 %, and 5 % is four times that.
+    # 4,000 batches of noise, half of it shared by two cameras. A corner's mean weights pixels by 4, 2, 2 and 1 ninths,
+    # like 3.2 equal ones: a variance of 13,000 draws is known to 1.2 %, and 5 % is four times that.
     rng = np.random.default_rng(8)
     shared = rng.standard_normal((4000, 1, 6))
     images = np.sqrt(0.5) * (shared + rng.standard_normal((4000, 2, 6)))

@@ -46,7 +46,7 @@ def solve(problem: NoisyQuadratic, options: Options, start: np.ndarray, domain: 
 
 
 def test_moves_are_those_of_kingma_and_ba() -> None:
-    # Algorithm 1 written out for one coordinate of step scale s: gradients and moves are per s.
+    # Algorithm 1, written out for one coordinate of step scale s: gradients and moves are in units of s.
     a, options = np.diag([4.0, 1.0, 9.0, 2.0]), Options(rate=0.1, max_steps=5)
     state, solver = Adam(DOMAIN, options).init(BEST + 0.8, 64), Adam(DOMAIN, options)
     scale, x = DOMAIN.scale, BEST + 0.8
@@ -62,8 +62,8 @@ def test_moves_are_those_of_kingma_and_ba() -> None:
 
 
 def test_converges_under_noise() -> None:
-    # Noise of a gradient here is as large as the gradient 0.1 to 0.6 step scales from the optimum, and a constant rate
-    # leaves x wandering. From 1.4 to 2.5 step scales away 8 seeds ended within 0.15; twice that is the bound.
+    # Noise is as large as the gradient is at 0.1 to 0.6 step scales from the optimum, and at a constant rate x keeps
+    # wandering. Started 1.4 to 2.5 step scales away, 8 seeds ended within 0.15; the bound is twice that.
     for seed in range(8):
         problem = NoisyQuadratic(np.diag([40.0, 10.0, 90.0, 20.0]), noise=20.0, seed=seed)
         state = solve(problem, Options(rate=0.03, max_steps=600), BEST + np.array([1.0, -0.8, -1.0, 0.7]))
@@ -80,7 +80,7 @@ def test_a_fit_that_still_moves_says_so() -> None:
 
 
 def test_the_prior_joins_the_gradient() -> None:
-    # Two equal curvatures meet half way.
+    # The prior and the data have equal curvatures, so the result is half way between them.
     domain = Domain((Coordinate(("enamel.alpha",), prior_mean=2.0, prior_sd=0.5),))
 
     class One(NoisyQuadratic):

@@ -1,4 +1,4 @@
-"""A fit with other Jacobians than its images' own states the errors it has, once its response is measured."""
+"""A fit that uses other Jacobians than those of its images states correct errors once its response is measured."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ SENSOR, IMAGE, SLOPE = 0.05, 0.05, 0.15
 
 
 class Linear:
-    """Images J x with the instruments ``similar`` in place of J, and noise of which the lights of a pixel share
-    half.
-    """
+    """Images J x; the fit uses ``similar`` instead of J. Lights of a pixel share half of their noise."""
 
     def __init__(self, seed: int, held: bool = False) -> None:
         rng = np.random.default_rng(1)
@@ -69,7 +67,7 @@ class Linear:
 
 
 def fitted(problem: Linear, *, measured: bool, offset: float) -> tuple[np.ndarray, Uncertainty]:
-    # A Newton step by the instruments' own curvature, carried there, then the closing measurement.
+    # A Newton step with the curvature that ``similar`` gives, the equations moved there, then the closing measurement.
     photo = problem.photograph(offset)
     start = problem.truth + 0.05
     equations = problem.equations(start, photo)
@@ -93,8 +91,8 @@ def rms(*, measured: bool, held: bool) -> np.ndarray:
 
 @pytest.mark.parametrize("held", [False, True])
 def test_stated_errors_are_those_seen_over_noise(held: bool) -> None:
-    # The rule of tables, an rms of 0.8 to 1.25; an honest one of 200 strays beyond in fewer than one of a thousand
-    # cases.
+    # The rule that tables use, an rms of 0.8 to 1.25: with correct errors, 200 values are outside it in fewer than one
+    # of a thousand cases.
     low, high = rms_bounds(ROUNDS)
     found = rms(measured=True, held=held)
     assert (found > low).all(), found
@@ -102,8 +100,8 @@ def test_stated_errors_are_those_seen_over_noise(held: bool) -> None:
 
 
 def model_and_loss(seed: int) -> tuple[ClosingModel, np.ndarray, Callable[[np.ndarray], float]]:
-    # Images are linear and instruments their own derivatives, so what a model says of x can be held against the loss
-    # itself.
+    # Images are linear and ``similar`` is their own derivative, so the model's statements about x can be compared with
+    # the loss itself.
     problem = Linear(seed)
     problem.similar = problem.exact
     photo, x = problem.photograph(0.0), problem.truth + 0.05
@@ -113,33 +111,33 @@ def model_and_loss(seed: int) -> tuple[ClosingModel, np.ndarray, Callable[[np.nd
 
 
 def assert_standard(z: list[float]) -> None:
-    # 200 problems: a mean beyond 4 of its errors comes in 6e-5 of them.
+    # 200 problems: a mean beyond 4 of its standard errors happens by chance with a probability of 6e-5.
     low, high = rms_bounds(ROUNDS)
     assert abs(np.mean(z)) < 4 / np.sqrt(ROUNDS)
     assert low < np.sqrt(np.mean(np.square(z))) < high
 
 
 def test_a_step_s_promise_is_what_the_loss_falls_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Derivatives are quiet: what their noise does to the curvature is the judge's allowance and not in the stated
-    # error.
+    # Derivatives have little noise here: its effect on the curvature is not in the stated error but in the margin of
+    # the judgement.
     monkeypatch.setattr("tests.unit.test_solve_closing.SLOPE", 0.01)
     z = []
     for seed in range(ROUNDS):
         model, x, loss = model_and_loss(seed)
         step = model.step()
-        promised, se = model.promise(step)
+        promised, se = model.predicted_change(step)
         z.append((promised - (loss(x + step) - loss(x))) / se)
     assert_standard(z)
 
 
 def test_a_step_s_slope_is_the_loss_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Along a step that no noise has chosen; of a quadratic loss the central difference is exact.
+    # Along a step that does not depend on noise; the central difference of a quadratic loss is exact.
     monkeypatch.setattr("tests.unit.test_solve_closing.SLOPE", 0.01)
     z = []
     for seed in range(ROUNDS):
         model, x, loss = model_and_loss(seed)
         step = np.full(len(x), -0.02)
-        z.append((model.slope(step) - 0.5 * (loss(x + step) - loss(x - step))) / model.promise(step)[1])
+        z.append((model.slope(step) - 0.5 * (loss(x + step) - loss(x - step))) / model.predicted_change(step)[1])
     assert_standard(z)
 
 
@@ -148,9 +146,9 @@ def test_without_the_measurement_they_are_not() -> None:
 
 
 def test_the_stated_noise_of_a_response_is_what_is_seen() -> None:
-    # Rendered rows and a borrowed one, mixed by T. Variances of 2000 draws, each known to 3 %, and stated by the draws
-    # themselves: 20 % is six times that.
-    borrowed, transform = np.array([False, False, True]), np.array([[1.0, 0.0, 0.3], [0.0, 0.8, -0.2], [0.1, 0.0, 1.2]])
+    # Rendered rows and a borrowed one, mixed by T. Variances of 2000 draws are known to 3 % each, and the draws
+    # themselves state them: 20 % is six times that.
+    copied, transform = np.array([False, False, True]), np.array([[1.0, 0.0, 0.3], [0.0, 0.8, -0.2], [0.1, 0.0, 1.2]])
     draws = []
     for seed in range(2000):
         problem = Linear(seed)
@@ -158,7 +156,7 @@ def test_the_stated_noise_of_a_response_is_what_is_seen() -> None:
         similar, exact = problem.pair(problem.similar, SLOPE), problem.pair(problem.exact, SLOPE)
         draws.append(
             closing_sums(
-                transform, similar, exact, borrowed, (np.zeros(400), np.zeros(400)), nothing, problem.weight, LIGHTS
+                transform, similar, exact, copied, (np.zeros(400), np.zeros(400)), nothing, problem.weight, LIGHTS
             )
         )
     stated = np.mean([draw.response_variance for draw in draws], axis=0)
@@ -191,8 +189,8 @@ def test_a_response_beyond_noise_is_taken_as_it_is() -> None:
 
 
 def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
-    # Twelve teeth of two coordinates, each of which responds with others of its own; noise of 0.1 and of 0.03 between
-    # teeth.
+    # Twelve teeth of two coordinates; each tooth responds differently, only with its own coordinates. The noise is 0.1,
+    # and 0.03 between teeth.
     rng = np.random.default_rng(5)
     domain = Domain(tuple(Coordinate((f"{k}.enamel.{leaf}",)) for k in range(12) for leaf in ("sigma", "alpha")))
     own = domain.relation == 0
@@ -204,8 +202,8 @@ def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
         response(sums, np.zeros((24, 24)), relation).excess
         for relation in (domain.relation, np.zeros_like(domain.relation))
     )
-    # Shrinking by 0.3^2 / (0.3^2 + 0.1^2) leaves an rms error of 0.095; one scatter for all entries shrinks the teeth's
-    # own by more than half.
+    # Shrinking by 0.3^2 / (0.3^2 + 0.1^2) gives an rms error of 0.095; with one scatter for all entries, the teeth's
+    # own entries would shrink by more than half.
     assert np.sqrt(np.mean((told - excess)[own] ** 2)) < 0.12
     assert np.sqrt(np.mean((alike - excess)[own] ** 2)) > 0.15
     assert np.abs(told[~own]).max() < 0.03
@@ -226,7 +224,7 @@ def test_the_measurement_survives_the_journal() -> None:
 
 
 def test_errors_follow_the_step_that_the_tissue_takes_and_not_the_one_it_asked_for() -> None:
-    # The tissue asks for more than one scale and may not go there; errors are best for where it goes.
+    # The tissue's step is longer than one scale, which is not allowed; the errors found are best for the step taken.
     rng, errors = np.random.default_rng(8), InstrumentErrors(("gain.green",), ((1e-2,),))
     domain = Domain(DOMAIN.coordinates, errors)
     root = rng.standard_normal((4, 4))
@@ -241,13 +239,14 @@ def test_errors_follow_the_step_that_the_tissue_takes_and_not_the_one_it_asked_f
     whole = -transform @ model.inverse @ gradient
     assert np.linalg.norm(step[:3] / domain.scale[:3]) < 0.5 * np.linalg.norm(whole[:3] / domain.scale[:3])
     for change in (-1e-3, 1e-3):
-        assert model.promise(step + np.array([0.0, 0.0, 0.0, change]))[0] > model.promise(step)[0]
+        assert model.predicted_change(step + np.array([0.0, 0.0, 0.0, change]))[0] > model.predicted_change(step)[0]
 
 
 def test_a_prior_used_in_full_takes_the_tissue_back_along_a_direction_that_images_leave_open() -> None:
-    # A gain of -10 % and a tissue that is 0.1 brighter make nearly the same images, so noisy derivatives leave that
-    # direction open. The prior of 1 % takes both back together. What is left of the step, 0.05 of another coordinate,
-    # counts as error, and would hold the tissue if the gain went along with it as if no direction were open.
+    # A gain of -10 % and a tissue that is 0.1 brighter make nearly the same images, so with noisy derivatives that
+    # direction is not determined. The prior of 1 % takes both back together. The rest of the step, 0.05 of another
+    # coordinate, counts as error; it would keep the tissue in place if the gain moved as if every direction were
+    # determined.
     domain, count, sensor, opened = (
         Domain(DOMAIN.coordinates, InstrumentErrors(("gain.green",), ((1e-4,),))),
         400,
@@ -266,26 +265,26 @@ def test_a_prior_used_in_full_takes_the_tissue_back_along_a_direction_that_image
         equations = normal_equations(exact + noise[0], exact + noise[1], *residuals, 1 / weight, weight, exact=1)
         x = np.array([1.0, 2.0, 2.0, -0.1])
         known = uncertainty(domain, x, equations)
-        if known.open_directions.shape[1]:
+        if known.undetermined_directions.shape[1]:
             opened += 1
             assert known.x[3] - x[3] == pytest.approx(0.1, abs=0.01)
-            # To a tenth: with the gain of the whole step it was 0.05 to 0.09.
+            # To a tenth; with the gain of the whole step it would be 0.05 to 0.09.
             assert known.x[0] - x[0] == pytest.approx(-0.1, abs=0.01)
     assert opened >= 5
 
 
 def test_an_answer_that_its_prior_would_take_too_far_goes_one_scale_and_states_the_rest_as_error() -> None:
-    # The tissue follows the gain one to one, and noise of renders leaves it to the gain's prior.
+    # The tissue follows the gain one to one, and with the noise of the renders only the gain's prior determines both.
     domain = Domain(DOMAIN.coordinates[:1], InstrumentErrors(("gain.green",), ((1e-6,),)))
     scale, rows, weight = float(domain.scale[0]), np.stack(2 * [np.linspace(0.5, 1.0, 50)]), np.full(50, 1e4)
     noise = 30 * np.cos(np.arange(50))
     equations = normal_equations(rows, rows, noise, -noise, 1 / weight, weight, exact=1)
-    # Of a jaw of four teeth each may move by a scale, which is two in their common norm.
+    # In a jaw of four teeth, each tooth may move by one scale, which is two in their common norm.
     for off, part_count, moved, rest in ((0.5, 1, 0.5, 0.0), (3.0, 1, 1.0, 2.0), (3.0, 4, 2.0, 1.0)):
         x = np.array([1.0, -off * scale])
         known = uncertainty(domain, x, equations, part_count=part_count)
         np.testing.assert_allclose((known.x - x) / scale, [-moved, moved], rtol=1e-6)
-        assert known.is_whole is (rest == 0)
+        assert known.is_full_step is (rest == 0)
         parts = known.se_parts(np.array([1.0, 0.0]))
         assert parts.get("unfinished", 0.0) == pytest.approx(rest * scale, rel=1e-6)
         assert known.covariance[0, 0] == pytest.approx(sum(part**2 for part in parts.values()), rel=1e-9)

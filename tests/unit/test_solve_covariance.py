@@ -33,8 +33,8 @@ def test_well_posed_fit_has_the_inverse_curvature_as_covariance() -> None:
 
 
 def test_sigma_and_g_along_a_valley_are_flagged_but_the_reduced_scattering_is_not() -> None:
-    # The data see only log sigma_s' = log sigma + log(1 - tanh x): its gradient in (log sigma, kappa, x) is (1, ~0, -(1
-    # + g)).
+    # The data depend only on log sigma_s' = log sigma + log(1 - tanh x), whose gradient by (log sigma, kappa, x) is
+    # (1, ~0, -(1 + g)).
     seen = np.array([1.0, 0.0, -1.8])
     h = 1e4 * np.outer(seen, seen) + np.diag([0.0, 1e4, 0.0])
     known = uncertainty(DOMAIN, DOMAIN.x_of(TISSUE), _equations(h))

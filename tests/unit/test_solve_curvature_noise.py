@@ -1,4 +1,4 @@
-"""Noise of a curvature in parts: what it says of directions and products is what the whole covariance says."""
+"""Noise of a curvature in parts: for directions and products it gives the same as the whole covariance."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_parts_of_measurements_that_know_few_coordinates_add_up_to_the_whole() -
     np.testing.assert_allclose(
         parts.of_product(directions[:, 0]), whole.of_product(directions[:, 0]), rtol=1e-11, atol=1e-12
     )
-    # A second block of the same coordinates adds to the part there is.
+    # A second block with the same coordinates is added to the existing part.
     assert len((parts + parts).parts) == 2
     np.testing.assert_allclose((parts + parts).variance(directions), parts.scaled(2.0).variance(directions), rtol=1e-12)
 

@@ -1,4 +1,4 @@
-"""The solver on problems whose truth is known: converges, never produces NaN, never takes a worse step."""
+"""The solver on problems whose truth is known: it converges, never produces NaN, and never takes a worse step."""
 
 # ruff: noqa: ARG002 - signatures are those of what is replaced
 from __future__ import annotations
@@ -83,7 +83,7 @@ def test_thousand_ill_conditioned_or_indefinite_systems_never_worsen() -> None:
             before = problem.loss(state.x)
             state = solver.step(problem, state)
             assert np.isfinite(state.x).all()
-            # The comparison is exact here, so the rule must be too.
+            # The comparison is exact here, so the rule must hold exactly.
             assert problem.loss(state.x) <= before
         improved += problem.loss(state.x) < first
     assert improved > 500
@@ -110,11 +110,11 @@ def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
 
 
 def test_thousand_noisy_systems_take_worse_steps_no_more_often_than_stated() -> None:
-    # A third each ill-conditioned, indefinite and nothing but noise, the comparison itself noisy. A step that is taken
-    # while truly worse is a false alarm at z = 3: 1.35e-3 of all comparisons at most. The count of these is Poisson;
-    # beyond its mean by four standard deviations, plus one, is one in 10,000. The last step, onto the minimum of all
-    # that is known, is refused only when surely worse, so it may lose up to what the comparison cannot see: with 3
-    # standard errors to refuse and one in 150,000 to be missed, 7.5 of them.
+    # One third each ill-conditioned, indefinite and nothing but noise, and the comparison itself is noisy. A step that
+    # is taken although it is worse is a false alarm at z = 3: at most 1.35e-3 of all comparisons. Their number is
+    # Poisson distributed; four standard deviations and one above its mean is one case in 10,000. The last step, to the
+    # minimum of all that is known, is refused only when it is surely worse, so it may lose as much as the comparison
+    # cannot detect: with 3 standard errors to refuse and one case in 150,000 to be missed, 7.5 of them.
     rng, worse, compared = np.random.default_rng(5), 0, 0
     for case in range(1000):
         problem, domain, x = _random_problem(rng)
@@ -207,8 +207,8 @@ def test_state_survives_the_journal_exactly() -> None:
 
 
 def test_a_stage_that_goes_on_with_the_same_measurements_forgets_nothing() -> None:
-    # Noise is all that is left at the start, so that nothing moves; variances of pooled gradients add like those of 256
-    # and 512 paths in one.
+    # The start has only noise, so nothing moves; the variances of pooled gradients add up to those of 256 and 512 paths
+    # in one render.
     problem, domain = Quadratic(np.eye(2), np.array([1.0, 2.0]), gradient_noise=1.0, loss_noise=100.0), _domain(2)
     solver = GaussNewton(domain, Options(max_samples=512))
     first = solver.step(problem, solver.init(problem.best, 256))
@@ -237,7 +237,7 @@ def test_trust_region_step_is_the_constrained_minimum() -> None:
 
 @dataclass
 class Overpromising(Quadratic):
-    """Derivatives of another loss than the one compared: they promise where nothing is to be gained."""
+    """The derivatives belong to another loss than the one compared: they promise a gain where there is none."""
 
     seen: float = 0.0
     """Standard error of a comparison."""
@@ -247,8 +247,8 @@ class Overpromising(Quadratic):
 
 
 def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> None:
-    # The promise, 408 x 0.07^2 = 2, is for a fifth of a unit of length, so that the model's own error is 0.2; the
-    # comparison sees nothing, 0.4 +- 1.
+    # The promise, 408 x 0.07^2 = 2, is for a fifth of a unit of length, so the model's own error is 0.2; the comparison
+    # shows nothing, 0.4 +- 1.
     problem = Overpromising(np.diag([816.0, 816.0]), np.array([0.07, 0.0]), seen=1.0)
     domain = Domain((Coordinate(("enamel.g1",)), Coordinate(("dentin.g1",))))
     start = np.zeros(2)
@@ -257,14 +257,15 @@ def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> N
     assert taken.accepted == 1
     refused = doubting.step(problem, doubting.init(start, 64))
     assert refused.accepted == 0
-    # Nor does the last step go there, as the comparison is not even on its side.
+    # The last step does not go there either, as the comparison does not favour it.
     assert refused.result is Result.NOISE_LIMITED
     np.testing.assert_array_equal(refused.x, start)
 
 
 def test_the_last_step_goes_where_both_witnesses_together_point() -> None:
-    # The promise is 2 again, uncertain by 0.53 of it. A comparison of 0.4 +- 10 knows nothing and leaves it standing by
-    # 1.9 standard errors: too few for a step on the way, enough for the last. One of 0.4 +- 0.1 knows better.
+    # The promise is 2 again, with a relative uncertainty of 0.53. A comparison of 0.4 +- 10 shows nothing, so the
+    # promise stays at 1.9 standard errors: too few for an ordinary step, enough for the last. A comparison of 0.4 +-
+    # 0.1 refutes it.
     domain = Domain((Coordinate(("enamel.g1",)), Coordinate(("dentin.g1",))))
     solver, start = GaussNewton(domain, Options(max_samples=64, slope_error=0.5)), np.zeros(2)
     ends = []

@@ -1,4 +1,4 @@
-"""What further images would teach is what they do teach."""
+"""What further images are predicted to add is what they add."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import uncertainty
-from services.fit.solve.information import Addition, addition, covariance_with
+from services.fit.solve.information import AddedInformation, added_information, covariance_with
 from services.fit.solve.normal_equations import NormalEquations, normal_equations
 
 DOMAIN = Domain((Coordinate(("enamel.sigma",)), Coordinate(("enamel.alpha",), 2.3, 1.0), Coordinate(("dentin.sigma",))))
@@ -26,7 +26,7 @@ def test_predicted_is_what_a_fit_with_both_states() -> None:
     known = uncertainty(DOMAIN, X, _equations(first))
     assert known.sandwich is not None
     zero = np.zeros(15)
-    added = addition(known.sandwich, (second, second), (zero, zero), np.full(15, NOISE**2), NOISE**-2)
+    added = added_information(known.sandwich, (second, second), (zero, zero), np.full(15, NOISE**2), NOISE**-2)
     both = uncertainty(DOMAIN, X, _equations(np.hstack([first, second])))
     np.testing.assert_allclose(covariance_with(known.sandwich, added), both.covariance, rtol=1e-9)
     np.testing.assert_allclose(covariance_with(known.sandwich, added.scaled(0.0)), known.covariance, rtol=1e-9)
@@ -35,7 +35,7 @@ def test_predicted_is_what_a_fit_with_both_states() -> None:
 def test_noise_that_looks_like_negative_information_is_none() -> None:
     known = uncertainty(DOMAIN, X, _equations(0.1 * np.random.default_rng(2).standard_normal((3, 40))))
     assert known.sandwich is not None
-    nothing = Addition(-0.5 * np.eye(3), np.zeros((3, 3)))
+    nothing = AddedInformation(-0.5 * np.eye(3), np.zeros((3, 3)))
     np.testing.assert_allclose(covariance_with(known.sandwich, nothing), known.covariance, rtol=1e-9)
 
 
@@ -46,10 +46,10 @@ def test_a_new_light_of_unknown_gain_teaches_what_a_fit_with_that_gain_states() 
     assert known.sandwich is not None
     zero, error = np.zeros(15), 0.03 * image[None]
     measured = (second, second), (zero, zero), np.full(15, NOISE**2), NOISE**-2
-    found = covariance_with(known.sandwich, addition(known.sandwich, *measured, error))
-    # The same with the light's gain, of prior 1 in units of its ±, among the unknowns.
+    found = covariance_with(known.sandwich, added_information(known.sandwich, *measured, error))
+    # The same with the light's gain among the unknowns; its prior is 1, in units of its ±.
     rows = np.block([[first, second], [np.zeros((1, 40)), error]]) / NOISE
     whole = rows @ rows.T + np.diag([*DOMAIN.prior[1], 1.0])
     np.testing.assert_allclose(found, np.linalg.inv(whole)[:3, :3], rtol=1e-6)
-    exact = covariance_with(known.sandwich, addition(known.sandwich, *measured))
+    exact = covariance_with(known.sandwich, added_information(known.sandwich, *measured))
     assert (np.diag(found) > 1.01 * np.diag(exact)).any()

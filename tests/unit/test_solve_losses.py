@@ -1,4 +1,4 @@
-"""Losses as weights: each is the derivative of what it says it minimises, on problems whose answer is known."""
+"""Losses as weights: each gives the derivative of the loss it stands for, on problems whose answer is known."""
 
 from __future__ import annotations
 
@@ -54,15 +54,15 @@ def located(loss: Loss, values: np.ndarray, spread: float, rounds: int = 60) -> 
 
 @pytest.mark.parametrize("loss", ["l1", "relative_l1"])
 def test_l1_finds_the_median(loss: Loss) -> None:
-    # An odd number of values; what stays is the smoothing below a tenth of the spread given.
+    # An odd number of values; the remaining difference is from smoothing below a tenth of the given spread.
     values = np.random.default_rng(3).standard_exponential(101)
     assert located(loss, values, spread=0.01) == pytest.approx(np.median(values), abs=0.002)
     assert abs(values.mean() - np.median(values)) > 0.1
 
 
 def test_robust_loss_ignores_a_shadow() -> None:
-    # A fifth of the values lies 20 standard deviations off: the mean moves by 4, Cauchy's place by less than 3 standard
-    # errors of the rest's mean.
+    # A fifth of the values is 20 standard deviations away: the mean moves by 4, Cauchy's estimate by less than 3
+    # standard errors of the mean of the rest.
     rng = np.random.default_rng(4)
     values = rng.standard_normal(500)
     values[:100] -= 20.0
@@ -71,7 +71,8 @@ def test_robust_loss_ignores_a_shadow() -> None:
 
 
 def test_robust_loss_is_as_good_as_least_squares_under_gaussian_noise() -> None:
-    # Efficiency 0.95 by design of the constant: over 400 sets of 100 the variance ratio's own error is 7 %; 3 sigma.
+    # The constant is chosen for an efficiency of 0.95; the variance ratio over 400 sets of 100 has an error of 7 %; 3
+    # sigma.
     rng = np.random.default_rng(5)
     sets = rng.standard_normal((400, 100))
     ratio = np.var([located("robust", s, 1.0, rounds=8) for s in sets]) / np.var(sets.mean(axis=1))

@@ -1,4 +1,4 @@
-"""Sums from two seeds are unbiased, and the errors they state are the errors they have."""
+"""Normal equations from two seeds: the sums are unbiased, and the stated errors are the observed ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MEASUREMENTS, LIGHTS = 160, 4
 
 
 def _noisy(rng: np.random.Generator) -> tuple[NormalEquations, ...]:
-    # Lights of a pixel share half of their noise's variance, as those of one walk do.
+    # Lights of a pixel share half of the variance of their noise, like lights of one walk.
     j, r, weight = _problem()
     reference = np.full(MEASUREMENTS, 0.05)
 
@@ -43,13 +43,13 @@ def test_sums_are_unbiased_and_their_errors_true() -> None:
     gradients = np.array([e.gradient for e in many])
     hessians = np.array([e.hessian for e in many])
 
-    # Means against the noise-free sums: 12 values, family-wise 1e-3 is |z| < 4.
+    # Means compared with the sums without noise: for 12 values, a family-wise error of 1e-3 is |z| < 4.
     for sample, exact in ((gradients, (weight * j) @ r), (hessians, (weight * j) @ j.T)):
         z = (sample.mean(axis=0) - exact) / (sample.std(axis=0) / np.sqrt(ROUNDS))
         assert np.abs(z).max() < 4
 
-    # Stated against seen variances: a variance of ROUNDS values has a relative error of sqrt(2 / ROUNDS) = 2.6 %,
-    # doubled for non-Gaussian products; 4 sigma.
+    # Stated compared with observed variances: a variance of ROUNDS values has a relative error of sqrt(2 / ROUNDS) =
+    # 2.6 %, doubled for non-Gaussian products; 4 sigma.
     tolerance = 4 * 2 * np.sqrt(2 / ROUNDS)
     for u in np.eye(3), np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]:
         seen = np.array([[direction @ h @ direction for direction in u.T] for h in hessians]).var(axis=0)
@@ -72,7 +72,7 @@ def test_data_noise_is_unbiased() -> None:
 
 @pytest.mark.parametrize("edge", [1, 8])
 def test_compared_losses_are_unbiased_and_their_error_true(edge: int) -> None:
-    # By cells of ``edge`` pixels the loss is that of their mean residuals, which the truth is made to be.
+    # In cells of ``edge`` pixels the loss is that of their mean residuals, which are made equal to the truth.
     rng = np.random.default_rng(7)
     cell = (np.arange(MEASUREMENTS // LIGHTS) // edge).astype(np.int32)
     old, new = (rng.standard_normal((LIGHTS, cell[-1] + 1))[:, cell].reshape(-1) for _ in range(2))
@@ -91,8 +91,8 @@ def test_compared_losses_are_unbiased_and_their_error_true(edge: int) -> None:
 
 
 def test_cells_take_away_noise_and_leave_what_is_smooth() -> None:
-    # 16 pixels to a cell; noise that outweighs residuals falls as their root, to a quarter. Within cells old and new
-    # differ by what every pixel has alike.
+    # 16 pixels in a cell: noise that is larger than the residuals falls with the root, to a quarter. Within a cell, the
+    # difference between old and new is the same for every pixel.
     rng, pixels = np.random.default_rng(8), 640
     cell = (np.arange(pixels) // 16).astype(np.int32)
     old, weight = 0.1 * rng.standard_normal(40)[cell], np.ones(pixels)
@@ -101,7 +101,7 @@ def test_cells_take_away_noise_and_leave_what_is_smooth() -> None:
     alone, together = loss_change(*o, *n, weight, 1), loss_change(*o, *n, weight, 1, cell)
     exact = loss_change(old, old, new, new, weight, 1)
     np.testing.assert_allclose(loss_change(old, old, new, new, weight, 1, cell).change, exact.change)
-    # Either error is an estimate from 40 cells, good to 20 %: far from the factor of 4 that is tested by half.
+    # Both errors are estimates from 40 cells, good to 20 %; they should differ by a factor of 4, and 2 is required.
     assert together.se < 0.5 * alone.se
     assert abs(together.change - exact.change) < 4 * together.se
 

@@ -1,5 +1,5 @@
-"""The prior of an instrument's errors, used in full: smaller errors where a fit did not use it, true ones, and faults
-by name.
+"""Using the prior of the instrument's errors in full: smaller errors where a fit had not used it, correct ones, and
+faults that are named.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ TISSUE, ERRORS, COUNT = 2, 3, 60
 
 @dataclass(frozen=True)
 class Crude:
-    """A linear fit by derivatives that are not the images' own, of images that a move changes too, of which it knows
-    nothing.
+    """A linear fit whose derivatives are not those of its images; a move also changes the images, and the fit does not
+    know of it.
     """
 
     answer: Array
-    """What it makes of measurements, (F, M)."""
+    """Derivative (F, M) of its answer by the measurements."""
     response: Array
-    """What it makes of the prior's means, B (F, K)."""
+    """Derivative B (F, K) of its answer by the prior's means."""
     exact: Array
     """The images' own derivatives, (M, F)."""
     move: Array
-    """What one ± of the move changes, (M,)."""
+    """Change (M,) of the measurements by one ± of the move."""
 
     @property
     def covariance(self) -> Array:
-        """Of its answer about the truth, (F, F)."""
+        """Covariance (F, F) of its answer about the truth."""
         moved = self.answer @ self.move
         return self.answer @ self.answer.T + self.response @ PRIOR @ self.response.T + np.outer(moved, moved)
 
@@ -43,7 +43,7 @@ class Crude:
         return Recombination(self.covariance, self.response, PRIOR)
 
     def draw(self, random: np.random.Generator, fault: Array | float = 0.0) -> Array:
-        """One answer less the truth, and its errors less their prior's means, (F + K,)."""
+        """One answer minus the truth, and the instrument's errors in it minus the means of their prior, (F + K,)."""
         means = random.standard_normal(ERRORS) @ np.sqrt(PRIOR) + fault
         measured = self.move * random.standard_normal() + random.standard_normal(COUNT)
         off = self.answer @ measured + self.response @ means
@@ -51,8 +51,8 @@ class Crude:
 
 
 def crude(seed: int, misfit: float, moved: float) -> Crude:
-    """Measurements of unit noise, in which the tissue is well and the errors are about as well known as by their
-    prior.
+    """Measurements with unit noise: they determine the tissue well, and the instrument's errors about as well as their
+    prior does.
     """
     random = np.random.default_rng(seed)
     exact = np.concatenate(
@@ -77,7 +77,7 @@ def test_a_fit_that_used_its_prior_in_full_stays_as_it_is() -> None:
 def test_no_error_is_known_worse_than_its_prior_and_every_other_at_least_as_well() -> None:
     one = crude(2, misfit=1.0, moved=2.0)
     assert one.covariance[TISSUE, TISSUE] > 1.5 * PRIOR[0, 0], "the crude fit is not crude"
-    settled = one.found.after(one.found.change()).covariance
+    settled = one.found.updated(one.found.change()).covariance
     assert (np.diag(settled)[TISSUE:] <= np.diag(PRIOR) * (1 + 1e-9)).all()
     assert (np.diag(settled) <= np.diag(one.covariance) * (1 + 1e-9)).all()
     assert settled[0, 0] < 0.9 * one.covariance[0, 0]
@@ -89,41 +89,44 @@ def test_what_it_states_is_what_repeated_fits_show() -> None:
     draws = np.array([one.draw(random) for _ in range(4000)])
     off, apart = draws[:, : TISSUE + ERRORS], draws[:, TISSUE + ERRORS :]
     shown = np.cov((off + apart @ change.T).T)
-    stated = one.found.after(change).covariance
+    stated = one.found.updated(change).covariance
     # A variance from 4,000 draws is known to 2.2 %: 4 of that.
     np.testing.assert_allclose(np.diag(shown) / np.diag(stated), 1.0, atol=4 * np.sqrt(2 / 4000))
-    np.testing.assert_allclose(np.diag(np.cov(apart.T)) / np.diag(one.found.spread), 1.0, atol=4 * np.sqrt(2 / 4000))
+    np.testing.assert_allclose(
+        np.diag(np.cov(apart.T)) / np.diag(one.found.difference_covariance), 1.0, atol=4 * np.sqrt(2 / 4000)
+    )
 
 
 def test_a_fault_is_named_with_its_size_and_does_not_draw_others_along() -> None:
     one, random, size = crude(4, misfit=0.3, moved=0.5), np.random.default_rng(5), np.array([-0.1, 0.0, 0.0])
     named = [faults(one.draw(random, fault=size)[TISSUE + ERRORS :], one.found) for _ in range(200)]
-    assert all(told and told[0].place == 0 for told in named)
+    assert all(told and told[0].index == 0 for told in named)
     sizes = np.array([told[0].size for told in named])
-    # The prior's mean is off by -0.1, so its error lies 0.1 above: mean of 200.
+    # The prior's mean is off by -0.1, so the error is 0.1 above it: mean of 200.
     assert abs(sizes.mean() - 0.1) < 4 * sizes.std() / np.sqrt(200)
-    # Of two others each one in 370 is named by chance: 200 times as many are below 6 in all but one case of 10,000.
+    # Each of the two others is named by chance in one case in 370: in 200 rounds there are fewer than 6 in all but one
+    # case in 10,000.
     assert sum(len(told) - 1 for told in named) < 6
 
 
 def test_good_calibrations_are_told_as_wrong_as_rarely_as_their_errors_say() -> None:
     one, random = crude(2, misfit=1.0, moved=2.0), np.random.default_rng(6)
     false = sum(bool(faults(one.draw(random)[TISSUE + ERRORS :], one.found)) for _ in range(2000))
-    # Three errors at z of 3: at most 3 / 370 of 2,000, 16; 4 of their Poisson errors above it.
+    # Three errors at z = 3: at most 3 / 370 of 2,000, which is 16; the bound is 4 Poisson errors above that.
     assert FAULT_Z == 3.0
     assert false < 16 + 4 * np.sqrt(16)
 
 
 def test_an_answer_that_is_freed_of_a_prior_does_not_follow_it_and_states_its_error() -> None:
     one, random = crude(4, misfit=0.3, moved=0.5), np.random.default_rng(7)
-    change = one.found.change(wrong=(0,))
-    after = one.found.after(change)
+    change = one.found.change(rejected=(0,))
+    after = one.found.updated(change)
     np.testing.assert_allclose(after.response[:, 0], 0.0, atol=1e-9)
-    # However far the prior's mean is off, the answer is not: mean and spread of 4,000 draws, 4 of their errors.
+    # However far off the prior's mean is, the answer is not: mean and spread of 4,000 draws, within 4 of their errors.
     draws = np.array([one.draw(random, fault=np.array([-0.3, 0.0, 0.0])) for _ in range(4000)])
     off = draws[:, : TISSUE + ERRORS] + draws[:, TISSUE + ERRORS :] @ change.T
     stated = np.sqrt(np.diag(after.covariance))
     assert (np.abs(off.mean(axis=0)) < 4 * stated / np.sqrt(4000)).all()
     np.testing.assert_allclose(off.std(axis=0) / stated, 1.0, atol=4 / np.sqrt(2 * 4000))
-    # Two of the answer's errors keep theirs.
+    # The two other errors keep their prior.
     assert (stated[TISSUE + 1 :] <= np.sqrt(np.diag(PRIOR))[1:] * (1 + 1e-9)).all()

@@ -1,4 +1,4 @@
-"""Steps of a stain texture on a product model whose truth is known: they lower F, find the texture, and leave alone
+"""Steps of a stain texture on a product model whose truth is known: they lower F, find the texture, and do not change
 what nobody sees.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from services.fit.solve.stains import DEEPEST, LONGEST_STEP, StainSolver, StainState, StainSums, clean
+from services.fit.solve.stains import DEEPEST, LONGEST_STEP, StainSolver, StainState, StainSums, clean_state
 
 TEXELS = 60
 CHAIN = np.stack([np.arange(TEXELS - 1), np.arange(1, TEXELS)], axis=1)
@@ -20,8 +20,8 @@ UNSEEN = slice(50, TEXELS)
 
 @dataclass
 class Toy:
-    """C_p = light_p exp(-sum_t S_pt d_t): a share 1 on the way out at one texel, another spread over its neighbourhood
-    on the way in.
+    """C_p = light_p exp(-sum_t S_pt d_t): on its way out the light passes one texel with a share of 1; on its way in, a
+    second share of 1 is spread over the texels around it.
     """
 
     light: np.ndarray
@@ -47,7 +47,7 @@ class Toy:
         return float(0.5 * self.weight * ((self.image(depth) - self.reference) ** 2).sum())
 
     def sums(self, depth: np.ndarray, seed: int = 0) -> StainSums:
-        # Two independent renders, as in a fit: one in the cotangents, one behind the shares.
+        # Two independent renders, as in a fit: one for the cotangents, one for the shares.
         rng = np.random.default_rng(seed)
         first, second = (self.image(depth) * (1 + self.noise * rng.standard_normal(len(self.light))) for _ in range(2))
         carried, explained = (self.weight * (c * second) @ self.shares for c in (first, self.reference))
@@ -62,9 +62,9 @@ def truth(low: float = 0.0) -> np.ndarray:
 
 
 def test_ratio_steps_lower_the_loss_however_uneven_the_texture() -> None:
-    # The bound holds for any texture without noise, as long as nothing is shifted: here a third of the surface is clean
-    # and the render starts too bright.
-    toy, state = Toy.of(truth()), clean(TEXELS)
+    # Without noise the bound holds for any texture, as long as nothing is shifted: here a third of the surface is clean
+    # and the first render is too bright.
+    toy, state = Toy.of(truth()), clean_state(TEXELS)
     for _ in range(6):
         before, state = toy.loss(state.depth), SOLVER.ratio_step(state, toy.sums(state.depth))
         assert toy.loss(state.depth) < before
@@ -72,9 +72,9 @@ def test_ratio_steps_lower_the_loss_however_uneven_the_texture() -> None:
 
 
 def test_ratio_steps_find_the_pattern_when_the_render_is_too_dark() -> None:
-    # Media that took the mean of the stain: everything is brighter than the render in the clean parts. The pattern
-    # comes out, up to a common depth.
-    toy, state = Toy.of(truth()), clean(TEXELS)
+    # The media have absorbed the mean of the stain, so clean parts are brighter than the render. The pattern is found
+    # up to a common depth.
+    toy, state = Toy.of(truth()), clean_state(TEXELS)
     toy.light = toy.light * 0.6
     for _ in range(2):
         state = SOLVER.ratio_step(state, toy.sums(state.depth))
@@ -83,9 +83,9 @@ def test_ratio_steps_find_the_pattern_when_the_render_is_too_dark() -> None:
 
 
 def test_exact_steps_find_the_texture() -> None:
-    # What stays after seven steps is the slowest direction, (1 - 1/4) damped to a momentum step's 0.48 each, and the
-    # prior, at most 1e-3 of the data here.
-    toy, state = Toy.of(truth()), clean(TEXELS)
+    # What remains after seven steps is the slowest direction, (1 - 1/4) for each step, reduced by momentum to 0.48, and
+    # the prior, at most 1e-3 of the data here.
+    toy, state = Toy.of(truth()), clean_state(TEXELS)
     for step in range(20):
         state = SOLVER.exact_step(state, toy.sums(state.depth), 0)
         if step == 6:
@@ -98,7 +98,7 @@ def test_shorter_steps_average_noise() -> None:
     for name, slower in (("constant", 0), ("falling", 1)):
         ends = []
         for seed in range(12):
-            toy, state = Toy.of(truth(0.1), noise=0.2), clean(TEXELS)
+            toy, state = Toy.of(truth(0.1), noise=0.2), clean_state(TEXELS)
             for step in range(16):
                 state = SOLVER.exact_step(state, toy.sums(state.depth, 100 * seed + step), slower * step)
             ends.append(state.depth[:50])
@@ -107,12 +107,12 @@ def test_shorter_steps_average_noise() -> None:
 
 
 def test_what_nobody_sees_stays_clean() -> None:
-    toy, state = Toy.of(truth()), clean(TEXELS)
+    toy, state = Toy.of(truth()), clean_state(TEXELS)
     for step in range(10):
         state = SOLVER.exact_step(state, toy.sums(state.depth), step)
-    assert not state.seen[UNSEEN].any()
-    assert state.seen[:50].any()
-    # Neighbours pull the first of them; ten texels away the prior has won.
+    assert not state.determined[UNSEEN].any()
+    assert state.determined[:50].any()
+    # Neighbours pull the first of these texels; ten texels away the prior dominates.
     assert state.depth[-1] < 0.25 * max(state.depth[49], 0.04)
 
 
@@ -120,7 +120,7 @@ def test_what_nobody_sees_stays_clean() -> None:
 def test_sums_of_any_size_give_finite_steps_of_a_stated_length(value: float) -> None:
     rng = np.random.default_rng(3)
     sums = StainSums(value * rng.uniform(-1, 1, TEXELS), value * rng.uniform(-1, 1, TEXELS), 0.0)
-    state = clean(TEXELS)
+    state = clean_state(TEXELS)
     for step in range(4):
         for moved in (SOLVER.ratio_step(state, sums), SOLVER.exact_step(state, sums, step)):
             assert np.isfinite(moved.depth).all()
@@ -133,7 +133,7 @@ def test_sums_of_any_size_give_finite_steps_of_a_stated_length(value: float) -> 
 def test_a_state_survives_the_journal_exactly() -> None:
     toy = Toy.of(truth(), noise=0.1)
     state = SOLVER.exact_step(
-        SOLVER.ratio_step(clean(TEXELS), toy.sums(np.zeros(TEXELS))), toy.sums(np.zeros(TEXELS)), 0
+        SOLVER.ratio_step(clean_state(TEXELS), toy.sums(np.zeros(TEXELS))), toy.sums(np.zeros(TEXELS)), 0
     )
     again = StainState.of(json.loads(json.dumps(state.record())))
     assert again.record() == state.record()

@@ -1,4 +1,4 @@
-"""The table search on images that are polynomials in the albedo by construction."""
+"""The table search, on images that are polynomials in the albedo by construction."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def test_finds_the_albedo_and_scale_it_was_given() -> None:
     for alpha, scale in ((0.93, 1.0), (0.99, 1.2), (0.997, 0.9)):
         image = scale * np.einsum("k,kln->ln", bin_powers(np.array([alpha]), EDGES)[0], orders)
         found = search_node(NODE, [(orders, orders)], EDGES, [_observed(image)], 3000)
-        # 3000 albedos over two decades of 1 - alpha: neighbours are 0.15 % of 1 - alpha apart; by error alone scale
-        # must not matter.
+        # 3000 albedos over two decades of 1 - alpha: neighbours differ by 0.15 % of 1 - alpha; the choice by error
+        # must not depend on the scale.
         closest = min(found, key=lambda c: c.error)
         assert abs(np.log((1 - closest.alpha) / (1 - alpha))) < 0.05
         assert abs(closest.scale / scale - 1) < 0.01
@@ -57,7 +57,7 @@ def test_independent_seeds_keep_noise_out_of_the_error() -> None:
     image = np.einsum("k,kln->ln", bin_powers(np.array([0.99]), EDGES)[0], orders)
     first, second = (orders * (1 + 2.0 * rng.standard_normal(orders.shape)) for _ in range(2))
     found = search_node(NODE, [(first, second)], EDGES, [_observed(image)], 500)[0]
-    # Noise of a pixel is 50 % here; one seed would give an error of about 0.4.
+    # The noise of a pixel is 50 % here; a single seed would give an error of about 0.4.
     assert found.error < 0.1
 
 

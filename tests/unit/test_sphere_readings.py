@@ -1,4 +1,4 @@
-"""Readings of an integrating sphere: both formats, what is made of them, and the sentence for what cannot be read."""
+"""Readings of an integrating sphere: both formats, what is derived from them, and the sentence for bad ones."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PLAIN: dict[str, Any] = {
     "totals": [{"wavelength_nm": 550, "R": 0.3, "R_se": 0.002, "T": 0.4, "T_se": 0.003}],
 }
 FEW = 12
-"""Nodes where the same model makes the readings and reads them, so that its own error cancels."""
+"""Number of nodes where the same model makes the readings and evaluates them, so that its own error cancels."""
 SPHERE = {
     "diameter_mm": 100,
     "sample_port_mm": 20,
@@ -62,7 +62,7 @@ def test_calculated_readings_give_their_coefficients_back(tmp_path: Path) -> Non
     for fitted, (scattering, absorption, g) in zip(fits, TRUTHS, strict=True):
         fit = fitted.fit
         assert fit.converged
-        # The listed inversion is within 1.1 % and 0.001; the readings' own 16 points leave less than 0.1 %.
+        # The listed inversion is right within 1.1 % and 0.001; the error from 16 points is below 0.1 %.
         assert fit.sigma_a.value == pytest.approx(absorption, rel=1.1e-2)
         assert fit.sigma_s_reduced.value == pytest.approx(scattering * (1 - g), rel=1e-3)
         assert fit.g.value == pytest.approx(g, abs=1e-3)
@@ -87,7 +87,7 @@ def test_all_calculated_readings_of_the_shared_data_give_their_coefficients_back
 
 
 def written(file: dict[str, Any], optics: Optics, **reading: Any) -> SphereFile:
-    """The file with the readings that the instrument gives of a medium."""
+    """The file with the readings that the instrument gives for a medium."""
     known = SphereFile.model_validate(file)
     totals = slab_totals(optics, known.cell.width_mm, interface_of(known.cell), FEW)
     first = known.totals[0].model_copy(update=reading)
@@ -108,7 +108,7 @@ def test_readings_through_any_instrument_give_the_medium_back(changes: dict[str,
     (fitted,) = fit_readings(written(PLAIN | {"g": 0.8} | changes, optics, source=source), FEW)
     assert fitted.fit.sigma_a.value == pytest.approx(0.05, rel=1e-5)
     assert fitted.fit.sigma_s_reduced.value == pytest.approx(0.8, rel=1e-5)
-    assert not fitted.fit.g.determined  # it was given
+    assert not fitted.fit.g.determined  # g was given, not measured
     assert fitted.fit.sigma_s is None
 
 
@@ -126,7 +126,7 @@ def test_standard_errors_are_those_of_repeated_readings() -> None:
             [other.fit.sigma_a.value - fit.sigma_a.value, other.fit.sigma_s_reduced.value - fit.sigma_s_reduced.value]
         )
     expected_se = np.sqrt(np.square(moved).sum(axis=0))
-    # Readings move by one standard error, over which the coefficients bend by less than 3 %.
+    # Readings are changed by one standard error, over which the coefficients are linear to 3 %.
     assert [fit.sigma_a.se, fit.sigma_s_reduced.se] == pytest.approx(expected_se, rel=3e-2)
 
 
@@ -218,7 +218,7 @@ def test_the_command_writes_by_wavelength(tmp_path: Path, capsys: pytest.Capture
     readings = json.loads((tmp_path / "out" / "readings.json").read_text())["550"]
     assert readings["R_fitted"] == pytest.approx(0.3, abs=1e-6)
     assert "550: σa" in capsys.readouterr().out
-    # One wavelength tells no colour.
+    # One wavelength gives no colour.
     assert not (tmp_path / "out" / "translucency.json").exists()
     with pytest.raises(SettingsError, match="darker backing"):
         sphere_command(file, tmp_path / "out", black=0.5, white=0.5)
@@ -233,7 +233,7 @@ def test_a_grey_slab_over_black_and_white() -> None:
     totals = slab_totals(optics, 2, interface_of(file.cell))
     told = translucency_of(file, fits, 0.05, 0.9)
     assert told is not None
-    # A spectrum without colour has X, Y, Z in the light's own ratio: Y is the reflectance, a and b are 0.
+    # A spectrum without colour has X, Y, Z in the ratio of the light's: Y is the reflectance, a and b are 0.
     dark, bright = over_backing(totals, 0.05), over_backing(totals, 0.9)
     assert told.contrast_ratio == pytest.approx(dark / bright, rel=1e-9)
     lightness = [116 * y ** (1 / 3) - 16 for y in (dark, bright)]
@@ -242,14 +242,15 @@ def test_a_grey_slab_over_black_and_white() -> None:
     wider = translucency_of(file, [Fitted(fitted.fit, optics, 4e-6 * np.eye(2))] * len(nm), 0.05, 0.9)
     assert wider is not None
     assert wider.translucency_parameter_se == pytest.approx(2 * told.translucency_parameter_se, rel=1e-6)
-    # Sixteen wavelengths that err by themselves do less than one error that all share, and at least a quarter of it.
+    # Independent errors of sixteen wavelengths have less effect than one error that all share, and at least a quarter
+    # of it.
     shared = [lightness_gain(Optics(0.101, 1.5, 0), file), lightness_gain(Optics(0.1, 1.501, 0), file)]
     common = float(np.hypot(*(np.array(shared) - told.translucency_parameter)))
     assert common / 4 < told.translucency_parameter_se < common
 
 
 def lightness_gain(optics: Optics, file: SphereFile) -> float:
-    """Of a slab without colour, from black to white: its translucency parameter."""
+    """Difference of lightness of a slab without colour over black and over white: its translucency parameter."""
     totals = slab_totals(optics, file.cell.width_mm, interface_of(file.cell))
     return 116 * (over_backing(totals, 0.9) ** (1 / 3) - over_backing(totals, 0.05) ** (1 / 3))
 
@@ -264,6 +265,6 @@ def test_lab_of_a_known_colour() -> None:
 def test_a_backing_sends_light_back_through_the_slab() -> None:
     totals = slab_totals(Optics(0, 2, 0), 1, interface_of(SphereFile.model_validate(PLAIN).cell))
     assert over_backing(totals, 0) == totals.reflectance
-    # A white slab over a white backing keeps nothing.
+    # A white slab over a white backing absorbs nothing.
     assert over_backing(totals, 1) == pytest.approx(1, abs=1e-6)
     assert math.isclose(totals.reflectance + totals.transmittance, 1, abs_tol=1e-6)

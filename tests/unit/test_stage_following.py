@@ -1,4 +1,4 @@
-"""What a job does whose task no worker runs, or whose worker dies with the result."""
+"""How a job follows a task that no worker runs, or whose worker dies with the result."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPEC = JobSpec(capture=Path("/mouth"))
 
 
 class Task:
-    """A future of the scheduler's: by its statuses, one after the other, and how often its result does not come."""
+    """A future of the scheduler: its statuses, one after the other, and how often its result does not arrive."""
 
     def __init__(self, *statuses: str, silent: int = 0) -> None:
         self._statuses, self._silent, self.asked = list(statuses), silent, 0
@@ -44,7 +44,7 @@ def follow(monkeypatch: pytest.MonkeyPatch, folder: Path, task: Task, stage: Sta
     monkeypatch.setattr("distributed.wait", wait)
     monkeypatch.setattr("services.pipeline.following.GRACE_S", 0.0)
     client: Any = SimpleNamespace(submit=lambda *_, **__: task, processing=dict, restart_workers=lambda *_, **__: None)
-    watch: Any = SimpleNamespace(tell=lambda: None)
+    watch: Any = SimpleNamespace(pass_on_events=lambda: None)
     described = StageTask(stage, "door", SPEC, folder, EventAddress("sqlite://", "job"))
     follow_stage(client, lambda: None, described, watch)
 
@@ -73,7 +73,7 @@ def test_a_result_that_dies_with_its_worker_is_waited_for_again(
 def test_a_task_that_is_lost_is_followed_until_it_has_run_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    # A worker that dies with a result leaves the task lost: neither running nor ended.
+    # When a worker dies with a result, the task is lost: neither running nor ended.
     task = Task("lost", "lost", "lost", "finished")
     follow(monkeypatch, tmp_path, task)
     assert task.asked == 1

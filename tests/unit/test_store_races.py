@@ -1,4 +1,4 @@
-"""Two that write at once: neither file nor lease is torn, and the newer attempt has the stage."""
+"""Two that write at once: files and leases stay whole, and the newer attempt's result remains."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from services.core.geometry import Record
 from services.core.store import StageWriter, open_stage, write_atomic
 
 HEAD_START_S = 1.0
-"""How long the overtaking one is given while the other holds still; the one that waits for a lock takes it all."""
+"""How long the overtaking writer is given while the other is held back; one that waits for a lock uses all of it."""
 
 
 class Note(Record):
-    """What a stage publishes here."""
+    """The result that a stage publishes here."""
 
     by: int
 
@@ -56,7 +56,7 @@ def test_the_newer_of_two_attempts_that_start_at_once_has_the_lease(
     newer: list[threading.Thread] = []
 
     def write_late(path: Path, content: bytes) -> None:
-        if content == b"2":  # the older one has compared and is about to write
+        if content == b"2":  # the older attempt has compared and is about to write
             newer.append(threading.Thread(target=StageWriter, args=(tmp_path, "fit", 3)))
             newer[0].start()
             newer[0].join(HEAD_START_S)

@@ -1,4 +1,4 @@
-"""An array that is read tells damage of its own, and leaves errors of its readers theirs."""
+"""A stored array reports damage as damage, and lets its readers' own errors through."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
-"""Stored truths hold what they say: optics of their subject, closed meshes, little space; and the sensor noise that is
-added is that of the variance files.
+"""Stored truths are as described: optics of their subject, closed meshes, little space; the added sensor noise has the
+variance in the files.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Threads that do short work in order."""
+"""Threads for short pieces of work, done in order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_work_that_hangs_does_not_keep_the_server_from_its_end(monkeypatch: pyte
     pool, goes_on = ThreadPool(1), threading.Event()
 
     async def close_while_it_works() -> bool:
-        work = asyncio.create_task(pool.ask(goes_on.wait, 30))
+        work = asyncio.create_task(pool.run(goes_on.wait, 30))
         await asyncio.sleep(0)
         pool.close()
         assert not work.done()
@@ -29,7 +29,7 @@ def test_what_is_under_way_is_awaited() -> None:
     pool, is_done = ThreadPool(1), threading.Event()
 
     async def close_after_asking() -> None:
-        asked = asyncio.create_task(pool.ask(is_done.set))
+        asked = asyncio.create_task(pool.run(is_done.set))
         await asyncio.sleep(0)
         pool.close()
         assert is_done.is_set()

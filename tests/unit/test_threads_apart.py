@@ -1,4 +1,4 @@
-"""Who looks up a token or a name does not wait for threads that hang in other work."""
+"""Looking up a token or a host name does not wait for threads that hang in other work."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.guarded_server import make_token
 
 @asynccontextmanager
 async def every_thread_hanging() -> AsyncIterator[None]:
-    """Those that everything shares, for the time of the block."""
+    """All threads of the common pool hang for the time of the block."""
     goes_on = threading.Event()
     asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
     hanging = asyncio.create_task(asyncio.to_thread(goes_on.wait, 60))

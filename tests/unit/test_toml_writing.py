@@ -1,4 +1,4 @@
-"""A raw folder's description is read by Python's own TOML reader as it was written."""
+"""Python's own TOML reader reads back a raw folder's description as it was written."""
 
 from __future__ import annotations
 

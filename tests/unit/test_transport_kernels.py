@@ -1,4 +1,4 @@
-"""A request like an earlier one is served by the kernel that was compiled for it."""
+"""A request that differs from an earlier one only in pixels and seeds uses the kernel compiled for that one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.support.small_tooth import camera_at, recipe, whole_view
 
 
 def test_new_pixels_and_seeds_need_no_new_kernel() -> None:
-    # Every list has a length of its own, and comes in memory of NumPy that is aligned or not by chance.
+    # Every list has a different length, and is in NumPy memory that is aligned or not by chance.
     engine, tissue = Engine(recipe()), Tissue(Medium(2, 0.95), Medium(3, 0.8), (0.5, 0.4))
     import drjit as dr
 

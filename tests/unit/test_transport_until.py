@@ -1,5 +1,5 @@
-"""Rounds of a walk that is to reach an error: they go on where the last one ended, grow within bounds, and stop when
-the error is there.
+"""Rounds of a walk until an error is reached: each goes on where the last one ended, grows within bounds, and the walk
+stops at that error.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ PIXELS = 400
 
 
 class Walk:
-    """Pixels of brightness 1 whose paths have a standard deviation of their own."""
+    """Pixels of brightness 1; each pixel's paths have their own standard deviation."""
 
     def __init__(self, spread: float) -> None:
         self.spread, self.rounds, self.random = spread, list[range](), np.random.default_rng(1)
@@ -41,8 +41,8 @@ def test_rounds_follow_on_and_grow_within_bounds() -> None:
     for last, following in zip(walk.rounds, walk.rounds[1:], strict=False):
         assert following.start == last.stop
         assert MIN_GROWTH <= following.stop / last.stop <= GROWTH
-    # An error of 5 % takes 200^2 paths; 6000 degrees of freedom know it to 2 %, and the last round leaves a margin of 5
-    # to 25 %.
+    # An error of 5 % needs 200^2 paths; it is known to 2 % from 6000 degrees of freedom, and the last round has a
+    # margin of 5 to 25 %.
     assert found.samples == 16 * walk.rounds[-1].stop
     assert 0.95 * 200**2 <= found.samples <= 1.35 * 200**2
     assert abs(found.mean.mean() - 1) <= 4.5 * 0.05 / np.sqrt(PIXELS)

@@ -1,4 +1,4 @@
-"""One judgement of a fit: what the report, the page, the API and the command line say is this."""
+"""One judgement of a fit, used alike by the report, the page, the API and the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Where webhooks may go: what is not public is refused, in every spelling, before and after its name is resolved."""
+"""Where webhooks may go: addresses that are not public are refused, in every spelling, before and after the name is
+resolved.
+"""
 
 from __future__ import annotations
 

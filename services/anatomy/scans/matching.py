@@ -29,7 +29,7 @@ SOFT_MM = 1.0
 SCALES = (0.8, 1.25)
 """Smallest and largest ratio of a tooth's size to the average's. Real teeth differ by 10 to 20 %, and an upper average
 also represents the smaller lower incisors."""
-NECK = 0.12
+NECK_SHARE = 0.12
 """Fraction of the crown's length above its neck in which the mesh is not compared, because its cervical line, or the
 place where it was cut and closed, differs from the average's."""
 MESH_POINTS, CROWN_POINTS = 3000, 2500
@@ -66,10 +66,6 @@ class Placements:
     misfits_mm: Array
     """(G,): mean distance, normals included, of the crown's points from the mesh."""
 
-    def of(self, chosen: NDArray[np.int64]) -> Placements:
-        """Select the placements with the given indices."""
-        return Placements(self.axes[chosen], self.centres_mm[chosen], self.scales[chosen], self.misfits_mm[chosen])
-
 
 class CrownMatch:
     """Average crown of a tooth's kind and side, for registration to the tooth's mesh."""
@@ -101,7 +97,7 @@ class CrownMatch:
         """Half of the average crown's extent (3,) along its own axes."""
         return np.asarray(np.ptp(self._crown_points(CROWN_POINTS).points_mm, axis=0) / 2)
 
-    def settled(self, axes: Array, points: int, rounds: int, top_mm: Array | None = None) -> Placements:
+    def register(self, axes: Array, points: int, rounds: int, top_mm: Array | None = None) -> Placements:
         """Register the crown to the mesh from given axes; at first the crown's top lies at the mesh's top.
 
         Args:
@@ -111,7 +107,11 @@ class CrownMatch:
             top_mm: (3,), initial position of the crown's top in place of the mesh's top.
         """
         crown = self._crown_points(points)
-        placed = self._begun(axes, crown.points_mm) if top_mm is None else self._hung(axes, crown.points_mm, top_mm)
+        placed = (
+            self._initial_placements(axes, crown.points_mm)
+            if top_mm is None
+            else self._placements_below(axes, crown.points_mm, top_mm)
+        )
         for _ in range(rounds):
             placed = self._step(placed, crown)
         _, distance = self._closest(placed, crown)
@@ -123,21 +123,21 @@ class CrownMatch:
         low, high = self._average.points_mm[:, 2].min(), self._average.points_mm[:, 2].max()
         misfits = np.full(len(placed.axes), FARTHEST_MM)
         for g, (axes, centre, scale) in enumerate(zip(placed.axes, placed.centres_mm, placed.scales, strict=True)):
-            seen = SurfacePoints((points - centre) @ axes.T / scale, normals @ axes.T).features
-            seen = seen[seen[:, 2] > low + NECK * (high - low)]
-            if len(seen) >= MIN_REVERSE_POINTS:
-                misfits[g] = np.minimum(self._average_tree.query(seen)[0], FARTHEST_MM).mean()
+            features = SurfacePoints((points - centre) @ axes.T / scale, normals @ axes.T).features
+            features = features[features[:, 2] > low + NECK_SHARE * (high - low)]
+            if len(features) >= MIN_REVERSE_POINTS:
+                misfits[g] = np.minimum(self._average_tree.query(features)[0], FARTHEST_MM).mean()
         return misfits
 
     def _crown_points(self, count: int) -> SurfacePoints:
         found = _sampled(self._crown, count)
         return SurfacePoints((found.points_mm - self._middle) * self._mirror, found.normals * self._mirror)
 
-    def _hung(self, axes: Array, crown_mm: Array, top_mm: Array) -> Placements:
+    def _placements_below(self, axes: Array, crown_mm: Array, top_mm: Array) -> Placements:
         ones = np.ones(len(axes))
         return Placements(axes, top_mm - np.ptp(crown_mm[:, 2]) / 2 * axes[:, 2], ones, ones)
 
-    def _begun(self, axes: Array, crown_mm: Array) -> Placements:
+    def _initial_placements(self, axes: Array, crown_mm: Array) -> Placements:
         along = np.einsum("gkj,nj->gkn", axes, self._mesh.points_mm)
         length, top = float(np.ptp(crown_mm[:, 2])), along[:, 2].max(axis=1)
         within = (along[:, 2] > (top - length)[:, None])[:, None]
@@ -180,10 +180,10 @@ def _sampled(mesh: Mesh, count: int) -> SurfacePoints:
     random = np.random.default_rng(0)
     corners = mesh.vertices_mm[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    twice = np.linalg.norm(normals, axis=1)
-    reached = np.cumsum(twice)
-    chosen = np.searchsorted(reached, (np.arange(count) + 0.5) / count * reached[-1])
+    doubled_areas = np.linalg.norm(normals, axis=1)
+    cumulative = np.cumsum(doubled_areas)
+    chosen = np.searchsorted(cumulative, (np.arange(count) + 0.5) / count * cumulative[-1])
     u, v = random.random((2, count))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     a, b, c = (corners[chosen, k] for k in range(3))
-    return SurfacePoints(a + u[:, None] * (b - a) + v[:, None] * (c - a), normals[chosen] / twice[chosen, None])
+    return SurfacePoints(a + u[:, None] * (b - a) + v[:, None] * (c - a), normals[chosen] / doubled_areas[chosen, None])

@@ -21,8 +21,8 @@ def neighbours(faces: Faces) -> NDArray[np.int64]:
     start, end = faces.astype(np.int64).reshape(-1), np.roll(faces, -1, axis=1).astype(np.int64).reshape(-1)
     key, twin = start * count + end, end * count + start
     order = np.argsort(key)
-    place = np.minimum(np.searchsorted(key[order], twin), len(key) - 1)
-    return np.where(key[order][place] == twin, order[place] // 3, -1).reshape(-1, 3)
+    found = np.minimum(np.searchsorted(key[order], twin), len(key) - 1)
+    return np.where(key[order][found] == twin, order[found] // 3, -1).reshape(-1, 3)
 
 
 def pieces(faces: Faces) -> NDArray[np.int64]:
@@ -176,11 +176,11 @@ def without_specks(mesh: Mesh, labels: NDArray[np.int64], share: float = 0.05) -
         speck[own] = size[number] < share * size.sum()
     labels = labels.copy()
     while speck.any():
-        beside = (across >= 0) & ~speck[across] & speck[:, None]
-        reached = np.flatnonzero(beside.any(axis=1))
+        is_adjacent = (across >= 0) & ~speck[across] & speck[:, None]
+        reached = np.flatnonzero(is_adjacent.any(axis=1))
         if len(reached) == 0:
             break
-        labels[reached] = labels[across[reached, beside[reached].argmax(axis=1)]]
+        labels[reached] = labels[across[reached, is_adjacent[reached].argmax(axis=1)]]
         speck[reached] = False
     return labels
 

@@ -67,9 +67,9 @@ STUB = Root()
 
 def whole_root(fdi: int) -> Root:
     """Root of average length for the tooth's kind; the roots of a molar are replaced by one of their common width."""
-    place = fdi % 10
-    taper = MOLAR_TAPER if place >= FIRST_MOLAR else WHOLE_TAPER
-    return Root(root_length_mm(place, is_upper=is_upper(fdi)), taper, narrowing=WHOLE_NARROWING)
+    position = fdi % 10
+    taper = MOLAR_TAPER if position >= FIRST_MOLAR else WHOLE_TAPER
+    return Root(root_length_mm(position, is_upper=is_upper(fdi)), taper, narrowing=WHOLE_NARROWING)
 
 
 def close_crown(crown: Mesh, occlusal: NDArray[np.float64], name: str, root: Root = STUB) -> Mesh:

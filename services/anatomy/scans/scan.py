@@ -12,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from services.anatomy.scans.parting import part_by_landmarks
 from services.anatomy.scans.patches import middle_mm
+from services.anatomy.scans.segmentation import GINGIVA, segment_by_landmarks
 from services.anatomy.scans.units import MM_PER_UNIT, Unit, require_anatomical_scale
 from services.anatomy.templates.average_arch import is_upper
 from services.core.errors import CaptureInputError, InputError
@@ -25,8 +25,6 @@ Numbering = Literal["universal", "fdi", "either"]
 one exceeds the Universal numbers; else Universal numbers."""
 Jaw = Literal["upper", "lower"]
 
-GINGIVA = 0
-"""Label of the gingiva."""
 LABEL = "Label"
 """Default name of the array of labels."""
 HIGHEST_UNIVERSAL = 32
@@ -99,7 +97,7 @@ def read_scan(
     mesh = Mesh(MM_PER_UNIT[units] * mesh.vertices_mm, mesh.faces)
     if values is None:
         mesh.require_surface(f"of scan {path}", EXTENT_MM)
-        fdi = part_by_landmarks(mesh, points_mm or {}, f"scan {path}")
+        fdi = segment_by_landmarks(mesh, points_mm or {}, f"scan {path}")
     else:
         fdi = _fdi_numbers(values, numbering, path)
     scan = LabelledScan(mesh, fdi, doubled, is_labelled)
@@ -136,14 +134,14 @@ def _require_one_jaw(scan: LabelledScan, path: Path, jaw: Jaw | None) -> None:
 def _triangle_labels(file: ScanFile, path: Path, labels: str) -> NDArray[np.float64]:
     # Labels (F,) of the triangles, from the scan's file or from a file beside it.
     if Path(labels).suffix.lower() in SIDECARS:
-        beside = path.parent / labels
-        return _per_triangle(read_sidecar(beside), file, f"Label file {beside}")
+        sidecar = path.parent / labels
+        return _per_triangle(read_sidecar(sidecar), file, f"Label file {sidecar}")
     found = _array(file, labels)
     if found is not None:
         return _per_triangle(np.asarray(found, dtype=np.float64), file, f"Scan {path}, array {labels},")
-    held = ", ".join(sorted(file.triangle_arrays | file.vertex_arrays)) or "none"
+    available = ", ".join(sorted(file.triangle_arrays | file.vertex_arrays)) or "none"
     raise CaptureInputError(
-        f"Scan {path} has no label per triangle named {labels} (it has: {held}); export it with its segmentation, "
+        f"Scan {path} has no label per triangle named {labels} (it has: {available}); export it with its segmentation, "
         "or name a file of labels beside it (.json, .npy, .txt, .csv)."
     )
 

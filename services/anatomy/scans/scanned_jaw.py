@@ -25,9 +25,10 @@ from services.anatomy.scans.patches import (
     without_specks,
 )
 from services.anatomy.scans.roots import STUB, Root, close_crown, whole_root
-from services.anatomy.scans.scan import GINGIVA, LabelledScan
+from services.anatomy.scans.scan import LabelledScan
 from services.anatomy.scans.scanned_gums import gums_solid
-from services.anatomy.templates.average_arch import nominal_places, side_of_front
+from services.anatomy.scans.segmentation import GINGIVA, MIN_SPREAD_RATIO
+from services.anatomy.templates.average_arch import nominal_positions, side_of_front
 from services.core.errors import CaptureInputError
 from services.core.geometry import Mesh, Tooth
 
@@ -38,9 +39,6 @@ SMALLEST_CROWN_MM2 = 15.0
 STEEPEST_TILT_DEG = 25.0
 """Largest angle between a tooth's axis and the arch's normal; upper front teeth lean to the front by about this
 angle."""
-FLAT = 0.2
-"""Ratio of the spread of the crowns across their line to that along it, above which their middles span the occlusal
-plane."""
 
 
 @dataclass(frozen=True)
@@ -156,9 +154,9 @@ def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64], Repairs]:
     # Manifold surface with one rim, its labels without specks and with smooth borders, and the repairs.
     kept = manifold_piece(scan.mesh)
     labels = scan.fdi[kept]
-    lost = set(scan.teeth) - set(labels.tolist())
-    if lost or not (labels == GINGIVA).any():
-        what = f"tooth {min(lost)}" if lost else "the gingiva"
+    missing = set(scan.teeth) - set(labels.tolist())
+    if missing or not (labels == GINGIVA).any():
+        what = f"tooth {min(missing)}" if missing else "the gingiva"
         raise CaptureInputError(
             f"In the scan {what} hangs together with nothing else; export one connected surface of the jaw."
         )
@@ -182,7 +180,7 @@ def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float6
     # normal of the scan's rim determines the rotation about that line.
     opening = vector_area_mm2(surface)
     _, spread, principal = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)
-    plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
+    plane = len(teeth) > 2 and spread[1] > MIN_SPREAD_RATIO * spread[0]
     occlusal = principal[2] if plane else opening - (opening @ principal[0]) * principal[0]
     occlusal = _unit(occlusal * np.sign(occlusal @ opening))
 
@@ -190,11 +188,11 @@ def _arch_axes(teeth: tuple[int, ...], surface: Mesh, middles: NDArray[np.float6
     # nearer to a mirrored arch.
     side = np.linalg.svd(occlusal[None])[2][1]
     across = np.stack([side, np.cross(occlusal, side)])
-    seen = (middles - middles.mean(axis=0)) @ across.T
-    nominal = nominal_places(teeth)[0][:, :2]
+    projected = (middles - middles.mean(axis=0)) @ across.T
+    nominal = nominal_positions(teeth)[0][:, :2]
     nominal -= nominal.mean(axis=0)
-    seen_plane, nominal_plane = seen @ (1, 1j), nominal @ (1, 1j)
-    match, mirrored = np.vdot(nominal_plane, seen_plane), np.vdot(nominal_plane.conj(), seen_plane)
+    measured_plane, nominal_plane = projected @ (1, 1j), nominal @ (1, 1j)
+    match, mirrored = np.vdot(nominal_plane, measured_plane), np.vdot(nominal_plane.conj(), measured_plane)
     if abs(mirrored) > abs(match) * (1 + 1e-3) and len(teeth) > 2 and plane:
         raise CaptureInputError(
             "The scan's teeth run the wrong way around the arch; exchange left and right in its labels, or mirror the"
@@ -217,8 +215,10 @@ def _tooth_axes(
         occlusal = _unit(_unit(vector_area_mm2(crowns[teeth[k]])) + upward)
         tilt = np.arccos(occlusal @ upward)
         if tilt > np.radians(STEEPEST_TILT_DEG):
-            lean = _unit(occlusal - (occlusal @ upward) * upward)
-            occlusal = np.cos(np.radians(STEEPEST_TILT_DEG)) * upward + np.sin(np.radians(STEEPEST_TILT_DEG)) * lean
+            tilt_direction = _unit(occlusal - (occlusal @ upward) * upward)
+            occlusal = (
+                np.cos(np.radians(STEEPEST_TILT_DEG)) * upward + np.sin(np.radians(STEEPEST_TILT_DEG)) * tilt_direction
+            )
         buccal = _unit(np.cross(occlusal, tangent))
         axes[teeth[k]] = np.stack([np.cross(buccal, occlusal), buccal, occlusal])
     return axes

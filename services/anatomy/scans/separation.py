@@ -61,10 +61,10 @@ def separate(teeth: tuple[Tooth, ...], gums: Mesh | None) -> SeparateSurfaces:
         return SeparateSurfaces(
             tuple(outer.faces_in(together) for outer in outers), (_EMPTY,) * len(teeth), _EMPTY, contacts
         )
-    holder = _Solid(gums, "gums.ply")
-    outside, within = together + holder.body, together ^ holder.body
+    gums_solid = _Solid(gums, "gums.ply")
+    outside, within = together + gums_solid.body, together ^ gums_solid.body
     crowns, roots = (tuple(outer.faces_in(body) for outer in outers) for body in (outside, within))
-    return SeparateSurfaces(crowns, roots, holder.faces_in(outside), contacts)
+    return SeparateSurfaces(crowns, roots, gums_solid.faces_in(outside), contacts)
 
 
 _EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))

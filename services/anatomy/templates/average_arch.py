@@ -31,7 +31,7 @@ def side_of_front(fdi: int) -> int:
     return 1 if fdi // 10 % 2 == 0 else -1
 
 
-def nominal_places(teeth: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def nominal_positions(teeth: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Middles (N, 3) in mm and canonical axes (N, 3, 3) of the given teeth in an average arch.
 
     The rows of the axes are x = y × z, y buccal and z occlusal.
@@ -39,14 +39,14 @@ def nominal_places(teeth: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray
     line = np.concatenate([NOMINAL_MM[::-1] * (-1, 1), NOMINAL_MM])
     steps = np.gradient(line, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
-    places = np.array(
+    indices = np.array(
         [len(NOMINAL_MM) + (number % 10 - 1 if side_of_front(number) > 0 else -(number % 10)) for number in teeth]
     )
     axes = np.zeros((len(teeth), 3, 3))
-    axes[:, 0, :2] = steps[places]
-    axes[:, 1, :2] = np.stack([-steps[places, 1], steps[places, 0]], axis=-1)
+    axes[:, 0, :2] = steps[indices]
+    axes[:, 1, :2] = np.stack([-steps[indices, 1], steps[indices, 0]], axis=-1)
     axes[:, 2, 2] = 1.0
-    return np.concatenate([line[places], np.zeros((len(teeth), 1))], axis=1), axes
+    return np.concatenate([line[indices], np.zeros((len(teeth), 1))], axis=1), axes
 
 
 def arch_from_middles(teeth: tuple[int, ...], middles_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -54,6 +54,6 @@ def arch_from_middles(teeth: tuple[int, ...], middles_mm: NDArray[np.float64]) -
 
     Middles in a line do not determine the rotation about it, which is then arbitrary.
     """
-    nominal, _ = nominal_places(teeth)
+    nominal, _ = nominal_positions(teeth)
     left, _, right = np.linalg.svd((nominal - nominal.mean(axis=0)).T @ (middles_mm - middles_mm.mean(axis=0)))
     return np.asarray(left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right)

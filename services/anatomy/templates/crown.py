@@ -232,10 +232,10 @@ def _dentin_profile(form: CrownForm, crown_length_mm: float, outer: Profile, sca
 def _dentin_top_mm(form: CrownForm, crown_length_mm: float, dentin: Profile, scale: float) -> float:
     # Height of the dentin's top: below the tip by the enamel's thickness, and where the walls leave enough room.
     heights = np.linspace(0.0, crown_length_mm, 1000)
-    room = (dentin(heights)[1] >= DENTIN_EDGE_MM) & (
+    fits = (dentin(heights)[1] >= DENTIN_EDGE_MM) & (
         heights + enamel_thickness_mm(form, crown_length_mm, heights, scale) <= crown_length_mm
     )
-    return float(heights[room].max())
+    return float(heights[fits].max())
 
 
 def _stack(profile: Profile, ends_mm: tuple[float, float], rounding_mm: tuple[float, float], form: CrownForm) -> Mesh:

@@ -69,10 +69,10 @@ def build_incisor(columns: int = 40) -> Incisor:
     """
     crown = _stack(_outer_profile, (-ROOT_STUB_MM, CROWN_MM), (ROOT_ROUNDING_MM, EDGE_ROUNDING_MM), columns)
     heights = np.linspace(0.0, CROWN_MM, 1000)
-    room = (_dentin_profile(heights)[1] >= DENTIN_EDGE_MM) & (heights + enamel_thickness_mm(heights) <= CROWN_MM)
+    fits = (_dentin_profile(heights)[1] >= DENTIN_EDGE_MM) & (heights + enamel_thickness_mm(heights) <= CROWN_MM)
     core = _stack(
         _dentin_profile,
-        (-ROOT_STUB_MM + ROOT_ENAMEL_MM, float(heights[room].max())),
+        (-ROOT_STUB_MM + ROOT_ENAMEL_MM, float(heights[fits].max())),
         (ROOT_ROUNDING_MM, DENTIN_EDGE_MM / 2),
         columns,
     )

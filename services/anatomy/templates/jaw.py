@@ -22,9 +22,9 @@ from services.core.errors import MeshError
 from services.core.geometry import Mesh
 
 RIGHT, LEFT = 10, 20
-"""Numbers of the upper quadrants, to which the place is added to give the FDI number."""
-PLACES = range(1, 8)
-"""Places of the teeth from the midline; there are no third molars."""
+"""Numbers of the upper quadrants, to which the position is added to give the FDI number."""
+POSITIONS = range(1, 8)
+"""Positions of the teeth from the midline; there are no third molars."""
 GAP_MM = 0.07
 """Smallest distance between neighbours, mm."""
 MAX_MOVES = 60
@@ -34,7 +34,7 @@ GAP_ERROR_MM = 0.005
 SEPARATION_MM = 1.0
 """Distance between two teeth, in addition to their half widths, before they are moved together, mm."""
 SHORT_OF_PLANE_MM = {2: 0.6, 7: 0.3}
-"""Distance in mm by which teeth end above the occlusal plane, by place from the midline."""
+"""Distance in mm by which teeth end above the occlusal plane, by position from the midline."""
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 """Reflection (3, 3) that exchanges left and right."""
 
@@ -87,7 +87,7 @@ class Jaw:
 
 
 @dataclass(frozen=True)
-class Stance:
+class ToothVariation:
     """Deviation of one tooth from the average."""
 
     enamel_scale: float = 1.0
@@ -110,9 +110,9 @@ def build_jaw(seed: int | None = None) -> Jaw:
     arch = Arch()
     random = None if seed is None else np.random.default_rng(seed)
     size = 1.0 if random is None else 1 + SIZE_SPREAD * float(random.uniform(-1, 1))
-    right = _quadrant(arch, _stances(random), None)
+    right = _quadrant(arch, _variations(random), None)
     # Build the left quadrant as a mirrored right one, in contact with the mirrored right central incisor.
-    left = right if random is None else _quadrant(arch, _stances(random), _mirrored(right[0][0]))
+    left = right if random is None else _quadrant(arch, _variations(random), _mirrored(right[0][0]))
 
     sockets = tuple(socket for _, socket in reversed(right)) + tuple(
         replace(socket, arc_mm=-socket.arc_mm) for _, socket in left
@@ -122,11 +122,11 @@ def build_jaw(seed: int | None = None) -> Jaw:
     return Jaw(tuple(_grown(tooth, size) for tooth in teeth), _scaled(gums, size), _scaled(cavity, size))
 
 
-def _stances(random: np.random.Generator | None) -> tuple[Stance, ...]:
+def _variations(random: np.random.Generator | None) -> tuple[ToothVariation, ...]:
     if random is None:
-        return tuple(Stance() for _ in PLACES)
+        return tuple(ToothVariation() for _ in POSITIONS)
     tilt, turn = TILT_SPREAD_DEG, TURN_SPREAD_DEG
-    draws = random.uniform(-1, 1, (len(PLACES), 6)) * [
+    draws = random.uniform(-1, 1, (len(POSITIONS), 6)) * [
         ENAMEL_SPREAD,
         tilt,
         tilt,
@@ -134,37 +134,41 @@ def _stances(random: np.random.Generator | None) -> tuple[Stance, ...]:
         SHIFT_SPREAD_MM,
         SHIFT_SPREAD_MM,
     ]
-    return tuple(Stance(1 + enamel, (x, y, z), forward, longer) for enamel, x, y, z, forward, longer in draws.tolist())
+    return tuple(
+        ToothVariation(1 + enamel, (x, y, z), forward, longer) for enamel, x, y, z, forward, longer in draws.tolist()
+    )
 
 
-def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -> list[tuple[JawTooth, Socket]]:
+def _quadrant(
+    arch: Arch, variations: tuple[ToothVariation, ...], first: JawTooth | None
+) -> list[tuple[JawTooth, Socket]]:
     # Starting at the midline, move each tooth along the arch until it almost touches the tooth before it. The first
     # tooth is moved to the midline's plane if it has no neighbour.
     placed: list[tuple[JawTooth, Socket]] = []
     neighbour = None if first is None else SurfaceDistance(_far_half(first))
     arc_mm = 0.0
-    for place, stance in zip(PLACES, stances, strict=True):
-        d = upper_tooth(place)
-        solid = build_tooth(d, stance.enamel_scale)
+    for position, variation in zip(POSITIONS, variations, strict=True):
+        d = upper_tooth(position)
+        solid = build_tooth(d, variation.enamel_scale)
         arc_mm -= d.md_crown_mm / 2 + SEPARATION_MM
         facing = solid.outer.vertices_mm[solid.outer.vertices_mm[:, 0] > d.md_crown_mm / 4]
-        frame, spare_mm = _standing(arch, arc_mm, solid, d, stance), SEPARATION_MM
+        frame, gap_error_mm = _upright_frame(arch, arc_mm, solid, d, variation), SEPARATION_MM
         for _ in range(MAX_MOVES):
-            if abs(spare_mm) < GAP_ERROR_MM:
+            if abs(gap_error_mm) < GAP_ERROR_MM:
                 break
             points = frame.world_from_canonical(facing)
-            spare_mm = float(
+            gap_error_mm = float(
                 -points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM
             )
             # Move by a little less than the gap, because turning with the arch may bring a corner nearer than the move.
-            arc_mm += 0.85 * spare_mm
-            frame = _standing(arch, arc_mm, solid, d, stance)
+            arc_mm += 0.85 * gap_error_mm
+            frame = _upright_frame(arch, arc_mm, solid, d, variation)
         else:
             raise MeshError(
-                f"Tooth {RIGHT + place} finds no place beside its neighbour along the arch; give it a smaller"
+                f"Tooth {RIGHT + position} finds no place beside its neighbour along the arch; give it a smaller"
                 " variation."
             )
-        tooth = _stood(solid, frame, RIGHT + place)
+        tooth = _posed(solid, frame, RIGHT + position)
         neighbour = SurfaceDistance(_far_half(tooth))
         cervix_z_mm = float(frame.world_from_canonical(np.array([[0.0, 0.0, solid.cervix_mm]]))[0, 2])
         curvature_mm = (d.curvature_mesial_mm + d.curvature_distal_mm) / 2
@@ -173,21 +177,23 @@ def _quadrant(arch: Arch, stances: tuple[Stance, ...], first: JawTooth | None) -
     return placed
 
 
-def _standing(arch: Arch, arc_mm: float, solid: ToothSolid, d: ToothDimensions, stance: Stance) -> ToothFrame:
+def _upright_frame(
+    arch: Arch, arc_mm: float, solid: ToothSolid, d: ToothDimensions, variation: ToothVariation
+) -> ToothFrame:
     # Frame of a tooth that stands upright on the arch with its tip on the occlusal plane, then turned about its middle.
     from scipy.spatial.transform import Rotation
 
     at = np.array([arc_mm])
     point, outward, mesial = arch.points_mm(at)[0], arch.outward(at)[0], arch.tangents(at)[0]
     upright = np.array([[*mesial, 0.0], [*outward, 0.0], [0.0, 0.0, 1.0]])
-    rotation = Rotation.from_euler("xyz", stance.turn_deg, degrees=True).as_matrix().T @ upright
+    rotation = Rotation.from_euler("xyz", variation.turn_deg, degrees=True).as_matrix().T @ upright
     tip_mm = float(solid.outer.vertices_mm[:, 2].max())
-    height = stance.longer_mm - SHORT_OF_PLANE_MM.get(d.position, 0.0) - tip_mm
-    origin = np.append(point + stance.forward_mm * outward, height)
+    height = variation.longer_mm - SHORT_OF_PLANE_MM.get(d.position, 0.0) - tip_mm
+    origin = np.append(point + variation.forward_mm * outward, height)
     return ToothFrame(rotation, -rotation @ origin)
 
 
-def _stood(solid: ToothSolid, frame: ToothFrame, fdi: int) -> JawTooth:
+def _posed(solid: ToothSolid, frame: ToothFrame, fdi: int) -> JawTooth:
     outer, dentin = (
         Mesh(frame.world_from_canonical(mesh.vertices_mm), mesh.faces) for mesh in (solid.outer, solid.dentin)
     )

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from starlette.requests import HTTPConnection
 
 
-LOOKERS = 4
+LOOKUP_THREADS = 4
 """Number of threads that look up tokens and owners. They do nothing else, so that no disk or name server that hangs can
 delay ALL OFF."""
 
@@ -24,7 +24,7 @@ class Access:
     """Identifies the callers of one server; ``sessions`` is None where access is open."""
 
     def __init__(self, tokens: Tokens, sessions: Sessions | None) -> None:
-        self.tokens, self.sessions, self.lookers = tokens, sessions, ThreadPool(LOOKERS)
+        self.tokens, self.sessions, self.lookup_pool = tokens, sessions, ThreadPool(LOOKUP_THREADS)
 
     async def identify(self, request: HTTPConnection) -> Caller:
         """Return the caller, identified by the Authorization header or else by the session cookie.
@@ -44,7 +44,7 @@ class Access:
             if presented.startswith(DARK):
                 return await self._of_session(self.sessions.read_dark_key(presented), only_darkens=True)
             if (token := self.tokens.trusted(presented=presented)) is None:
-                token = await self.lookers.ask(self.tokens.authenticate, presented)
+                token = await self.lookup_pool.run(self.tokens.authenticate, presented)
             return Caller.of(token)
         if (cookie := request.cookies.get(COOKIE)) is not None:
             return await self._of_session(self.sessions.read(cookie))
@@ -54,7 +54,7 @@ class Access:
 
     async def _of_session(self, session: Session, *, only_darkens: bool = False) -> Caller:
         if (token := self.tokens.trusted(session_of=session.sha256)) is None:
-            token = await self.lookers.ask(self.tokens.living, session.token_id, session.sha256)
+            token = await self.lookup_pool.run(self.tokens.authenticate_session, session.token_id, session.sha256)
         return Caller.of(token, by_session=True, only_darkens=only_darkens)
 
     @staticmethod

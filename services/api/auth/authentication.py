@@ -20,10 +20,10 @@ from services.api.auth.access import Access
 from services.api.auth.audit import AuditedAction, AuditLog
 from services.api.auth.browser_protection import SAFE_METHODS
 from services.api.auth.ownership import Ownership
-from services.api.auth.scopes import LIVENESS, SETUP, Found, GuardedRoute, find_route, guarded_routes
+from services.api.auth.scopes import LIVENESS, SETUP, RouteMatch, ScopedRoute, find_route, scoped_routes
 from services.api.auth.tokens import Caller, public_id
 from services.api.http.problems import MEDIA_TYPE, Problem, database_lost, response_of
-from services.api.http.rate_limits import Rates, network_of
+from services.api.http.rate_limits import RateLimits, network_of
 from services.api.http.request_log import method_of
 from services.api.http.thread_pools import ThreadPool
 from services.client.errors import RateError, ScopeError, UnauthenticatedError
@@ -48,16 +48,16 @@ class AuthenticationMiddleware:
         app: ASGIApp,
         owner: Starlette,
         access: Access,
-        rates: Rates,
+        rate_limits: RateLimits,
         audit: AuditLog,
-        auditors: ThreadPool,
-        dark_auditors: ThreadPool,
+        audit_pool: ThreadPool,
+        dark_audit_pool: ThreadPool,
     ) -> None:
-        self._app, self._access, self._rates = app, access, rates
+        self._app, self._access, self._rate_limits = app, access, rate_limits
         # Build the table before the first request: FastAPI builds every route when the routes are first walked, which
         # takes 0.2 s.
-        self._routes: Sequence[GuardedRoute] = guarded_routes(owner.routes)
-        self._audit, self._auditors, self._dark_auditors = audit, auditors, dark_auditors
+        self._routes: Sequence[ScopedRoute] = scoped_routes(owner.routes)
+        self._audit, self._audit_pool, self._dark_audit_pool = audit, audit_pool, dark_audit_pool
         self._ownership = Ownership(access.tokens.engine)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -75,7 +75,7 @@ class AuthenticationMiddleware:
         )
         try:
             refusal = await (
-                self._stranger_refusal(request, audited) if _is_setup(found) else self._refusal(request, found, audited)
+                self._setup_refusal(request, audited) if _is_setup(found) else self._refusal(request, found, audited)
             )
         except SQLAlchemyError:
             refusal = database_lost(scope["path"])
@@ -84,33 +84,33 @@ class AuthenticationMiddleware:
             return
         await self._pass(request, found.route, audited, receive, send)
 
-    async def _refusal(self, request: HTTPConnection, found: Found, audited: AuditedAction) -> Response | None:
+    async def _refusal(self, request: HTTPConnection, found: RouteMatch, audited: AuditedAction) -> Response | None:
         """Return the answer to a request that may not pass; None if it may."""
         path, is_change = request.scope["path"], request.scope["method"] not in SAFE_METHODS
         try:
             caller = await self._access.identify(request)
         except UnauthenticatedError as problem:
-            return await self._refuse_unknown(request, problem, audited)
+            return await self._refuse_unauthenticated(request, problem, audited)
         audited.who, audited.token = caller.name, caller.token.id if caller.token else None
-        if wait_s := self._rates.count(audited.token or network_of(audited.address), is_change=is_change):
-            return _too_many(
+        if wait_s := self._rate_limits.count(audited.token or network_of(audited.address), is_change=is_change):
+            return _rate_limited(
                 f"Token {caller.name} asked" if caller.token else f"Address {audited.address} asked", wait_s, path
             )
         if found.route is None:
-            return _nothing_there(found, path, request.scope["method"])
+            return _not_found(found, path, request.scope["method"])
         try:
             found.route.admit(caller)
         except ScopeError as problem:
-            await self._auditors.ask(self._audit.append, audited, HTTPStatus.FORBIDDEN)
+            await self._audit_pool.run(self._audit.append, audited, HTTPStatus.FORBIDDEN)
             lacking = f', scope="{found.route.needs.scope}"' if found.route.needs else ""
             return response_of(
                 problem, path, {"WWW-Authenticate": f'Bearer realm="dentine", error="insufficient_scope"{lacking}'}
             )
         request.scope["caller"], request.scope["audited"] = caller, audited
-        return await self._hidden(request, found.route, found.ids, caller, audited)
+        return await self._ownership_refusal(request, found.route, found.ids, caller, audited)
 
-    async def _hidden(
-        self, request: HTTPConnection, route: GuardedRoute, ids: dict[str, str], caller: Caller, audited: AuditedAction
+    async def _ownership_refusal(
+        self, request: HTTPConnection, route: ScopedRoute, ids: dict[str, str], caller: Caller, audited: AuditedAction
     ) -> Response | None:
         """Return the answer to a request that names something of another owner, before anything else of the request is
         looked at; None if it may pass. The answer is the same as for something that does not exist.
@@ -118,30 +118,30 @@ class AuthenticationMiddleware:
         named = None if caller.viewer.sees_all else self._ownership.named_in(route.template, ids)
         if named is None:
             return None
-        thing, name = named
-        if (owner := thing.known_owner(name)) is None:
-            owner = await self._access.lookers.ask(thing.find_owner, self._ownership.engine, name)
+        kind, name = named
+        if (owner := kind.cached_owner(name)) is None:
+            owner = await self._access.lookup_pool.run(kind.find_owner, self._ownership.engine, name)
         if caller.viewer.may_see(owner):
             return None
         if _is_audited(request.scope, route):
-            await self._auditors.ask(self._audit.append, audited, HTTPStatus.NOT_FOUND)
-        return response_of(thing.absent(name), request.scope["path"])
+            await self._audit_pool.run(self._audit.append, audited, HTTPStatus.NOT_FOUND)
+        return response_of(kind.unknown_error(name), request.scope["path"])
 
-    async def _stranger_refusal(self, request: HTTPConnection, audited: AuditedAction) -> Response | None:
+    async def _setup_refusal(self, request: HTTPConnection, audited: AuditedAction) -> Response | None:
         """Return the answer to a caller with a setup link who is over the rate limit; None if the link may be tried.
         Each try counts as a request without a valid token.
         """
         audited.who, request.scope["audited"] = "setup link", audited
-        if wait_s := self._rates.count_refusal(network_of(audited.address)):
-            await self._tell_of_many(audited)
-            return _too_many(f"Address {audited.address} asked", wait_s, request.scope["path"])
+        if wait_s := self._rate_limits.count_refusal(network_of(audited.address)):
+            await self._audit_excess(audited)
+            return _rate_limited(f"Address {audited.address} asked", wait_s, request.scope["path"])
         return None
 
-    async def _tell_of_many(self, audited: AuditedAction) -> None:
-        if self._rates.is_worth_telling(network_of(audited.address)):
-            await self._auditors.ask(self._audit.append, audited, HTTPStatus.TOO_MANY_REQUESTS)
+    async def _audit_excess(self, audited: AuditedAction) -> None:
+        if self._rate_limits.should_audit_refusal(network_of(audited.address)):
+            await self._audit_pool.run(self._audit.append, audited, HTTPStatus.TOO_MANY_REQUESTS)
 
-    async def _refuse_unknown(
+    async def _refuse_unauthenticated(
         self, request: HTTPConnection, problem: UnauthenticatedError, audited: AuditedAction
     ) -> Response:
         """Answer and audit a request without a valid token. Refusals of one address are audited singly up to the rate
@@ -151,62 +151,62 @@ class AuthenticationMiddleware:
         """
         credential = Access.credential(request)
         audited.token = public_id(credential) if credential else None
-        if wait_s := self._rates.count_refusal(network_of(audited.address)):
-            await self._tell_of_many(audited)
-            return _too_many(f"Address {audited.address} was refused", wait_s, request.scope["path"])
-        await self._auditors.ask(self._audit.append, audited, HTTPStatus.UNAUTHORIZED)
+        if wait_s := self._rate_limits.count_refusal(network_of(audited.address)):
+            await self._audit_excess(audited)
+            return _rate_limited(f"Address {audited.address} was refused", wait_s, request.scope["path"])
+        await self._audit_pool.run(self._audit.append, audited, HTTPStatus.UNAUTHORIZED)
         challenge = 'Bearer realm="dentine"' + (', error="invalid_token"' if credential else "")
         return response_of(problem, request.scope["path"], {"WWW-Authenticate": challenge})
 
     async def _pass(
-        self, request: HTTPConnection, route: GuardedRoute | None, audited: AuditedAction, receive: Receive, send: Send
+        self, request: HTTPConnection, route: ScopedRoute | None, audited: AuditedAction, receive: Receive, send: Send
     ) -> None:
         scope = request.scope
         is_audited = _is_audited(scope, route)
-        auditors = (
-            self._dark_auditors
+        audit_pool = (
+            self._dark_audit_pool
             if route is not None and route.needs is not None and route.needs.darkens
-            else self._auditors
+            else self._audit_pool
         )
-        known_at, is_over = time.monotonic(), False
+        checked_at_s, is_over = time.monotonic(), False
 
         async def send_audited(message: Message) -> None:
-            nonlocal known_at, is_over
+            nonlocal checked_at_s, is_over
             if is_over:
                 return
             if message["type"] == "http.response.start" and is_audited:
-                audited.ids |= _made(message)
+                audited.ids |= _created_resource(message)
                 try:
-                    await auditors.ask(self._audit.append, audited, message["status"])
+                    await audit_pool.run(self._audit.append, audited, message["status"])
                 except SQLAlchemyError:
                     is_over = True
-                    full = PlatformError(
+                    unwritable = PlatformError(
                         "The audit log cannot be written, so nothing is handed out; check the database and its disk."
                     )
-                    await response_of(full, scope["path"])(scope, receive, send)
+                    await response_of(unwritable, scope["path"])(scope, receive, send)
                     return
             if (
                 message["type"] == "http.response.body"
                 and message.get("more_body")
-                and time.monotonic() - known_at > RECHECK_S
+                and time.monotonic() - checked_at_s > RECHECK_S
             ):
-                known_at, is_over = time.monotonic(), not await self._is_still_known(request)
+                checked_at_s, is_over = time.monotonic(), not await self._is_still_authenticated(request)
                 if is_over:
                     await send({"type": "http.response.body", "body": b""})
-                    work.cancel()
+                    serving.cancel()
                     return
             await send(message)
 
-        with anyio.CancelScope() as work:
+        with anyio.CancelScope() as serving:
             try:
                 await self._app(scope, receive, send_audited)
             except Exception:
                 if is_audited:
                     with suppress(SQLAlchemyError):
-                        await auditors.ask(self._audit.append, audited, HTTPStatus.INTERNAL_SERVER_ERROR)
+                        await audit_pool.run(self._audit.append, audited, HTTPStatus.INTERNAL_SERVER_ERROR)
                 raise
 
-    async def _is_still_known(self, request: HTTPConnection) -> bool:
+    async def _is_still_authenticated(self, request: HTTPConnection) -> bool:
         # A database that does not answer cannot say that the token has ended; the next message asks it again.
         try:
             with suppress(SQLAlchemyError):
@@ -216,13 +216,13 @@ class AuthenticationMiddleware:
         return True
 
 
-def _is_audited(scope: Scope, route: GuardedRoute | None) -> bool:
+def _is_audited(scope: Scope, route: ScopedRoute | None) -> bool:
     return scope["method"] not in SAFE_METHODS or (
         route is not None and route.needs is not None and route.needs.audited
     )
 
 
-def _is_public(scope: Scope, found: Found) -> bool:
+def _is_public(scope: Scope, found: RouteMatch) -> bool:
     """Whether a request needs no caller: it asks for the liveness route, or for a path that only the static files of
     the page can answer.
     """
@@ -231,7 +231,7 @@ def _is_public(scope: Scope, found: Found) -> bool:
     return not scope["path"].startswith("/v1/") and not found.allowed_methods
 
 
-def _is_setup(found: Found) -> bool:
+def _is_setup(found: RouteMatch) -> bool:
     return found.route is not None and found.route.template == SETUP
 
 
@@ -239,16 +239,16 @@ def _address(scope: Scope) -> str:
     return scope["client"][0] if scope.get("client") else "unknown"
 
 
-def _made(message: Message) -> dict[str, str]:
+def _created_resource(message: Message) -> dict[str, str]:
     location = next((value for name, value in message["headers"] if name.lower() == b"location"), None)
     return {} if location is None else {"made": location.decode("latin-1")}
 
 
-def _too_many(who: str, wait_s: int, path: str) -> Response:
+def _rate_limited(who: str, wait_s: int, path: str) -> Response:
     return response_of(RateError(f"{who} too often; wait {wait_s} s."), path, {"Retry-After": str(wait_s)})
 
 
-def _nothing_there(found: Found, path: str, method: str) -> Response:
+def _not_found(found: RouteMatch, path: str, method: str) -> Response:
     if found.allowed_methods:
         allowed = ", ".join(sorted(found.allowed_methods))
         problem = Problem.of(

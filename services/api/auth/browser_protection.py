@@ -24,7 +24,7 @@ PAGE_POLICY = (
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-_ALWAYS = (
+_HEADERS = (
     (b"content-security-policy", PAGE_POLICY.encode()),
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"no-referrer"),
@@ -35,8 +35,8 @@ _ALWAYS = (
         b"camera=(), display-capture=(), geolocation=(), hid=(), microphone=(), payment=(), serial=(), usb=()",
     ),
 )
-_BY_TLS_ONLY = (b"strict-transport-security", f"max-age={365 * 86400}".encode())
-_NOT_KEPT = (b"cache-control", b"no-store")
+_TLS_HEADER = (b"strict-transport-security", f"max-age={365 * 86400}".encode())
+_API_HEADER = (b"cache-control", b"no-store")
 
 
 class BrowserProtection:
@@ -50,7 +50,7 @@ class BrowserProtection:
 
     def __init__(self, app: ASGIApp, *, names: Iterable[str], secure: bool) -> None:
         self._app, self._names = app, frozenset(name.strip("[] ").lower() for name in names)
-        self._headers = (*_ALWAYS, *((_BY_TLS_ONLY,) if secure else ()))
+        self._headers = (*_HEADERS, *((_TLS_HEADER,) if secure else ()))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -58,7 +58,7 @@ class BrowserProtection:
             await self._app(scope, receive, send)
             return
 
-        async def send_shielded(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 is_api = scope["path"].startswith("/v1/")
                 own = [one for one in message["headers"] if not (is_api and one[0] == b"cache-control")]
@@ -66,26 +66,26 @@ class BrowserProtection:
                 message["headers"] = [
                     *own,
                     *(one for one in self._headers if one[0] not in set_already),
-                    *([_NOT_KEPT] if is_api else []),
+                    *([_API_HEADER] if is_api else []),
                 ]
             await send(message)
 
-        asked, refusal = Headers(scope=scope), None
-        if _name_of(asked.get("host", "")) not in self._names:
+        headers, refusal = Headers(scope=scope), None
+        if _name_of(headers.get("host", "")) not in self._names:
             detail = (
                 "This server does not go by the name in the request's Host; add it to DENTINE__SERVER__NAMES, or use"
                 " another."
             )
             refusal = Problem.of(HTTPStatus.BAD_REQUEST, "foreign-host", detail, scope["path"])
-        elif scope["method"] not in SAFE_METHODS and _is_foreign(asked):
+        elif scope["method"] not in SAFE_METHODS and _is_foreign(headers):
             detail = "Another site asked for this change; use the dashboard or the API itself."
             refusal = Problem.of(HTTPStatus.FORBIDDEN, "foreign-origin", detail, scope["path"])
         if refusal is not None:
             await Response(refusal.model_dump_json(), refusal.status, media_type=MEDIA_TYPE)(
-                scope, receive, send_shielded
+                scope, receive, send_with_headers
             )
             return
-        await self._app(scope, receive, send_shielded)
+        await self._app(scope, receive, send_with_headers)
 
 
 def _name_of(host: str) -> str | None:
@@ -93,17 +93,17 @@ def _name_of(host: str) -> str | None:
     return match[1].strip("[]").lower() if match else None
 
 
-def _is_foreign(asked: Headers) -> bool:
+def _is_foreign(headers: Headers) -> bool:
     """Whether the page of another site may be behind a change.
 
     A browser says in Origin or Sec-Fetch-Site where a change comes from; a request with a cookie must say so.
     """
-    origin, site = asked.get("origin"), asked.get("sec-fetch-site")
-    if origin is not None and _host_of(origin) != asked.get("host"):
+    origin, site = headers.get("origin"), headers.get("sec-fetch-site")
+    if origin is not None and _host_of(origin) != headers.get("host"):
         return True
     if site not in {None, "same-origin", "none"}:
         return True
-    return origin is None and site is None and "cookie" in asked and "authorization" not in asked
+    return origin is None and site is None and "cookie" in headers and "authorization" not in headers
 
 
 def _host_of(origin: str) -> str | None:

@@ -13,21 +13,21 @@ from services.api.auth.sessions import Sessions, read_key
 from services.api.auth.setup_links import SetupLinks
 from services.api.auth.tokens import Tokens
 from services.api.http.body_limit import BodyLimit
-from services.api.http.rate_limits import Rates
+from services.api.http.rate_limits import RateLimits
 from services.api.http.thread_pools import ThreadPool
 from services.core.settings import ServerSettings
 
 
 def install(
-    app: FastAPI, settings: ServerSettings, engine: sql.Engine, auditors: ThreadPool, dark_auditors: ThreadPool
+    app: FastAPI, settings: ServerSettings, engine: sql.Engine, audit_pool: ThreadPool, dark_audit_pool: ThreadPool
 ) -> None:
     """Add the routes of tokens, sessions and audit, and the middleware that limits bodies and authenticates all
     requests.
 
     Args:
-        auditors: threads that write audit rows.
-        dark_auditors: threads that write the audit rows of requests that darken a dome, so that their answers wait for
-            no other row.
+        audit_pool: threads that write audit rows.
+        dark_audit_pool: threads that write the audit rows of requests that darken a dome, so that their answers wait
+            for no other row.
     """
     sessions = Sessions(read_key(settings.data), settings.session_s) if settings.access == "tokens" else None
     access, audit = Access(Tokens(engine), sessions), AuditLog(engine)
@@ -37,8 +37,8 @@ def install(
         AuthenticationMiddleware,
         owner=app,
         access=access,
-        rates=Rates(settings.rates),
+        rate_limits=RateLimits(settings.rates),
         audit=audit,
-        auditors=auditors,
-        dark_auditors=dark_auditors,
+        audit_pool=audit_pool,
+        dark_audit_pool=dark_audit_pool,
     )

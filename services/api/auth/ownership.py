@@ -13,7 +13,7 @@ from services.api.jobs.table import deletion_table, job_table, unknown_deletion,
 from services.core.errors import DentineError
 from services.pipeline.database import Query
 
-MAX_KNOWN = 20_000
+MAX_CACHED = 20_000
 """Largest number of owners of one kind that are kept in memory, some 4 MB. They are never read again because owners
 never change."""
 _DELETIONS = "/v1/deletions/"
@@ -26,13 +26,15 @@ def _owner_by(name: sql.Column[str], owner: sql.Column[str]) -> Query:
 class OwnedKind:
     """A kind of object that has an owner and that paths name: jobs, captures or receipts of deletions."""
 
-    def __init__(self, name: sql.Column[str], owner: sql.Column[str], absent: Callable[[str], DentineError]) -> None:
-        self._query, self.absent = _owner_by(name, owner), absent
-        self._known: dict[str, str] = {}
+    def __init__(
+        self, name: sql.Column[str], owner: sql.Column[str], unknown_error: Callable[[str], DentineError]
+    ) -> None:
+        self._query, self.unknown_error = _owner_by(name, owner), unknown_error
+        self._cached_owners: dict[str, str] = {}
 
-    def known_owner(self, name: str) -> str | None:
+    def cached_owner(self, name: str) -> str | None:
         """Return the owner if it was looked up before, else None."""
-        return self._known.get(name)
+        return self._cached_owners.get(name)
 
     def find_owner(self, engine: sql.Engine, name: str) -> str | None:
         """Look up the owner in the database; None if there is no such object."""
@@ -41,9 +43,9 @@ class OwnedKind:
         rows = self._query.rows(engine, of=name)
         if not rows:
             return None
-        if len(self._known) >= MAX_KNOWN:
-            self._known.clear()
-        owner = self._known[name] = str(rows[0][0])
+        if len(self._cached_owners) >= MAX_CACHED:
+            self._cached_owners.clear()
+        owner = self._cached_owners[name] = str(rows[0][0])
         return owner
 
 

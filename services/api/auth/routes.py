@@ -12,7 +12,7 @@ from services.api.auth.scopes import needs
 from services.api.auth.sessions import COOKIE, Sessions
 from services.api.auth.setup_links import SetupLinks
 from services.api.auth.tokens import NAME, Caller, IssuedToken, Scope, Token
-from services.api.http.bodies import BodyRoute, Sent
+from services.api.http.bodies import BodyRoute, ValidatedBody
 from services.api.http.problems import refusals
 from services.client.errors import SetupLinkError, UnauthenticatedError
 from services.core.geometry import Record
@@ -66,10 +66,14 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
     router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 422))
 
     @router.post("/tokens", status_code=201, tags=["access"], dependencies=[needs("admin")])
-    def create(wanted: Sent[TokenRequest], request: Request, response: Response) -> IssuedToken:
+    def create(token_request: ValidatedBody[TokenRequest], request: Request, response: Response) -> IssuedToken:
         """Make a token. Its secret is in this answer and nowhere else."""
         issued = access.tokens.create(
-            wanted.name, wanted.scopes, wanted.expires_days, request.scope["audited"], wanted.group
+            token_request.name,
+            token_request.scopes,
+            token_request.expires_days,
+            request.scope["audited"],
+            token_request.group,
         )
         response.headers["Location"] = f"/v1/tokens/{issued.id}"
         return issued
@@ -92,7 +96,7 @@ def build_access_router(access: Access, audit: AuditLog, links: SetupLinks, *, s
         return value
 
     @router.post("/setup", status_code=201, tags=["access"])
-    def set_up(link: Sent[SetupRequest], request: Request, response: Response) -> IssuedToken:
+    def set_up(link: ValidatedBody[SetupRequest], request: Request, response: Response) -> IssuedToken:
         """Make the first administrator's token by the link in the server's log, which works once, and open a browser
         session for it.
         """

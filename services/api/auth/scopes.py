@@ -31,7 +31,7 @@ PAGE = "dashboard"
 """Name of the mount of the static page, which holds no data."""
 
 
-class Needs(HTTPBearer):
+class RequiredScope(HTTPBearer):
     """Dependency that refuses callers without a scope; the OpenAPI description shows it as the security of the
     route.
     """
@@ -56,7 +56,7 @@ def needs(scope: str, *, audited: bool = False, darkens: bool = False) -> params
             those of other routes.
     """
     known = Scope(scope)
-    return params.Security(Needs(known, audited=audited, darkens=darkens), scopes=[known])
+    return params.Security(RequiredScope(known, audited=audited, darkens=darkens), scopes=[known])
 
 
 def require(caller: Caller | None, scope: Scope) -> None:
@@ -75,22 +75,22 @@ async def _viewer(request: Request) -> Viewer:
     return caller.viewer
 
 
-Asker = Annotated[Viewer, Depends(_viewer)]
+CurrentViewer = Annotated[Viewer, Depends(_viewer)]
 """Annotation of a handler's parameter that receives who asks. The authentication middleware has checked already whether
 the caller may see what the path names by ``job_id`` or ``capture``."""
 
 
 @dataclass(frozen=True)
-class GuardedRoute:
+class ScopedRoute:
     """A route of the application and the scopes that it declares."""
 
     template: str
     methods: frozenset[str]
     pattern: re.Pattern[str]
-    declared: tuple[Needs, ...]
+    declared: tuple[RequiredScope, ...]
 
     @property
-    def needs(self) -> Needs | None:
+    def needs(self) -> RequiredScope | None:
         """The declared scope; None unless there is exactly one."""
         return self.declared[0] if len(self.declared) == 1 else None
 
@@ -116,27 +116,27 @@ class GuardedRoute:
 
 
 @dataclass(frozen=True)
-class Found:
+class RouteMatch:
     """Result of looking up the route of a request. ``route`` is None where the path is known for other methods alone,
     which ``allowed_methods`` then holds, or not known at all.
     """
 
-    route: GuardedRoute | None
+    route: ScopedRoute | None
     ids: dict[str, str]
     allowed_methods: frozenset[str] = frozenset()
 
 
-def guarded_routes(routes: Sequence[BaseRoute]) -> list[GuardedRoute]:
+def scoped_routes(routes: Sequence[BaseRoute]) -> list[ScopedRoute]:
     """Return every route of an application but its page, with those of included routers and mounted applications."""
     found = []
     for context in iter_route_contexts(routes):
         if isinstance(context.original_route, Mount) and context.name == PAGE:
             continue
         declared = tuple(
-            one.dependency for one in getattr(context, "dependencies", ()) if isinstance(one.dependency, Needs)
+            one.dependency for one in getattr(context, "dependencies", ()) if isinstance(one.dependency, RequiredScope)
         )
         found.append(
-            GuardedRoute(
+            ScopedRoute(
                 context.path_format or "",
                 frozenset(getattr(context, "methods", None) or ()),
                 context.path_regex,
@@ -146,12 +146,12 @@ def guarded_routes(routes: Sequence[BaseRoute]) -> list[GuardedRoute]:
     return found
 
 
-def find_route(routes: Sequence[GuardedRoute], method: str, path: str) -> Found:
+def find_route(routes: Sequence[ScopedRoute], method: str, path: str) -> RouteMatch:
     """Find the first route that takes a method and a path."""
     allowed: frozenset[str] = frozenset()
     for route in routes:
         if match := route.pattern.match(path):
             if method in route.methods or not route.methods:
-                return Found(route, match.groupdict())
+                return RouteMatch(route, match.groupdict())
             allowed |= route.methods
-    return Found(None, {}, allowed)
+    return RouteMatch(None, {}, allowed)

@@ -65,11 +65,11 @@ class SetupLinks:
         """
         presented = _hash(secret)
         with writing(self._engine) as connection:
-            held = connection.scalars(
+            stored_hashes = connection.scalars(
                 sql.select(setup_link_table.c.sha256).where(setup_link_table.c.expires_s > self._clock())
             ).all()
             is_known = (
-                sum(hmac.compare_digest(presented, one) for one in held) > 0
+                sum(hmac.compare_digest(presented, one) for one in stored_hashes) > 0
             )  # every link is compared, so that the time taken discloses nothing
             if not is_known or _has_token(connection):
                 what = "This setup link was used, has expired or is unknown"

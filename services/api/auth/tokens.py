@@ -153,7 +153,7 @@ class _Credential(NamedTuple):
         return cls(None if presented is None else _hash(presented), session_of)
 
 
-class _Trust(NamedTuple):
+class _TrustedToken(NamedTuple):
     """A token that was looked up, until when it is trusted (in ticks, s), and the number of revocations and ended
     sessions at this server before the look-up began. A later one makes it void.
     """
@@ -176,7 +176,7 @@ class Tokens:
     ) -> None:
         self.engine, self._clock, self._ticks = engine, clock, ticks
         self.ended_sessions = EndedSessions(engine, clock)
-        self._trusted: dict[_Credential, _Trust] = {}
+        self._trusted: dict[_Credential, _TrustedToken] = {}
         self._revocations = 0
 
     def create(
@@ -207,15 +207,15 @@ class Tokens:
             raise InputError(
                 f"Group {group!r} of token {name} does not serve; use up to 64 letters, digits, points and hyphens."
             )
-        if not (wanted := sorted(set(scopes))):
+        if not (requested_scopes := sorted(set(scopes))):
             raise InputError(f"Token {name} has no scope; give at least one of {', '.join(Scope)}.")
         now = self._clock()
         with writing(self.engine) as connection:
             namesake = sql.select(token_table).where(token_table.c.name == name, token_table.c.revoked_s.is_(None))
-            if any(_is_living(other, now) for other in connection.execute(namesake).mappings()):
+            if any(_is_valid(other, now) for other in connection.execute(namesake).mappings()):
                 raise InputError(f"Token name {name!r} is in use; revoke that token or choose another name.")
             expires_s = None if expires_days is None else now + expires_days * DAY_S
-            return insert_token(connection, name, wanted, now, expires_s, audited, group)
+            return insert_token(connection, name, requested_scopes, now, expires_s, audited, group)
 
     def list(self) -> list[Token]:
         """Return every token, newest first, with revoked and expired ones."""
@@ -236,14 +236,14 @@ class Tokens:
         """
         now = self._clock()
         with writing(self.engine) as connection:
-            is_meant = sql.or_(
+            is_named = sql.or_(
                 token_table.c.id == token_id,
                 sql.and_(token_table.c.name == token_id, token_table.c.revoked_s.is_(None)),
             )
             id_first = sql.case((token_table.c.id == token_id, 0), else_=1)
             found = (
                 connection.execute(
-                    sql.select(token_table).where(is_meant).order_by(id_first, token_table.c.created_s.desc())
+                    sql.select(token_table).where(is_named).order_by(id_first, token_table.c.created_s.desc())
                 )
                 .mappings()
                 .first()
@@ -260,8 +260,8 @@ class Tokens:
         return Token(**_fields(row))
 
     def trusted(self, *, presented: str | None = None, session_of: str | None = None) -> Token | None:
-        """Return the token that ``authenticate`` has found for ``presented``, or ``living`` for ``session_of``, if it
-        is still trusted, else None. The database is not asked.
+        """Return the token that ``authenticate`` has found for ``presented``, or ``authenticate_session`` for
+        ``session_of``, if it is still trusted, else None. The database is not asked.
         """
         found = self._trusted.get(_Credential.of(presented, session_of))
         return (
@@ -278,17 +278,17 @@ class Tokens:
         """
         revocations, row = self._revocations, self._find(public_id(presented) or "")
         is_same = hmac.compare_digest(_hash(presented), row["sha256"] if row else _hash(""))
-        if row is None or not is_same or not _is_living(row, self._clock()):
+        if row is None or not is_same or not _is_valid(row, self._clock()):
             raise UnauthenticatedError("This token is unknown, expired or revoked; ask an administrator for a new one.")
         self._note_use(row)
-        return self._trust(_Credential.of(presented), row, revocations)
+        return self._remember(_Credential.of(presented), row, revocations)
 
     def end_session(self, sha256: str, expires_s: float) -> None:
         """End a session: at this server with the next request, at others within ``TRUSTED_S``."""
         self.ended_sessions.add(sha256, expires_s)
         self._revocations += 1
 
-    def living(self, token_id: str, session: str | None = None) -> Token:
+    def authenticate_session(self, token_id: str, session: str | None = None) -> Token:
         """Look up the valid token with this id, for a session that was opened with it.
 
         Args:
@@ -300,18 +300,18 @@ class Tokens:
         revocations, row = self._revocations, self._find(token_id)
         if session is not None and self.ended_sessions.has(session):
             raise UnauthenticatedError("This session was ended; sign in again with a token.")
-        if row is None or not _is_living(row, self._clock()):
+        if row is None or not _is_valid(row, self._clock()):
             raise UnauthenticatedError(
                 "The token of this session has expired or was revoked; sign in with another one."
             )
-        return self._trust(_Credential.of(session_of=session or token_id), row, revocations)
+        return self._remember(_Credential.of(session_of=session or token_id), row, revocations)
 
-    def _trust(self, credential: _Credential, row: Any, revocations: int) -> Token:
+    def _remember(self, credential: _Credential, row: Any, revocations: int) -> Token:
         token = Token(**_fields(row))
-        left_s = math.inf if token.expires_s is None else token.expires_s - self._clock()
+        remaining_s = math.inf if token.expires_s is None else token.expires_s - self._clock()
         if len(self._trusted) >= MAX_TRUSTED:
             self._trusted.clear()
-        self._trusted[credential] = _Trust(token, self._ticks() + min(TRUSTED_S, left_s), revocations)
+        self._trusted[credential] = _TrustedToken(token, self._ticks() + min(TRUSTED_S, remaining_s), revocations)
         return token
 
     def _find(self, token_id: str) -> Any:
@@ -366,7 +366,7 @@ def _hash(token: str) -> str:
     return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _is_living(row: Any, now: float) -> bool:
+def _is_valid(row: Any, now: float) -> bool:
     return row["revoked_s"] is None and (row["expires_s"] is None or now < row["expires_s"])
 
 

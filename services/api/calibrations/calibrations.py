@@ -172,11 +172,13 @@ class Calibrations:
         return spec.model_copy(update={"calibration": self._content(spec.calibration.name)})
 
     def _entries(self, viewer: Viewer) -> tuple[StoredName, ...]:
-        entries = [read_record(path, StoredName) for names in self._seen(viewer) for path in names.glob("*.json")]
+        entries = [
+            read_record(path, StoredName) for names in self._visible_folders(viewer) for path in names.glob("*.json")
+        ]
         return tuple(sorted(entries, key=lambda entry: (-entry.created_s, entry.name, entry.owner)))
 
     def _named(self, name: str, viewer: Viewer) -> StoredName:
-        paths = [names / f"{name}.json" for names in self._seen(viewer)] if re.fullmatch(NAME, name) else []
+        paths = [names / f"{name}.json" for names in self._visible_folders(viewer)] if re.fullmatch(NAME, name) else []
         if (path := next((path for path in paths if path.is_file()), None)) is None:
             raise UnknownCalibrationError(f"There is no calibration {name}; list the calibrations to see their names.")
         return read_record(path, StoredName)
@@ -192,7 +194,7 @@ class Calibrations:
     def _names(self, owner: str) -> Path:
         return self._folder / "names" if owner == DEFAULT_GROUP else self._folder / "owners" / owner
 
-    def _seen(self, viewer: Viewer) -> tuple[Path, ...]:
+    def _visible_folders(self, viewer: Viewer) -> tuple[Path, ...]:
         # Return the folders of names that a viewer may see, that of the viewer's own owner first.
         own, others = (
             self._names(viewer.owner),

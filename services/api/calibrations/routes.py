@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Response
 from fastapi import Path as PathParameter
 
-from services.api.auth.scopes import Asker, needs
+from services.api.auth.scopes import CurrentViewer, needs
 from services.api.calibrations.calibrations import (
     NAME,
     CalibrationCreation,
@@ -13,9 +13,9 @@ from services.api.calibrations.calibrations import (
     Calibrations,
     NamedCalibration,
 )
-from services.api.calibrations.made import made_by
+from services.api.calibrations.job_calibrations import calibration_of_job
 from services.api.captures.captures import Captures
-from services.api.http.bodies import BodyRoute, Sent
+from services.api.http.bodies import BodyRoute, ValidatedBody
 from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import refusals
 from services.api.http.thread_pools import ThreadPool
@@ -26,30 +26,30 @@ Name = Annotated[str, PathParameter(pattern=f"^{NAME}$", description="1 to 60 le
 
 
 def build_calibrations_router(
-    calibrations: Calibrations, captures: Captures, jobs: Jobs, openers: ThreadPool
+    calibrations: Calibrations, captures: Captures, jobs: Jobs, file_pool: ThreadPool
 ) -> APIRouter:
     """Build the routes of stored calibrations, of those in captures, and of those that jobs have made.
 
     Args:
-        openers: threads that read the files of jobs.
+        file_pool: threads that read the files of jobs.
     """
     router = APIRouter(prefix="/v1", route_class=BodyRoute, tags=["calibrations"], responses=refusals(404, 409, 422))
 
-    def tell(creation: CalibrationCreation) -> Response:
+    def respond(creation: CalibrationCreation) -> Response:
         headers = {"Location": f"/v1/calibrations/{creation.detail.name}"}
         return Response(creation.detail.model_dump_json(), 201 if creation.is_new else 200, headers, JSON)
 
     @router.get("/calibrations", dependencies=[needs("read")])
     @in_json
-    def every(asker: Asker) -> list[NamedCalibration]:
+    def every(viewer: CurrentViewer) -> list[NamedCalibration]:
         """List calibrations, newest first."""
-        return calibrations.list(asker)
+        return calibrations.list(viewer)
 
     @router.get("/calibrations/{name}", dependencies=[needs("read")])
     @in_json
-    def get(name: Name, asker: Asker) -> CalibrationDetail:
+    def get(name: Name, viewer: CurrentViewer) -> CalibrationDetail:
         """One calibration with its cameras and lights."""
-        return calibrations.get(name, asker)
+        return calibrations.get(name, viewer)
 
     @router.put(
         "/calibrations/{name}",
@@ -58,12 +58,12 @@ def build_calibrations_router(
         responses={200: {"model": CalibrationDetail}},
         dependencies=[needs("submit")],
     )
-    def put(name: Name, calibration: Sent[Calibration], asker: Asker) -> Response:
+    def put(name: Name, calibration: ValidatedBody[Calibration], viewer: CurrentViewer) -> Response:
         """Store a calibration under a new name: 201, or 200 where it is there already.
 
         A name never changes its content: 409.
         """
-        return tell(calibrations.put(name, calibration, asker))
+        return respond(calibrations.put(name, calibration, viewer))
 
     @router.put(
         "/jobs/{job_id}/calibration/{name}",
@@ -72,13 +72,13 @@ def build_calibrations_router(
         responses={200: {"model": CalibrationDetail}},
         dependencies=[needs("submit")],
     )
-    @openers.answering
-    def keep(job_id: str, name: Name, asker: Asker) -> Response:
+    @file_pool.wrap_handler
+    def keep(job_id: str, name: Name, viewer: CurrentViewer) -> Response:
         """Store what a calibration job made under a new name: 201, or 200 where it is there already.
 
         The job may be deleted then.
         """
-        return tell(calibrations.put(name, made_by(jobs, job_id), asker))
+        return respond(calibrations.put(name, calibration_of_job(jobs, job_id), viewer))
 
     @router.get("/captures/{capture}/calibration", dependencies=[needs("read")])
     @in_json

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 import sqlalchemy as sql
 
 from services.api.captures.blobs import Blobs, Write, sync_folders
-from services.api.captures.descriptions import CaptureReader, ReadHere
+from services.api.captures.descriptions import CaptureReader, InProcessReader
 from services.api.captures.file_locks import FileLocks
 from services.api.captures.table import CaptureTable, FileRow, unknown_capture
 from services.api.captures.uploads import Uploads, upload_path
@@ -82,12 +82,12 @@ class Captures:
         write: Write = os.write,
         reader: CaptureReader | None = None,
     ) -> None:
-        self._reader: CaptureReader = reader or ReadHere()
+        self._reader: CaptureReader = reader or InProcessReader()
         self._limits, self._data, self._now_s = limits, data, now_s
-        self._table, self._blobs, self._claims = CaptureTable(engine), Blobs(data, write), FileLocks()
-        self.uploads = Uploads(self._table, self._blobs, self._claims, limits, now_s)
+        self._table, self._blobs, self._locks = CaptureTable(engine), Blobs(data, write), FileLocks()
+        self.uploads = Uploads(self._table, self._blobs, self._locks, limits, now_s)
         self._free_bytes = free_bytes or (lambda: shutil.disk_usage(data).free)
-        self._guard = threading.RLock()
+        self._lock = threading.RLock()
 
     def create(
         self, manifest: UploadManifest, key: str | None = None, viewer: Viewer = LOCAL_VIEWER
@@ -108,7 +108,7 @@ class Captures:
                     f"File {file.path} has the SHA-256 of another file of another size; hash the files again."
                 )
         digest, key = manifest.digest(viewer.owner), viewer.key(key)
-        with self._guard:
+        with self._lock:
             self.sweep()
             if (earlier := self._table.find(digest, key)) is not None:
                 return CaptureCreation(self.get(earlier.id), is_new=False)
@@ -126,7 +126,7 @@ class Captures:
     def get(self, capture: str) -> CaptureDetail:
         """One capture with its files."""
         found = self._table.get(capture)
-        files = tuple(self._shown(row) for row in self._table.files(capture))
+        files = tuple(self._file_detail(row) for row in self._table.files(capture))
         missing = sum(file.bytes - file.received_bytes for file in files)
         return CaptureDetail(**found.model_dump(), path=f"{FOLDER}/{capture}", missing_bytes=missing, files=files)
 
@@ -174,7 +174,7 @@ class Captures:
             if row.file.path in details
         ]
         if not faults:
-            with self._guard:
+            with self._lock:
                 self.uploads.require_open(capture, or_committed=True)
                 self._publish(capture, rows)
                 self._table.change_state(capture, CaptureState.COMMITTED)
@@ -187,21 +187,21 @@ class Captures:
         Raises:
             CaptureStateError: a job uses it. LockedError: a file of it is being sent.
         """
-        with self._guard:
+        with self._lock:
             self._table.get(capture)
             if (job := self._table.job_with(f"{FOLDER}/{capture}")) is not None:
                 raise CaptureStateError(f"Capture {capture} is used by job {job}; delete that job first.")
-            if self._claims.any_of(capture):
+            if self._locks.holds_any(capture):
                 raise LockedError(f"A file of capture {capture} is being sent; end that first.")
             self._retire(capture)
             self._table.delete(capture)
 
     def sweep(self) -> None:
         """Expire the captures that were not committed in time, and delete those that expired long ago."""
-        with self._guard:
+        with self._lock:
             now_s = self._now_s()
             for capture in self._table.in_state(CaptureState.OPEN, now_s):
-                if not self._claims.any_of(capture.id):
+                if not self._locks.holds_any(capture.id):
                     self._retire(capture.id)
             for capture in self._table.in_state(CaptureState.EXPIRED, now_s + self._limits.open_for_s):
                 self._retire(capture.id)  # again, in case a server died in the middle of it
@@ -209,7 +209,7 @@ class Captures:
                     self._table.delete(capture.id)
 
     @contextmanager
-    def keeping(self, spec: JobSpec, viewer: Viewer = LOCAL_VIEWER) -> Iterator[None]:
+    def holding(self, spec: JobSpec, viewer: Viewer = LOCAL_VIEWER) -> Iterator[None]:
         """Keep an uploaded capture from being deleted while a job that names it, as capture or mouth, is recorded;
         other paths pass.
 
@@ -217,7 +217,7 @@ class Captures:
             SettingsError: there is no such capture that the viewer may see, or it is not committed.
         """
         option, path = ("capture", spec.capture) if spec.rig is None else ("rig.mouth", spec.rig.mouth)
-        with self._guard:
+        with self._lock:
             if path is not None and is_uploaded(path):
                 try:
                     found = self._table.get(path.name)
@@ -243,7 +243,7 @@ class Captures:
             return spec
         return spec.model_copy(update={"capture": self._data / spec.capture})
 
-    def _shown(self, row: FileRow) -> CaptureFile:
+    def _file_detail(self, row: FileRow) -> CaptureFile:
         is_known, received = self.uploads.is_known(row), self.uploads.received_bytes(row)
         return CaptureFile(
             **row.file.model_dump(),
@@ -256,7 +256,7 @@ class Captures:
         file, received = row.file, self.uploads.received_bytes(row)
         if received == file.bytes:
             try:
-                with self._claims.claim(row.capture, row.number):
+                with self._locks.hold(row.capture, row.number):
                     self.uploads.finish(row)
             except CorruptUploadError as problem:
                 return FileFault(path=file.path, kind="corrupt", detail=problem.message)
@@ -331,14 +331,14 @@ class Captures:
                 f"The capture has {total} bytes and {limits.largest_capture_bytes} are allowed; leave some files out."
             )
 
-    def _require_space(self, wanted_bytes: int) -> None:
+    def _require_space(self, missing_bytes: int) -> None:
         outstanding = self._table.outstanding_bytes()
         if (
-            wanted_bytes > 0
-            and (free := self._free_bytes()) < wanted_bytes + outstanding + self._limits.keep_free_bytes
+            missing_bytes > 0
+            and (free := self._free_bytes()) < missing_bytes + outstanding + self._limits.keep_free_bytes
         ):
             raise DiskFullError(
-                f"The capture needs {wanted_bytes} bytes of disk, and of {free} free ones {outstanding} are promised to"
-                f" open captures and {self._limits.keep_free_bytes} kept back; free some space on the server, or delete"
-                " captures."
+                f"The capture needs {missing_bytes} bytes of disk, and of {free} free ones {outstanding} are promised"
+                f" to open captures and {self._limits.keep_free_bytes} kept back; free some space on the server, or"
+                " delete captures."
             )

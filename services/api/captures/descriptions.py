@@ -21,12 +21,12 @@ MAX_DESCRIPTION_BYTES = 4 * 2**20
 """Largest description that is parsed, in bytes. Five thousand images with the longest names, under a thousand lights,
 take a third of it."""
 MAX_CAMERAS = 1000
-"""Largest number of cameras of a capture, more than any rig has. With as many lights, a ``Described`` stays below a
-megabyte."""
-_PLACES = ("capture.json", DESCRIPTION, MANIFEST, f"capture/{MANIFEST}")
+"""Largest number of cameras of a capture, more than any rig has. With as many lights, a ``CaptureDescription`` stays
+below a megabyte."""
+_DESCRIPTION_FILES = ("capture.json", DESCRIPTION, MANIFEST, f"capture/{MANIFEST}")
 
 
-class Described(Record):
+class CaptureDescription(Record):
     """Cameras, lights and size of a capture."""
 
     calibration: Calibration
@@ -47,11 +47,11 @@ class CaptureReader(Protocol):
             names: names of all files of the capture.
         """
 
-    def describe(self, capture: Path) -> Described:
+    def describe(self, capture: Path) -> CaptureDescription:
         """See ``describe``."""
 
 
-class ReadHere:
+class InProcessReader:
     """Reads in this process."""
 
     def content_faults(
@@ -62,20 +62,20 @@ class ReadHere:
             if (fault := content_fault(path, name, limits, names)) is not None:
                 yield name, fault
 
-    def describe(self, capture: Path) -> Described:
+    def describe(self, capture: Path) -> CaptureDescription:
         """See ``describe``."""
         return describe(capture)
 
 
-Describe = Callable[[Path], Described]
+Describe = Callable[[Path], CaptureDescription]
 
 
 def description_file(capture: Path) -> Path | None:
     """Return the file with the description of a capture, or of the one that a job holds; None if there is none."""
-    return next((path for name in _PLACES if (path := capture / name).is_file()), None)
+    return next((path for name in _DESCRIPTION_FILES if (path := capture / name).is_file()), None)
 
 
-def describe(capture: Path) -> Described:
+def describe(capture: Path) -> CaptureDescription:
     """Read the description of a folder capture or of a published one.
 
     Raises:
@@ -97,6 +97,8 @@ def describe(capture: Path) -> Described:
                 f"{path} lists {count} {what}, more than any rig has ({most}); remove those without images."
             )
     pixels: Mapping[str, int] = {camera.name: camera.size[0] * camera.size[1] for camera in description.cameras}
-    seen = [image.camera for image in description.images] or [name for name in pixels for _ in description.lights]
+    image_cameras = [image.camera for image in description.images] or [
+        name for name in pixels for _ in description.lights
+    ]
     calibration = Calibration.of_capture(description)
-    return Described(calibration=calibration, image_px=sum(pixels.get(name, 0) for name in seen))
+    return CaptureDescription(calibration=calibration, image_px=sum(pixels.get(name, 0) for name in image_cameras))

@@ -13,29 +13,29 @@ class FileLocks:
     """The files of captures that some request is working on."""
 
     def __init__(self) -> None:
-        self._guard = threading.Lock()
-        self._taken: set[tuple[str, int]] = set()
+        self._lock = threading.Lock()
+        self._held: set[tuple[str, int]] = set()
 
     @contextmanager
-    def claim(self, capture: str, number: int) -> Iterator[None]:
+    def hold(self, capture: str, number: int) -> Iterator[None]:
         """Hold the lock of a file.
 
         Raises:
             LockedError: another request holds it.
         """
-        with self._guard:
-            if (capture, number) in self._taken:
+        with self._lock:
+            if (capture, number) in self._held:
                 raise LockedError(
                     f"Another request is sending file number {number} of capture {capture}; wait for it to end."
                 )
-            self._taken.add((capture, number))
+            self._held.add((capture, number))
         try:
             yield
         finally:
-            with self._guard:
-                self._taken.discard((capture, number))
+            with self._lock:
+                self._held.discard((capture, number))
 
-    def any_of(self, capture: str) -> bool:
+    def holds_any(self, capture: str) -> bool:
         """Whether some request is working on a file of this capture."""
-        with self._guard:
-            return any(taken == capture for taken, _ in self._taken)
+        with self._lock:
+            return any(held == capture for held, _ in self._held)

@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES, Described
+from services.api.captures.descriptions import MAX_DESCRIPTION_BYTES, CaptureDescription
 from services.client.errors import error_of
 from services.core.errors import CaptureInputError, DentineError, PlatformError
 from services.core.settings import UploadLimits
@@ -93,11 +93,11 @@ class ReadingProcess:
         return bytes(line)
 
 
-class ReadApart:
+class SubprocessReader:
     """A ``CaptureReader`` that reads in processes of bounded memory and time."""
 
     def __init__(self) -> None:
-        self._places, self._lock, self._idle = (
+        self._slots, self._lock, self._idle = (
             threading.BoundedSemaphore(PROCESSES),
             threading.Lock(),
             list[ReadingProcess](),
@@ -125,10 +125,10 @@ class ReadApart:
                     ),
                 )
                 continue
-            asked = [(str(path), name) for path, name in batch]
+            paths = [(str(path), name) for path, name in batch]
             try:
                 answer = self._ask(
-                    {"files": asked, "limits": limits.model_dump(), "names": sorted(names) if is_parsed else []}, name
+                    {"files": paths, "limits": limits.model_dump(), "names": sorted(names) if is_parsed else []}, name
                 )
             except CostlyFileError as problem:
                 yield name, str(problem)
@@ -137,14 +137,14 @@ class ReadApart:
                 (name, fault) for (_, name), fault in zip(batch, answer["faults"], strict=True) if fault is not None
             )
 
-    def describe(self, capture: Path) -> Described:
+    def describe(self, capture: Path) -> CaptureDescription:
         """Read the description of a capture; see ``descriptions``.
 
         Raises:
             CaptureInputError, CorruptStoreError: the description cannot be read, or not within the bounds.
         """
         try:
-            return Described.model_validate(self._ask({"capture": str(capture)}, str(capture))["described"])
+            return CaptureDescription.model_validate(self._ask({"capture": str(capture)}, str(capture))["described"])
         except CostlyFileError as problem:
             raise CaptureInputError(str(problem)) from problem
 
@@ -156,7 +156,7 @@ class ReadApart:
             one.close()
 
     def _ask(self, request: dict[str, Any], name: str) -> dict[str, Any]:
-        with self._places:
+        with self._slots:
             with self._lock:
                 process = self._idle.pop() if self._idle else None
             began = time.monotonic()
@@ -164,14 +164,14 @@ class ReadApart:
             if answer is None and time.monotonic() - began < MAX_S:  # none was idle, or the idle one had died
                 if process is not None:
                     process.close()
-                process = _started()
+                process = _start_process()
                 answer = process.ask(request)
             assert process is not None
             with self._lock:
-                is_kept = answer is not None and not answer["is_last"] and not self._is_closed
-                if is_kept:
+                is_reusable = answer is not None and not answer["is_last"] and not self._is_closed
+                if is_reusable:
                     self._idle.append(process)
-            if not is_kept:
+            if not is_reusable:
                 process.close()
         if answer is None or "is_costly" in answer:
             bounds = f"{MAX_BYTES // 2**20} MiB of memory and {MAX_S:g} s"
@@ -183,7 +183,7 @@ class ReadApart:
         return answer
 
 
-def _started() -> ReadingProcess:
+def _start_process() -> ReadingProcess:
     try:
         return ReadingProcess()
     except OSError as problem:

@@ -38,12 +38,12 @@ def main(max_bytes: int) -> None:
             return
 
 
-def _answer(asked: dict[str, Any]) -> dict[str, Any]:
+def _answer(request: dict[str, Any]) -> dict[str, Any]:
     try:
-        if "capture" in asked:
-            return {"described": describe(Path(asked["capture"])).model_dump(mode="json")}
-        limits, names = UploadLimits.model_validate(asked["limits"]), frozenset(asked["names"])
-        return {"faults": [content_fault(Path(path), name, limits, names) for path, name in asked["files"]]}
+        if "capture" in request:
+            return {"described": describe(Path(request["capture"])).model_dump(mode="json")}
+        limits, names = UploadLimits.model_validate(request["limits"]), frozenset(request["names"])
+        return {"faults": [content_fault(Path(path), name, limits, names) for path, name in request["files"]]}
     except DentineError as problem:
         return {"code": problem.code, "message": problem.message}
     except MemoryError:

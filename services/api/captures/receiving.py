@@ -32,7 +32,7 @@ DRAIN_BYTES = 16 * 2**20
 pipe."""
 
 
-class SilenceError(Exception):
+class ClientSilentError(Exception):
     """The client sent nothing for too long."""
 
 
@@ -52,11 +52,11 @@ async def receive(
     Raises:
         LockedError, OffsetError, TooLargeError, ChecksumError, CorruptUploadError, DiskFullError: see ``Uploads`` and
             ``PartialFile``.
-        SilenceError: nothing came for too long; what came before is kept as if the connection had broken.
+        ClientSilentError: nothing came for too long; what came before is kept as if the connection had broken.
     """
-    body = _audible(stream, uploads.limits.silence_s)
+    body = _limit_silence(stream, uploads.limits.silence_s)
     try:
-        with uploads.claims.claim(capture, number):
+        with uploads.locks.hold(capture, number):
             upload = await in_thread(uploads.begin, capture, number, offset)
             result = (
                 await _append(uploads, upload, body, checksum)
@@ -74,20 +74,20 @@ async def receive(
 async def _append(uploads: Uploads, upload: Upload, body: AsyncIterator[bytes], checksum: Checksum | None) -> Received:
     with ExitStack() as opened:
         partial = await in_thread(_open, uploads, upload, opened)
-        tail = _Tail(uploads, upload, partial, checksum)
+        writer = _UploadWriter(uploads, upload, partial, checksum)
         try:
             async for chunk in body:
-                tail.buffer += chunk
-                if len(tail.buffer) >= BLOCK_BYTES:
-                    await in_thread(tail.flush)
-        except (ClientDisconnect, SilenceError):
+                writer.buffer += chunk
+                if len(writer.buffer) >= BLOCK_BYTES:
+                    await in_thread(writer.flush)
+        except (ClientDisconnect, ClientSilentError):
             if checksum is None:
-                await in_thread(tail.flush)
-                await in_thread(tail.record)
+                await in_thread(writer.flush)
+                await in_thread(writer.record)
             raise
-        await in_thread(tail.flush)
-        tail.require_checksum()
-        return await in_thread(tail.record)
+        await in_thread(writer.flush)
+        writer.require_checksum()
+        return await in_thread(writer.record)
 
 
 def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
@@ -102,7 +102,7 @@ def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
         raise
 
 
-class _Tail:
+class _UploadWriter:
     """Appends the bytes of one request to an upload: they are buffered, then written, then recorded."""
 
     def __init__(self, uploads: Uploads, upload: Upload, partial: PartialFile, checksum: Checksum | None) -> None:
@@ -150,7 +150,7 @@ class _Tail:
             )
 
 
-async def _audible(stream: AsyncIterator[bytes], silence_s: float) -> AsyncIterator[bytes]:
+async def _limit_silence(stream: AsyncIterator[bytes], silence_s: float) -> AsyncIterator[bytes]:
     while True:
         try:
             async with asyncio.timeout(silence_s):
@@ -158,13 +158,13 @@ async def _audible(stream: AsyncIterator[bytes], silence_s: float) -> AsyncItera
         except StopAsyncIteration:
             return
         except TimeoutError as problem:
-            raise SilenceError from problem
+            raise ClientSilentError from problem
         yield chunk
 
 
 async def _drain(body: AsyncIterator[bytes]) -> None:
     dropped = 0
-    with suppress(ClientDisconnect, SilenceError):
+    with suppress(ClientDisconnect, ClientSilentError):
         async for chunk in body:
             dropped += len(chunk)
             if dropped > DRAIN_BYTES:

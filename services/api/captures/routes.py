@@ -11,11 +11,11 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.api.auth.scopes import Asker, needs
+from services.api.auth.scopes import CurrentViewer, needs
 from services.api.captures.captures import Captures
 from services.api.captures.tus_routes import build_tus_router
 from services.api.http.awaited_threads import in_thread
-from services.api.http.bodies import BodyRoute, Sent
+from services.api.http.bodies import BodyRoute, ValidatedBody
 from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import MEDIA_TYPE, Problem, refusals
 from services.client.capture_records import CaptureDetail, CapturePage, FileFault, UploadManifest
@@ -73,27 +73,27 @@ def build_captures_router(captures: Captures) -> APIRouter:
         dependencies=[needs("submit")],
     )
     def create(
-        manifest: Sent[UploadManifest],
-        asker: Asker,
+        manifest: ValidatedBody[UploadManifest],
+        viewer: CurrentViewer,
         idempotency_key: Annotated[str | None, Header(max_length=200)] = None,
     ) -> Response:
         """Announce a capture and learn which of its files are known already.
 
         The same manifest gives the same capture, and status 200.
         """
-        creation = captures.create(manifest, idempotency_key, asker)
+        creation = captures.create(manifest, idempotency_key, viewer)
         headers = {"Location": f"/v1/captures/{creation.capture.id}"}
         return Response(creation.capture.model_dump_json(), 201 if creation.is_new else 200, headers, JSON)
 
     @under.get("", dependencies=[needs("read")])
     @in_json
     def page(
-        asker: Asker,
+        viewer: CurrentViewer,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
         before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None,
     ) -> CapturePage:
         """List captures, newest first."""
-        return captures.page(limit, before, asker)
+        return captures.page(limit, before, viewer)
 
     @under.get("/{capture}", dependencies=[needs("read")])
     @in_json

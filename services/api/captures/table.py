@@ -222,11 +222,11 @@ class CaptureTable:
 
     def known(self, contents: Iterable[str], owner: str) -> set[str]:
         """Return those contents, by SHA-256, that an owner has sent completely."""
-        wanted, found = sorted(set(contents)), set[str]()
+        requested, found = sorted(set(contents)), set[str]()
         own = sql.select(capture_table.c.id).where(capture_table.c.owner == owner)
         with self._engine.connect() as connection:
-            for start in range(0, len(wanted), _BATCH):
-                of_batch = file_table.c.sha256.in_(wanted[start : start + _BATCH])
+            for start in range(0, len(requested), _BATCH):
+                of_batch = file_table.c.sha256.in_(requested[start : start + _BATCH])
                 query = sql.select(file_table.c.sha256).where(
                     of_batch, file_table.c.is_known, file_table.c.capture.in_(own)
                 )
@@ -283,17 +283,17 @@ class CaptureTable:
 
     def unreferenced(self, contents: Iterable[str], besides: str) -> set[str]:
         """Return those contents that no file of a capture other than ``besides`` has."""
-        wanted = sorted(set(contents))
+        requested = sorted(set(contents))
         used: set[str] = set()
         with self._engine.connect() as connection:
-            for start in range(0, len(wanted), _BATCH):
-                of_batch = file_table.c.sha256.in_(wanted[start : start + _BATCH])
+            for start in range(0, len(requested), _BATCH):
+                of_batch = file_table.c.sha256.in_(requested[start : start + _BATCH])
                 used.update(
                     connection.scalars(
                         sql.select(file_table.c.sha256).where(of_batch, file_table.c.capture != besides).distinct()
                     )
                 )
-        return set(wanted) - used
+        return set(requested) - used
 
     def job_with(self, path: str) -> str | None:
         """Return the id of a job that names this capture; None if there is none."""

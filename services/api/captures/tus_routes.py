@@ -12,8 +12,8 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
-from services.api.auth.scopes import Asker, needs
-from services.api.captures.receiving import SilenceError, receive
+from services.api.auth.scopes import CurrentViewer, needs
+from services.api.captures.receiving import ClientSilentError, receive
 from services.api.captures.uploads import Upload, Uploads, upload_path
 from services.api.http.problems import refusals
 from services.client import tus
@@ -29,12 +29,12 @@ class TusRoute(APIRoute):
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
 
-        async def send_named(message: Message) -> None:
+        async def send_with_version(message: Message) -> None:
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message)["Tus-Resumable"] = tus.VERSION
             await send(message)
 
-        await super().handle(scope, receive, send_named)
+        await super().handle(scope, receive, send_with_version)
 
 
 def require_version(
@@ -55,7 +55,7 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
     )
     versioned = [Depends(require_version)]
 
-    def told(upload: Upload) -> dict[str, str]:
+    def upload_headers(upload: Upload) -> dict[str, str]:
         metadata = tus.format_metadata({"capture": upload.row.capture, "path": upload.row.file.path})
         return _progress(upload.offset, upload.expires_s) | {
             "Upload-Length": str(upload.row.file.bytes),
@@ -74,7 +74,7 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
 
     @router.post("", status_code=201, dependencies=[*versioned, needs("submit")], response_class=Response)
     def create(
-        asker: Asker,
+        viewer: CurrentViewer,
         upload_length: Annotated[int, Header(ge=0, le=2**53)],
         upload_metadata: Annotated[str, Header(max_length=2000)],
     ) -> Response:
@@ -87,15 +87,16 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
             raise UploadError(
                 f"Upload-Metadata lacks {min(missing)!r}; name the capture's id and the file's path in it."
             )
-        upload = uploads.create(metadata["capture"], metadata["path"], upload_length, asker)
+        upload = uploads.create(metadata["capture"], metadata["path"], upload_length, viewer)
         return Response(
-            status_code=201, headers={"Location": upload_path(upload.row.capture, upload.row.number)} | told(upload)
+            status_code=201,
+            headers={"Location": upload_path(upload.row.capture, upload.row.number)} | upload_headers(upload),
         )
 
     @router.head("/{capture}/{number}", dependencies=[*versioned, needs("submit")], response_class=Response)
     def head(capture: str, number: FileNumber) -> Response:
         """How far the file is."""
-        return Response(headers=told(uploads.find(capture, number)))
+        return Response(headers=upload_headers(uploads.find(capture, number)))
 
     @router.patch(
         "/{capture}/{number}",
@@ -127,7 +128,7 @@ def build_tus_router(uploads: Uploads) -> APIRouter:
         with suppress(ClientDisconnect):
             try:
                 received = await receive(uploads, capture, number, upload_offset, aiter(request.stream()), checksum)
-            except SilenceError:
+            except ClientSilentError:
                 raise HTTPException(
                     408,
                     f"Nothing was sent for {uploads.limits.silence_s:g} s; ask for Upload-Offset and go on from there",

@@ -43,9 +43,9 @@ class Uploads:
     """
 
     def __init__(
-        self, table: CaptureTable, blobs: Blobs, claims: FileLocks, limits: UploadLimits, now_s: Callable[[], float]
+        self, table: CaptureTable, blobs: Blobs, locks: FileLocks, limits: UploadLimits, now_s: Callable[[], float]
     ) -> None:
-        self.limits, self.claims = limits, claims
+        self.limits, self.locks = limits, locks
         self._table, self._blobs, self._now_s = table, blobs, now_s
 
     def create(self, capture: str, path: str, size_bytes: int, viewer: Viewer = LOCAL_VIEWER) -> Upload:
@@ -131,7 +131,7 @@ class Uploads:
             LockedError: it is being sent. CaptureStateError: the capture is committed.
         """
         self.require_open(capture)
-        with self.claims.claim(capture, number):
+        with self.locks.hold(capture, number):
             row = self.find(capture, number).row
             self._blobs.discard_partial(capture, number)
             self._table.change_file(

@@ -27,7 +27,7 @@ def change_database_password(url: str, file: Path) -> None:
     if parsed.get_backend_name() != "postgresql":
         raise SettingsError("Only a Postgres database has a password; set DENTINE__SERVER__DATABASE to its URL.")
     planned = file.with_name("password.next")
-    if planned.exists() and _is_let_in(url, planned):
+    if planned.exists() and _can_connect(url, planned):
         write_password(file, read_password(planned))
     write_private(planned, f"{secrets.token_urlsafe(PASSWORD_BYTES)}\n".encode())
     engine = open_database(with_password_file(url, file))
@@ -47,7 +47,7 @@ def change_database_password(url: str, file: Path) -> None:
     planned.unlink()
 
 
-def _is_let_in(url: str, password_file: Path) -> bool:
+def _can_connect(url: str, password_file: Path) -> bool:
     engine = open_database(with_password_file(url, password_file))
     try:
         with engine.connect():

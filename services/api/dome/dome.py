@@ -82,7 +82,7 @@ class Dome:
     def __init__(self, settings: DomeSettings, jobs: Jobs) -> None:
         self._settings, self._limits = settings, LightLimits(settings)
         self._address, self._jobs, self._process = settings.address, jobs, DomeProcess(settings)
-        self._driving = threading.Lock()
+        self._manual_lock = threading.Lock()
 
     def start(self) -> None:
         """Start the process that drives the dome, so that the first ALL OFF need not wait for it."""
@@ -126,20 +126,20 @@ class Dome:
         shown, others = _shown(stopped.result(), viewer)
         return AllOff(status=status, stopped=shown, others_stopped=others)
 
-    def light(self, wanted: LightRequest, viewer: Viewer = LOCAL_VIEWER) -> DomeStatus:
+    def light(self, request: LightRequest, viewer: Viewer = LOCAL_VIEWER) -> DomeStatus:
         """Switch one light on for a limited time.
 
         Raises:
             UnknownDomeError: this server has no dome. DomeBusyError: a capture or a preflight uses a dome.
                 SettingsError: the level is above the limit, or there is no such light. RigError and its kinds.
         """
-        if wanted.level > self._settings.max_level:
+        if request.level > self._settings.max_level:
             raise SettingsError(
-                f"'level': {wanted.level:g} is above this server's {self._settings.max_level:g}"
+                f"'level': {request.level:g} is above this server's {self._settings.max_level:g}"
                 " (DENTINE__SERVER__DOME__MAX_LEVEL); lower it."
             )
-        with self._driven_by_hand(viewer):
-            return _status(self._ask(ANSWER_S, do="light", **wanted.model_dump()))
+        with self._manual_control(viewer):
+            return _status(self._ask(ANSWER_S, do="light", **request.model_dump()))
 
     def dark(self) -> DomeStatus:
         """Switch off the light that was switched on by hand; a capture is not affected.
@@ -161,21 +161,21 @@ class Dome:
         if self._address is not None:
             self._limits.require(rig.model_copy(update={"dome": self._address}))
         self._jobs.server_paths.require("mouth", rig.mouth)
-        with self._driven_by_hand(viewer):
+        with self._manual_control(viewer):
             return PreflightResult(findings=self._ask(PREFLIGHT_S, do="preflight", rig=rig).findings)
 
-    def make_way(self) -> None:
+    def yield_to_capture(self) -> None:
         """Switch off a light that was switched on by hand, before a capture begins; a preflight is waited for."""
-        with self._driving:
+        with self._manual_lock:
             if self._process.is_running:
                 with suppress(DentineError):
                     self._ask(ANSWER_S, do="dark")
 
     @contextmanager
-    def _driven_by_hand(self, viewer: Viewer) -> Iterator[None]:
+    def _manual_control(self, viewer: Viewer) -> Iterator[None]:
         # Hold the lock while looking for running captures: a capture that begins afterwards waits for it in
-        # ``make_way``.
-        if not self._driving.acquire(timeout=BUSY_S):
+        # ``yield_to_capture``.
+        if not self._manual_lock.acquire(timeout=BUSY_S):
             raise DomeBusyError("The dome is busy with a preflight; wait for it, or press ALL OFF.")
         try:
             if capturing := self._jobs.capturing():
@@ -187,7 +187,7 @@ class Dome:
                 )
             yield
         finally:
-            self._driving.release()
+            self._manual_lock.release()
 
     def _switch_off(self) -> DomeStatus:
         try:

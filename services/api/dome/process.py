@@ -20,8 +20,8 @@ from services.core.dome import DomeAnswer, DomeCommand
 from services.core.errors import DentineError, PlatformError, RigError
 from services.core.settings import DomeSettings
 
-DOOR = "services.capture.console"
-END_S = 10.0
+CONSOLE_MODULE = "services.capture.console"
+EXIT_TIMEOUT_S = 10.0
 
 
 class DomeProcess:
@@ -36,7 +36,7 @@ class DomeProcess:
         self._settings, self._lock, self._numbers = settings, threading.Lock(), itertools.count(1)
         self._process: subprocess.Popen[str] | None = None
         self._commands: queue.SimpleQueue[DomeCommand | None] = queue.SimpleQueue()
-        self._waiting: dict[int, Future[DomeAnswer]] = {}
+        self._pending: dict[int, Future[DomeAnswer]] = {}
 
     @property
     def is_running(self) -> bool:
@@ -50,17 +50,17 @@ class DomeProcess:
             DentineError: the error that the command ended with. TimeoutError: there was no answer in time.
                 PlatformError: the packages of the dome are not installed.
         """
-        asked = DomeCommand.model_validate({"number": next(self._numbers)} | command)
+        request = DomeCommand.model_validate({"number": next(self._numbers)} | command)
         future: Future[DomeAnswer] = Future()
         with self._lock:
             self._start()
-            waiting = self._waiting
-            waiting[asked.number] = future
-            self._commands.put(asked)
+            pending = self._pending
+            pending[request.number] = future
+            self._commands.put(request)
         try:
             answer = future.result(timeout_s)
         finally:
-            waiting.pop(asked.number, None)
+            pending.pop(request.number, None)
         if answer.code is not None:
             raise error_of(answer.code, answer.message) or DentineError(answer.message)
         return answer
@@ -82,7 +82,7 @@ class DomeProcess:
     def close(self) -> None:
         """Let the process switch the dome dark and end."""
         with self._lock:
-            self._end(END_S)
+            self._end(EXIT_TIMEOUT_S)
 
     def _end(self, patience_s: float) -> None:
         process, self._process = self._process, None
@@ -102,22 +102,27 @@ class DomeProcess:
         self._end(0.0)
         if importlib.util.find_spec("pymodbus") is None:
             raise PlatformError("The dome's packages are not installed on the server; install dentine[capture].")
-        command = [sys.executable, "-m", DOOR, self._settings.model_dump_json()]
+        command = [sys.executable, "-m", CONSOLE_MODULE, self._settings.model_dump_json()]
         # The process has a session of its own, because Ctrl-C must not reach it before the server has closed its pipe.
         self._process = subprocess.Popen(  # noqa: S603
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
-        self._commands, self._waiting = queue.SimpleQueue(), {}
+        self._commands, self._pending = queue.SimpleQueue(), {}
         threading.Thread(
-            target=_speak, args=(self._process, self._commands, self._waiting), name="to the dome process", daemon=True
+            target=_write_commands,
+            args=(self._process, self._commands, self._pending),
+            name="to the dome process",
+            daemon=True,
         ).start()
-        threading.Thread(target=_listen, args=(self._process, self._waiting), name="dome process", daemon=True).start()
+        threading.Thread(
+            target=_read_answers, args=(self._process, self._pending), name="dome process", daemon=True
+        ).start()
 
 
-def _speak(
+def _write_commands(
     process: subprocess.Popen[str],
     commands: queue.SimpleQueue[DomeCommand | None],
-    waiting: dict[int, Future[DomeAnswer]],
+    pending: dict[int, Future[DomeAnswer]],
 ) -> None:
     """Write every command, then close the pipe, which makes the process end."""
     assert process.stdin is not None
@@ -125,24 +130,24 @@ def _speak(
         try:
             print(command.model_dump_json(), file=process.stdin, flush=True)
         except BrokenPipeError:
-            _tell_ended(waiting, command.number)
+            _fail_pending(pending, command.number)
     with suppress(BrokenPipeError):
         process.stdin.close()
 
 
-def _listen(process: subprocess.Popen[str], waiting: dict[int, Future[DomeAnswer]]) -> None:
+def _read_answers(process: subprocess.Popen[str], pending: dict[int, Future[DomeAnswer]]) -> None:
     assert process.stdout is not None
     with process.stdout:
         for line in process.stdout:
             answer = DomeAnswer.model_validate_json(line)
-            if (future := waiting.pop(answer.number, None)) is not None:
+            if (future := pending.pop(answer.number, None)) is not None:
                 future.set_result(answer)
-    _tell_ended(waiting, *waiting)
+    _fail_pending(pending, *pending)
 
 
-def _tell_ended(waiting: dict[int, Future[DomeAnswer]], *numbers: int) -> None:
+def _fail_pending(pending: dict[int, Future[DomeAnswer]], *numbers: int) -> None:
     for number in numbers:
-        if (future := waiting.pop(number, None)) is not None:
+        if (future := pending.pop(number, None)) is not None:
             future.set_exception(
                 RigError(
                     "The process that works the dome ended, and so did its light; ask again, the server's log says why"

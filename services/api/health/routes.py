@@ -39,14 +39,14 @@ def build_health_router(readiness: Readiness, registry: CollectorRegistry) -> AP
         """Whether a submitted job would run: database, scheduler, workers, store and disk are each tried."""
         checks = readiness.checks()
         if bad := [check for check in checks if not check.ok]:
-            told = Problem.of(
+            problem = Problem.of(
                 HTTPStatus.SERVICE_UNAVAILABLE,
                 "not-ready",
                 " ".join(check.sentence for check in bad),
                 request.scope["path"],
             )
             return Response(
-                NotReady(**told.model_dump(), checks=checks).model_dump_json(), told.status, media_type=MEDIA_TYPE
+                NotReady(**problem.model_dump(), checks=checks).model_dump_json(), problem.status, media_type=MEDIA_TYPE
             )
         return Response(Ready(status="ready", checks=checks).model_dump_json(), media_type="application/json")
 

@@ -2,7 +2,7 @@
 
 from fastapi import APIRouter
 
-from services.api.auth.scopes import Asker, needs
+from services.api.auth.scopes import CurrentViewer, needs
 from services.api.health.worker_states import WorkerList, list_workers
 from services.api.http.json_responses import in_json
 from services.api.http.problems import refusals
@@ -16,10 +16,10 @@ def build_workers_router(workers: Workers, repository: Repository) -> APIRouter:
 
     @router.get("/workers", dependencies=[needs("read")])
     @in_json
-    def every(asker: Asker) -> WorkerList:
+    def every(viewer: CurrentViewer) -> WorkerList:
         """The workers, what each does of the caller's jobs, and how many jobs they got done; 503 where their scheduler
         does not answer.
         """
-        return list_workers(workers, repository, asker)
+        return list_workers(workers, repository, viewer)
 
     return router

@@ -18,7 +18,7 @@ from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.placement import DOME, STAGES
 from services.core.stage import StageName
 from services.pipeline.database import Query
-from services.pipeline.workers import NOT_STARTED, TOLD, Workers
+from services.pipeline.workers import FAULT_KEY, NOT_STARTED, Workers
 
 HOUR_S, DAY_S = 3600.0, 86400.0
 _TASK = re.compile(rf"({'|'.join(get_args(StageName))})-(\w+)-[0-9a-f]{{8}}(-.*)?")
@@ -74,25 +74,27 @@ def list_workers(workers: Workers, repository: Repository, viewer: Viewer = LOCA
     Raises:
         SchedulerLostError: the scheduler does not answer.
     """
-    seen = workers.look()
+    cluster = workers.census()
     found = (
         ()
-        if seen is None
+        if cluster is None
         else tuple(
-            sorted(_states(seen.workers, seen.processing, _seen_by(viewer, repository)), key=lambda one: one.name)
+            sorted(
+                _states(cluster.workers, cluster.processing, _visibility(viewer, repository)), key=lambda one: one.name
+            )
         )
     )
     now_s = time.time()
     in_day, in_hour = _SUCCEEDED.rows(repository.engine, hour_ago_s=now_s - HOUR_S, day_ago_s=now_s - DAY_S)[0]
     return WorkerList(
         workers=found,
-        sentence=_sentence(found, is_started=seen is not None),
+        sentence=_sentence(found, is_started=cluster is not None),
         succeeded_last_hour=in_hour,
         succeeded_last_day=in_day,
     )
 
 
-def _seen_by(viewer: Viewer, repository: Repository) -> Callable[[str], bool]:
+def _visibility(viewer: Viewer, repository: Repository) -> Callable[[str], bool]:
     if viewer.sees_all:
         return lambda _: True
     own = {str(job) for (job,) in _OWN_AT_WORK.rows(repository.engine, of_owner=viewer.owner)}
@@ -102,7 +104,7 @@ def _seen_by(viewer: Viewer, repository: Repository) -> Callable[[str], bool]:
 def _states(
     workers: Mapping[str, Mapping[str, Any]],
     processing: Mapping[str, Iterable[Any]],
-    is_seen: Callable[[str], bool] = lambda _: True,
+    is_visible: Callable[[str], bool] = lambda _: True,
 ) -> Iterable[WorkerState]:
     for address, worker in workers.items():
         keys = (_TASK.fullmatch(str(key)) for key in processing.get(address, ()))
@@ -110,21 +112,21 @@ def _states(
             name=str(worker["name"]),
             host=str(worker["host"]),
             threads=worker["nthreads"],
-            tasks=_tasks((key for key in keys if key is not None), is_seen),
+            tasks=_tasks((key for key in keys if key is not None), is_visible),
             memory_bytes=worker["metrics"].get("memory", 0),
             memory_limit_bytes=worker["memory_limit"] or None,
             has_dome=bool(worker["resources"].get(DOME)),
             runs_stages=bool(worker["resources"].get(STAGES)),
-            fault=str(worker.get(TOLD) or ""),
+            fault=str(worker.get(FAULT_KEY) or ""),
             heard_s=worker["last_seen"],
         )
 
 
-def _tasks(keys: Iterable[re.Match[str]], is_seen: Callable[[str], bool]) -> tuple[WorkerTask, ...]:
+def _tasks(keys: Iterable[re.Match[str]], is_visible: Callable[[str], bool]) -> tuple[WorkerTask, ...]:
     """Return each stage once, of however many tasks the worker has."""
     found = dict.fromkeys((key[1], key[2]) for key in keys)
     return tuple(
-        WorkerTask.model_validate({"stage": stage, "job": job if is_seen(job) else None}) for stage, job in found
+        WorkerTask.model_validate({"stage": stage, "job": job if is_visible(job) else None}) for stage, job in found
     )
 
 

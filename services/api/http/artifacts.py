@@ -93,12 +93,14 @@ def artifact_response(request: Request, path: Path) -> Response:
         headers["Content-Security-Policy"] = REPORT_POLICY
     if tag in (request.headers.get("if-none-match") or ""):
         return Response(status_code=304, headers=headers)
-    asked = request.headers.get("range")
-    if asked is not None and request.headers.get("if-range", tag) not in {tag, modified}:
-        asked = None
-    ranges = None if asked is None else _ranges(asked, stat.st_size)
+    range_header = request.headers.get("range")
+    if range_header is not None and request.headers.get("if-range", tag) not in {tag, modified}:
+        range_header = None
+    ranges = None if range_header is None else _ranges(range_header, stat.st_size)
     if ranges is not None and max(ranges)[0] >= stat.st_size:
-        problem = RangeError(f"The file has {stat.st_size} bytes, not those that '{asked}' names; ask for others.")
+        problem = RangeError(
+            f"The file has {stat.st_size} bytes, not those that '{range_header}' names; ask for others."
+        )
         return response_of(problem, request.scope["path"], {"Content-Range": f"bytes */{stat.st_size}"})
     first, end = (0, stat.st_size) if ranges is None else ranges[0]
     if (ranges is None or len(ranges) == 1) and end - first <= MAX_BYTES_AT_ONCE:
@@ -110,11 +112,11 @@ def artifact_response(request: Request, path: Path) -> Response:
     return FileResponse(path, headers=headers, media_type=_media_type(path), stat_result=stat)
 
 
-def _ranges(asked: str, size_bytes: int) -> list[tuple[int, int]] | None:
+def _ranges(range_header: str, size_bytes: int) -> list[tuple[int, int]] | None:
     """Parse a Range header into pairs of the first byte and the byte after the last one. Returns None if the header is
     malformed or counts in another unit than bytes (RFC 9110, 14.1).
     """
-    unit, _, ranges = asked.partition("=")
+    unit, _, ranges = range_header.partition("=")
     found = [_RANGE.fullmatch(part.strip()) for part in ranges.split(",")]
     parts = [(part["first"], part["last"]) for part in found if part is not None]
     if (

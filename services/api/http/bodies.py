@@ -39,7 +39,7 @@ thread."""
 T = TypeVar("T")
 
 
-def _few_faults(value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
+def _limit_faults(value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
     if isinstance(value, dict) and len(value) > MAX_FAULTS:
         raise PydanticCustomError("many_faults", "The body has {count} members", {"count": len(value)})
     try:
@@ -50,7 +50,7 @@ def _few_faults(value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
         raise PydanticCustomError("many_faults", "The body has {count} faults", {"count": count}) from None
 
 
-Sent = Annotated[T, WrapValidator(_few_faults)]
+ValidatedBody = Annotated[T, WrapValidator(_limit_faults)]
 """Annotation of a request body that is validated as a record. Sequences in it stop at their first fault by themselves
 (``fail_fast``)."""
 
@@ -69,10 +69,10 @@ def parse(body: bytes) -> Any:
             f"The body has up to {values} values and {most} are allowed in its {len(body)} bytes; send what the route"
             " asks for."
         )
-    return json.loads(body, object_pairs_hook=_of_few_members)
+    return json.loads(body, object_pairs_hook=_limit_members)
 
 
-def _of_few_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
+def _limit_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) > MAX_MEMBERS:
         raise SettingsError(
             f"An object of the body has {len(members)} members and {MAX_MEMBERS} are allowed; send what the route asks"
@@ -82,7 +82,7 @@ def _of_few_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class BodyRoute(APIRoute):
-    """A route whose body is parsed and validated in ``app.state.parsers`` where it is long."""
+    """A route whose body is parsed and validated in ``app.state.parser_pool`` where it is long."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """Return the handler of the route, which receives the body as a validated record."""
@@ -99,9 +99,9 @@ class BodyRoute(APIRoute):
         class ReadRequest(Request):
             async def json(self) -> Any:
                 # FastAPI validates the result once more, but accepts a record as it is.
-                parsers: ThreadPool = self.app.state.parsers
+                parser_pool: ThreadPool = self.app.state.parser_pool
                 body = await self.body()
-                return read(body) if len(body) <= SHORT_BYTES else await parsers.ask(read, body)
+                return read(body) if len(body) <= SHORT_BYTES else await parser_pool.run(read, body)
 
         async def answer(request: Request) -> Response:
             try:

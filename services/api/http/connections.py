@@ -28,68 +28,68 @@ MAX_SHARE = 0.5
 MAX_BACKLOG = 256
 """Largest number of connections that are accepted in one go. More would keep the event loop busy for more than some ten
 milliseconds."""
-TOLD_EVERY_S = 600.0
+WARNING_INTERVAL_S = 600.0
 """Time in s after which a warning is logged again if its cause persists."""
-SHED = 16
+SHED_COUNT = 16
 """Number of connections without a request that are closed when file descriptors run out."""
 _OUT_OF_DESCRIPTORS = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 _TOO_SLOW = b"HTTP/1.1 408 Request Timeout\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
 
 
-class Crowd:
+class ConnectionLimiter:
     """The open connections. Those without a request are kept in the order in which they began to wait: ``fresh`` ones
     have never sent a request, ``served`` ones have.
     """
 
     def __init__(self, limits: ConnectionLimits) -> None:
-        self.most, self.header_s = min(limits.most, round(MAX_SHARE * raise_descriptors())), limits.header_s
+        self.max_open, self.header_s = min(limits.most, round(MAX_SHARE * raise_descriptors())), limits.header_s
         self.open: set[BoundedProtocol] = set()
         self.fresh: dict[BoundedProtocol, None] = {}
         self.served: dict[BoundedProtocol, None] = {}
-        self._told_at: dict[str, float] = {}
+        self._next_warning_s: dict[str, float] = {}
 
-    def admit(self, newcomer: BoundedProtocol) -> bool:
+    def admit(self, connection: BoundedProtocol) -> bool:
         """Admit a new connection. Where all places are taken, the connection that has waited longest without a request
         is closed for it; returns False where all connections are at work.
         """
-        if len(self.open) >= self.most and not self.shed(1):
-            self.tell(
+        if len(self.open) >= self.max_open and not self.shed(1):
+            self.warn(
                 "All %d connections are at work; further ones are refused. See DENTINE__SERVER__CONNECTIONS__MOST.",
-                self.most,
+                self.max_open,
             )
             return False
-        self.open.add(newcomer)
+        self.open.add(connection)
         return True
 
     def shed(self, count: int) -> int:
         """Close up to ``count`` connections without a request; returns how many were closed."""
         chosen = [*self.fresh, *self.served][:count]
-        for one in chosen:
-            self.leave(one)
-            one.transport.abort()
+        for connection in chosen:
+            self.leave(connection)
+            connection.transport.abort()
         if chosen:
-            self.tell("Connections without a request are closed to make room for others.")
+            self.warn("Connections without a request are closed to make room for others.")
         return len(chosen)
 
-    def leave(self, one: BoundedProtocol) -> None:
+    def leave(self, connection: BoundedProtocol) -> None:
         """Remove a connection from the open and the waiting ones."""
-        self.open.discard(one)
-        self.end_wait(one)
+        self.open.discard(connection)
+        self.end_wait(connection)
 
-    def wait(self, one: BoundedProtocol, *, is_fresh: bool) -> None:
+    def wait(self, connection: BoundedProtocol, *, is_fresh: bool) -> None:
         """Note that a connection waits for a request, and whether it has never sent one (``is_fresh``)."""
-        (self.fresh if is_fresh else self.served)[one] = None
+        (self.fresh if is_fresh else self.served)[connection] = None
 
-    def end_wait(self, one: BoundedProtocol) -> None:
+    def end_wait(self, connection: BoundedProtocol) -> None:
         """Note that a connection has a request, or is closed."""
-        self.fresh.pop(one, None)
-        self.served.pop(one, None)
+        self.fresh.pop(connection, None)
+        self.served.pop(connection, None)
 
-    def tell(self, message: str, *values: object) -> None:
-        """Log a warning, at most once in ``TOLD_EVERY_S``."""
+    def warn(self, message: str, *values: object) -> None:
+        """Log a warning, at most once in ``WARNING_INTERVAL_S``."""
         now = asyncio.get_running_loop().time()
-        if now >= self._told_at.get(message, now):
-            self._told_at[message] = now + TOLD_EVERY_S
+        if now >= self._next_warning_s.get(message, now):
+            self._next_warning_s[message] = now + WARNING_INTERVAL_S
             logging.getLogger(__name__).warning(message, *values)
 
     def handle_exception(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -102,25 +102,25 @@ class Crowd:
             and problem.errno in _OUT_OF_DESCRIPTORS
             and "accept" in context.get("message", "")
         ):
-            self.tell(
+            self.warn(
                 "No descriptor is left for further connections (%s); raise the limit of open files.", problem.strerror
             )
-            self.shed(SHED)
+            self.shed(SHED_COUNT)
         else:
             loop.default_exception_handler(context)
 
 
 class BoundedProtocol(H11Protocol):
-    """HTTP/1.1 protocol of one connection of a ``Crowd``."""
+    """HTTP/1.1 protocol of one connection of a ``ConnectionLimiter``."""
 
-    def __init__(self, crowd: Crowd, *arguments: Any, **options: Any) -> None:
+    def __init__(self, limiter: ConnectionLimiter, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._crowd, self._limit = crowd, cast("asyncio.TimerHandle | None", None)
+        self._limiter, self._request_timer = limiter, cast("asyncio.TimerHandle | None", None)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Admit the connection of a client, or close it."""
         super().connection_made(transport)
-        if self._crowd.admit(self):
+        if self._limiter.admit(self):
             self._await_request()
         else:
             transport.abort()
@@ -128,7 +128,7 @@ class BoundedProtocol(H11Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the connection, which is closed."""
         self._end_wait()
-        self._crowd.leave(self)
+        self._limiter.leave(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -149,14 +149,14 @@ class BoundedProtocol(H11Protocol):
 
     def _await_request(self) -> None:
         self._end_wait()
-        self._crowd.wait(self, is_fresh=self.cycle is None)
-        self._limit = self.loop.call_later(self._crowd.header_s, self._close)
+        self._limiter.wait(self, is_fresh=self.cycle is None)
+        self._request_timer = self.loop.call_later(self._limiter.header_s, self._close)
 
     def _end_wait(self) -> None:
-        self._crowd.end_wait(self)
-        if self._limit is not None:
-            self._limit.cancel()
-            self._limit = None
+        self._limiter.end_wait(self)
+        if self._request_timer is not None:
+            self._request_timer.cancel()
+            self._request_timer = None
 
     def _close(self) -> None:
         if self.conn.trailing_data[0]:
@@ -165,17 +165,17 @@ class BoundedProtocol(H11Protocol):
 
 
 class BoundedServer(uvicorn.Server):
-    """A uvicorn server whose connections belong to a ``Crowd``."""
+    """A uvicorn server whose connections belong to a ``ConnectionLimiter``."""
 
     def __init__(self, config: uvicorn.Config, limits: ConnectionLimits) -> None:
-        self._crowd = Crowd(limits)
-        config.http = cast("Any", partial(BoundedProtocol, self._crowd))
+        self._limiter = ConnectionLimiter(limits)
+        config.http = cast("Any", partial(BoundedProtocol, self._limiter))
         config.backlog = MAX_BACKLOG
         super().__init__(config)
 
     async def startup(self, sockets: Any = None) -> None:
-        """Begin to listen, with the exception handler of the ``Crowd``."""
-        asyncio.get_running_loop().set_exception_handler(self._crowd.handle_exception)
+        """Begin to listen, with the exception handler of the ``ConnectionLimiter``."""
+        asyncio.get_running_loop().set_exception_handler(self._limiter.handle_exception)
         await super().startup(sockets)
 
 
@@ -184,8 +184,8 @@ def raise_descriptors() -> int:
     returns the limit.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
-    if soft < wanted:
+    limit = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MAX_DESCRIPTORS)
+    if soft < limit:
         with suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            resource.setrlimit(resource.RLIMIT_NOFILE, (limit, hard))
     return resource.getrlimit(resource.RLIMIT_NOFILE)[0]

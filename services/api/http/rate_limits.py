@@ -33,7 +33,7 @@ class MovingWindow:
         return 0
 
 
-class Rates:
+class RateLimits:
     """Counts requests. The methods that count return how many seconds to wait, 0 where the request may go on.
 
     All methods are to be called from the same thread.
@@ -43,7 +43,7 @@ class Rates:
         self._reads = MovingWindow(settings.reads_per_10_s, 10.0)
         self._writes = MovingWindow(settings.writes_per_10_s, 10.0)
         self._refusals = MovingWindow(settings.refusals_per_minute, 60.0)
-        self._tellings = MovingWindow(1, 60.0)
+        self._audited_refusals = MovingWindow(1, 60.0)
 
     def count(self, caller: str, *, is_change: bool) -> int:
         """Count a request of a token or, without one, of an address."""
@@ -53,9 +53,9 @@ class Rates:
         """Count a request without a valid token."""
         return self._refusals.hit(address)
 
-    def is_worth_telling(self, address: str) -> bool:
+    def should_audit_refusal(self, address: str) -> bool:
         """Whether a refusal of this address is to be audited; true once a minute."""
-        return self._tellings.hit(address) == 0
+        return self._audited_refusals.hit(address) == 0
 
 
 def network_of(address: str) -> str:

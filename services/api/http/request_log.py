@@ -40,13 +40,13 @@ class RequestLog:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        asked = Headers(scope=scope).get(HEADER, "")
-        request_id = asked if _WELL_FORMED.fullmatch(asked) else secrets.token_hex(8)
+        requested_id = Headers(scope=scope).get(HEADER, "")
+        request_id = requested_id if _WELL_FORMED.fullmatch(requested_id) else secrets.token_hex(8)
         scope.setdefault("state", {})["request_id"] = request_id
         bind_request(request_id)
         started_s, status = time.perf_counter(), 0
 
-        async def send_named(message: Message) -> None:
+        async def send_with_id(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 MutableHeaders(scope=message)[HEADER] = request_id
@@ -55,20 +55,20 @@ class RequestLog:
             await send(message)
 
         try:
-            await self._app(scope, receive, send_named)
+            await self._app(scope, receive, send_with_id)
         finally:
             duration_s = time.perf_counter() - started_s
             if not status:  # an exception, which an outer layer answers
                 status = 500
                 self._metrics.count(scope["method"], route_of(scope), status, duration_s)
-            told = {
+            fields = {
                 "method": method_of(scope),
                 "route": route_of(scope),
                 "status": status,
                 "duration_s": round(duration_s, 6),
             }
             logging.getLogger(__name__).info(
-                "Request answered.", extra=told | {"client": scope["client"][0] if scope.get("client") else None}
+                "Request answered.", extra=fields | {"client": scope["client"][0] if scope.get("client") else None}
             )
 
 

@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, Self, TypeVar
 
 import sqlalchemy as sql
 
-MAX_READERS = 8
+MAX_DATABASE_THREADS = 8
 """Number of threads that read a database over a network, where most of the time is spent waiting."""
 CLOSE_S = 5.0
 """Longest time in s that the end of the server waits for work under way."""
@@ -29,24 +29,25 @@ class ThreadPool:
         self._pool = ThreadPoolExecutor(count, "short work")
 
     @classmethod
-    def reading(cls, engine: sql.Engine) -> Self:
+    def for_database(cls, engine: sql.Engine) -> Self:
         """Create a pool that reads the database: one thread where it is a file, as SQLite answers sooner than several
-        threads can hand the interpreter lock to each other, which they must do after every query; else ``MAX_READERS``.
+        threads can hand the interpreter lock to each other, which they must do after every query; else
+        ``MAX_DATABASE_THREADS``.
         """
-        return cls(1 if engine.dialect.name == "sqlite" else MAX_READERS)
+        return cls(1 if engine.dialect.name == "sqlite" else MAX_DATABASE_THREADS)
 
-    async def ask(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
+    async def run(self, work: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
         """Run the work in the pool and return its result."""
         return await asyncio.get_running_loop().run_in_executor(
             self._pool, partial(copy_context().run, work, *arguments, **options)
         )
 
-    def answering(self, handler: Callable[P, R]) -> Callable[P, Coroutine[Any, Any, R]]:
+    def wrap_handler(self, handler: Callable[P, R]) -> Callable[P, Coroutine[Any, Any, R]]:
         """Wrap a handler so that it runs in this pool, where FastAPI would run it in one of forty threads."""
 
         @wraps(handler)
         async def answer(*arguments: P.args, **options: P.kwargs) -> R:
-            return await self.ask(handler, *arguments, **options)
+            return await self.run(handler, *arguments, **options)
 
         return answer
 

@@ -34,11 +34,11 @@ def _entry(archive: zipfile.ZipFile, sink: _Sink, path: Path, name: str) -> Iter
         stat = path.stat()
         info = zipfile.ZipInfo(name, max(time.gmtime(stat.st_mtime)[:6], _EARLIEST))
         info.external_attr = 0o644 << 16
-        left = info.file_size = stat.st_size
+        remaining_bytes = info.file_size = stat.st_size
         with archive.open(info, "w") as target:
-            while piece := source.read(min(PIECE_BYTES, left)):
+            while piece := source.read(min(PIECE_BYTES, remaining_bytes)):
                 target.write(piece)
-                left -= len(piece)
+                remaining_bytes -= len(piece)
                 yield sink.take()
 
 

@@ -1,4 +1,4 @@
-"""Decides which queued jobs may start, and what the others wait for: a place beside the running jobs, disk, memory, a
+"""Decides which queued jobs may start, and what the others wait for: a slot beside the running jobs, disk, memory, a
 dome or workers.
 
 A job that needs more disk or memory than the machine has in total is refused when it is submitted.
@@ -42,7 +42,7 @@ _DESCRIPTIONS = ("capture.json", "raw.toml", "slab.json", MANIFEST, f"capture/{M
 """Files of which one marks a folder as a capture, or as a job that holds one."""
 KEPT_FREE_BYTES = 256 * 2**20
 """Bytes of disk that are kept free and that no job may count on."""
-AT_ONCE = 4
+DEFAULT_MAX_RUNNING = 4
 """Largest number of jobs that run side by side, unless the settings say otherwise. A further job ends none of them
 sooner, as they share the same workers, and takes memory; but two long jaws should not keep a short tooth waiting, and
 while one job is prepared or solves, another one keeps the workers busy."""
@@ -50,7 +50,7 @@ RETRY_S = 10.0
 """Time in s that a job waits after it was paused."""
 
 
-def turn(job: Job) -> tuple[int, int]:
+def queue_order(job: Job) -> tuple[int, int]:
     """Sort key for the order in which queued jobs start: those of higher priority first, among equals the oldest."""
     return rank(job.spec.priority), job.number
 
@@ -101,8 +101,8 @@ class Machine:
         return cls(disk.free, disk.total, psutil.virtual_memory().total if has_workers else None)
 
 
-_TURN = ("Waits for a place", "Waits for the dome")
-"""Beginnings of the reasons which say that the turn of a job has not come."""
+_QUEUE_REASONS = ("Waits for a place", "Waits for the dome")
+"""Beginnings of the reasons which say that a job waits for its turn in the queue."""
 
 
 @dataclass
@@ -113,7 +113,7 @@ class _Running:
     needs: Needs
     dome: str | None
     """Address of the dome that the job captures with; None where it does not capture."""
-    has_place: bool
+    has_slot: bool
     """Whether the job counts among those that share the workers; False while it only captures."""
     begun_s: float
     sharing_then_s: float
@@ -124,28 +124,33 @@ class Admission:
     """Holds jobs back and remembers why.
 
     Args:
-        look: returns the disk and memory that the machine has now.
+        measure_machine: returns the disk and memory that the machine has now.
         clock: time in s that no step of the system clock changes.
-        at_once: largest number of jobs that run side by side. A capture needs no place: it has a worker of its own, and
-            a person waits.
-        lacks: returns why no worker can capture (for True) or run other stages (for False); None if one can.
+        max_running: largest number of jobs that run side by side. A capture needs no slot: it has a worker of its own,
+            and a person waits.
+        missing_workers: returns why no worker can capture (for True) or run other stages (for False); None if one can.
     """
 
     def __init__(
         self,
-        look: Callable[[], Machine],
+        measure_machine: Callable[[], Machine],
         clock: Callable[[], float] = time.monotonic,
-        at_once: int = AT_ONCE,
-        lacks: Callable[[bool], str | None] = lambda _: None,
+        max_running: int = DEFAULT_MAX_RUNNING,
+        missing_workers: Callable[[bool], str | None] = lambda _: None,
     ) -> None:
-        self._look, self._clock, self._at_once, self._lacks = look, clock, at_once, lacks
+        self._measure_machine, self._clock, self._max_running, self._missing_workers = (
+            measure_machine,
+            clock,
+            max_running,
+            missing_workers,
+        )
         self._lock = threading.Lock()
         self._needs: dict[str, Needs] = {}
         self._paused: dict[str, tuple[float, str]] = {}
         self._reasons: dict[str, str] = {}
         self._running: dict[str, _Running] = {}
         self._stalled: dict[str, str] = {}
-        self._lacking: dict[bool, str | None] = {}
+        self._shortages: dict[bool, str | None] = {}
         self._first_in_line = ""
         self._sharing_s, self._summed_to_s = 0.0, clock()
 
@@ -153,9 +158,9 @@ class Admission:
     def sharing(self) -> int:
         """Number of jobs that share the workers now."""
         with self._lock:
-            return len(self._placed())
+            return len(self._slot_holders())
 
-    def beside(self, job_id: str) -> float:
+    def mean_sharing(self, job_id: str) -> float:
         """Mean number of jobs that have shared the workers since a job began, itself included."""
         with self._lock:
             self._sum_sharing()
@@ -169,7 +174,7 @@ class Admission:
         Raises:
             JobTooLargeError: the job needs more disk or memory than the machine has in total.
         """
-        needs, machine = predict(spec), self._look()
+        needs, machine = predict(spec), self._measure_machine()
         if needs.disk_bytes > machine.disk_bytes - KEPT_FREE_BYTES:
             raise JobTooLargeError(
                 f"The job needs about {_gib(needs.disk_bytes)} of disk and there are {_gib(machine.disk_bytes)} in all;"
@@ -192,7 +197,7 @@ class Admission:
         """
         waiting = set(job_ids)
         with self._lock:
-            self._lacking, self._first_in_line = {}, ""
+            self._shortages, self._first_in_line = {}, ""
             for known in (self._needs, self._paused, self._reasons):
                 for job_id in known.keys() - waiting:
                     del known[job_id]
@@ -216,18 +221,18 @@ class Admission:
             self._sum_sharing()
             self._running[job_id] = _Running(number, needs, dome, not is_to_capture, self._summed_to_s, self._sharing_s)
 
-    def takes_place(self, job_id: str) -> bool:
-        """Whether a job that has captured may go on with its other stages; if so, it takes a place like any other
+    def try_claim_slot(self, job_id: str) -> bool:
+        """Whether a job that has captured may go on with its other stages; if so, it takes a slot like any other
         job.
         """
-        memory_bytes = self._look().memory_bytes
+        memory_bytes = self._measure_machine().memory_bytes
         with self._lock:
             job = self._running[job_id]
             job.dome = None
-            if not job.has_place:
+            if not job.has_slot:
                 self._sum_sharing()
-                job.has_place = not self._no_place() and not self._no_memory(job.needs, memory_bytes)
-            return job.has_place
+                job.has_slot = not self._slot_obstacle() and not self._memory_obstacle(job.needs, memory_bytes)
+            return job.has_slot
 
     def end(self, job_id: str) -> None:
         """Remove a job from those that run."""
@@ -236,16 +241,16 @@ class Admission:
             del self._running[job_id]
             self._stalled.pop(job_id, None)
 
-    def look_for_stalled(self) -> None:
+    def find_stalled(self) -> None:
         """Find the running jobs whose next task no worker can take. ``stalled`` then says why, until a later look finds
         a worker that can.
         """
         with self._lock:
             captures = {job_id: job.dome is not None for job_id, job in self._running.items()}
-        lacking = {kind: self._lacks(kind) for kind in set(captures.values())}
+        shortage = {kind: self._missing_workers(kind) for kind in set(captures.values())}
         with self._lock:
-            still = {job_id: lacking[kind] for job_id, kind in captures.items() if job_id in self._running}
-            self._stalled = {job_id: f"Waits for workers: {why}" for job_id, why in still.items() if why is not None}
+            current = {job_id: shortage[kind] for job_id, kind in captures.items() if job_id in self._running}
+            self._stalled = {job_id: f"Waits for workers: {why}" for job_id, why in current.items() if why is not None}
 
     def pause(self, job_id: str, problem: DentineError) -> None:
         """Make a job wait for ``RETRY_S`` because a problem has stopped it."""
@@ -260,68 +265,72 @@ class Admission:
         with self._lock:
             return self._stalled.get(job_id)
 
-    def reason(self, job_id: str, *, besides_turn: bool = False) -> str | None:
-        """Why a queued job does not start; None if nothing keeps it, or with ``besides_turn`` nothing but its turn."""
+    def reason(self, job_id: str, *, ignore_queue: bool = False) -> str | None:
+        """Why a queued job does not start; None if nothing keeps it, or with ``ignore_queue`` nothing but the queue."""
         with self._lock:
             reason = self._reasons.get(job_id)
-            return None if besides_turn and reason is not None and reason.startswith(_TURN) else reason
+            return None if ignore_queue and reason is not None and reason.startswith(_QUEUE_REASONS) else reason
 
     def _obstacle(self, job_id: str, spec: JobSpec, *, is_to_capture: bool) -> str:
         # Look for the obstacle that costs least to find first. Nothing slow is done under the lock.
         with self._lock:
             if job_id in self._running:
                 return "Waits until its earlier run has ended."
-            if obstacle := self._pause_of(job_id) or (self._busy_dome(spec) if is_to_capture else self._no_place()):
+            if obstacle := self._pause_obstacle(job_id) or (
+                self._dome_obstacle(spec) if is_to_capture else self._slot_obstacle()
+            ):
                 return obstacle
-        if is_to_capture not in self._lacking:
-            self._lacking[is_to_capture] = self._lacks(is_to_capture)
-        if (lacking := self._lacking[is_to_capture]) is not None:
-            return f"Waits for workers: {lacking}"
-        machine = self._look()
+        if is_to_capture not in self._shortages:
+            self._shortages[is_to_capture] = self._missing_workers(is_to_capture)
+        if (shortage := self._shortages[is_to_capture]) is not None:
+            return f"Waits for workers: {shortage}"
+        machine = self._measure_machine()
         needs = self._needs[job_id] = self._needs.get(job_id) or predict(spec)
         with self._lock:
-            return self._no_disk(needs, machine) or ("" if is_to_capture else self._no_turn(needs, machine))
+            return self._disk_obstacle(needs, machine) or (
+                "" if is_to_capture else self._queue_obstacle(needs, machine)
+            )
 
-    def _no_turn(self, needs: Needs, machine: Machine) -> str:
+    def _queue_obstacle(self, needs: Needs, machine: Machine) -> str:
         if self._first_in_line:
             return self._first_in_line
-        if short := self._no_memory(needs, machine.memory_bytes):
+        if short := self._memory_obstacle(needs, machine.memory_bytes):
             # A job that needs much memory would never start if all that need less went before it.
             self._first_in_line = "Waits behind a job that is before it and waits for memory."
         return short
 
-    def _pause_of(self, job_id: str) -> str:
+    def _pause_obstacle(self, job_id: str) -> str:
         until, reason = self._paused.get(job_id, (0.0, ""))
         if self._clock() < until:
             return reason
         self._paused.pop(job_id, None)
         return ""
 
-    def _busy_dome(self, spec: JobSpec) -> str:
+    def _dome_obstacle(self, spec: JobSpec) -> str:
         dome = spec.rig.dome if spec.rig else None
         busy = next((job.number for job in self._running.values() if job.dome == dome), None)
-        return "" if busy is None else f"{_TURN[1]} {dome}: job {busy} captures with it."
+        return "" if busy is None else f"{_QUEUE_REASONS[1]} {dome}: job {busy} captures with it."
 
-    def _no_place(self) -> str:
-        placed = self._placed()
+    def _slot_obstacle(self) -> str:
+        holders = self._slot_holders()
         return (
-            f"{_TURN[0]}: {_named(placed)}, and {self._at_once} at once is the most."
-            if len(placed) >= self._at_once
+            f"{_QUEUE_REASONS[0]}: {_named(holders)}, and {self._max_running} at once is the most."
+            if len(holders) >= self._max_running
             else ""
         )
 
-    def _no_memory(self, needs: Needs, memory_bytes: int | None) -> str:
-        placed = self._placed()
-        held = sum(job.needs.memory_bytes for job in placed)
-        if memory_bytes is None or not placed or held + needs.memory_bytes <= memory_bytes:
+    def _memory_obstacle(self, needs: Needs, memory_bytes: int | None) -> str:
+        holders = self._slot_holders()
+        held = sum(job.needs.memory_bytes for job in holders)
+        if memory_bytes is None or not holders or held + needs.memory_bytes <= memory_bytes:
             return ""
         what = (
             f"about {_gib(needs.memory_bytes)} are needed beside the {_gib(held)} of those that run, and there are"
             f" {_gib(memory_bytes)}"
         )
-        return f"Waits for memory: {_named(placed)}; {what}."
+        return f"Waits for memory: {_named(holders)}; {what}."
 
-    def _no_disk(self, needs: Needs, machine: Machine) -> str:
+    def _disk_obstacle(self, needs: Needs, machine: Machine) -> str:
         # A running job counts with all the disk that it was predicted to need, because what it has written already is
         # not measured again.
         kept = sum(job.needs.disk_bytes for job in self._running.values())
@@ -333,11 +342,11 @@ class Admission:
 
     def _sum_sharing(self) -> None:
         now_s = self._clock()
-        self._sharing_s += len(self._placed()) * (now_s - self._summed_to_s)
+        self._sharing_s += len(self._slot_holders()) * (now_s - self._summed_to_s)
         self._summed_to_s = now_s
 
-    def _placed(self) -> list[_Running]:
-        return [job for job in self._running.values() if job.has_place]
+    def _slot_holders(self) -> list[_Running]:
+        return [job for job in self._running.values() if job.has_slot]
 
 
 def _named(jobs: list[_Running]) -> str:

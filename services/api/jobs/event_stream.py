@@ -65,7 +65,7 @@ class EventBatch:
 
     text: bytes
     last_id: int
-    ended: JobState | None
+    final_state: JobState | None
     """State in which the job ended, where these are its last events: a final state, or DELETING. Else None."""
     is_full: bool
     """Whether the batch is full, so that there may be more events already."""
@@ -73,9 +73,9 @@ class EventBatch:
     @property
     def text_with_end(self) -> bytes:
         """The batch as a stream of this job alone sends it, with event ``end`` after the last event."""
-        if self.ended is None:
+        if self.final_state is None:
             return self.text
-        return self.text + format_sse_event(event="end", data_str=f'"{self.ended}"')
+        return self.text + format_sse_event(event="end", data_str=f'"{self.final_state}"')
 
 
 @dataclass
@@ -93,20 +93,22 @@ class Epoch:
     """Reads that are under way, by job and the id after which they read."""
 
 
-class EventFeed:
+class EventBroadcaster:
     """Follows the event table while ``run`` runs.
 
     It is created before the first stream, so that no event falls between those that the stream has read and those that
     ``run`` looks for.
 
     Args:
-        ask: calls a function that reads the database in a thread.
+        run_in_thread: calls a function that reads the database in a thread.
     """
 
     def __init__(
-        self, repository: Repository, ask: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread
+        self,
+        repository: Repository,
+        run_in_thread: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread,
     ) -> None:
-        self._repository, self._ask, self._newest = repository, ask, repository.newest_event()
+        self._repository, self._run_in_thread, self._newest = repository, run_in_thread, repository.newest_event()
         self._epochs = deque([Epoch(0)], MAX_EPOCHS)
 
     async def run(self) -> None:
@@ -116,13 +118,13 @@ class EventFeed:
         while True:
             newest: dict[str, int] = {}
             with suppress(sql.exc.SQLAlchemyError):  # streams go on after a database was away for a while
-                newest = await self._ask(partial(self._repository.newest_events, self._newest))
+                newest = await self._run_in_thread(partial(self._repository.newest_events, self._newest))
             if newest:
                 self._newest = max(newest.values())
-                ended = self._epochs[-1]
-                self._epochs.append(Epoch(ended.number + 1))
-                ended.jobs = frozenset(newest)
-                ended.ended.set()
+                current = self._epochs[-1]
+                self._epochs.append(Epoch(current.number + 1))
+                current.jobs = frozenset(newest)
+                current.ended.set()
             await asyncio.sleep(PERIOD_S)
 
     async def answer(self, job_id: str, after: int) -> Response:
@@ -134,31 +136,31 @@ class EventFeed:
         """
         epoch = self._epochs[-1]
         batch = await self._read(epoch, job_id, after)
-        if batch.ended is not None:
+        if batch.final_state is not None:
             return Response(batch.text_with_end, headers=UNBUFFERED, media_type=EventStream.media_type)
         return EventStream(self.follow(job_id, after, (epoch, batch)), headers=UNBUFFERED)
 
     async def follow(
-        self, job_id: str, after: int, opening: tuple[Epoch, EventBatch] | None = None
+        self, job_id: str, after: int, first: tuple[Epoch, EventBatch] | None = None
     ) -> AsyncIterator[bytes]:
         """Yield a job's events after an id as server-sent events: first those of the past, then new ones as they come,
         up to the job's final state or its deletion.
 
         Args:
-            opening: the epoch and the first batch, where they were read already.
+            first: the epoch and the first batch, where they were read already.
         """
         while True:
-            epoch = self._epochs[-1] if opening is None else opening[0]
+            epoch = self._epochs[-1] if first is None else first[0]
             try:
-                batch = await self._read(epoch, job_id, after) if opening is None else opening[1]
+                batch = await self._read(epoch, job_id, after) if first is None else first[1]
             except UnknownJobError:
                 return
             except sql.exc.SQLAlchemyError:
-                batch = EventBatch(b"", after, ended=None, is_full=False)  # the next ping's read makes up for it
-            opening = None
-            if told := batch.text_with_end:
-                yield told
-            if batch.ended is not None:
+                batch = EventBatch(b"", after, final_state=None, is_full=False)  # the next ping's read makes up for it
+            first = None
+            if text := batch.text_with_end:
+                yield text
+            if batch.final_state is not None:
                 return
             after = batch.last_id
             while not batch.is_full:
@@ -168,7 +170,7 @@ class EventFeed:
                 except TimeoutError:
                     yield KEEPALIVE_COMMENT
                     break
-                following = self._after(epoch)
+                following = self._next_epoch(epoch)
                 if job_id in epoch.jobs or following is None:
                     break
                 epoch = following
@@ -197,8 +199,8 @@ class EventFeed:
                     continue  # the next ping's read makes up for it
                 if batch.text:
                     yield batch.text
-                if batch.ended is not None:
-                    yield end_of(job_id, batch.ended)
+                if batch.final_state is not None:
+                    yield end_of(job_id, batch.final_state)
                     del reached[job_id]
                     continue
                 reached[job_id] = batch.last_id
@@ -214,19 +216,19 @@ class EventFeed:
                     yield KEEPALIVE_COMMENT
                     due = set(reached)
                     break
-                following = self._after(epoch)
+                following = self._next_epoch(epoch)
                 due = reached.keys() & epoch.jobs if following is not None else set(reached)
                 epoch = following or self._epochs[-1]
             due &= reached.keys()
 
-    def _after(self, epoch: Epoch) -> Epoch | None:
+    def _next_epoch(self, epoch: Epoch) -> Epoch | None:
         """Return the epoch after one that has ended; None if it is no longer remembered.
 
         Epochs hold no reference to their successor, because a stalled stream would then keep all later epochs in
         memory.
         """
-        back = self._epochs[-1].number - epoch.number
-        return self._epochs[-back] if back <= len(self._epochs) else None
+        distance = self._epochs[-1].number - epoch.number
+        return self._epochs[-distance] if distance <= len(self._epochs) else None
 
     async def _read(self, epoch: Epoch, job_id: str, after: int) -> EventBatch:
         """Read a job's events up to this epoch at least. Callers that ask for the same events in the same epoch share
@@ -234,7 +236,7 @@ class EventFeed:
         """
         key = (job_id, after)
         if key not in epoch.reads:
-            epoch.reads[key] = asyncio.create_task(self._ask(partial(_read, self._repository, job_id, after)))
+            epoch.reads[key] = asyncio.create_task(self._run_in_thread(partial(_read, self._repository, job_id, after)))
             epoch.reads[key].add_done_callback(lambda _: epoch.reads.pop(key))
         return await asyncio.shield(epoch.reads[key])
 
@@ -242,10 +244,10 @@ class EventFeed:
 def _read(repository: Repository, job_id: str, after: int) -> EventBatch:
     state = repository.get(job_id).state  # read before the events, so that they include that of a final state
     events = repository.events_of(job_id).read(after, MAX_EVENTS)
-    told = b"".join(format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events)
+    text = b"".join(format_sse_event(data_str=event.model_dump_json(), id=str(event.id)) for event in events)
     is_full = len(events) == MAX_EVENTS
     has_ended = (state.is_final or state is JobState.DELETING) and not is_full
-    return EventBatch(told, events[-1].id if events else after, state if has_ended else None, is_full)
+    return EventBatch(text, events[-1].id if events else after, state if has_ended else None, is_full)
 
 
 def end_of(job_id: str, state: JobState | None) -> bytes:

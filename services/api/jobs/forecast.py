@@ -63,10 +63,10 @@ class Outlook:
         lasting = 1.0 if elapsed_s <= 0 else survival((math.log(elapsed_s) - self.centre) / self.spread, self.degrees)
         if lasting < OUTLIVED:
             return None
-        low, high = (self._outlasted_by(lasting * (1 + sign * share) / 2) for sign in (1, -1))
+        low, high = (self._quantile_s(lasting * (1 + sign * share) / 2) for sign in (1, -1))
         return max(low - max(elapsed_s, 0.0), 0.0), high - max(elapsed_s, 0.0)
 
-    def _outlasted_by(self, share: float) -> float:
+    def _quantile_s(self, share: float) -> float:
         return math.exp(min(self.centre + self.spread * _inverse_survival(share, self.degrees), 700.0))
 
 
@@ -80,10 +80,10 @@ def foresee(past: Sequence[Observation], features: Sequence[float], slopes: Sequ
     if len(past) < MIN_OBSERVATIONS:
         return None
     x, y = np.array([one.features for one in past]), np.log([one.seconds for one in past])
-    surprises = _regress(x, y, slopes).residuals
-    before = np.concatenate([[0.0], surprises[:-1]])
+    errors = _regress(x, y, slopes).residuals
+    before = np.concatenate([[0.0], errors[:-1]])
     fit = _regress(np.column_stack([x, before]), y, (*slopes, PERSISTENCE))
-    step = np.array([*features, surprises[-1]]) - fit.x_mean
+    step = np.array([*features, errors[-1]]) - fit.x_mean
     variance = fit.squares / (len(past) - 1) * (1 + 1 / len(past) + step @ np.linalg.solve(fit.information, step))
     return Outlook(float(fit.y_mean + step @ fit.slope), math.sqrt(float(variance)), len(past) - 1)
 

@@ -102,14 +102,14 @@ def read_history(log: EventLog, points: int, channel: str | None = None) -> Hist
     step that a later attempt repeats replaces the earlier one.
     """
     thinned: dict[str, _Thinned] = {}
-    for told in log.data_of("step"):
-        name = str(told.data.get("channel", ""))
-        if isinstance(told.data.get("step"), int) and channel in {None, name}:
-            thinned.setdefault(name, _Thinned(points)).add(told)
+    for event in log.data_of("step"):
+        name = str(event.data.get("channel", ""))
+        if isinstance(event.data.get("step"), int) and channel in {None, name}:
+            thinned.setdefault(name, _Thinned(points)).add(event)
     return History(series=[_series(name, one) for name, one in thinned.items()])
 
 
-class Histories:
+class HistoryCache:
     """Cache of curves as JSON.
 
     Rows of the event table never change, so that a curve is read again only once its job has a newer event.
@@ -132,19 +132,19 @@ class Histories:
                 return kept[1]
         text = read_history(log, points, channel).model_dump_json().encode()
         with self._lock:
-            self._drop(key)
+            self._evict(key)
             self._kept[key] = newest, text
-            self._bytes += _kept_bytes(channel, text)
+            self._bytes += _entry_bytes(channel, text)
             while self._bytes > self._max_bytes:
-                self._drop(next(iter(self._kept)))
+                self._evict(next(iter(self._kept)))
         return text
 
-    def _drop(self, key: tuple[str, int, str | None]) -> None:
+    def _evict(self, key: tuple[str, int, str | None]) -> None:
         if (kept := self._kept.pop(key, None)) is not None:
-            self._bytes -= _kept_bytes(key[2], kept[1])
+            self._bytes -= _entry_bytes(key[2], kept[1])
 
 
-def _kept_bytes(channel: str | None, text: bytes) -> int:
+def _entry_bytes(channel: str | None, text: bytes) -> int:
     return len(text) + 4 * len(channel or "") + ENTRY_BYTES
 
 

@@ -15,7 +15,7 @@ from services.api.http.json_responses import JSON, in_json
 from services.api.http.problems import refusals
 from services.api.http.thread_pools import ThreadPool
 from services.api.http.zip_stream import stream_zip
-from services.api.jobs.history import Histories, History, LogPage, PreviewPage, read_log, read_previews
+from services.api.jobs.history import History, HistoryCache, LogPage, PreviewPage, read_log, read_previews
 from services.api.jobs.jobs import Jobs
 from services.api.jobs.parameter_table import parameter_table
 from services.api.presets import Preset, find_preset, list_presets
@@ -28,21 +28,21 @@ from services.pipeline.event_log import EventLog
 After = Annotated[int, Query(ge=0, le=MAX_ID, description="id of the last one that is known already")]
 
 
-def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -> APIRouter:
+def build_observe_router(jobs: Jobs, database_pool: ThreadPool, file_pool: ThreadPool) -> APIRouter:
     """Build the routes.
 
     Args:
-        readers: threads that query the database.
-        openers: threads that read the files of jobs.
+        database_pool: threads that query the database.
+        file_pool: threads that read the files of jobs.
     """
     router = APIRouter(prefix="/v1", responses=refusals(404, 422))
-    histories = Histories()
+    history_cache = HistoryCache()
 
     def events_of(job_id: str) -> EventLog:
         return jobs.repository.events_of(jobs.repository.get(job_id).id)
 
     @router.get("/jobs/{job_id}/logs", tags=["jobs"], dependencies=[needs("read")])
-    @readers.answering
+    @database_pool.wrap_handler
     @in_json
     def logs(
         job_id: str,
@@ -55,17 +55,17 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
         return read_log(events_of(job_id), after, limit, stage, attempt)
 
     @router.get("/jobs/{job_id}/history", response_model=History, tags=["jobs"], dependencies=[needs("read")])
-    @readers.answering
+    @database_pool.wrap_handler
     def history(
         job_id: str,
         points: Annotated[int, Query(ge=3, le=5000)] = 500,
         channel: Annotated[str | None, Query(max_length=100)] = None,
     ) -> Response:
         """Loss, errors and parameters of the fit per channel over steps, thinned to at most so many points."""
-        return Response(histories.read(events_of(job_id), points, channel), media_type=JSON)
+        return Response(history_cache.read(events_of(job_id), points, channel), media_type=JSON)
 
     @router.get("/jobs/{job_id}/previews", tags=["artifacts"], dependencies=[needs("read")])
-    @readers.answering
+    @database_pool.wrap_handler
     @in_json
     def previews(job_id: str, after: After = 0, limit: Annotated[int, Query(ge=1, le=1000)] = 200) -> PreviewPage:
         """Pictures that the fit has made so far, oldest first."""
@@ -78,7 +78,7 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
         tags=["artifacts"],
         dependencies=[needs("read", audited=True)],
     )
-    @openers.answering
+    @file_pool.wrap_handler
     def preview(
         job_id: str,
         preview_id: Annotated[int, PathParameter(ge=1, le=MAX_ID)],
@@ -116,7 +116,7 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
         tags=["artifacts"],
         dependencies=[needs("read", audited=True)],
     )
-    @openers.answering
+    @file_pool.wrap_handler
     def parameters(job_id: str) -> Response:
         """What the job has measured, for a spreadsheet: a row per channel and parameter with value, standard error and
         unit.
@@ -127,14 +127,14 @@ def build_observe_router(jobs: Jobs, readers: ThreadPool, openers: ThreadPool) -
         return Response(table, headers=headers, media_type="text/csv")
 
     @router.get("/presets", tags=["options"], dependencies=[needs("read")])
-    @readers.answering
+    @database_pool.wrap_handler
     @in_json
     def presets() -> list[Preset]:
         """Named sets of options."""
         return list_presets()
 
     @router.get("/presets/{name}", tags=["options"], dependencies=[needs("read")])
-    @readers.answering
+    @database_pool.wrap_handler
     @in_json
     def preset(name: str) -> Preset:
         """One set of options, to merge into a job's own."""

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from services.api.calibrations.calibrations import Calibrations, is_stored
 from services.api.captures.captures import Captures, is_uploaded
-from services.api.captures.reading import ReadApart
+from services.api.captures.reading import SubprocessReader
 from services.api.data_folder import keep_password_apart, require_own_folder
 from services.api.jobs.admission import Admission, Machine
 from services.api.jobs.erasure import erase, forget_listing
@@ -58,32 +58,34 @@ class Jobs:
     """Use cases of jobs over one data folder. Jobs run between ``start`` and ``close``.
 
     Args:
-        lacks: returns why no worker can run a stage; see ``Admission``.
+        missing_workers: returns why no worker can run a stage; see ``Admission``.
 
     Raises:
         SettingsError: the database belongs to another data folder.
     """
 
     def __init__(
-        self, settings: ServerSettings, run: RunJob, lacks: Callable[[bool], str | None] = lambda _: None
+        self, settings: ServerSettings, run: RunJob, missing_workers: Callable[[bool], str | None] = lambda _: None
     ) -> None:
         self._data, self._keep_days = settings.data.resolve(), settings.keep_days
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(keep_password_apart(settings.database_url, self._data))
         if settings.database is not None:
             require_own_folder(self.repository.engine, self._data)
-        self.reader = ReadApart()
+        self.reader = SubprocessReader()
         self.captures = Captures(self.repository.engine, self._data, settings.uploads, reader=self.reader)
         self.calibrations = Calibrations(self._data)
         self._light_limits, self.server_paths = LightLimits(settings.dome), ServerPaths.of(settings)
         self._stores = ServerStores(settings)
         has_workers, machine = settings.scheduler is None, machine_class() if settings.scheduler is None else None
         self._admission = Admission(
-            lambda: Machine.of(self._data, has_workers=has_workers), at_once=settings.jobs_at_once, lacks=lacks
+            lambda: Machine.of(self._data, has_workers=has_workers),
+            max_running=settings.jobs_at_once,
+            missing_workers=missing_workers,
         )
-        places, running = settings.jobs_at_once, lambda: self._admission.sharing
+        slots, running = settings.jobs_at_once, lambda: self._admission.sharing
         self._time_ranges = TimeRanges(
-            self.repository, self.locate, self._is_kept_by, machine, places, running, self.reader.describe
+            self.repository, self.locate, self._obstacle, machine, slots, running, self.reader.describe
         )
 
         def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
@@ -98,7 +100,7 @@ class Jobs:
             self._admission,
             self._tidy,
             self._time_ranges.learn,
-            self.server_paths.tell,
+            self.server_paths.redact,
         )
         self._is_alone = settings.database is None
         self._deleting = threading.Lock()
@@ -117,9 +119,9 @@ class Jobs:
         self.reader.close()
         self.repository.close()
 
-    def take_turn(self, job_id: str) -> None:
-        """Require a place for the next stage of a job that has captured; see ``Runner.take_turn``."""
-        self._runner.take_turn(job_id)
+    def require_slot(self, job_id: str) -> None:
+        """Require a slot for the next stage of a job that has captured; see ``Runner.require_slot``."""
+        self._runner.require_slot(job_id)
 
     def folder(self, job_id: str) -> Path:
         """Return the folder of a job's stages and results."""
@@ -166,7 +168,7 @@ class Jobs:
         self._admission.refuse_too_large(
             self.locate(spec)
         )  # before the lock below, as it walks through the capture and others would wait
-        with self.captures.keeping(spec, viewer):
+        with self.captures.holding(spec, viewer):
             creation = self.repository.create(spec, key, request_id, name, viewer)
         logging.getLogger(__name__).info("Job submitted.", extra={"job": creation.job.id, "is_new": creation.is_new})
         self._runner.wake()
@@ -181,12 +183,12 @@ class Jobs:
         if self.repository.get(job_id).state is JobState.RUNNING:
             # Darken before the cancellation is recorded: reading the database never waits, writing to it may take
             # seconds.
-            self._tell_to_stop(job_id)
+            self._request_stop(job_id)
         if self.repository.apply(job_id, Trigger.CANCEL).instruction is Instruction.STOP:
-            self._tell_to_stop(job_id)  # again, as a job that has just begun withdraws an earlier request
+            self._request_stop(job_id)  # again, as a job that has just begun withdraws an earlier request
         return self.repository.get(job_id)
 
-    def _tell_to_stop(self, job_id: str) -> None:
+    def _request_stop(self, job_id: str) -> None:
         try:
             request_cancel(self.folder(job_id))
         except OSError as problem:  # the runner asks again in each of its rounds
@@ -222,7 +224,7 @@ class Jobs:
 
     def capturing(self) -> list[Job]:
         """Return the jobs under way, of any server of the database, whose capture is not published yet."""
-        return self._to_capture(
+        return self._awaiting_capture(
             self.repository.page(MAX_RUNNING, only=JobFilter(states=(JobState.RUNNING, JobState.CANCELLING)))
         )
 
@@ -234,15 +236,15 @@ class Jobs:
         """
         return any(
             job.spec.rig is not None and not job.spec.rig.is_simulated
-            for job in self._to_capture([self.repository.get(job_id)])
+            for job in self._awaiting_capture([self.repository.get(job_id)])
         )
 
     def cancel_captures(self) -> list[Job]:
         """Cancel every job that captures or will capture next; returns these jobs in their state before."""
         cancelled, capturing = [], self.capturing()
         for job in capturing:  # all before the first is recorded, as each may have a dome of its own
-            self._tell_to_stop(job.id)
-        for job in self._to_capture(self.repository.queued()) + capturing:
+            self._request_stop(job.id)
+        for job in self._awaiting_capture(self.repository.queued()) + capturing:
             with suppress(JobStateError):
                 self.cancel(job.id)
                 cancelled.append(job)
@@ -254,17 +256,17 @@ class Jobs:
             return None
         # Ask only for the obstacle of the state that was read: a job that was read as running may have been paused
         # since.
-        look = self._admission.stalled if job.state is JobState.RUNNING else self._admission.reason
-        if (reason := look(job.id)) is not None:
-            return self.server_paths.tell(reason, self.locate(job.spec))
+        find_reason = self._admission.stalled if job.state is JobState.RUNNING else self._admission.reason
+        if (reason := find_reason(job.id)) is not None:
+            return self.server_paths.redact(reason, self.locate(job.spec))
         return (
             None
             if job.state is JobState.RUNNING or self.is_running()
             else "This server does not run jobs; restart it and read its log."
         )
 
-    def _is_kept_by(self, job: Job) -> str | None:
-        return self._admission.reason(job.id, besides_turn=True) if job.state is JobState.QUEUED else None
+    def _obstacle(self, job: Job) -> str | None:
+        return self._admission.reason(job.id, ignore_queue=True) if job.state is JobState.QUEUED else None
 
     def time_range(self, job: Job) -> TimeRange | None:
         """How long until a job ends; None if it neither runs nor waits."""
@@ -283,7 +285,7 @@ class Jobs:
         """Whether queued jobs will be run."""
         return self._runner.is_running
 
-    def _to_capture(self, jobs: list[Job]) -> list[Job]:
+    def _awaiting_capture(self, jobs: list[Job]) -> list[Job]:
         return [job for job in jobs if job.spec.rig is not None and not is_published(self.folder(job.id), "capture")]
 
     def _tidy(self) -> None:

@@ -131,10 +131,10 @@ class PastRuns:
             if ended_s is not None:  # else the job was deleted meanwhile
                 connection.execute(past_run_table.insert().values(row | {"ended_s": ended_s}))
 
-    def alike(self, method: str, machine: str) -> list[PastRun]:
+    def similar(self, method: str, machine: str) -> list[PastRun]:
         """Return the newest runs of jobs of the same method on the same class of machine, oldest first."""
-        alike = (past_run_table.c.method == method) & (past_run_table.c.machine == machine)
-        query = sql.select(past_run_table).where(alike).order_by(past_run_table.c.ended_s.desc()).limit(NEWEST)
+        similar = (past_run_table.c.method == method) & (past_run_table.c.machine == machine)
+        query = sql.select(past_run_table).where(similar).order_by(past_run_table.c.ended_s.desc()).limit(NEWEST)
         with self._engine.connect() as connection:
             return [_run(row) for row in reversed(connection.execute(query).mappings().all())]
 

@@ -62,7 +62,7 @@ class Job(Record):
         ),
     )
 
-    def seen_by(self, viewer: Viewer) -> Job:
+    def redacted_for(self, viewer: Viewer) -> Job:
         """Return the job as a viewer may see it: without the folders on the server, for one who may not use them."""
         return self if viewer.uses_paths else self.model_copy(update={"spec": without_folders(self.spec)})
 

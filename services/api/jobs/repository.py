@@ -28,14 +28,14 @@ from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.records import JobSpec
 from services.pipeline.database import Query, open_database, writing
 from services.pipeline.event_log import (
-    Begun,
     EventAddress,
     EventLog,
-    begun,
+    JobProgress,
     event_table,
     insert_event,
     latest_of_stages,
     lease_table,
+    progress_of_jobs,
 )
 
 KNOWN_JOBS = 1024
@@ -140,7 +140,7 @@ class Repository:
         with writing(self.engine) as connection:
             connection.execute(job_table.update().where(job_table.c.id == job_id).values(name=name))
             renamed = self._find(connection, job_id)
-        return self._verdicts.judged([renamed])[0]
+        return self._verdicts.with_verdicts([renamed])[0]
 
     def submitted(self, spec: JobSpec, key: str, viewer: Viewer = LOCAL_VIEWER) -> Job | None:
         """The job that its owner submitted with this idempotency key, if there is one.
@@ -157,9 +157,9 @@ class Repository:
         Raises:
             UnknownJobError: there is none with this id.
         """
-        return self._verdicts.judged([self._only(_ONE.rows(self.engine, of=job_id), job_id)])[0]
+        return self._verdicts.with_verdicts([self._only(_ONE.rows(self.engine, of=job_id), job_id)])[0]
 
-    def seen(self, job_ids: Iterable[str], viewer: Viewer) -> set[str]:
+    def visible_ids(self, job_ids: Iterable[str], viewer: Viewer) -> set[str]:
         """Return the ids of those jobs that exist and that a viewer may see."""
         found = (_ONE.rows(self.engine, of=job_id) for job_id in job_ids)
         return {job.id for job in self._jobs(rows[0] for rows in found if rows) if viewer.may_see(job.owner)}
@@ -167,7 +167,7 @@ class Repository:
     def page(self, limit: int, before: int | None = None, only: JobFilter | None = None) -> list[Job]:
         """Return up to ``limit`` jobs, newest first, of those with a number below ``before``."""
         values = {"most": limit} | ({} if before is None else {"before": before})
-        return self._verdicts.judged(
+        return self._verdicts.with_verdicts(
             self._jobs(_listing(only or JobFilter(), is_first=before is None).rows(self.engine, **values))
         )
 
@@ -175,9 +175,9 @@ class Repository:
         """Return the jobs that run or wait, in the order of their submission."""
         return self._jobs(_UNFINISHED.rows(self.engine))
 
-    def begun(self) -> dict[str, Begun]:
+    def begun(self) -> dict[str, JobProgress]:
         """Return how far the stages are of each job that runs or waits and was begun, by job."""
-        return begun(_BEGUN.rows(self.engine))
+        return progress_of_jobs(_BEGUN.rows(self.engine))
 
     def queued(self) -> list[Job]:
         """Return the jobs that wait, in the order of their submission."""
@@ -229,7 +229,7 @@ class Repository:
         with writing(self.engine) as connection:
             return self._apply(connection, job_id, trigger, failure)
 
-    def tell(self, job_id: str, message: str) -> None:
+    def append_message(self, job_id: str, message: str) -> None:
         """Append a sentence to the events of a job, if the job still waits."""
         is_waiting = sql.select(job_table.c.id).where(job_table.c.id == job_id, job_table.c.state == JobState.QUEUED)
         with writing(self.engine) as connection:

@@ -11,14 +11,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field, StringConstraints
 
-from services.api.auth.scopes import Asker, needs, require
+from services.api.auth.scopes import CurrentViewer, needs, require
 from services.api.auth.tokens import Scope
 from services.api.http.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
-from services.api.http.bodies import BodyRoute, Sent
+from services.api.http.bodies import BodyRoute, ValidatedBody
 from services.api.http.json_responses import in_json
 from services.api.http.problems import refusals
 from services.api.http.thread_pools import ThreadPool
-from services.api.jobs.event_stream import EVENT_ANSWERS, UNBUFFERED, EventFeed, EventStream, end_of
+from services.api.jobs.event_stream import EVENT_ANSWERS, UNBUFFERED, EventBroadcaster, EventStream, end_of
 from services.api.jobs.jobs import Jobs, StageProgress
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Deletion, Job
@@ -29,15 +29,15 @@ from services.core.owners import Viewer
 from services.core.records import JobName, JobSpec, KindName
 from services.pipeline.database import MAX_ID
 
-LOOK_S = 2.0
+ESTIMATE_TIMEOUT_S = 2.0
 """Longest time in s that the answer about a job waits for the disks of captures, which are read to predict how long
 jobs take."""
 
 
 MAX_STREAMED = 64
 """Largest number of jobs in one stream of events."""
-_PLACE = "a job's id, and after a colon the id of its last event that is known already"
-Place = Annotated[str, StringConstraints(pattern=r"^[0-9a-zA-Z]{1,40}(:[0-9]{1,9})?$")]
+_STREAM_POSITION = "a job's id, and after a colon the id of its last event that is known already"
+StreamPosition = Annotated[str, StringConstraints(pattern=r"^[0-9a-zA-Z]{1,40}(:[0-9]{1,9})?$")]
 
 
 class Submission(JobSpec):
@@ -84,39 +84,44 @@ class Health(Record):
 
 
 def build_router(
-    jobs: Jobs, feed: EventFeed, readers: ThreadPool, openers: ThreadPool, lookers: ThreadPool, cancellers: ThreadPool
+    jobs: Jobs,
+    broadcaster: EventBroadcaster,
+    database_pool: ThreadPool,
+    file_pool: ThreadPool,
+    capture_pool: ThreadPool,
+    cancel_pool: ThreadPool,
 ) -> APIRouter:
     """Build the routes.
 
     Args:
-        feed: follows the event table.
-        readers: threads that query the database.
-        openers: threads that read the files of jobs.
-        lookers: threads that read captures, whose disks may hang.
-        cancellers: threads that cancel jobs.
+        broadcaster: follows the event table.
+        database_pool: threads that query the database.
+        file_pool: threads that read the files of jobs.
+        capture_pool: threads that read captures, whose disks may hang.
+        cancel_pool: threads that cancel jobs.
     """
     router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 409, 413, 422, 507))
     schema = json.dumps(JobSpec.model_json_schema())
 
     @in_json
-    def tell(job: Job, remaining: TimeRange | None, asker: Viewer) -> JobDetail:
-        shown = job.seen_by(asker)
+    def detail(job: Job, remaining: TimeRange | None, viewer: Viewer) -> JobDetail:
+        shown = job.redacted_for(viewer)
         fields = {name: getattr(shown, name) for name in Job.model_fields}
         return JobDetail(**fields, stages=jobs.progress(job), waits_for=jobs.waits_for(job), remaining=remaining)
 
-    def find(job_id: str, asker: Viewer) -> Job | Response:
+    def find(job_id: str, viewer: Viewer) -> Job | Response:
         job = jobs.repository.get(job_id)
-        return tell(job, None, asker) if job.state.is_final else job
+        return detail(job, None, viewer) if job.state.is_final else job
 
-    async def look(job: Job) -> TimeRange | None:
+    async def estimate_remaining(job: Job) -> TimeRange | None:
         try:
-            async with asyncio.timeout(LOOK_S):
-                return await lookers.ask(jobs.time_range, job)
+            async with asyncio.timeout(ESTIMATE_TIMEOUT_S):
+                return await capture_pool.run(jobs.time_range, job)
         except TimeoutError:
             return TimeRange(
                 reason=(
-                    f"The captures of this job and those before it could not be looked at within {LOOK_S:g} s; ask"
-                    " again."
+                    f"The captures of this job and those before it could not be looked at within {ESTIMATE_TIMEOUT_S:g}"
+                    " s; ask again."
                 )
             )
 
@@ -124,8 +129,8 @@ def build_router(
         "/jobs", status_code=201, responses={200: {"model": Job}}, tags=["jobs"], dependencies=[needs("submit")]
     )
     def submit(
-        wanted: Sent[Submission],
-        asker: Asker,
+        submission: ValidatedBody[Submission],
+        viewer: CurrentViewer,
         request: Request,
         response: Response,
         idempotency_key: Annotated[str | None, Header(max_length=200)] = None,
@@ -134,18 +139,18 @@ def build_router(
 
         A job with a rig needs scope operate-dome too, unless its dome is simulated.
         """
-        if wanted.rig is not None and not wanted.rig.is_simulated:
+        if submission.rig is not None and not submission.rig.is_simulated:
             require(request.scope.get("caller"), Scope.OPERATE_DOME)
-        creation = jobs.submit(wanted.spec(), idempotency_key, request.state.request_id, wanted.name, asker)
+        creation = jobs.submit(submission.spec(), idempotency_key, request.state.request_id, submission.name, viewer)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
         return creation.job
 
     @router.get("/jobs", tags=["jobs"], dependencies=[needs("read")])
-    @readers.answering
+    @database_pool.wrap_handler
     @in_json
     def page(
-        asker: Asker,
+        viewer: CurrentViewer,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
         before: Annotated[int | None, Query(ge=0, le=MAX_ID)] = None,
         state: Annotated[tuple[JobState, ...], Query(description="give several to allow each")] = (),
@@ -158,28 +163,32 @@ def build_router(
         ] = None,
     ) -> JobPage:
         """List jobs, newest first."""
-        only = JobFilter(
+        filters = JobFilter(
             states=state, kind=kind, created_after_s=created_after_s, created_before_s=created_before_s, source=capture
         )
-        found = jobs.repository.page(limit + 1, before, only=only.seen_by(asker))
+        found = jobs.repository.page(limit + 1, before, only=filters.visible_to(viewer))
         return JobPage(
-            jobs=[job.seen_by(asker) for job in found[:limit]],
+            jobs=[job.redacted_for(viewer) for job in found[:limit]],
             next_before=found[limit - 1].number if len(found) > limit else None,
         )
 
     @router.get("/jobs/{job_id}", response_model=JobDetail, tags=["jobs"], dependencies=[needs("read")])
-    async def get(job_id: str, asker: Asker) -> Response:
+    async def get(job_id: str, viewer: CurrentViewer) -> Response:
         """One job with its stages."""
-        found = await readers.ask(find, job_id, asker)
-        return found if isinstance(found, Response) else await readers.ask(tell, found, await look(found), asker)
+        found = await database_pool.run(find, job_id, viewer)
+        return (
+            found
+            if isinstance(found, Response)
+            else await database_pool.run(detail, found, await estimate_remaining(found), viewer)
+        )
 
     @router.patch("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])
-    def rename(job_id: str, label: Sent[Label]) -> Job:
+    def rename(job_id: str, label: ValidatedBody[Label]) -> Job:
         """Give a job another label, or none; nothing else of it can be changed."""
         return jobs.repository.rename(job_id, label.name)
 
     @router.post("/jobs/{job_id}/cancel", status_code=202, tags=["jobs"], dependencies=[needs("submit", darkens=True)])
-    @cancellers.answering
+    @cancel_pool.wrap_handler
     def cancel(job_id: str) -> Job:
         """Cancel a job. The lights go off first; what it has published is kept."""
         return jobs.cancel(job_id)
@@ -201,7 +210,7 @@ def build_router(
         return jobs.delete(job_id)
 
     @router.get("/deletions/{job_id}", tags=["jobs"], dependencies=[needs("read")])
-    @readers.answering
+    @database_pool.wrap_handler
     @in_json
     def deletion(job_id: str) -> Deletion:
         """The receipt of a deleted job."""
@@ -216,32 +225,34 @@ def build_router(
     )
     async def events(job_id: str, last_event_id: Annotated[int | None, Header(ge=0, le=MAX_ID)] = None) -> Response:
         """The job's events, replayed after Last-Event-ID and then live; event 'end' carries the final state."""
-        return await feed.answer(job_id, last_event_id or 0)
+        return await broadcaster.answer(job_id, last_event_id or 0)
 
     @router.get(
         "/events", response_class=Response, responses=EVENT_ANSWERS, tags=["jobs"], dependencies=[needs("read")]
     )
     async def events_of_several(
-        asker: Asker,
-        job: Annotated[tuple[Place, ...], Query(min_length=1, max_length=MAX_STREAMED, description=_PLACE)],
+        viewer: CurrentViewer,
+        job: Annotated[
+            tuple[StreamPosition, ...], Query(min_length=1, max_length=MAX_STREAMED, description=_STREAM_POSITION)
+        ],
     ) -> Response:
         """The events of several jobs in one stream, as a browser has few connections.
 
         Event 'end' names the job and its final state, null for an absent one.
         """
-        places = {job_id: int(after or 0) for job_id, _, after in (place.partition(":") for place in job)}
-        seen = await readers.ask(jobs.repository.seen, places, asker)
+        positions = {job_id: int(after or 0) for job_id, _, after in (position.partition(":") for position in job)}
+        visible = await database_pool.run(jobs.repository.visible_ids, positions, viewer)
 
         async def follow() -> AsyncIterator[bytes]:
-            for job_id in sorted(set(places) - seen):
+            for job_id in sorted(set(positions) - visible):
                 yield end_of(job_id, None)
-            async for batch in feed.follow_several({job_id: places[job_id] for job_id in seen}):
+            async for batch in broadcaster.follow_several({job_id: positions[job_id] for job_id in visible}):
                 yield batch
 
         return EventStream(follow(), headers=UNBUFFERED)
 
     @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
-    @openers.answering
+    @file_pool.wrap_handler
     @in_json
     def artifacts(job_id: str) -> list[Artifact]:
         """List the job's files."""
@@ -254,7 +265,7 @@ def build_router(
         tags=["artifacts"],
         dependencies=[needs("read", audited=True)],
     )
-    @openers.answering
+    @file_pool.wrap_handler
     def artifact(job_id: str, path: str, request: Request) -> Response:
         """One file; takes Range and If-None-Match."""
         return artifact_response(request, open_artifact(jobs.folder(jobs.repository.get(job_id).id), path))

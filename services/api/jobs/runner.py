@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from services.api.jobs.admission import Admission, turn
+from services.api.jobs.admission import Admission, queue_order
 from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.records import Failure, Job, Lease
 from services.api.jobs.repository import Repository
@@ -24,8 +24,8 @@ from services.core.errors import (
 )
 from services.core.records import JobSpec
 from services.core.stage import StageName
-from services.core.store import telling_disk_faults
-from services.pipeline.database import patiently
+from services.core.store import translate_disk_errors
+from services.pipeline.database import retry_while_lost
 from services.pipeline.event_log import EventAddress
 from services.pipeline.logs import log_context
 from services.pipeline.stages import first_stage, request_cancel, withdraw_cancel
@@ -41,8 +41,8 @@ ROUND_S = 10.0
 again."""
 
 
-class WaitsForItsTurnError(Exception):
-    """A job has captured, and there is no place yet for its other stages."""
+class NoFreeSlotError(Exception):
+    """A job has captured, and there is no slot yet for its other stages."""
 
 
 class Runner:
@@ -54,7 +54,7 @@ class Runner:
         on_round: called in every round.
         on_success: called with a job that has succeeded, and the mean number of jobs that shared the workers while it
             ran.
-        tell: returns the reason why a job failed or waits in a form that everybody who sees the job may read.
+        redact: returns the reason why a job failed or waits in a form that everybody who sees the job may read.
     """
 
     def __init__(
@@ -66,9 +66,9 @@ class Runner:
         admission: Admission,
         on_round: Callable[[], None],
         on_success: Callable[[Job, float], None],
-        tell: Callable[[str, JobSpec], str] = lambda sentence, _: sentence,
+        redact: Callable[[str, JobSpec], str] = lambda sentence, _: sentence,
     ) -> None:
-        self._tell = tell
+        self._redact = redact
         self._repository, self._folder, self._locate, self._run, self._admission = (
             repository,
             folder,
@@ -80,9 +80,9 @@ class Runner:
         self._holder = f"{socket.gethostname()}-{secrets.token_hex(4)}"
         self._wake, self._closing, self._lock = threading.Event(), threading.Event(), threading.Lock()
         self._running: dict[str, tuple[Lease, threading.Thread]] = {}
-        self._told_obstacles: dict[str, str | None] = {}
-        parts = {"jobs": self._start_jobs, "leases": self._look_after, "rounds": self._make_rounds}
-        self._threads = [threading.Thread(target=part, name=name) for name, part in parts.items()]
+        self._reported_obstacles: dict[str, str | None] = {}
+        loops = {"jobs": self._start_jobs, "leases": self._maintain_leases, "rounds": self._make_rounds}
+        self._threads = [threading.Thread(target=loop, name=name) for name, loop in loops.items()]
 
     def start(self, *, alone: bool) -> None:
         """Start the threads. ``alone`` says that no other server shares the database, so that jobs under way there were
@@ -113,59 +113,59 @@ class Runner:
             if thread.ident is not None:
                 thread.join()
         # A job that was started meanwhile has asked for its own end; see _prepare.
-        for _, thread in self._under_way():
+        for _, thread in self._running_jobs():
             thread.join()
 
     def wake(self) -> None:
         """Wake the thread that starts jobs."""
         self._wake.set()
 
-    def take_turn(self, job_id: str) -> None:
-        """Require a place for a stage that follows a job's capture; called before each such stage in the job's own
+    def require_slot(self, job_id: str) -> None:
+        """Require a slot for a stage that follows a job's capture; called before each such stage in the job's own
         thread.
 
         Raises:
-            WaitsForItsTurnError: all places are taken.
+            NoFreeSlotError: all slots are taken.
         """
-        if not self._admission.takes_place(job_id):
-            raise WaitsForItsTurnError
+        if not self._admission.try_claim_slot(job_id):
+            raise NoFreeSlotError
 
     @property
     def is_running(self) -> bool:
         """Whether queued jobs will be run."""
         return all(thread.is_alive() for thread in self._threads) and not self._closing.is_set()
 
-    def _under_way(self) -> list[tuple[Lease, threading.Thread]]:
+    def _running_jobs(self) -> list[tuple[Lease, threading.Thread]]:
         with self._lock:
             return list(self._running.values())
 
     def _leases(self) -> list[Lease]:
-        return [lease for lease, _ in self._under_way()]
+        return [lease for lease, _ in self._running_jobs()]
 
     def _start_jobs(self) -> None:
         while not self._closing.is_set():
             self._wake.wait()
             self._wake.clear()
             try:
-                self._start_what_may()
+                self._start_admitted()
             except Exception:  # a fault of the database or the data folder
                 logging.getLogger(__name__).exception("starting jobs failed; trying again in %g s", ROUND_S)
 
-    def _start_what_may(self) -> None:
+    def _start_admitted(self) -> None:
         # Go through the queued jobs in turn; those that wait for disk or workers let others pass.
-        queued = sorted(self._repository.queued(), key=turn)
+        queued = sorted(self._repository.queued(), key=queue_order)
         self._admission.begin_round(job.id for job in queued)
-        self._told_obstacles = {
-            job.id: told for job in queued if (told := self._told_obstacles.get(job.id)) is not None
+        self._reported_obstacles = {
+            job.id: reported for job in queued if (reported := self._reported_obstacles.get(job.id)) is not None
         }
         for job in queued:
             if self._closing.is_set():
                 return
             spec, is_to_capture = self._locate(job.spec), first_stage(job.spec, self._folder(job.id)) == "capture"
             if self._admission.holds(job.id, spec, is_to_capture=is_to_capture):
-                self._tell_obstacle(job.id, spec)
+                self._report_obstacle(job.id, spec)
                 continue
-            self._told_obstacles.pop(job.id, None)
+            self._reported_obstacles.pop(job.id, None)
             try:
                 lease = self._repository.lease(job.id, self._holder, LEASE_S)
             except JobStateError:
@@ -176,16 +176,16 @@ class Runner:
                 self._running[job.id] = lease, thread
             thread.start()
 
-    def _tell_obstacle(self, job_id: str, located: JobSpec) -> None:
+    def _report_obstacle(self, job_id: str, located: JobSpec) -> None:
         # Write the obstacle as an event, so that clients that watch the job see it at once; once for each kind of
         # obstacle, as its numbers change all the time. That others are first in line is not written, as nobody can act
         # on it.
-        reason = self._admission.reason(job_id, besides_turn=True)
+        reason = self._admission.reason(job_id, ignore_queue=True)
         kind = None if reason is None else reason.partition(":")[0]
-        if kind != self._told_obstacles.get(job_id):
-            self._told_obstacles[job_id] = kind
+        if kind != self._reported_obstacles.get(job_id):
+            self._reported_obstacles[job_id] = kind
             if reason is not None:
-                self._repository.tell(job_id, self._tell(reason, located))
+                self._repository.append_message(job_id, self._redact(reason, located))
 
     def _run_in_thread(self, lease: Lease) -> None:
         job = lease.job
@@ -200,12 +200,12 @@ class Runner:
             self._admission.end(job.id)
             self._wake.set()
 
-    def _look_after(self) -> None:
+    def _maintain_leases(self) -> None:
         log = logging.getLogger(__name__)
         while not self._closing.wait(ROUND_S):
             try:
                 self._renew_leases()
-                self._admission.look_for_stalled()
+                self._admission.find_stalled()
             except Exception:
                 log.exception("looking after jobs failed; trying again in %g s", ROUND_S)
             self._wake.set()
@@ -242,7 +242,7 @@ class Runner:
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", job.id, problem)
             return
-        except WaitsForItsTurnError:
+        except NoFreeSlotError:
             trigger = Trigger.PAUSE
         except (DiskFullError, ReadOnlyStoreError, SchedulerLostError) as problem:
             self._admission.pause(job.id, problem)
@@ -262,12 +262,12 @@ class Runner:
                 Failure(code="internal-error", message=message, exit_status=1, stage=self._stage(job)),
             )
         if failure is not None:
-            failure = failure.model_copy(update={"message": self._tell(failure.message, self._locate(job.spec))})
+            failure = failure.model_copy(update={"message": self._redact(failure.message, self._locate(job.spec))})
         self._settle(lease, trigger, failure)
 
     def _settle(self, lease: Lease, trigger: Trigger, failure: Failure | None) -> None:
         try:
-            transition = patiently(lambda: self._repository.settle(lease, trigger, failure))
+            transition = retry_while_lost(lambda: self._repository.settle(lease, trigger, failure))
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", lease.job.id, problem)
             return
@@ -275,10 +275,10 @@ class Runner:
             "Job ran.", extra={"state": transition.state, "failure": failure.code if failure else None}
         )
         if transition.state is JobState.SUCCEEDED:
-            self._on_success(lease.job, self._admission.beside(lease.job.id))
+            self._on_success(lease.job, self._admission.mean_sharing(lease.job.id))
 
     def _prepare(self, lease: Lease, folder: Path) -> None:
-        with telling_disk_faults(folder):
+        with translate_disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             withdraw_cancel(folder)
             if self._closing.is_set() or self._is_cancelled(lease):
@@ -287,7 +287,7 @@ class Runner:
     def _after_cancel(self, job: Job) -> Trigger:
         # The cancel came from a user, from the end of this server, or from neither: tasks can also be cancelled in Dask
         # itself. Then the job goes on, but after a pause, so that this does not repeat over and over at once.
-        if patiently(lambda: self._repository.get(job.id).state) is JobState.CANCELLING:
+        if retry_while_lost(lambda: self._repository.get(job.id).state) is JobState.CANCELLING:
             return Trigger.STOPPED
         if self._closing.is_set():
             return Trigger.LOSE

@@ -96,9 +96,9 @@ class ServerPaths:
         if resolved is None or not _is_there(path):
             raise SettingsError(f"Option '{option}': {path} does not exist on the server; {remedy}.")
 
-    def tell(self, sentence: str, located: JobSpec) -> str:
+    def redact(self, sentence: str, located: JobSpec) -> str:
         """Return a sentence about a job without the server's folders, if some of its readers may not name them."""
-        return sentence if self._roots is None else told_without_folders(sentence, located, self._data)
+        return sentence if self._roots is None else redact_folders(sentence, located, self._data)
 
     def _is_allowed(self, path: Path) -> bool:
         return not path.is_relative_to(self._data) and any(path.is_relative_to(root) for root in self._roots or ())
@@ -118,7 +118,7 @@ def without_folders(spec: JobSpec) -> JobSpec:
     return spec.model_copy(update=changes) if changes else spec
 
 
-def told_without_folders(text: str, located: JobSpec, data: Path) -> str:
+def redact_folders(text: str, located: JobSpec, data: Path) -> str:
     """Remove the server's folders, in which the files of a job lie, from a sentence about the job: not everybody who
     reads it may name them.
 

@@ -70,7 +70,7 @@ class JobFilter(Record):
     owner: str | None = Field(default=None, description="whose jobs; null: everybody's")
     by_name: bool = Field(default=False, description="whether source is looked for in the path's last part alone")
 
-    def seen_by(self, viewer: Viewer) -> JobFilter:
+    def visible_to(self, viewer: Viewer) -> JobFilter:
         """Return the filter, restricted to what a viewer may see."""
         return self.model_copy(
             update={"owner": None if viewer.sees_all else viewer.owner, "by_name": not viewer.uses_paths}

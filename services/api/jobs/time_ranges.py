@@ -15,7 +15,7 @@ from typing import Self
 from pydantic import Field
 
 from services.api.captures.descriptions import Describe, describe
-from services.api.jobs.admission import turn
+from services.api.jobs.admission import queue_order
 from services.api.jobs.forecast import MIN_OBSERVATIONS, Observation, foresee
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.past_runs import TENTHS, PastRun, tenth_of
@@ -26,7 +26,7 @@ from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.records import JobSpec
 from services.core.stage import StageName
-from services.pipeline.event_log import Begun, EventLog
+from services.pipeline.event_log import EventLog, JobProgress
 from services.pipeline.stages import stages_of
 
 SIZE_SLOPE = 0.5
@@ -35,7 +35,7 @@ proportionality (1)."""
 
 SHORTEST_S = 1e-3
 """Shortest duration in s of which a logarithm is taken."""
-WIDEST = 100.0
+MAX_RANGE_RATIO = 100.0
 """Largest ratio of a range's limits. A wider range says nothing and is not given."""
 
 
@@ -49,8 +49,8 @@ class TimeRange(Record):
     past_jobs: int = Field(default=0, description="how many past jobs it is learned from")
     reason: str | None = Field(default=None, description="why there is no range")
 
-    def after(self, running: Sequence[Self], ahead: Sequence[Self], places: int) -> Self:
-        """Return the range of a job that begins once the running jobs and those ahead of it leave a place free.
+    def after(self, running: Sequence[Self], ahead: Sequence[Self], slots: int) -> Self:
+        """Return the range of a job that begins once the running jobs and those ahead of it leave a slot free.
 
         Lower limits are added to lower ones and upper to upper ones, because on a busy machine all jobs are late
         together.
@@ -58,13 +58,13 @@ class TimeRange(Record):
         Args:
             running: ranges of the jobs that run.
             ahead: ranges of the queued jobs that start before this one.
-            places: largest number of jobs that run side by side.
+            slots: largest number of jobs that run side by side.
         """
         if self.low_s is None or self.high_s is None:
             return self
         low_s, high_s = (
             _start_s(
-                [getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], places
+                [getattr(one, limit) or 0.0 for one in running], [getattr(one, limit) or 0.0 for one in ahead], slots
             )
             for limit in ("low_s", "high_s")
         )
@@ -72,9 +72,9 @@ class TimeRange(Record):
         return self.model_copy(update={"low_s": self.low_s + low_s, "high_s": self.high_s + high_s, "past_jobs": fewer})
 
 
-def _start_s(running_s: list[float], ahead_s: list[float], places: int) -> float:
-    """Return in how many s a place is free, when each job ahead takes the place that is free first."""
-    free_s = sorted(running_s)[max(len(running_s) - places, 0) :] + [0.0] * (places - len(running_s))
+def _start_s(running_s: list[float], ahead_s: list[float], slots: int) -> float:
+    """Return in how many s a slot is free, when each job ahead takes the slot that is free first."""
+    free_s = sorted(running_s)[max(len(running_s) - slots, 0) :] + [0.0] * (slots - len(running_s))
     heapq.heapify(free_s)
     for lasts_s in ahead_s:
         heapq.heapreplace(free_s, free_s[0] + lasts_s)
@@ -109,11 +109,11 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
     weight = (
         0.0
         if position.took_s is None or not pairs
-        else sum(took_s / (took_s + left_s) for took_s, left_s in pairs) / len(pairs)
+        else sum(took_s / (took_s + remaining_s) for took_s, remaining_s in pairs) / len(pairs)
     )
     past = [
-        Observation((*_features(run), weight * math.log(took_s)), left_s)
-        for run, (took_s, left_s) in zip(compared, pairs, strict=True)
+        Observation((*_features(run), weight * math.log(took_s)), remaining_s)
+        for run, (took_s, remaining_s) in zip(compared, pairs, strict=True)
     ]
     pace = 0.0 if position.took_s is None else weight * math.log(max(position.took_s, SHORTEST_S))
     outlook = foresee(past, (*job_size, pace), (*[SIZE_SLOPE * (1 - weight)] * len(job_size), 1.0))
@@ -123,15 +123,15 @@ def time_range(job_size: tuple[float, ...], position: Position, runs: list[PastR
             " tell a time."
         )
         return TimeRange(past_jobs=len(past), reason=what)
-    left = outlook.remaining_s(position.since_s)
-    if left is None:
+    remaining_s = outlook.remaining_s(position.since_s)
+    if remaining_s is None:
         return TimeRange(past_jobs=len(past), reason=f"It takes longer than {len(past)} jobs like it let expect.")
-    if left[1] + position.since_s > WIDEST * (left[0] + position.since_s):
+    if remaining_s[1] + position.since_s > MAX_RANGE_RATIO * (remaining_s[0] + position.since_s):
         return TimeRange(
             past_jobs=len(past),
             reason=f"The {len(past)} past jobs differ too much from each other, or from this one, to tell a time.",
         )
-    return TimeRange(low_s=left[0], high_s=left[1], past_jobs=len(past))
+    return TimeRange(low_s=remaining_s[0], high_s=remaining_s[1], past_jobs=len(past))
 
 
 def _features(run: PastRun) -> tuple[float, ...]:
@@ -151,7 +151,7 @@ class TimeRanges:
         locate: returns a job's options with the folder of an uploaded capture.
         waits_for: returns what a queued job waits for other than the end of other jobs; None if nothing.
         machine: class of the machine that runs jobs; None where it is known only once they run.
-        places: largest number of jobs that run side by side.
+        slots: largest number of jobs that run side by side.
         running: returns how many jobs share the workers now.
         describe: reads the description of a capture.
     """
@@ -162,12 +162,12 @@ class TimeRanges:
         locate: Callable[[JobSpec], JobSpec],
         waits_for: Callable[[Job], str | None],
         machine: str | None,
-        places: int = 1,
+        slots: int = 1,
         running: Callable[[], int] = lambda: 1,
         describe: Describe = describe,
     ) -> None:
         self._repository, self._locate, self._waits_for, self._machine = repository, locate, waits_for, machine
-        self._places, self._running, self._describe = places, running, describe
+        self._slots, self._running, self._describe = slots, running, describe
 
     def learn(self, job: Job, beside: float = 1.0) -> None:
         """Record the run of a job that has succeeded; ``beside`` is the mean number of jobs that shared the workers
@@ -179,25 +179,28 @@ class TimeRanges:
     def of(self, job: Job) -> TimeRange | None:
         """How long until a job ends; None if it neither runs nor waits."""
         if job.state is JobState.RUNNING:
-            return self._own(
-                job, self._repository.events_of(job.id).begun(), _Past(self._repository), max(self._running(), 1)
+            return self._own_range(
+                job, self._repository.events_of(job.id).progress(), _Past(self._repository), max(self._running(), 1)
             )
         if job.state is not JobState.QUEUED:
             return None
         unfinished, stages, past = self._repository.unfinished(), self._repository.begun(), _Past(self._repository)
         running = [one for one in unfinished if one.state is JobState.RUNNING]
-        ahead = sorted((one for one in unfinished if one.state is JobState.QUEUED and turn(one) < turn(job)), key=turn)
-        beside = min(self._places, len(running) + len(ahead) + 1)
-        own = self._own(job, stages.get(job.id, Begun()), past, beside)
+        ahead = sorted(
+            (one for one in unfinished if one.state is JobState.QUEUED and queue_order(one) < queue_order(job)),
+            key=queue_order,
+        )
+        beside = min(self._slots, len(running) + len(ahead) + 1)
+        own = self._own_range(job, stages.get(job.id, JobProgress()), past, beside)
         if own.low_s is None:
             return own
-        earlier = [self._own(one, stages.get(one.id, Begun()), past, beside) for one in (*running, *ahead)]
+        earlier = [self._own_range(one, stages.get(one.id, JobProgress()), past, beside) for one in (*running, *ahead)]
         for one, range_ in zip((*running, *ahead), earlier, strict=True):
             if range_.reason is not None:
                 return TimeRange(reason=f"Job {one.number} comes first: {range_.reason}")
-        return own.after(earlier[: len(running)], earlier[len(running) :], self._places)
+        return own.after(earlier[: len(running)], earlier[len(running) :], self._slots)
 
-    def _own(self, job: Job, stages: Begun, past: _Past, beside: float) -> TimeRange:
+    def _own_range(self, job: Job, stages: JobProgress, past: _Past, beside: float) -> TimeRange:
         # This is the range without the time for the jobs that go first.
         if (waits_for := self._waits_for(job)) is not None:
             return TimeRange(reason=waits_for)
@@ -211,7 +214,7 @@ class TimeRanges:
             stages.started.data.get("machine") if stages.started is not None else self._machine
         ) or past.newest_machine
         return time_range(
-            size.features, position, [] if machine is None else past.alike(method_of(job.spec), machine), beside
+            size.features, position, [] if machine is None else past.similar(method_of(job.spec), machine), beside
         )
 
 
@@ -222,13 +225,13 @@ class _Past:
 
     def __init__(self, repository: Repository) -> None:
         self._runs = repository.past_runs
-        self._alike: dict[tuple[str, str], list[PastRun]] = {}
+        self._similar: dict[tuple[str, str], list[PastRun]] = {}
 
-    def alike(self, method: str, machine: str) -> list[PastRun]:
+    def similar(self, method: str, machine: str) -> list[PastRun]:
         """Return the newest runs of jobs of the same method on the same class of machine, oldest first."""
-        if (method, machine) not in self._alike:
-            self._alike[method, machine] = self._runs.alike(method, machine)
-        return self._alike[method, machine]
+        if (method, machine) not in self._similar:
+            self._similar[method, machine] = self._runs.similar(method, machine)
+        return self._similar[method, machine]
 
     @cached_property
     def newest_machine(self) -> str | None:
@@ -244,14 +247,14 @@ def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position |
     if job.state is JobState.QUEUED:
         if not latest:
             return Position()
-        return Position(_following(stages, latest[-1])) if latest[-1].kind == "finished" else None
+        return Position(_next_stage(stages, latest[-1])) if latest[-1].kind == "finished" else None
     if not latest:
         return Position(since_s=time.time() - job.changed_s)
     last, tenth, reached_s = latest[-1], 0, latest[-1].time_s
     if last.stage is None or (last.kind != "finished" and (last.attempt > 1 or last.time_s < job.changed_s)):
         return None
     if last.kind == "finished":
-        stage = _following(stages, last)
+        stage = _next_stage(stages, last)
         tenth = TENTHS - 1 if stage == last.stage else 0
     else:
         stage, tenth = last.stage, tenth_of(last.done or 0.0)
@@ -266,6 +269,6 @@ def _position(job: Job, latest: Sequence[JobEvent], log: EventLog) -> Position |
     )
 
 
-def _following(stages: tuple[StageName, ...], event: JobEvent) -> StageName:
+def _next_stage(stages: tuple[StageName, ...], event: JobEvent) -> StageName:
     """Return the stage after that of an event; after the last stage, the last one again."""
     return stages[min(stages.index(event.stage) + 1, len(stages) - 1)] if event.stage in stages else stages[0]

@@ -20,11 +20,11 @@ from services.core.results import Verdict
 from services.core.verdict import VERDICT
 from services.pipeline.event_log import event_table
 
-MAX_KEPT = 1024
+MAX_CACHED = 1024
 """Largest number of verdicts that are kept in memory, the same as of jobs."""
 
 
-_UNREAD: Any = object()
+_NOT_CACHED: Any = object()
 
 
 class Verdicts:
@@ -36,18 +36,20 @@ class Verdicts:
 
     def __init__(self, engine: sql.Engine) -> None:
         self._engine = engine
-        self._kept: OrderedDict[tuple[str, float], Verdict | None] = OrderedDict()
+        self._cache: OrderedDict[tuple[str, float], Verdict | None] = OrderedDict()
 
-    def judged(self, jobs: Sequence[Job]) -> list[Job]:
+    def with_verdicts(self, jobs: Sequence[Job]) -> list[Job]:
         """Return the jobs, those that have succeeded with their verdicts."""
         succeeded = {(job.id, job.changed_s) for job in jobs if job.state is JobState.SUCCEEDED}
-        kept = {key: verdict for key in succeeded if (verdict := self._kept.get(key, _UNREAD)) is not _UNREAD}
-        if missing := succeeded - kept.keys():
+        cached = {
+            key: verdict for key in succeeded if (verdict := self._cache.get(key, _NOT_CACHED)) is not _NOT_CACHED
+        }
+        if missing := succeeded - cached.keys():
             found = self._read([job_id for job_id, _ in missing])
-            kept |= {key: found.get(key[0]) for key in missing}
-            self._keep(kept)
-        told = ((job, kept.get((job.id, job.changed_s))) for job in jobs)
-        return [job if verdict is None else job.model_copy(update={"verdict": verdict}) for job, verdict in told]
+            cached |= {key: found.get(key[0]) for key in missing}
+            self._store(cached)
+        judged = ((job, cached.get((job.id, job.changed_s))) for job in jobs)
+        return [job if verdict is None else job.model_copy(update={"verdict": verdict}) for job, verdict in judged]
 
     def _read(self, job_ids: list[str]) -> dict[str, Verdict | None]:
         columns = event_table.c
@@ -56,10 +58,10 @@ class Verdicts:
             rows = connection.execute(sql.select(columns.job, columns.data).where(of_fits).order_by(columns.id)).all()
         return {job: _verdict(from_json(data)) for job, data in rows}  # the last fit's, where there were several
 
-    def _keep(self, found: dict[tuple[str, float], Verdict | None]) -> None:
-        self._kept |= found
-        while len(self._kept) > MAX_KEPT:
-            self._kept.popitem(last=False)
+    def _store(self, found: dict[tuple[str, float], Verdict | None]) -> None:
+        self._cache |= found
+        while len(self._cache) > MAX_CACHED:
+            self._cache.popitem(last=False)
 
 
 def _verdict(data: dict[str, Any]) -> Verdict | None:

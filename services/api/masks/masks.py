@@ -83,7 +83,7 @@ class Masks:
                 JobStateError: the job is at work.
         """
         require_mask(content, self._camera(job, camera, light))
-        self._require_rest(job)
+        self._require_idle(job)
         path = mask_path(self._jobs.folder(job.id), camera, light)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, plain_png(content))
@@ -94,7 +94,7 @@ class Masks:
         Raises:
             UnknownMaskError: there is none. JobStateError: the job is at work.
         """
-        self._require_rest(job)
+        self._require_idle(job)
         self.get(job, camera, light).unlink()
 
     def prepared(self, job: Job, camera: str, light: str) -> bytes:
@@ -147,6 +147,6 @@ class Masks:
         assert spec.rig is not None
         return self._jobs.reader.describe(root if is_published(root, "capture") else spec.rig.mouth).calibration
 
-    def _require_rest(self, job: Job) -> None:
+    def _require_idle(self, job: Job) -> None:
         if (state := self._jobs.repository.get(job.id).state) in _AT_WORK:
             raise JobStateError(f"Job {job.id} is {state}; wait for it or cancel it, then change its masks.")

@@ -29,7 +29,7 @@ def upgrade(engine: sql.Engine, to: str = "head") -> None:
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent))
     config.set_main_option("path_separator", "os")
-    with _telling_refusals(engine), writing(engine) as connection:
+    with _translated_errors(engine), writing(engine) as connection:
         config.attributes["connection"] = connection
         tables = sql.inspect(connection).get_table_names()
         if "job" in tables and "alembic_version" not in tables:
@@ -39,7 +39,7 @@ def upgrade(engine: sql.Engine, to: str = "head") -> None:
 
 
 @contextmanager
-def _telling_refusals(engine: sql.Engine) -> Iterator[None]:
+def _translated_errors(engine: sql.Engine) -> Iterator[None]:
     try:
         yield
     except sql.exc.OperationalError as problem:

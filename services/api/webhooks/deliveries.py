@@ -15,7 +15,14 @@ from typing import Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.webhooks.outbox import DAY_S, TRY_FOR_S, collect_changes, has_news, insert_delivery, message_body
+from services.api.webhooks.outbox import (
+    DAY_S,
+    TRY_FOR_S,
+    collect_changes,
+    has_new_events,
+    insert_delivery,
+    message_body,
+)
 from services.api.webhooks.tables import DeliveryState, attempt_table, delivery_table, webhook_table
 from services.api.webhooks.webhooks import find_webhook, switch_off
 from services.client.errors import UnknownWebhookError
@@ -76,7 +83,7 @@ class Deliveries:
     def collect(self, now_s: float) -> int:
         """Add deliveries for the changes of state since the last call; returns how many."""
         with self._engine.connect() as connection:
-            if not has_news(connection):
+            if not has_new_events(connection):
                 return 0  # looking for changes costs no write
         with writing(self._engine) as connection:
             _forget(connection, now_s - KEEP_S)

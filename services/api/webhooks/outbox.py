@@ -24,7 +24,7 @@ _BATCH = 500
 _READER = "webhooks"
 
 
-def has_news(connection: sql.Connection) -> bool:
+def has_new_events(connection: sql.Connection) -> bool:
     """Whether the event table is to be read: a state has changed, or the table has grown so far that the cursor should
     follow.
     """

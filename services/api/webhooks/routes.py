@@ -7,7 +7,7 @@ from fastapi import APIRouter, Path, Query, Response
 from pydantic import Field
 
 from services.api.auth.scopes import needs
-from services.api.http.bodies import BodyRoute, Sent
+from services.api.http.bodies import BodyRoute, ValidatedBody
 from services.api.http.problems import refusals
 from services.api.webhooks.deliveries import Deliveries, Delivery
 from services.api.webhooks.webhooks import NewWebhook, Webhook, WebhookChange, WebhookRequest, Webhooks
@@ -35,11 +35,11 @@ def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRoute
     )
 
     @router.post("", status_code=201)
-    def create(wanted: Sent[WebhookRequest], response: Response) -> NewWebhook:
+    def create(request: ValidatedBody[WebhookRequest], response: Response) -> NewWebhook:
         """Subscribe to changes of jobs' states from now on. The secret is shown this once."""
-        made = webhooks.create(wanted)
-        response.headers["Location"] = f"/v1/webhooks/{made.id}"
-        return made
+        webhook = webhooks.create(request)
+        response.headers["Location"] = f"/v1/webhooks/{webhook.id}"
+        return webhook
 
     @router.get("")
     def page() -> list[Webhook]:
@@ -52,9 +52,9 @@ def build_webhook_router(webhooks: Webhooks, deliveries: Deliveries) -> APIRoute
         return webhooks.get(webhook_id)
 
     @router.patch("/{webhook_id}")
-    def change(webhook_id: str, wanted: Sent[WebhookChange]) -> Webhook:
+    def change(webhook_id: str, request: ValidatedBody[WebhookChange]) -> Webhook:
         """Change the address or the states, or switch it on or off."""
-        return webhooks.change(webhook_id, wanted)
+        return webhooks.change(webhook_id, request)
 
     @router.delete("/{webhook_id}", status_code=204)
     def delete(webhook_id: str) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 from services.bench.figures.ambient import under_ambient_light
-from services.bench.figures.cast import FULL, QUICK, Cast
 from services.bench.figures.drawings import (
     Drawn,
     caption_page,
@@ -25,12 +24,13 @@ from services.bench.figures.drawings import (
     whole_jaw,
 )
 from services.bench.figures.environment import memorial, under_an_environment
+from services.bench.figures.figure_cases import FULL, QUICK, FigureCases
 from services.bench.fits.tooth_capture import real_tooth
 from services.core.errors import DentineError, InputError
 from services.core.store import write_atomic
 from services.fit.export.pictures import png_bytes
 
-Drawing = Callable[[Cast], Drawn]
+Drawing = Callable[[FigureCases], Drawn]
 
 FIGURES: Mapping[str, Drawing] = MappingProxyType(
     {
@@ -53,16 +53,16 @@ def chosen_figures(names: str | None) -> tuple[str, ...]:
     Raises:
         InputError: a figure does not exist, or the list is empty.
     """
-    asked = tuple(FIGURES) if names is None else tuple(filter(None, (name.strip() for name in names.split(","))))
-    for name in asked:
+    requested = tuple(FIGURES) if names is None else tuple(filter(None, (name.strip() for name in names.split(","))))
+    for name in requested:
         if name not in FIGURES:
             raise InputError(f"Figure '{name}' does not exist; known are {', '.join(FIGURES)}.")
-    if not asked:
+    if not requested:
         raise InputError(f"Option --only names no figure; known are {', '.join(FIGURES)}.")
-    return tuple(name for name in FIGURES if name in asked)
+    return tuple(name for name in FIGURES if name in requested)
 
 
-def keep(folder: Path, name: str, drawn: Drawn) -> None:
+def write_figure(folder: Path, name: str, drawn: Drawn) -> None:
     """Write a figure and its caption, and the page of all figures in the folder."""
     write_atomic(folder / f"{name}.png", png_bytes(drawn.picture))
     write_atomic(folder / f"{name}.txt", (drawn.caption + "\n").encode())
@@ -86,11 +86,13 @@ def main(arguments: list[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     try:
-        names, cast = (
+        names, cases = (
             chosen_figures(options.only),
-            Cast(QUICK if options.quick else FULL, options.out / "work", None if options.quick else real_tooth()),
+            FigureCases(
+                QUICK if options.quick else FULL, options.out / "work", None if options.quick else real_tooth()
+            ),
         )
-        cast.work.mkdir(parents=True, exist_ok=True)
+        cases.work.mkdir(parents=True, exist_ok=True)
         for name in names:
             if name == "environment" and memorial() is None:
                 print(
@@ -98,7 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
                     flush=True,
                 )
                 continue
-            keep(options.out, name, FIGURES[name](cast))
+            write_figure(options.out, name, FIGURES[name](cases))
             print(options.out / f"{name}.png", flush=True)
     except DentineError as problem:
         print(f"figures: {problem.message}", file=sys.stderr)

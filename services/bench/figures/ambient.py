@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.bench.figures.cases import Case
-from services.bench.figures.cast import Cast
 from services.bench.figures.drawings import Drawn
+from services.bench.figures.figure_cases import FigureCases
 from services.bench.figures.fitted import Fitted
-from services.bench.figures.surroundings import seen_under
+from services.bench.figures.surroundings import render_under
 from services.bench.fits.tooth_capture import tissue_of
 from services.core.files.meshes import read_mesh
 from services.core.records import FolderCapture
@@ -35,9 +35,9 @@ QUANTITIES = tuple(
 Row = dict[str, Any]
 
 
-def under_ambient_light(cast: Cast) -> Drawn:
+def under_ambient_light(cases: FigureCases) -> Drawn:
     """Draw the results of fits of one view with constant light from all around added to its photographs."""
-    rows = ambient_rows(cast)
+    rows = ambient_rows(cases)
     return Drawn(
         plot(rows),
         "A procedural incisor of known dentin from one side, with constant light from all around added to every"
@@ -45,22 +45,22 @@ def under_ambient_light(cast: Cast) -> Drawn:
     )
 
 
-def ambient_rows(cast: Cast) -> list[Row]:
+def ambient_rows(cases: FigureCases) -> list[Row]:
     """Fit the photographs with each strength of ambient light, first without any.
 
     Returns:
         Rows of ``fraction`` (strength as a fraction of the mean radiance of the fitted photographs), ``fit_error``,
         ``held_out_error``, and for each quantity its ``value``, ``se`` and ``truth``.
     """
-    case = cast.lone_view
-    source = case.capture.rendered(cast.work)
+    case = cases.single_view
+    source = case.capture.rendered(cases.work)
     media = json.loads((source / "truth.json").read_text())["channels"][CHANNEL]
     rows = []
-    for fraction in cast.effort.ambient:
+    for fraction in cases.effort.ambient:
         folder = (
-            case.fitted_with(cast.work, _added(source, case, fraction), f"-ambient-{fraction:g}")
+            case.fitted_with(cases.work, _added(source, case, fraction), f"-ambient-{fraction:g}")
             if fraction
-            else case.fitted(cast.work)
+            else case.fitted(cases.work)
         )
         rows.append({"fraction": fraction} | described(Fitted(folder).report, media))
     return rows
@@ -69,9 +69,9 @@ def ambient_rows(cast: Cast) -> list[Row]:
 def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.float64]]:
     # Return the added radiance (H, W) by camera, rendered with the true media. The render is kept beside the capture,
     # because it serves every strength.
-    kept = source.with_name(f"{source.name}-around.npz")
+    cache = source.with_name(f"{source.name}-around.npz")
     description = read_record(source / "capture.json", FolderCapture)
-    if not kept.is_file():
+    if not cache.is_file():
         truth = json.loads((source / "truth.json").read_text())
         media = truth["channels"][CHANNEL]
         tissue = tissue_of({f"{part}.{leaf}": value for part in media for leaf, value in media[part].items()})
@@ -85,11 +85,11 @@ def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.fl
         }
         constant = {"type": "constant", "radiance": 1.0}
         around = {
-            c.name: seen_under(constant, surfaces, tissue, c, **options)
+            c.name: render_under(constant, surfaces, tissue, c, **options)
             for c in description.cameras
             if c.name in case.cameras
         }
-        np.savez(kept, allow_pickle=False, **around)
+        np.savez(cache, allow_pickle=False, **around)
     channel = description.channels.index(CHANNEL)
     fitted = [
         np.load(source / image.file)[..., channel]
@@ -97,7 +97,7 @@ def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.fl
         if case.is_fitted(image.camera, image.light)
     ]
     mean = float(np.concatenate([image[image > 0] for image in fitted]).mean())
-    with np.load(kept) as stored:
+    with np.load(cache) as stored:
         # Keep the pixels of the tooth alone: those beside it show the surroundings, which are masked in a capture.
         on_tooth = {
             camera: np.where(_tooth_pixels(source, description, camera), stored[camera], 0.0) for camera in stored.files
@@ -106,8 +106,8 @@ def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.fl
 
 
 def _tooth_pixels(source: Path, description: FolderCapture, camera: str) -> NDArray[np.bool_]:
-    seen = [np.load(source / image.file).max(axis=-1) > 0 for image in description.images if image.camera == camera]
-    return np.asarray(np.any(seen, axis=0))
+    is_lit = [np.load(source / image.file).max(axis=-1) > 0 for image in description.images if image.camera == camera]
+    return np.asarray(np.any(is_lit, axis=0))
 
 
 def described(report: FitReport, media: Mapping[str, Mapping[str, float]]) -> Row:

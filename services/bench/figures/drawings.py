@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.bench.figures.cases import Case
-from services.bench.figures.cast import FIVE_LIGHTS, FIVE_OTHERS, FRONT_LIGHTS, SIDE_LIGHTS, SPREAD_LIGHTS, Cast
+from services.bench.figures.figure_cases import (
+    FIVE_LIGHTS,
+    FIVE_OTHERS,
+    FRONT_LIGHTS,
+    SIDE_LIGHTS,
+    SPREAD_LIGHTS,
+    FigureCases,
+)
 from services.bench.figures.fitted import Comparisons, Fitted, Image, error_of, loss_of
 from services.bench.figures.mosaic import RESIDUAL_LIMIT, Column, cropped, mosaic, photo_and_fit
 from services.fit.export.pictures import Image8, signed_map, tone_map, white_level
@@ -26,9 +33,9 @@ class Drawn:
     caption: str
 
 
-def front_and_side(cast: Cast) -> Drawn:
+def front_and_side(cases: FigureCases) -> Drawn:
     """Draw fig. 8: nine front lights, which were fitted, and a side view and nine side lights, which were not."""
-    comparisons = Fitted(cast.front.fitted(cast.work)).compared(cast.effort.shown_samples)
+    comparisons = Fitted(cases.front.fitted(cases.work)).compared(cases.effort.shown_samples)
     groups = [("c1", FRONT_LIGHTS), ("c2", FRONT_LIGHTS), ("c1", SIDE_LIGHTS)]
     rows = [
         [drawn for camera, lights in groups for drawn in _drawn(comparisons, (camera, lights[n]))]
@@ -42,19 +49,19 @@ def front_and_side(cast: Cast) -> Drawn:
     errors = [error_of(comparisons, [(camera, light) for light in lights]) for camera, lights in groups]
     return Drawn(
         mosaic(rows, columns, scale=2),
-        f"An isolated tooth ({cast.tooth_name}) of known dentin, fitted to nine front lights of one camera (left):"
+        f"An isolated tooth ({cases.tooth_name}) of known dentin, fitted to nine front lights of one camera (left):"
         f" error {_percent(errors[0])}. Not fitted: a side view under the same lights (centre) {_percent(errors[1])},"
         f" and nine side lights (right) {_percent(errors[2])}. {DIFFERENCE}",
     )
 
 
-def stages(cast: Cast) -> Drawn:
+def stages(cases: FigureCases) -> Drawn:
     """Draw fig. 9: a homogeneous tooth, a tooth of both media and one with stains, beside the photograph."""
-    fitted = Fitted(cast.stained.fitted(cast.work))
+    fitted = Fitted(cases.stained.fitted(cases.work))
     (channel,) = fitted.channels
     homogeneous = similar_tissue(fitted.stage_tissue(channel, "homogeneous"), SIMILAR_G)
     found = [
-        fitted.compared(cast.effort.shown_samples, optics)
+        fitted.compared(cases.effort.shown_samples, optics)
         for optics in (
             {channel: homogeneous},
             {channel: fitted.stage_tissue(channel, "exact")},
@@ -95,10 +102,10 @@ def stages(cast: Cast) -> Drawn:
     )
 
 
-def five_lights(cast: Cast) -> Drawn:
+def five_lights(cases: FigureCases) -> Drawn:
     """Draw fig. 10: three cameras under five lights, which were fitted, and under five others, which were not."""
     comparisons, cameras = (
-        Fitted(cast.five_lights.fitted(cast.work)).compared(cast.effort.shown_samples),
+        Fitted(cases.five_lights.fitted(cases.work)).compared(cases.effort.shown_samples),
         ("c0", "c1", "c2"),
     )
     rows = [
@@ -117,14 +124,14 @@ def five_lights(cast: Cast) -> Drawn:
     )
     return Drawn(
         mosaic(rows, columns, scale=2),
-        f"One tooth in colour ({cast.tooth_name}, dentin known), fitted to three cameras under five lights (left half):"
-        f" error {_percent(fit)}; under five lights that were not fitted (right half): {_percent(unseen)}.",
+        f"One tooth in colour ({cases.tooth_name}, dentin known), fitted to three cameras under five lights (left"
+        f" half): error {_percent(fit)}; under five lights that were not fitted (right half): {_percent(unseen)}.",
     )
 
 
-def unseen_camera(cast: Cast) -> Drawn:
+def unseen_camera(cases: FigureCases) -> Drawn:
     """Draw fig. 13: two cameras, which were fitted, and a third one, which was not."""
-    comparisons = Fitted(cast.two_cameras.fitted(cast.work)).compared(cast.effort.shown_samples)
+    comparisons = Fitted(cases.two_cameras.fitted(cases.work)).compared(cases.effort.shown_samples)
     rows = [
         [drawn for camera in ("c0", "c1", "c2") for drawn in _drawn(comparisons, (camera, light))]
         for light in FIVE_LIGHTS
@@ -134,26 +141,26 @@ def unseen_camera(cast: Cast) -> Drawn:
         for name in ("c0, not fitted", "c1, fitted", "c2, fitted")
         for column in (Column(name, starts_group=True), Column("fit"), Column("difference"))
     ]
-    seen, unseen = (
+    fitted_error, unseen_error = (
         error_of(comparisons, [(camera, light) for camera in cameras for light in FIVE_LIGHTS])
         for cameras in (("c1", "c2"), ("c0",))
     )
     return Drawn(
         mosaic(rows, columns, FIVE_LIGHTS, scale=3),
-        f"Two cameras fitted (c1 and c2, five lights; {cast.tooth_name}, dentin known), the third (c0, left) was not:"
-        f" error {_percent(seen)} on the fitted ones, {_percent(unseen)} on the third, a ratio of"
-        f" {unseen / max(seen, 1e-9):.2f}. {DIFFERENCE}",
+        f"Two cameras fitted (c1 and c2, five lights; {cases.tooth_name}, dentin known), the third (c0, left) was not:"
+        f" error {_percent(fitted_error)} on the fitted ones, {_percent(unseen_error)} on the third, a ratio of"
+        f" {unseen_error / max(fitted_error, 1e-9):.2f}. {DIFFERENCE}",
     )
 
 
-def whole_jaw(cast: Cast, subject: int) -> Drawn:
+def whole_jaw(cases: FigureCases, subject: int) -> Drawn:
     """Draw figs. 11 and 12: all teeth of a jaw in three views."""
-    return _jaw(cast, cast.jaw(subject))
+    return _jaw(cases, cases.jaw(subject))
 
 
-def _jaw(cast: Cast, case: Case) -> Drawn:
-    fitted = Fitted(case.fitted(cast.work))
-    comparisons = fitted.compared(cast.effort.shown_samples)
+def _jaw(cases: FigureCases, case: Case) -> Drawn:
+    fitted = Fitted(case.fitted(cases.work))
+    comparisons = fitted.compared(cases.effort.shown_samples)
     shown = [(camera, light) for camera in case.cameras for light in ("l0", "l3")]
     rows = [_drawn(comparisons, image) for image in shown]
     columns = [Column(name) for name in ("photo", "fit", "difference")]

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from services.bench.figures.cast import Cast
 from services.bench.figures.drawings import Drawn
+from services.bench.figures.figure_cases import FigureCases
 from services.bench.figures.fitted import Fitted
 from services.bench.figures.gallery import SIMILAR_G
 from services.bench.figures.mosaic import Column, mosaic
-from services.bench.figures.surroundings import environment_light, read_environment, seen_under
+from services.bench.figures.surroundings import environment_light, read_environment, render_under
 from services.core.geometry import Camera, Mesh
 from services.fit.export.pictures import tone_map, white_level
 from services.fit.optics.domain import similar_tissue
@@ -30,19 +30,19 @@ def memorial() -> Path | None:
     return path if path.is_file() else None
 
 
-def under_an_environment(cast: Cast) -> Drawn:
+def under_an_environment(cases: FigureCases) -> Drawn:
     """Draw the tooth of fig. 10 under an environment in three orientations, without and with mirror reflection.
 
     Raises:
         InputError: the environment's file does not exist.
     """
-    fitted = Fitted(cast.five_lights.fitted(cast.work))
+    fitted = Fitted(cases.five_lights.fitted(cases.work))
     environment = read_environment(memorial() or MEMORIAL)
     (tooth,), (dentin,) = fitted.observations.teeth, fitted.dentins()
     surfaces = {"outer": tooth.outer} | (
         {} if dentin is None else {"dentin": Mesh(dentin.vertices_mm(fitted.report.shape), dentin.base.faces)}
     )
-    camera = finer(fitted.observations.manifest.cameras[1], cast.effort.environment_px)
+    camera = finer(fitted.observations.manifest.cameras[1], cases.effort.environment_px)
     rows = []
     for roughness in (None, ROUGHNESS):
         images = []
@@ -52,13 +52,13 @@ def under_an_environment(cast: Cast) -> Drawn:
                 tissue = fitted.optics(channel)
                 assert isinstance(tissue, Tissue)
                 options = {
-                    "samples": cast.effort.environment_samples,
+                    "samples": cases.effort.environment_samples,
                     "boundary": fitted.spec.boundary,
                     "ior": fitted.spec.ior,
                     "roughness": roughness,
                 }
                 light = environment_light(environment[..., k], turn)
-                channels.append(seen_under(light, surfaces, similar_tissue(tissue, SIMILAR_G), camera, **options))  # type: ignore[arg-type]
+                channels.append(render_under(light, surfaces, similar_tissue(tissue, SIMILAR_G), camera, **options))  # type: ignore[arg-type]
             images.append(np.stack(channels, axis=-1))
         rows.append(images)
     width, height = camera.size
@@ -68,7 +68,7 @@ def under_an_environment(cast: Cast) -> Drawn:
     columns = [Column(f"turned by {turn:.0f} degrees") for turn in TURNS_DEGREES]
     return Drawn(
         mosaic(pictures, columns, ["fitted", "with GGX"], scale=1),
-        f"The tooth of fig10 ({cast.tooth_name}, fitted in colour) under the light of a church, an ordinary photograph"
+        f"The tooth of fig10 ({cases.tooth_name}, fitted in colour) under the light of a church, an ordinary photograph"
         " wrapped around it, turned three ways; above as a fit sees teeth, below with the mirror image in its enamel"
         f" put back (GGX, roughness {ROUGHNESS:g}). By similar media of mean cosine {SIMILAR_G:g}.",
     )

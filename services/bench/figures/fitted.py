@@ -20,7 +20,7 @@ from services.core.store import open_stage
 from services.fit.checks.evaluate import ErrorSums, error_sums
 from services.fit.export.asset import mouth_of
 from services.fit.export.pictures import Picture
-from services.fit.export.stains import kept_stains
+from services.fit.export.stains import read_stains
 from services.fit.inputs.observations import Observations, ViewStack, channel_scene, read_channel, read_observations
 from services.fit.jaw.driver import known_dentins
 from services.fit.optics.parameters import Mouth, Tissue
@@ -98,7 +98,7 @@ class Fitted:
         """Return the reported media of a channel."""
         if self.spec.kind == "jaw":
             return mouth_of(self.report, channel)
-        stains = kept_stains(self._stage[0])
+        stains = read_stains(self._stage[0])
         tissue = tissue_of({name: estimate.value for name, estimate in self.report.parameters[channel].items()})
         return replace(tissue, shape=self.report.shape, stain=None if stains is None else stains.textures.get(channel))
 
@@ -121,7 +121,7 @@ class Fitted:
 
     def renderer(self, channel: str) -> Engine:
         """Return the engine of a channel's scene under all lights."""
-        stains = kept_stains(self._stage[0])
+        stains = read_stains(self._stage[0])
         return Engine(
             channel_scene(
                 self.observations, channel, self.dentins(), self.spec, None if stains is None else stains.corners_uv

@@ -57,7 +57,7 @@ def environment_light(image: Array, turn_degrees: float) -> dict[str, Any]:
     return {"type": "envmap", "bitmap": mi.Bitmap(image[..., None].astype(np.float32)), "to_world": turned}
 
 
-def seen_under(
+def render_under(
     light: dict[str, Any],
     surfaces: Surfaces,
     tissue: Tissue,

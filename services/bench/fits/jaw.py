@@ -43,7 +43,7 @@ class Case:
 
     pixel_mm: float
     photograph_samples: int
-    judge_samples: int
+    error_samples: int
     options: Mapping[str, Any]
     """Options of the job."""
 
@@ -74,7 +74,7 @@ class JawRow(Row):
 
 
 @dataclass
-class Judge:
+class ErrorRecorder:
     """Measures the error of a mouth, makes a row of it and passes on all rows so far."""
 
     case: PreparedTooth
@@ -83,7 +83,7 @@ class Judge:
     samples: int
     rows: list[JawRow] = field(default_factory=list)
 
-    def row(self, seconds: float, mouth: Mouth, stage: str, step: int) -> None:
+    def record(self, seconds: float, mouth: Mouth, stage: str, step: int) -> None:
         """Measure the error of a mouth and keep the row."""
         fitted, held_out = self.case.errors(mouth, samples=self.samples, seed=11)
         fdi = [str(tooth.fdi) for tooth in self.case.observations.teeth]
@@ -91,7 +91,7 @@ class Judge:
             benchmark="jaw", peer="dentine", seconds=seconds, error=held_out.resolved_error or 0.0,
             error_se=held_out.error_se or 0.0, fitted_error=fitted.resolved_error or 0.0, stage=stage, step=step,
             off={
-                one: tooth_off(found, true)
+                one: relative_errors(found, true)
                 for one, found, true in zip(fdi, mouth.teeth, self.truth.teeth, strict=True)
             },
             peak_memory_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
@@ -100,7 +100,7 @@ class Judge:
         self.keep([one.model_dump() for one in self.rows])
 
 
-def tooth_off(found: Tissue, true: Tissue) -> dict[str, float]:
+def relative_errors(found: Tissue, true: Tissue) -> dict[str, float]:
     """Return the relative errors of reduced scattering and of 1 - alpha' of both media."""
 
     def measure(tissue: Tissue, part: str, leaf: str) -> float:
@@ -128,9 +128,11 @@ def run(*, quick: bool, keep: Callable[[list[dict[str, Any]]], None] = lambda _:
             case.options
         )
         truth = known_mouth(jaw_surfaces(SUBJECT), CHANNEL, SUBJECT)
-        judge = Judge(prepared_jaw(folder / "job", JobSpec.model_validate(options)), truth, keep, case.judge_samples)
-        timed_fit(judge)
-    return [row.model_dump() for row in judge.rows]
+        recorder = ErrorRecorder(
+            prepared_jaw(folder / "job", JobSpec.model_validate(options)), truth, keep, case.error_samples
+        )
+        timed_fit(recorder)
+    return [row.model_dump() for row in recorder.rows]
 
 
 def write_photographs(folder: Path, case: Case) -> None:
@@ -172,7 +174,7 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     )
 
 
-def timed_fit(judge: Judge) -> FitReport:
+def timed_fit(recorder: ErrorRecorder) -> FitReport:
     """Run the product's own fit stage in this process, and measure its error after every joint step and at its end."""
     from services.fit.execution.attempt import Attempt
     from services.fit.jaw.driver import JawDriver
@@ -184,17 +186,17 @@ def timed_fit(judge: Judge) -> FitReport:
         nonlocal paused, step
         if event.kind == "step" and event.data["tooth"] is None:
             begun, step = time.process_time(), int(event.data["step"])
-            judge.row(
-                begun - started - paused, mouth_of(event.data["parameters"], judge.truth), event.data["stage"], step
+            recorder.record(
+                begun - started - paused, mouth_of(event.data["parameters"], recorder.truth), event.data["stage"], step
             )
             paused += time.process_time() - begun
 
-    context = LocalContext(judge.case.job, listener=listen)
+    context = LocalContext(recorder.case.job, listener=listen)
     started = time.process_time()
-    report = JawDriver(Attempt(judge.case.spec, context, StageWriter(judge.case.job, "fit", 1), ENGINE)).run(
+    report = JawDriver(Attempt(recorder.case.spec, context, StageWriter(recorder.case.job, "fit", 1), ENGINE)).run(
         time.time()
     )
-    judge.row(time.process_time() - started - paused, reported_mouth(report, judge.truth), "final", step)
+    recorder.record(time.process_time() - started - paused, reported_mouth(report, recorder.truth), "final", step)
     return report
 
 

@@ -41,13 +41,13 @@ class StockFit:
         self.rate, self.rounds, self.seconds, self._samples = rate, 0, 0.0, samples
         begun = time.process_time()
         files = folder / "outer.ply", folder / "dentin.ply"
-        seen, (tooth,), (view,) = case.observations, case.observations.teeth, case.views
+        observations, (tooth,), (view,) = case.observations, case.observations.teeth, case.views
         assert tooth.dentin is not None
         for file, mesh in zip(files, (tooth.outer, tooth.dentin), strict=True):
             write_mesh(file, mesh)
         self._start, (width, height) = Tissue(start, start), view.camera.size
         x, y = view.pixels.T
-        positions, intensities = seen.light_positions_mm, seen.light_intensities(CHANNEL)
+        positions, intensities = observations.light_positions_mm, observations.light_intensities(CHANNEL)
         self._scenes: list[tuple[Any, Any, Any, Any]] = []
         signal = 0.0
         for light in np.flatnonzero(~view.held_out):

@@ -43,7 +43,7 @@ QUICK_CHOICE_S, QUICK_LIMIT_S = 20.0, 60.0
 MARK_GROWTH = 1.12
 """Ratio of the times of two successive measurements of a peer's error."""
 MARGIN = 1.1
-JUDGE_SAMPLES = 1024
+ERROR_SAMPLES = 1024
 
 Case = Literal["race", "scale"]
 Keep = Callable[[list[dict[str, Any]]], None]
@@ -68,7 +68,7 @@ class ToothRow(Row):
 
 
 @dataclass
-class Judge:
+class ErrorRecorder:
     """Measures the error of a tooth's parameters, makes a row of it and passes on all rows so far."""
 
     case: PreparedTooth
@@ -76,7 +76,7 @@ class Judge:
     samples: int
     rows: list[ToothRow] = field(default_factory=list)
 
-    def row(self, peer: str, seconds: float, tissue: Tissue, stage: str, **more: Any) -> ToothRow:
+    def record(self, peer: str, seconds: float, tissue: Tissue, stage: str, **more: Any) -> ToothRow:
         """Measure the error of a tooth's media and keep the row."""
         fitted, held_out = self.case.errors(tissue, samples=self.samples, seed=11)
         values = {
@@ -110,22 +110,24 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tooth = smallest_case(folder, pixel_step=3 if quick else 1)
-        judge = Judge(tooth, keep, 256 if quick else JUDGE_SAMPLES)
-        ours = our_fit(judge, folder / "ours", OURS, tooth.spec)
-        peers = {PEER: stock_fit(judge, folder, *((QUICK_CHOICE_S, QUICK_LIMIT_S) if quick else (CHOICE_S, LIMIT_S)))}
+        recorder = ErrorRecorder(tooth, keep, 256 if quick else ERROR_SAMPLES)
+        ours = our_fit(recorder, folder / "ours", OURS, tooth.spec)
+        peers = {
+            PEER: stock_fit(recorder, folder, *((QUICK_CHOICE_S, QUICK_LIMIT_S) if quick else (CHOICE_S, LIMIT_S)))
+        }
         if "solver" in JobSpec.model_fields:
             peers[OUR_ADAM] = our_fit(
-                judge, folder / "adam", OUR_ADAM, tooth.spec.model_copy(update={"solver": "adam"})
+                recorder, folder / "adam", OUR_ADAM, tooth.spec.model_copy(update={"solver": "adam"})
             )
         target = max(MARGIN * ours[-1].error, tooth.resolution())
         for rows in peers.values():
-            judge.rows.append(summary(ours, rows, target))
-            if judge.rows[-1].lower_bound:
-                judge.rows.append(summary(ours, rows, rows[-1].error, "tooth-at-its-end"))
-    return [row.model_dump() for row in judge.rows]
+            recorder.rows.append(summary(ours, rows, target))
+            if recorder.rows[-1].lower_bound:
+                recorder.rows.append(summary(ours, rows, rows[-1].error, "tooth-at-its-end"))
+    return [row.model_dump() for row in recorder.rows]
 
 
-def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothRow]:
+def our_fit(recorder: ErrorRecorder, folder: Path, peer: str, spec: JobSpec) -> list[ToothRow]:
     """Run the product's own fit stage in this process, and measure its error after every step of its solver and at its
     end.
     """
@@ -142,38 +144,40 @@ def our_fit(judge: Judge, folder: Path, peer: str, spec: JobSpec) -> list[ToothR
         if event.kind == "step":
             begun = time.process_time()
             rows.append(
-                judge.row(peer, begun - started - paused, tissue_of(event.data["parameters"]), event.data["stage"])
+                recorder.record(
+                    peer, begun - started - paused, tissue_of(event.data["parameters"]), event.data["stage"]
+                )
             )
             paused += time.process_time() - begun
 
     folder.mkdir()
-    (folder / "prepared").symlink_to(judge.case.job / "prepared")
+    (folder / "prepared").symlink_to(recorder.case.job / "prepared")
     context = LocalContext(folder, listener=listen)
     started = time.process_time()
     report = FitDriver(Attempt(spec, context, StageWriter(folder, "fit", 1), ENGINE)).run(time.time())
     seconds = time.process_time() - started - paused
     values = {name: estimate.value for name, estimate in report.parameters["green"].items()}
-    rows.append(judge.row(peer, seconds, tissue_of(values), "final"))
+    rows.append(recorder.record(peer, seconds, tissue_of(values), "final"))
     return rows
 
 
-def stock_fit(judge: Judge, folder: Path, choice_s: float, limit_s: float) -> list[ToothRow]:
+def stock_fit(recorder: ErrorRecorder, folder: Path, choice_s: float, limit_s: float) -> list[ToothRow]:
     """Run the peer at its best learning rate until ``limit_s``, after a trial of ``choice_s`` for each rate."""
     tried: list[tuple[StockFit, list[ToothRow]]] = []
     for rate in RATES:
-        tried.append((StockFit(judge.case, folder, rate), []))
-        _descend(judge, *tried[-1], choice_s)
+        tried.append((StockFit(recorder.case, folder, rate), []))
+        _descend(recorder, *tried[-1], choice_s)
     fit, rows = min(tried, key=lambda one: one[1][-1].fitted_error)
-    _descend(judge, fit, rows, limit_s)
+    _descend(recorder, fit, rows, limit_s)
     return rows
 
 
-def _descend(judge: Judge, fit: StockFit, rows: list[ToothRow], until_s: float) -> None:
+def _descend(recorder: ErrorRecorder, fit: StockFit, rows: list[ToothRow], until_s: float) -> None:
     mark = fit.seconds if not rows else MARK_GROWTH * fit.seconds
     while fit.seconds < until_s:
         fit.step()
         if fit.seconds >= mark or fit.seconds >= until_s:
-            rows.append(judge.row(PEER, fit.seconds, fit.tissue(), f"round {fit.rounds}", rate=fit.rate))
+            rows.append(recorder.record(PEER, fit.seconds, fit.tissue(), f"round {fit.rounds}", rate=fit.rate))
             mark = MARK_GROWTH * fit.seconds
 
 

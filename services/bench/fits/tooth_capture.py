@@ -100,9 +100,9 @@ class PreparedTooth:
         """Return the error sums on fitted and on held-out images, from two renders of so many paths per pixel."""
         fitted, held_out = ErrorSums(), ErrorSums()
         for number, view in enumerate(self.views):
-            seen = View(view.camera, view.pixels)
+            bare_view = View(view.camera, view.pixels)
             first, second = (
-                self.engine.images(tissue, seen, samples=samples, seed=7919 * number + 2 * seed + k).mean
+                self.engine.images(tissue, bare_view, samples=samples, seed=7919 * number + 2 * seed + k).mean
                 for k in range(2)
             )
             held = view.held_out[:, None]

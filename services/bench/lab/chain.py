@@ -38,34 +38,34 @@ PIXELS_MM = 0.5
 """Edge at the teeth of the squares of pixels whose means are fitted: light spreads in a tooth at least as far."""
 
 
-def calibrated(root: Path, tell: Callable[[str], None]) -> None:
+def calibrated(root: Path, report_step: Callable[[str], None]) -> None:
     """Calibrate the rig from the session's frames if it is not calibrated."""
     out = root / CALIBRATION
     if (out / CALIBRATION_FILE).is_file():
         return
-    session = calibrate(root / SESSION, tell)
+    session = calibrate(root / SESSION, report_step)
     out.mkdir(parents=True, exist_ok=True)
     # The record is written last, so where it exists all files do.
     write_report(session, out)
     write_session(session, out)
     for limit in session.judgement.broken:
-        tell(f"{limit.what}: {limit.value:.3g} {limit.unit} is beyond its limit of {limit.limit:g}")
+        report_step(f"{limit.what}: {limit.value:.3g} {limit.unit} is beyond its limit of {limit.limit:g}")
 
 
-def registered(root: Path, pixel_mm: float, tell: Callable[[str], None]) -> Registration:
+def registered(root: Path, pixel_mm: float, report_step: Callable[[str], None]) -> Registration:
     """Register the scan if it is not registered; its outlines may be off by up to one pixel where pixels are coarse.
 
     Args:
         root: folder of the laboratory.
         pixel_mm: edge of a photograph's pixel at the teeth.
-        tell: called with a description of the step as it begins.
+        report_step: called with a description of the step as it begins.
     """
     folder = root / MOUTH
     if (folder / REGISTRATION).is_file():
         return read_record(folder / REGISTRATION, Registration)
     # Teeth without a record come from an attempt that did not finish.
     shutil.rmtree(folder / "teeth", ignore_errors=True)
-    tell("registration: landmarks, outlines")
+    report_step("registration: landmarks, outlines")
     return register_folder(folder, max_misfit_mm=max(MAX_MISFIT_MM, pixel_mm))
 
 
@@ -77,7 +77,7 @@ def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpe
         pixel_mm: edge of a photograph's pixel at the teeth.
         options: options of the job that replace the ones here.
     """
-    told = {
+    defaults = {
         "capture": capture.resolve(),
         "fdi": FITTED,
         "boundary": "matched",
@@ -89,10 +89,10 @@ def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpe
         # light at the teeth.
         "accept_calibration": True,
     }
-    return JobSpec.model_validate(told | dict(options))
+    return JobSpec.model_validate(defaults | dict(options))
 
 
-def forget(root: Path) -> None:
+def remove_results(root: Path) -> None:
     """Remove the calibration, the job and the comparisons, which were made from other frames."""
     for name in (CALIBRATION, JOB, COMPARISON):
         shutil.rmtree(root / name, ignore_errors=True)

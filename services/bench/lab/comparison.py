@@ -90,8 +90,8 @@ def step_errors(root: Path) -> StepErrors:
     registration = read_record(root / MOUTH / REGISTRATION, Registration)
     pose, actual = np.array(registration.rig_from_scan), session_from_scan(root)
     centre = np.array(registration.centre_mm)
-    there = (actual @ np.linalg.inv(pose) @ [*centre, 1.0])[:3]
-    turn = actual[:3, :3] @ pose[:3, :3].T
+    true_centre = (actual @ np.linalg.inv(pose) @ [*centre, 1.0])[:3]
+    rotation = actual[:3, :3] @ pose[:3, :3].T
     lights = {light.name: light for light in true.lights}
     positions = [(np.array(one.position_mm), np.array(lights[one.name].position_mm)) for one in found.lights]
     off = np.array([np.linalg.norm(one - two) for one, two in positions])
@@ -104,8 +104,8 @@ def step_errors(root: Path) -> StepErrors:
         ]
     )
     return StepErrors(
-        teeth_mm=float(np.linalg.norm(there - centre)),
-        teeth_deg=float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))),
+        teeth_mm=float(np.linalg.norm(true_centre - centre)),
+        teeth_deg=float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))),
         lights_mm=_rms(off),
         lights_deg=_rms(np.array(angle)),
         intensity=_rms(ratios),
@@ -138,14 +138,14 @@ def summary(root: Path, jobs: Mapping[str, Path]) -> dict[str, Any]:
         jobs: folders of the jobs of the variants that were run, by the variant's name.
     """
     chain = outcome(root, root / JOB)
-    told: dict[str, Any] = {"chain": _plain(chain), "steps": step_errors(root).model_dump()}
-    told["variants"] = {name: _plain(outcome(root, job)) for name, job in jobs.items()}
+    results: dict[str, Any] = {"chain": _plain(chain), "steps": step_errors(root).model_dump()}
+    results["variants"] = {name: _plain(outcome(root, job)) for name, job in jobs.items()}
     if "perfect" in jobs:
-        asked = verdict(chain, outcome(root, jobs["perfect"]))
-        told["asked"] = {
-            what: {"value": value, "limit": limit, "kept": kept} for what, (value, limit, kept) in asked.items()
+        requirements = verdict(chain, outcome(root, jobs["perfect"]))
+        results["asked"] = {
+            what: {"value": value, "limit": limit, "kept": kept} for what, (value, limit, kept) in requirements.items()
         }
-    return told
+    return results
 
 
 def _plain(one: Outcome) -> dict[str, Any]:

@@ -63,15 +63,15 @@ VARIANTS = {
 
 def true_calibration(root: Path) -> Calibration:
     """Return the true rig in the frame of the session's first board."""
-    told = read_record(root / TRUTH / LAB_RECORD, LabRecord)
+    record = read_record(root / TRUTH / LAB_RECORD, LabRecord)
     rig = read_record(root / TRUTH / CALIBRATION_FILE, Calibration)
-    return in_session_frame(rig, np.array(told.world_from_session))
+    return in_session_frame(rig, np.array(record.world_from_session))
 
 
 def session_from_scan(root: Path) -> Floats:
     """Return the true transform session_from_scan (4, 4)."""
-    told = read_record(root / TRUTH / LAB_RECORD, LabRecord)
-    return np.asarray(np.linalg.inv(np.array(told.world_from_session)) @ np.array(told.world_from_scan))
+    record = read_record(root / TRUTH / LAB_RECORD, LabRecord)
+    return np.asarray(np.linalg.inv(np.array(record.world_from_session)) @ np.array(record.world_from_scan))
 
 
 def write_variant(root: Path, out: Path, known: Known) -> Path:
@@ -88,12 +88,12 @@ def write_variant(root: Path, out: Path, known: Known) -> Path:
         (read_record(root / CALIBRATION / CALIBRATION_FILE, Calibration), true_calibration(root)),
     )
     registration = read_record(mouth / REGISTRATION, Registration)
-    move = np.eye(4)
+    transform = np.eye(4)
     if known.pose:
-        move = session_from_scan(root) @ np.linalg.inv(np.array(registration.rig_from_scan))
+        transform = session_from_scan(root) @ np.linalg.inv(np.array(registration.rig_from_scan))
     for tooth in read_teeth(mouth):
-        write_mesh(teeth_folder(out, tooth.fdi) / "outer.ply", _placed(tooth.outer, move))
-    write_mesh(out / "gums.ply", _placed(read_mesh(mouth / "gums.ply"), move))
+        write_mesh(teeth_folder(out, tooth.fdi) / "outer.ply", _transformed(tooth.outer, transform))
+    write_mesh(out / "gums.ply", _transformed(read_mesh(mouth / "gums.ply"), transform))
     if not known.pose:
         shutil.copyfile(mouth / REGISTRATION, out / REGISTRATION)
 
@@ -111,8 +111,8 @@ def _mixed(found: Calibration, true: Calibration, known: Known) -> Calibration:
     cameras = []
     for one, real in zip(found.cameras, true.cameras, strict=True):
         geometry, light = (real if known.cameras else one), (real if known.radiometry else one)
-        told = {"radiance_per_count": light.radiance_per_count, "vignetting": light.vignetting}
-        cameras.append(geometry.model_copy(update=told))
+        radiometry = {"radiance_per_count": light.radiance_per_count, "vignetting": light.vignetting}
+        cameras.append(geometry.model_copy(update=radiometry))
     lights = []
     for lamp in found.lights:
         actual = next(light for light in true.lights if light.name == lamp.name)
@@ -129,9 +129,9 @@ def _linked(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _placed(mesh: Mesh, move: Floats) -> Mesh:
-    return Mesh(_applied(move, mesh.vertices_mm), mesh.faces)
+def _transformed(mesh: Mesh, transform: Floats) -> Mesh:
+    return Mesh(_transformed_points(transform, mesh.vertices_mm), mesh.faces)
 
 
-def _applied(move: Floats, points_mm: Floats) -> Floats:
-    return np.asarray(points_mm @ move[:3, :3].T + move[:3, 3])
+def _transformed_points(transform: Floats, points_mm: Floats) -> Floats:
+    return np.asarray(points_mm @ transform[:3, :3].T + transform[:3, 3])

@@ -22,11 +22,11 @@ STEPS = {
 }
 
 
-def write_summary(root: Path, told: Mapping[str, Any]) -> None:
+def write_summary(root: Path, summary: Mapping[str, Any]) -> None:
     """Write ``summary.json`` and ``summary.html`` into a laboratory's folder."""
-    write_atomic(root / SUMMARY, (json.dumps(told, indent=1) + "\n").encode())
-    rows = [_row("found calibration and pose", told["chain"])]
-    rows += [_row(name, one) for name, one in told["variants"].items()]
+    write_atomic(root / SUMMARY, (json.dumps(summary, indent=1) + "\n").encode())
+    rows = [_row("found calibration and pose", summary["chain"])]
+    rows += [_row(name, one) for name, one in summary["variants"].items()]
     asked = [
         {
             "what": what,
@@ -34,23 +34,23 @@ def write_summary(root: Path, told: Mapping[str, Any]) -> None:
             "limit": f"{one['limit']:g}",
             "kept": "yes" if one["kept"] else "no",
         }
-        for what, one in told.get("asked", {}).items()
+        for what, one in summary.get("asked", {}).items()
     ]
-    steps = [{"what": name, "value": f"{told['steps'][key]:.3g}"} for key, name in STEPS.items()]
-    names = list(told["chain"]["media"])
+    steps = [{"what": name, "value": f"{summary['steps'][key]:.3g}"} for key, name in STEPS.items()]
+    names = list(summary["chain"]["media"])
     page = page_template(TEMPLATE).render(rows=rows, asked=asked, steps=steps, names=names)
     write_atomic(root / PAGE, page.encode())
 
 
-def lines(told: Mapping[str, Any]) -> list[str]:
+def lines(summary: Mapping[str, Any]) -> list[str]:
     """Return the summary as a few lines for a terminal."""
     found = []
-    for name, one in {"chain": told["chain"], **told["variants"]}.items():
+    for name, one in {"chain": summary["chain"], **summary["variants"]}.items():
         row = _row(name, one)
         found.append(f"{name}: held-out error {row['held_out']}, on fitted images {row['fit']}{row['note']}")
         found += [f"  {key}: {value}" for key, value in zip(one["media"], row["media"], strict=True)]
-    found.append("off the truth: " + ", ".join(f"{name} {told['steps'][key]:.3g}" for key, name in STEPS.items()))
-    for what, one in told.get("asked", {}).items():
+    found.append("off the truth: " + ", ".join(f"{name} {summary['steps'][key]:.3g}" for key, name in STEPS.items()))
+    for what, one in summary.get("asked", {}).items():
         kept = "" if one["kept"] else ", NOT KEPT"
         found.append(f"{what}: {one['value']:.2f} (limit {one['limit']:g}){kept}")
     return found

@@ -21,7 +21,7 @@ def measured(
     pixel_mm: float,
     compare: Sequence[str],
     workers: int | None,
-    tell: Callable[[str], None],
+    report_step: Callable[[str], None],
     *,
     coarse: bool = False,
 ) -> dict[str, Any]:
@@ -32,22 +32,22 @@ def measured(
         pixel_mm: edge of a photograph's pixel at the teeth.
         compare: names of ``VARIANTS``.
         workers: number of processes of each job; None for the job's own number.
-        tell: called with a description of each step as it begins.
+        report_step: called with a description of each step as it begins.
         coarse: use the options for a first, coarse result.
     """
     options = COARSE if coarse else {}
-    calibrated(root, tell)
-    registered(root, pixel_mm, tell)
-    tell("job: preparation and fit")
+    calibrated(root, report_step)
+    registered(root, pixel_mm, report_step)
+    report_step("job: preparation and fit")
     _run(job_of(root / MOUTH, pixel_mm, options), root / JOB, workers)
     jobs = {}
     for name in compare:
         folder, known = root / COMPARISON / name.replace(" ", "-"), VARIANTS[name]
         if not (folder / MOUTH / DESCRIPTION).is_file():
             write_variant(root, folder / MOUTH, known)
-        tell(f"comparison: {name}")
-        told = {**options, "instrument": "off"} if known.is_all else options
-        _run(job_of(folder / MOUTH, pixel_mm, told), folder / JOB, workers)
+        report_step(f"comparison: {name}")
+        job_options = {**options, "instrument": "off"} if known.is_all else options
+        _run(job_of(folder / MOUTH, pixel_mm, job_options), folder / JOB, workers)
         jobs[name] = folder / JOB
     return summary(root, jobs)
 

@@ -107,7 +107,7 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
     files.put_view(subject.view_of(0, camera))
     view = files.view(0, camera)
     assert view is not None
-    frames = source.matched(0)
+    frames = source.matched_frames(0)
     motions = dict(source.match(view, frames))
     writer = ImageWriter(files, source, subject, HandMasks(scene.root, source.description), view)
     images = source.images(view, (LIGHT,) * (TURNS + 1), motions)

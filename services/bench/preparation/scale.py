@@ -70,8 +70,8 @@ def picture(rows: list[Row]) -> Figure:
 
     figure, (axes,) = grid(1)
     axes.plot([row["seconds"] if "seconds" in row else row["clock_s"] for row in rows], "o")
-    told = ("workers", "tooth_by_height")
-    names = [", ".join(f"{row[key]:g} {key}" for key in ("images", *told) if key in row) for row in rows]
+    varied = ("workers", "tooth_by_height")
+    names = [", ".join(f"{row[key]:g} {key}" for key in ("images", *varied) if key in row) for row in rows]
     axes.set_xticks(range(len(rows)), names, rotation=30, ha="right", fontsize=8)
     axes.set(ylabel="s", ylim=(0, None))
     axes.grid(alpha=0.25)

@@ -17,7 +17,7 @@ def near_beam_folder(**changes: Any) -> SlabFolder:
     """
     angles = {"f": (-5, -15, -25), "b": (8, 18, -15)}
     sides = {"f": "front", "b": "back"}
-    told: dict[str, Any] = {
+    description: dict[str, Any] = {
         "kind": "slab",
         "units": "mm",
         "wavelengths_nm": [532.0],
@@ -33,15 +33,15 @@ def near_beam_folder(**changes: Any) -> SlabFolder:
             for k, angle in enumerate(own)
         ],
     }
-    told.update(changes)
-    told["images"] = [
+    description.update(changes)
+    description["images"] = [
         {
             "camera": camera["name"],
             "light": light["name"],
             "file": f"{camera['name']}_{light['name']}.npy",
             "variance_file": f"{camera['name']}_{light['name']}_var.npy",
         }
-        for light in told["lights"]
-        for camera in told["cameras"]
+        for light in description["lights"]
+        for camera in description["cameras"]
     ]
-    return SlabFolder.model_validate(told)
+    return SlabFolder.model_validate(description)

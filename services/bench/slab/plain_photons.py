@@ -61,11 +61,11 @@ def plain_images(
     grid = x_from, x_to, y_from, y_to, folder.pixels.columns, folder.pixels.rows
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, light in enumerate(folder.lights):
-            seen = [k for k, entry in enumerate(folder.images) if entry.light == light.name]
-            if not seen:
+            light_images = [k for k, entry in enumerate(folder.images) if entry.light == light.name]
+            if not light_images:
                 continue
             beam = _arriving(folder, light, index)
-            places = [(k, (seed, number, k, batch)) for batch in range(BATCHES) for k in seen]
+            places = [(k, (seed, number, k, batch)) for batch in range(BATCHES) for k in light_images]
 
             def batch(place: tuple[int, tuple[int, ...]], beam: tuple[float, ...] = beam) -> Array:
                 image, one = place
@@ -76,9 +76,9 @@ def plain_images(
                 return np.asarray(images[0])
 
             batches = np.stack(list(pool.map(batch, places))) * folder.beam.power / (photons // BATCHES)
-            batches = batches.reshape(BATCHES, len(seen), *shape[1:])
-            means[seen] = batches.mean(axis=0)
-            variances[seen] = batches.var(axis=0, ddof=1) / BATCHES
+            batches = batches.reshape(BATCHES, len(light_images), *shape[1:])
+            means[light_images] = batches.mean(axis=0)
+            variances[light_images] = batches.var(axis=0, ddof=1) / BATCHES
     return means, variances
 
 
@@ -177,7 +177,7 @@ def _trace(
         while True:
             # Fly to the next collision. A face on the way either reflects the photon or lets it leave, at random.
             flight = -math.log(1 - random.random()) / sigma_t
-            gone = False
+            has_left = False
             while True:
                 to_face = ((width - z) if w > 0 else -z) / w if w != 0 else math.inf
                 if flight < to_face:
@@ -185,10 +185,10 @@ def _trace(
                 x, y, flight = x + u * to_face, y + v * to_face, flight - to_face
                 z = width if w > 0 else 0.0
                 if random.random() >= _reflectance(abs(w), index):
-                    gone = True
+                    has_left = True
                     break
                 w = -w
-            if gone:
+            if has_left:
                 break
             x, y, z = x + u * flight, y + v * flight, z + w * flight
             weight *= albedo

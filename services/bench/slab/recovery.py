@@ -142,9 +142,13 @@ def compared(truth: Truth, fit: SlabFit, bound: Bound, seed: int) -> Recovery:
     }
     numbers = {}
     for name, slope in slopes(material).items():
-        told = getattr(fit.parameters, name)
+        estimate = getattr(fit.parameters, name)
         numbers[name] = Recovered(
-            truth=true[name], value=told.value, se=told.se, bound=bound.of(slope), determined=told.determined
+            truth=true[name],
+            value=estimate.value,
+            se=estimate.se,
+            bound=bound.of(slope),
+            determined=estimate.determined,
         )
     phase = truth.phase_per_sr()
     difference = np.interp(FINE_RAD, ANGLES_RAD, np.array(fit.phase.value_per_sr)) - phase

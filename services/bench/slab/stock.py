@@ -108,7 +108,7 @@ def descend(
 
     atoms = Mixtures(unit_atoms(np.stack([hg_values(g) for g in COSINES], axis=1)))
     tables = np.stack([hg_values(g, node_angles()) for g in COSINES], axis=1)
-    begun = atoms.begun(guess)
+    begun = atoms.initial_medium(guess)
     x = np.log(np.append(begun.atom_weights, max(begun.absorption_per_mm, SMALLEST_PER_MM)))
     medium = medium_of(1.0, 0.5, PHASES[PHASE])
     views = [
@@ -117,9 +117,9 @@ def descend(
             scenes(truth.folder, medium, "prbvolpath"), images, variances, strict=True
         )
     ]
-    mean, square, told = np.zeros_like(x), np.zeros_like(x), QUICK_ITERATIONS if quick else ITERATIONS
+    mean, square, reported = np.zeros_like(x), np.zeros_like(x), QUICK_ITERATIONS if quick else ITERATIONS
     seconds = 0.0
-    for iteration in range(1, max(told) + 1):
+    for iteration in range(1, max(reported) + 1):
         clock = time.process_time()
         slope = np.zeros_like(x)
         for number, view in enumerate(views):
@@ -131,7 +131,7 @@ def descend(
         unbiased = np.sqrt(square / (1 - SQUARE_DECAY**iteration)) + SMALL
         x = x - rate * mean / (1 - MEAN_DECAY**iteration) / unbiased
         seconds += time.process_time() - clock
-        if iteration in told:
+        if iteration in reported:
             yield iteration, atoms.material_at(np.exp(x)), seconds
 
 

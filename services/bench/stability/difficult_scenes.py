@@ -44,7 +44,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SceneCheck:
     """Result of rendering a scene."""
 
     numbers: int
@@ -92,7 +92,7 @@ def scenes() -> Iterator[Scene]:
     yield Scene("lights 1000 km away", farther, TISSUE, far, TISSUE)
 
 
-def look(scene: Scene, *, samples: int, seed: int) -> Seen:
+def check_scene(scene: Scene, *, samples: int, seed: int) -> SceneCheck:
     """Render the images and all derivatives of a scene, seen along the upper face of the box.
 
     Raises:
@@ -111,7 +111,7 @@ def look(scene: Scene, *, samples: int, seed: int) -> Seen:
         z = float(np.max(np.abs(image.mean.sum(axis=1) - other.mean.sum(axis=1)) / spread))
     negative = int(np.count_nonzero(image.mean.sum(axis=1) < -LARGEST_Z * np.sqrt(image.variance.sum(axis=1))))
     error = float(np.sqrt(image.variance.sum()) / np.linalg.norm(image.mean))
-    return Seen(image.mean.size + jacobian.jacobian.size, negative, error, z)
+    return SceneCheck(image.mean.size + jacobian.jacobian.size, negative, error, z)
 
 
 def ellipsoid(semi_axes_mm: NDArray[np.float64]) -> Mesh:

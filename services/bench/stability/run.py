@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from services.bench import Row
 from services.bench.stability.corners import REGIONS, SMOOTH, Corners, draw
-from services.bench.stability.difficult_scenes import look, scenes
+from services.bench.stability.difficult_scenes import check_scene, scenes
 from services.bench.stability.formula_errors import FORMULAS, worst_by_region
 from services.fit.optics import fresnel
 from services.fit.optics.parameters import MEDIUM_FIELDS
@@ -212,12 +212,12 @@ def scene_rows(*, samples: int, seed: int = 4) -> list[StabilityRow]:
     rows = []
     for scene in scenes():
         begun = time.perf_counter()
-        seen = look(scene, samples=samples, seed=seed)
+        check = check_scene(scene, samples=samples, seed=seed)
         rows.append(
             StabilityRow(
-                benchmark="stability-scene", peer="dentine", seconds=time.perf_counter() - begun, error=seen.error,
-                region=scene.name, quantity="images and derivatives", sets=seen.numbers, non_finite=0,
-                negative=seen.negative, z=seen.z,
+                benchmark="stability-scene", peer="dentine", seconds=time.perf_counter() - begun, error=check.error,
+                region=scene.name, quantity="images and derivatives", sets=check.numbers, non_finite=0,
+                negative=check.negative, z=check.z,
             )
         )  # fmt: skip
     return rows

@@ -46,8 +46,8 @@ class IncisorStack:
         width, height = self.camera.size
         y, x = np.mgrid[0:height, 0:width]
         everything = View(self.camera, np.stack([x.ravel(), y.ravel()], axis=1).astype(np.int32))
-        seen = engine.images(tissue, everything, samples=16, seed=99).mean.sum(axis=0) > 0
-        return View(self.camera, everything.pixels[seen])
+        is_lit = engine.images(tissue, everything, samples=16, seed=99).mean.sum(axis=0) > 0
+        return View(self.camera, everything.pixels[is_lit])
 
     def some_lights(self, count: int) -> NDArray[np.int64]:
         """Return the indices of some lights, for a peer that is too slow for all of them."""

@@ -51,8 +51,8 @@ class PlainWalk(Walk):
             scatters, dr.fma(walker.omega, distance, walker.origin), dr.select(crosses, beyond, walker.origin)
         )
         walker.place = dr.select(crosses, geometry.beyond(walker.place, walker.omega, hit), walker.place)
-        (count,) = walker.so_far.counts
-        walker.so_far.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
+        (count,) = walker.scatterings.counts
+        walker.scatterings.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
 
         # Connect to the lights, then sample a new direction.
         self._connect(
@@ -66,7 +66,7 @@ class PlainWalk(Walk):
         # Russian roulette: paths of low weight survive with a probability in proportion to their weight.
         share = (
             walker.weight
-            * dr.exp(mi.Float(walker.so_far.counts[0]) * self.media.log_alpha[0])
+            * dr.exp(mi.Float(walker.scatterings.counts[0]) * self.media.log_alpha[0])
             / (ROULETTE_WEIGHT * walker.reference)
         )
         faded = (share < 1) & (walker.rng.next_float32() >= share)
@@ -77,7 +77,11 @@ class PlainWalk(Walk):
             walker.sample = walker.sample + 1
             fresh = self.start.begin(walker.lane, walker.sample, ended)
             walker.rng, walker.origin, walker.omega, walker.place = fresh.rng, fresh.origin, fresh.omega, fresh.place
-            walker.weight, walker.reference, walker.so_far.counts = fresh.weight, mi.Float(fresh.weight), [mi.UInt32(0)]
+            walker.weight, walker.reference, walker.scatterings.counts = (
+                fresh.weight,
+                mi.Float(fresh.weight),
+                [mi.UInt32(0)],
+            )
             walker.active = walker.sample < limit
             return walker
 

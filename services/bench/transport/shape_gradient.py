@@ -135,12 +135,13 @@ def _compare(
     our_bias_squared = _resolved(theirs - ours.mean[0], noise_squared)
 
     derivative = np.average([theirs, ours.mean[0]], weights=[1 / covariance[0, 0], 1 / ours.mean_variance[0]])
-    wanted = (WANTED_ERROR * derivative) ** 2
+    target_variance = (WANTED_ERROR * derivative) ** 2
     costs = {
-        h: d.seconds * d.variance[0] / max(wanted - curvature_squared * h**4, 1e-300) for h, d in differences.items()
+        h: d.seconds * d.variance[0] / max(target_variance - curvature_squared * h**4, 1e-300)
+        for h, d in differences.items()
     }
     best = min(costs, key=lambda h: costs[h])
-    our_cost = ours.seconds * ours.variance[0] / max(wanted - our_bias_squared, 1e-300)
+    our_cost = ours.seconds * ours.variance[0] / max(target_variance - our_bias_squared, 1e-300)
     z = float((theirs - ours.mean[0]) / np.sqrt(noise_squared))
 
     def row(peer: str, estimate: Estimate, paths: int) -> GradientRow:

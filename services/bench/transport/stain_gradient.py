@@ -25,7 +25,7 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 Array = NDArray[np.float64]
 
 MIDDLE, STEP = 0.6, 0.4
-SEEN = 0.05
+MIN_SIGNAL_SHARE = 0.05
 """Smallest derivative of a visible texel, as a fraction of the largest."""
 PEER = "central differences, step 0.4"
 
@@ -50,11 +50,11 @@ def stain_rows(*, quick: bool) -> list[GradientRow]:
     estimates = np.stack([ours(100 + repeat) for repeat in range(repeats)])
     seconds = (time.process_time() - begun) / repeats
     mean = estimates.mean(axis=0)
-    seen = np.argwhere(np.abs(mean) >= SEEN * np.abs(mean).max())
-    share = seconds / len(seen)
+    bright_pixels = np.argwhere(np.abs(mean) >= MIN_SIGNAL_SHARE * np.abs(mean).max())
+    share = seconds / len(bright_pixels)
 
     rows, ratios = [], []
-    for row, column in seen[np.linspace(0, len(seen) - 1, count).astype(int)]:
+    for row, column in bright_pixels[np.linspace(0, len(bright_pixels) - 1, count).astype(int)]:
         name = f"texel {row}, {column}"
         values = estimates[:, row, column]
 

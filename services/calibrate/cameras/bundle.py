@@ -163,7 +163,7 @@ def layout_of(rig: Rig, *, lenses_fixed: bool = False) -> Layout:
     )
 
 
-def draw(rig: Rig, corners: Corners) -> Floats:
+def project_corners(rig: Rig, corners: Corners) -> Floats:
     """Return the pixels (N, 2) to which a rig projects corners."""
     pixels = np.empty_like(corners.pixels)
     local = pose_apply(rig.places[corners.place], corners.corners_mm)
@@ -225,17 +225,17 @@ def fit_bundle(
     if robust:
         values, inliers = _without_outliers(layout, start, corners, values, weights)
         _require_inliers(views, corners, inliers)
-    kept = corners.kept(inliers)
-    values, converged = _solve(layout, start, kept, values, weights)
+    used = corners.selected(inliers)
+    values, converged = _solve(layout, start, used, values, weights)
     rig = layout.unpack(values, start)
-    residuals = corners.pixels - draw(rig, corners)
-    whitened = residuals[inliers] / weights[kept.camera, None]
+    residuals = corners.pixels - project_corners(rig, corners)
+    whitened = residuals[inliers] / weights[used.camera, None]
     freedom = max(whitened.size - layout.length, 1)
     sigma = np.maximum(weights * np.sqrt((whitened**2).sum() / freedom), SIGMA_FLOOR_PX)
     return BundleFit(
         rig=rig,
         layout=layout,
-        covariance=_covariance(jacobian(layout, rig, kept, sigma)),
+        covariance=_covariance(jacobian(layout, rig, used, sigma)),
         sigma_px=sigma,
         residuals_px=residuals,
         inliers=inliers,
@@ -248,25 +248,33 @@ def _without_outliers(
     layout: Layout, start: Rig, corners: Corners, values: Floats, weights: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the parameters (length,) of a robust fit, and a mask (N,) of the corners that are inliers of it."""
-    scale, kept = 1.0, corners.kept(~_misplaced(corners, draw(layout.unpack(values, start), corners)))
+    scale, plausible = (
+        1.0,
+        corners.selected(~_misplaced(corners, project_corners(layout.unpack(values, start), corners))),
+    )
     for _ in range(ROBUST_ROUNDS):
-        off = np.abs(kept.pixels - draw(layout.unpack(values, start), kept)) / weights[kept.camera, None]
+        off = (
+            np.abs(plausible.pixels - project_corners(layout.unpack(values, start), plausible))
+            / weights[plausible.camera, None]
+        )
         before, scale = scale, max(MAD_TO_SIGMA * float(np.median(off)), SIGMA_FLOOR_PX)
         if abs(scale - before) < SETTLED_SCALE * before:
             break
-        values, _ = _solve(layout, start, kept, values, scale * weights, huber=True)
-    off = np.abs(corners.pixels - draw(layout.unpack(values, start), corners)) / weights[corners.camera, None]
+        values, _ = _solve(layout, start, plausible, values, scale * weights, huber=True)
+    off = (
+        np.abs(corners.pixels - project_corners(layout.unpack(values, start), corners)) / weights[corners.camera, None]
+    )
     return values, off.max(axis=1) <= OUTLIER_SIGMAS * scale
 
 
-def _misplaced(corners: Corners, drawn: Floats) -> NDArray[np.bool_]:
+def _misplaced(corners: Corners, projected: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of the corners of photographs that the first guess projects far away, such as those of frames
     that were interchanged.
 
     Huber's loss bounds the influence of each corner, but a whole photograph of wrong corners still biases the poses of
     its place and its camera. At least one photograph of every camera and of every place stays.
     """
-    off = np.linalg.norm(corners.pixels - drawn, axis=1)
+    off = np.linalg.norm(corners.pixels - projected, axis=1)
     median = np.array([float(np.median(off[corners.view == view])) for view in range(corners.view.max() + 1)])
     bad = median > max(MISPLACED_PX, MISPLACED_TIMES * float(np.median(median)))
     for numbers in (corners.camera, corners.place):
@@ -301,17 +309,17 @@ def jacobian(layout: Layout, rig: Rig, corners: Corners, sigma_px: Floats) -> ob
 
     entries, rows, columns = [], [], []
     for camera in range(len(rig.lenses)):
-        seen, _, by_lens, by_camera, by_place = derivative_blocks(rig, corners, camera)
-        row = np.stack([2 * seen, 2 * seen + 1], axis=1)[:, :, None]
-        places = corners.place[seen]
-        moved = places > 0
+        visible, _, by_lens, by_camera, by_place = derivative_blocks(rig, corners, camera)
+        row = np.stack([2 * visible, 2 * visible + 1], axis=1)[:, :, None]
+        places = corners.place[visible]
+        has_pose = places > 0
         place_columns = layout.place_columns(0)[None, :] + 6 * places[:, None]
-        everywhere = np.ones(len(seen), dtype=bool)
-        blocks = [(by_camera, np.broadcast_to(layout.camera_columns(camera), (len(seen), 6)), everywhere)]
-        blocks.append((by_place, place_columns, moved))
+        all_rows = np.ones(len(visible), dtype=bool)
+        blocks = [(by_camera, np.broadcast_to(layout.camera_columns(camera), (len(visible), 6)), all_rows)]
+        blocks.append((by_place, place_columns, has_pose))
         if not layout.lenses_fixed:
             lens_columns = layout.lens_columns(camera)
-            blocks.append((by_lens, np.broadcast_to(lens_columns, (len(seen), len(lens_columns))), everywhere))
+            blocks.append((by_lens, np.broadcast_to(lens_columns, (len(visible), len(lens_columns))), all_rows))
         for block, column, chosen in blocks:
             part = block[chosen] / sigma_px[camera]
             entries.append(part.ravel())
@@ -339,10 +347,10 @@ def _solve(
     from scipy.optimize import least_squares
 
     def residuals(x: Floats) -> Floats:
-        off = draw(layout.unpack(x, template), corners) - corners.pixels
+        off = project_corners(layout.unpack(x, template), corners) - corners.pixels
         return (off / sigma[corners.camera, None]).ravel()
 
-    answer = least_squares(
+    solution = least_squares(
         residuals,
         values,
         jac=lambda x: jacobian(layout, layout.unpack(x, template), corners, sigma),
@@ -357,7 +365,7 @@ def _solve(
         gtol=1e-10,
         max_nfev=100,
     )
-    return np.asarray(answer.x), bool(answer.success)
+    return np.asarray(solution.x), bool(solution.success)
 
 
 def _covariance(whitened: object) -> Floats:

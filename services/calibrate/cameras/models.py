@@ -62,24 +62,24 @@ def choose_lens(
         CaptureInputError: the camera shows fewer than three boards.
     """
     if len(usable(views)) < MIN_BOARDS:
-        held = fit_lens(views, size, MODEL_OF_FEW, name)
-        return ModelChoice(held.rig.lenses[0], float(held.sigma_px[0]), {})
+        fit = fit_lens(views, size, MODEL_OF_FEW, name)
+        return ModelChoice(fit.rig.lenses[0], float(fit.sigma_px[0]), {})
     good = without_outliers(of_one_camera(usable(views)), fit_lens(views, size, MODEL_FOR_OUTLIERS, name))
     errors = {model: _cross_validated(good, size, model, name, min(folds, len(good) // 2)) for model in models}
     chosen = next(model for model in errors if not any(_beats(other, errors[model]) for other in errors.values()))
-    told = {model: float(np.sqrt(np.mean(squares))) for model, squares in errors.items()}
-    return ModelChoice(*lens_and_scatter(good, size, chosen, name), held_out_px=told)
+    rms_px = {model: float(np.sqrt(np.mean(squares))) for model, squares in errors.items()}
+    return ModelChoice(*lens_and_scatter(good, size, chosen, name), held_out_px=rms_px)
 
 
 def without_outliers(views: Sequence[View], fit: BundleFit) -> list[View]:
     """Return the usable views without the corners that are outliers of a fit."""
-    return usable([view.kept(fit.inliers[fit.corners.view == number]) for number, view in enumerate(views)])
+    return usable([view.selected(fit.inliers[fit.corners.view == number]) for number, view in enumerate(views)])
 
 
 def held_out_squares(views: Sequence[View], lens: Lens) -> Floats:
     """Return the mean squared reprojection error (V,) in px² of each view, with the pose that fits the view best."""
-    drawn = (lens.project(pose_apply(board_pose(view, lens), view.corners_mm)) for view in views)
-    return np.array([((d - view.pixels) ** 2).sum(axis=1).mean() for d, view in zip(drawn, views, strict=True)])
+    projected = (lens.project(pose_apply(board_pose(view, lens), view.corners_mm)) for view in views)
+    return np.array([((d - view.pixels) ** 2).sum(axis=1).mean() for d, view in zip(projected, views, strict=True)])
 
 
 def of_one_camera(views: Sequence[View]) -> list[View]:

@@ -31,7 +31,7 @@ class View:
     ids: NDArray[np.int64]
     name: str = ""
 
-    def kept(self, mask: NDArray[np.bool_]) -> View:
+    def selected(self, mask: NDArray[np.bool_]) -> View:
         """Return the view with only the corners that the mask (N,) selects."""
         return replace(self, corners_mm=self.corners_mm[mask], pixels=self.pixels[mask], ids=self.ids[mask])
 
@@ -54,7 +54,7 @@ class Corners:
     corners_mm: Floats
     pixels: Floats
 
-    def kept(self, mask: NDArray[np.bool_]) -> Corners:
+    def selected(self, mask: NDArray[np.bool_]) -> Corners:
         """Return the corners that the mask (N,) selects."""
         return Corners(self.camera[mask], self.place[mask], self.view[mask], self.corners_mm[mask], self.pixels[mask])
 

@@ -78,14 +78,19 @@ def board_pose(view: View, lens: Lens) -> Floats:
     import cv2
 
     flat = np.ascontiguousarray(lens.undistort(view.pixels)[:, :2])
-    eye = np.eye(3)
-    found, turn, shift = cv2.solvePnP(view.corners_mm, flat, eye, None, flags=cv2.SOLVEPNP_IPPE)
-    if not found:
+    identity = np.eye(3)
+    is_found, rotation, translation = cv2.solvePnP(view.corners_mm, flat, identity, None, flags=cv2.SOLVEPNP_IPPE)
+    if not is_found:
         raise CaptureInputError(f"The board in {view.name} has no pose that draws its corners; photograph it again.")
-    turn, shift = cv2.solvePnPRefineLM(
-        view.corners_mm, view.pixels, lens.matrix, lens.distortion if len(lens.distortion) else None, turn, shift
+    rotation, translation = cv2.solvePnPRefineLM(
+        view.corners_mm,
+        view.pixels,
+        lens.matrix,
+        lens.distortion if len(lens.distortion) else None,
+        rotation,
+        translation,
     )
-    return np.concatenate([np.ravel(turn), np.ravel(shift)])
+    return np.concatenate([np.ravel(rotation), np.ravel(translation)])
 
 
 def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str]) -> Rig:
@@ -104,9 +109,9 @@ def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str
         for number, view in enumerate(views)
         if id(view) in good
     }
-    waiting = sorted(poses, key=lambda number: -len(views[number].pixels))
-    while waiting:
-        linked = [n for n in waiting if views[n].place in places or views[n].camera in cameras]
+    remaining = sorted(poses, key=lambda number: -len(views[number].pixels))
+    while remaining:
+        linked = [n for n in remaining if views[n].place in places or views[n].camera in cameras]
         if not linked:
             break
         view, camera_from_board = views[linked[0]], poses[linked[0]]
@@ -114,12 +119,12 @@ def first_rig(views: Sequence[View], lenses: Sequence[Lens], names: Sequence[str
             cameras.setdefault(view.camera, camera_from_board @ np.linalg.inv(places[view.place]))
         else:
             places[view.place] = np.linalg.inv(cameras[view.camera]) @ camera_from_board
-        waiting.remove(linked[0])
+        remaining.remove(linked[0])
     for _ in range(VOTES):
         _vote(views, lenses, poses, cameras, places)
-    if alone := next((name for number, name in enumerate(names) if number not in cameras), None):
+    if unlinked := next((name for number, name in enumerate(names) if number not in cameras), None):
         raise CaptureInputError(
-            f"Camera {alone} sees no board together with the other cameras; photograph a board where both see it."
+            f"Camera {unlinked} sees no board together with the other cameras; photograph a board where both see it."
         )
     if len(places) < n_places:
         missing = next(place for place in range(n_places) if place not in places)
@@ -145,35 +150,39 @@ def _vote(
     """
     linked = [number for number in poses if views[number].camera in cameras and views[number].place in places]
     for camera in cameras:
-        mine = [number for number in linked if views[number].camera == camera]
-        proposed = [poses[number] @ np.linalg.inv(places[views[number].place]) for number in mine]
-        drawn = [(views[n], lenses[camera], [pose @ places[views[n].place] for pose in proposed]) for n in mine]
-        if len(proposed) > 2:
-            cameras[camera] = proposed[_best(drawn)]
-    for place in list(places)[1:]:
-        mine = [number for number in linked if views[number].place == place]
-        proposed = [np.linalg.inv(cameras[views[number].camera]) @ poses[number] for number in mine]
-        drawn = [
-            (views[n], lenses[views[n].camera], [cameras[views[n].camera] @ pose for pose in proposed]) for n in mine
+        own_views = [number for number in linked if views[number].camera == camera]
+        proposed = [poses[number] @ np.linalg.inv(places[views[number].place]) for number in own_views]
+        candidates = [
+            (views[n], lenses[camera], [pose @ places[views[n].place] for pose in proposed]) for n in own_views
         ]
         if len(proposed) > 2:
-            places[place] = proposed[_best(drawn)]
+            cameras[camera] = proposed[_best(candidates)]
+    for place in list(places)[1:]:
+        own_views = [number for number in linked if views[number].place == place]
+        proposed = [np.linalg.inv(cameras[views[number].camera]) @ poses[number] for number in own_views]
+        candidates = [
+            (views[n], lenses[views[n].camera], [cameras[views[n].camera] @ pose for pose in proposed])
+            for n in own_views
+        ]
+        if len(proposed) > 2:
+            places[place] = proposed[_best(candidates)]
 
 
-def _best(drawn: Sequence[tuple[View, Lens, list[Floats]]]) -> int:
+def _best(candidates: Sequence[tuple[View, Lens, list[Floats]]]) -> int:
     """Return the number of the proposed pose with the least median reprojection error over the corners of all views.
 
     Args:
-        drawn: for each view, its lens and the proposed poses camera_from_board (4, 4), in the same order for all views.
+        candidates: for each view, its lens and the proposed poses camera_from_board (4, 4), in the same order for all
+            views.
     """
-    offs = [
+    distances_px = [
         [
             np.linalg.norm(lens.project(pose_apply(pose_vector(pose), view.corners_mm)) - view.pixels, axis=1)
             for pose in proposed
         ]
-        for view, lens, proposed in drawn
+        for view, lens, proposed in candidates
     ]
-    return int(np.argmin([np.median(np.concatenate(own)) for own in zip(*offs, strict=True)]))
+    return int(np.argmin([np.median(np.concatenate(own)) for own in zip(*distances_px, strict=True)]))
 
 
 def _spans_a_plane(corners_mm: Floats) -> bool:

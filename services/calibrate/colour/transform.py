@@ -88,14 +88,14 @@ def fit_colour(rgb: Floats, xyz: Floats, camera: str, white: Floats = D50) -> Co
     chosen = "root polynomial" if takes_roots else "matrix"
     matrix = least_squares_matrix(models["matrix"], xyz)
     roots = least_squares_matrix(models["root polynomial"], xyz) if takes_roots else None
-    drawn = models[chosen] @ (matrix if roots is None else roots).T
+    fitted_xyz = models[chosen] @ (matrix if roots is None else roots).T
     return ColourFit(
         matrix=matrix,
         root_polynomial=roots,
         held_out=left_out[chosen],
         held_out_by_model={name: float(one.mean()) for name, one in left_out.items()},
-        fitted=delta_e_2000(lab_from_xyz(drawn, white), target),
-        residuals=drawn - xyz,
+        fitted=delta_e_2000(lab_from_xyz(fitted_xyz, white), target),
+        residuals=fitted_xyz - xyz,
     )
 
 

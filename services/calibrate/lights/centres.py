@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibrate.lights.mirror import Eye, outline_errors, sphere_from_outline
+from services.calibrate.lights.mirror import PosedCamera, outline_errors, sphere_from_outline
 from services.calibrate.lights.positions import EDGE_SHIFT_SE_PX, HUBER_SIGMAS
 from services.calibrate.reweighted import solve_reweighted
 
@@ -37,23 +37,23 @@ class OutlineView:
     outline_px: Floats
 
 
-def fit_centres(views: Sequence[OutlineView], eyes: Sequence[Eye]) -> Floats:
+def fit_centres(views: Sequence[OutlineView], cameras: Sequence[PosedCamera]) -> Floats:
     """Fit the spheres' centres (P, 3) by place, in mm.
 
     All edges of a camera may be detected outside or inside the true outline by one common shift. In one camera this
     shift looks like a nearer or farther sphere; several cameras together separate it from the distance.
     """
     count = max(view.place for view in views) + 1
-    start = np.zeros(3 * count + len(eyes))
+    start = np.zeros(3 * count + len(cameras))
     for place in range(count):
         here = [view for view in views if view.place == place]
-        found = [sphere_from_outline(eyes[view.camera], view.outline_px, view.radius_mm) for view in here]
+        found = [sphere_from_outline(cameras[view.camera], view.outline_px, view.radius_mm) for view in here]
         start[3 * place : 3 * place + 3] = np.mean(found, axis=0)
 
     def residuals(values: Floats) -> Floats:
         centres, shifts = values[: 3 * count].reshape(-1, 3), values[3 * count :]
         off = [
-            outline_errors(eyes[view.camera], view.outline_px, centres[view.place], view.radius_mm)
+            outline_errors(cameras[view.camera], view.outline_px, centres[view.place], view.radius_mm)
             - shifts[view.camera]
             for view in views
         ]

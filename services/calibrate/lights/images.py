@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibrate.lights.mirror import Eye, outline_errors, sphere_from_outline
+from services.calibrate.lights.mirror import PosedCamera, outline_errors, sphere_from_outline
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -72,7 +72,7 @@ def about_outline(outline_px: Floats, shape: tuple[int, ...]) -> tuple[slice, sl
     return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
 
-def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) -> Outline | None:
+def find_outline(grey: Image, camera: PosedCamera, radius_mm: float, distance_mm: float) -> Outline | None:
     """Find the outline of a sphere of known radius at about the given distance; None where none is found.
 
     A circle search in a reduced image comes first. Then the steepest change of brightness along rays from the middle is
@@ -87,7 +87,7 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
     # Clip at four times the 60th percentile, because highlights are much brighter than any outline.
     top = 4 * float(np.percentile(small, 60)) + 1e-12
     eight = np.clip(small / top * 255, 0, 255).astype(np.uint8)
-    expected = float(eye.lens.values[0]) * radius_mm / distance_mm / shrink
+    expected = float(camera.lens.values[0]) * radius_mm / distance_mm / shrink
     circle = _circle(cv2.GaussianBlur(eight, (0, 0), 1.0), expected)
     if circle is None:
         return None
@@ -102,12 +102,12 @@ def find_outline(grey: Image, eye: Eye, radius_mm: float, distance_mm: float) ->
     near = cv2.GaussianBlur(np.log(part + np.float32(floor)).astype(np.float32), (0, 0), SMOOTHING_PX)
     logs = Logs(near, low, (width, height))
     for band in BANDS:
-        sphere = sphere_from_outline(eye, points, radius_mm)
-        found = _edges(logs, eye, sphere, radius_mm, band)
-        points = _without_outliers(found, eye, radius_mm)
+        sphere = sphere_from_outline(camera, points, radius_mm)
+        found = _edges(logs, camera, sphere, radius_mm, band)
+        points = _without_outliers(found, camera, radius_mm)
         if len(points) < MIN_EDGES:
             return None
-    off = outline_errors(eye, points, sphere_from_outline(eye, points, radius_mm), radius_mm)
+    off = outline_errors(camera, points, sphere_from_outline(camera, points, radius_mm), radius_mm)
     return Outline(points, float(np.sqrt(np.mean(off**2))))
 
 
@@ -136,8 +136,8 @@ def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
         return None
     bright = (inside & (smooth - level > HALF * peak)).astype(np.uint8)
     _, labels = cv2.connectedComponents(bright)
-    mine = labels == labels[row, column]
-    weights = np.where(mine, part - level - HALF * peak * 0.5, 0)
+    in_highlight = labels == labels[row, column]
+    weights = np.where(in_highlight, part - level - HALF * peak * 0.5, 0)
     weights = np.maximum(weights, 0)
     total = float(weights.sum())
     return np.array([(weights * (x + 0.5)).sum() / total, (weights * (y + 0.5)).sum() / total])
@@ -169,19 +169,19 @@ def _circle(image: NDArray[np.uint8], expected_px: float) -> Floats | None:
     return None
 
 
-def _edges(logs: Logs, eye: Eye, sphere_mm: Floats, radius_mm: float, band: float) -> Floats:
+def _edges(logs: Logs, camera: PosedCamera, sphere_mm: Floats, radius_mm: float, band: float) -> Floats:
     """Return the points (E, 2) of steepest change across the outline of a sphere, within a band about it."""
     import cv2
 
-    middle = eye.project(sphere_mm[None])[0]
-    towards = sphere_mm - eye.centre_mm
+    middle = camera.project(sphere_mm[None])[0]
+    towards = sphere_mm - camera.centre_mm
     distance = float(np.linalg.norm(towards))
     axis, sine = towards / distance, radius_mm / distance
     one = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     one /= np.linalg.norm(one)
     circle = _unit_circle()
     across = circle[:, :1] * one + circle[:, 1:] * np.cross(axis, one)
-    edge = eye.project(eye.centre_mm + distance * (np.sqrt(1 - sine**2) * axis + sine * across))
+    edge = camera.project(camera.centre_mm + distance * (np.sqrt(1 - sine**2) * axis + sine * across))
     outward = (edge - middle) / np.linalg.norm(edge - middle, axis=1, keepdims=True)
     half = max(band * float(np.linalg.norm(edge - middle, axis=1).mean()), MIN_BAND_PX)
     offsets = np.arange(-half, half + 0.25, 0.25)
@@ -200,12 +200,12 @@ def _edges(logs: Logs, eye: Eye, sphere_mm: Floats, radius_mm: float, band: floa
     return np.asarray(found[inside & (top > 0)])
 
 
-def _without_outliers(points: Floats, eye: Eye, radius_mm: float) -> Floats:
+def _without_outliers(points: Floats, camera: PosedCamera, radius_mm: float) -> Floats:
     """Return the points (E, 2) without outliers from the outline of one sphere, which is fitted again three times."""
     for _ in range(3):
         if len(points) < MIN_EDGES:
             return points
-        off = outline_errors(eye, points, sphere_from_outline(eye, points, radius_mm), radius_mm)
+        off = outline_errors(camera, points, sphere_from_outline(camera, points, radius_mm), radius_mm)
         scale = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), 0.02)
         points = points[np.abs(off - np.median(off)) < OUTLIER_SIGMAS * scale]
     return points

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibrate.lights.mirror import Eye
+from services.calibrate.lights.mirror import PosedCamera
 from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
@@ -104,11 +104,13 @@ class IntensityFit:
     used: tuple[int, ...]
 
 
-def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def shading(
+    camera: PosedCamera, sphere: WhiteSphere, light_mm: Floats, pixels: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the factor cos θ ÷ (π d²) in mm⁻² at pixels (N,), and a mask (N,) of the pixels that show a usable part of
     the sphere.
     """
-    rays, origin = eye.directions(pixels), eye.centre_mm
+    rays, origin = camera.directions(pixels), camera.centre_mm
     towards = sphere.centre_mm - origin
     middle = rays @ towards
     inside = middle**2 - towards @ towards + sphere.radius_mm**2
@@ -122,11 +124,11 @@ def shading(eye: Eye, sphere: WhiteSphere, light_mm: Floats, pixels: Floats) -> 
     return np.asarray(cosine / (np.pi * distance**2)), np.asarray(usable)
 
 
-def slope(photo: WhitePhoto, eye: Eye, sphere: WhiteSphere, light_mm: Floats) -> Floats | None:
+def slope(photo: WhitePhoto, camera: PosedCamera, sphere: WhiteSphere, light_mm: Floats) -> Floats | None:
     """Return the ratio (C,) of the values to the known factor times the reflectance, by least squares under shot noise;
     None where fewer than ``MIN_PIXELS`` pixels are usable.
     """
-    factor, usable = shading(eye, sphere, light_mm, photo.pixels)
+    factor, usable = shading(camera, sphere, light_mm, photo.pixels)
     if np.count_nonzero(usable) < MIN_PIXELS:
         return None
     # The variance of shot noise is proportional to the value and so to the factor: with weights 1 ÷ factor the
@@ -136,7 +138,7 @@ def slope(photo: WhitePhoto, eye: Eye, sphere: WhiteSphere, light_mm: Floats) ->
 
 def fit_intensity(
     photos: Sequence[WhitePhoto],
-    eyes: Sequence[Eye],
+    cameras: Sequence[PosedCamera],
     spheres: Sequence[WhiteSphere],
     lights_mm: Floats,
     light_names: Sequence[str],
@@ -146,7 +148,7 @@ def fit_intensity(
 
     Args:
         photos: photographs of white spheres, each under one light.
-        eyes: calibrated cameras.
+        cameras: calibrated cameras.
         spheres: white spheres by place.
         lights_mm: positions of the lights (L, 3).
         light_names: names of the lights, for messages.
@@ -155,40 +157,50 @@ def fit_intensity(
     Raises:
         CaptureInputError: no photograph has enough pixels, or a sphere is dark in some channel under a light.
     """
-    found = [slope(one, eyes[one.camera], spheres[one.place], lights_mm[one.light]) for one in photos]
+    found = [slope(one, cameras[one.camera], spheres[one.place], lights_mm[one.light]) for one in photos]
     numbers = tuple(number for number, value in enumerate(found) if value is not None)
-    kept = [(photo, value) for photo, value in zip(photos, found, strict=True) if value is not None]
-    if not kept:
+    usable = [(photo, value) for photo, value in zip(photos, found, strict=True) if value is not None]
+    if not usable:
         raise CaptureInputError("No photograph of a white sphere shows enough of its lit side; photograph it larger.")
-    if dark := next((photo for photo, value in kept if value.min() <= 0), None):
+    if dark := next((photo for photo, value in usable if value.min() <= 0), None):
         raise CaptureInputError(
             f"Light {light_names[dark.light]} leaves a white sphere dark in some channel; look whether it was on, or"
             " another in its place."
         )
-    used = [photo for photo, _ in kept]
-    logs = np.log(np.array([value for _, value in kept]))
-    seen = np.unique([photo.light for photo in used])
+    used = [photo for photo, _ in usable]
+    logs = np.log(np.array([value for _, value in usable]))
+    shown_lights = np.unique([photo.light for photo in used])
     cosines = _log_cosines(used, spheres, lights_mm)
-    design = _design(used, seen, len(eyes))
+    design = _design(used, shown_lights, len(cameras))
     good = _without_wrong_photographs(design, logs)
     places = {photo.place for photo, is_good in zip(used, good, strict=True) if is_good}
     exponent, exponent_se = _common_exponent(design[good], logs[good].mean(axis=1), cosines[good], len(places))
     logs = logs - exponent * cosines[:, None]
     solver = np.zeros((design.shape[1], len(used)))
     solver[:, good] = np.linalg.pinv(design[good])
-    answer = solver @ logs
-    residuals = logs - design @ answer
+    solution = solver @ logs
+    residuals = logs - design @ solution
     freedom = max(np.count_nonzero(good) - np.linalg.matrix_rank(design[good]), 1)
     sigma = np.maximum(np.sqrt((residuals[good] ** 2).sum(axis=0) / freedom), SIGMA_FLOOR)
-    relative = np.exp(answer[: len(seen)])
+    relative = np.exp(solution[: len(shown_lights)])
     mean = relative.mean(axis=0)
     intensity = np.full((len(lights_mm), relative.shape[1]), np.nan)
-    intensity[seen] = relative / mean
-    steps = np.concatenate([np.zeros((1, relative.shape[1])), answer[len(seen) :]])
-    by_positions = _by_positions(used, eyes, spheres, lights_mm)
-    covariance, moved = _covariance(solver[: len(seen)], by_positions, sigma, relative, position_covariance)
+    intensity[shown_lights] = relative / mean
+    steps = np.concatenate([np.zeros((1, relative.shape[1])), solution[len(shown_lights) :]])
+    by_positions = _by_positions(used, cameras, spheres, lights_mm)
+    covariance, gain_by_positions = _covariance(
+        solver[: len(shown_lights)], by_positions, sigma, relative, position_covariance
+    )
     return IntensityFit(
-        intensity, 1 / (mean * np.exp(steps)), exponent, exponent_se, covariance, moved, sigma, residuals, numbers
+        intensity,
+        1 / (mean * np.exp(steps)),
+        exponent,
+        exponent_se,
+        covariance,
+        gain_by_positions,
+        sigma,
+        residuals,
+        numbers,
     )
 
 
@@ -207,9 +219,11 @@ def _without_wrong_photographs(design: Floats, logs: Floats) -> NDArray[np.bool_
         hat = design[good] @ np.linalg.pinv(design[good])
         # Take each residual against the fit of the other photographs. A photograph whose leverage is near 1 determines
         # its light alone, so the others cannot contradict it.
-        left = 1 - np.diag(hat)
+        one_minus_leverage = 1 - np.diag(hat)
         off = np.where(
-            left > MIN_FREEDOM, (brightness[good] - hat @ brightness[good]) / np.maximum(left, MIN_FREEDOM), 0.0
+            one_minus_leverage > MIN_FREEDOM,
+            (brightness[good] - hat @ brightness[good]) / np.maximum(one_minus_leverage, MIN_FREEDOM),
+            0.0,
         )
         scatter = MAD_TO_SIGMA * float(np.median(np.abs(off)))
         worst = int(np.argmax(np.abs(off)))
@@ -219,13 +233,15 @@ def _without_wrong_photographs(design: Floats, logs: Floats) -> NDArray[np.bool_
     return good
 
 
-def _design(photos: Sequence[WhitePhoto], seen: NDArray[np.int64], n_cameras: int) -> Floats:
-    """Return the design matrix (R, P): a column for each light in ``seen``, then one for each camera but the first."""
-    design = np.zeros((len(photos), len(seen) + n_cameras - 1))
+def _design(photos: Sequence[WhitePhoto], shown_lights: NDArray[np.int64], n_cameras: int) -> Floats:
+    """Return the design matrix (R, P): a column for each light in ``shown_lights``, then one for each camera but the
+    first.
+    """
+    design = np.zeros((len(photos), len(shown_lights) + n_cameras - 1))
     for row, photo in enumerate(photos):
-        design[row, np.searchsorted(seen, photo.light)] = 1
+        design[row, np.searchsorted(shown_lights, photo.light)] = 1
         if photo.camera > 0:
-            design[row, len(seen) + photo.camera - 1] = 1
+            design[row, len(shown_lights) + photo.camera - 1] = 1
     return design
 
 
@@ -249,15 +265,15 @@ def _common_exponent(design: Floats, logs: Floats, cosines: Floats, n_places: in
         return 0.0, float("inf")
     full = np.column_stack([design, cosines])
     inverse = np.linalg.pinv(full.T @ full)
-    answer = inverse @ full.T @ logs
+    solution = inverse @ full.T @ logs
     freedom = max(len(logs) - np.linalg.matrix_rank(full), 1)
-    error = float(np.sqrt(inverse[-1, -1] * ((logs - full @ answer) ** 2).sum() / freedom))
-    exponent = float(answer[-1])
+    error = float(np.sqrt(inverse[-1, -1] * ((logs - full @ solution) ** 2).sum() / freedom))
+    exponent = float(solution[-1])
     return (exponent, error) if exponent > LOBE_SIGMAS * error else (0.0, error)
 
 
 def _by_positions(
-    photos: Sequence[WhitePhoto], eyes: Sequence[Eye], spheres: Sequence[WhiteSphere], lights_mm: Floats
+    photos: Sequence[WhitePhoto], cameras: Sequence[PosedCamera], spheres: Sequence[WhiteSphere], lights_mm: Floats
 ) -> Floats:
     """Return the derivative (R, 3 L) in 1/mm of the slopes' logarithms with respect to the lights' positions, by
     central differences with a step of 0.1 mm.
@@ -269,7 +285,7 @@ def _by_positions(
             for sign in (-1, 1):
                 where = lights_mm[photo.light].copy()
                 where[axis] += sign * step
-                moved = slope(photo, eyes[photo.camera], spheres[photo.place], where)
+                moved = slope(photo, cameras[photo.camera], spheres[photo.place], where)
                 logs.append(np.log(moved).mean() if moved is not None else 0.0)
             derivative[row, 3 * photo.light + axis] = (logs[1] - logs[0]) / (2 * step)
     return derivative
@@ -287,7 +303,7 @@ def _covariance(
     """
     n_lights, n_channels = relative.shape
     size = n_lights * n_channels
-    covariance, moved = np.zeros((size, size)), np.zeros((size, by_positions.shape[1]))
+    covariance, gain_by_positions = np.zeros((size, size)), np.zeros((size, by_positions.shape[1]))
     for channel in range(n_channels):
         # Apply the gauge, a mean intensity of 1: subtract from each logarithm's error the mean of all, weighted by the
         # intensities.
@@ -295,7 +311,7 @@ def _covariance(
         rows = np.arange(n_lights) * n_channels + channel
         own = gauge @ solver
         covariance[np.ix_(rows, rows)] = sigma[channel] ** 2 * own @ own.T
-        moved[rows] = own @ by_positions
+        gain_by_positions[rows] = own @ by_positions
     if position_covariance is not None:
-        covariance += moved @ position_covariance @ moved.T
-    return covariance, moved
+        covariance += gain_by_positions @ position_covariance @ gain_by_positions.T
+    return covariance, gain_by_positions

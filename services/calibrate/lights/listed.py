@@ -29,7 +29,7 @@ mirrored, and a right-handed list never fits five times better when mirrored."""
 MIN_OUTLIER_MM = 20.0
 """Smallest distance of an outlier. Coordinates of a list measured by hand are off by some 4 mm, so lights closer than
 this are not misplaced, however well the few lights fit."""
-MAD_OF_DISTANCES = 1.538
+MEDIAN_LENGTH_SIGMAS = 1.538
 """Median length of a vector with three normal coordinates, in units of their σ."""
 
 
@@ -40,7 +40,7 @@ class AlignedList:
     Attributes:
         positions_mm: positions of all listed lights (L, 3).
         sigma_mm: standard deviation of one coordinate of the list about the found positions.
-        off_mm: distance between listed and found position (L,), NaN where no highlight was found.
+        distances_mm: distance between listed and found position (L,), NaN where no highlight was found.
         outliers: numbers of the lights that do not lie where they are listed.
         scale: median ratio of the distances between found lights to those between listed lights.
         is_mirrored: whether the list's mirror image fits far better, so that its frame is left-handed.
@@ -48,7 +48,7 @@ class AlignedList:
 
     positions_mm: Floats
     sigma_mm: float
-    off_mm: Floats
+    distances_mm: Floats
     outliers: tuple[int, ...]
     scale: float
     is_mirrored: bool
@@ -69,22 +69,22 @@ def align_list(listed_mm: Floats, found_mm: Floats) -> AlignedList | None:
     if np.count_nonzero(known) < MIN_LIGHTS:
         return None
     source, target = listed_mm[known], found_mm[known]
-    motion, off, sigma = _laid_over(source, target)
-    turned_over = source * [-1.0, 1.0, 1.0]
+    motion, off, sigma = _robust_alignment(source, target)
+    mirrored = source * [-1.0, 1.0, 1.0]
     distances = np.full(len(listed_mm), np.nan)
     distances[known] = off
     bad = np.flatnonzero(np.nan_to_num(distances) > max(OUTLIER_SIGMAS * sigma, MIN_OUTLIER_MM))
     return AlignedList(
         positions_mm=_moved(motion, listed_mm),
         sigma_mm=sigma,
-        off_mm=distances,
+        distances_mm=distances,
         outliers=tuple(int(n) for n in bad),
         scale=_scale(source, target),
-        is_mirrored=MIRRORED_TIMES * _laid_over(turned_over, target)[2] < sigma,
+        is_mirrored=MIRRORED_TIMES * _robust_alignment(mirrored, target)[2] < sigma,
     )
 
 
-def _laid_over(source: Floats, target: Floats) -> tuple[Floats, Floats, float]:
+def _robust_alignment(source: Floats, target: Floats) -> tuple[Floats, Floats, float]:
     """Return the rigid motion (4, 4) of the alignment, the remaining distances (N,) in mm, and the standard deviation
     of one coordinate in mm.
     """
@@ -92,7 +92,7 @@ def _laid_over(source: Floats, target: Floats) -> tuple[Floats, Floats, float]:
     for _ in range(ROUNDS):
         motion = _rigid(source, target, weights)
         off = np.linalg.norm(_moved(motion, source) - target, axis=1)
-        sigma = max(float(np.median(off)) / MAD_OF_DISTANCES, NOISE_FLOOR_MM)
+        sigma = max(float(np.median(off)) / MEDIAN_LENGTH_SIGMAS, NOISE_FLOOR_MM)
         weights = 1 / (1 + (off / (CAUCHY_SIGMAS * sigma)) ** 2)
     return motion, off, sigma
 
@@ -103,8 +103,8 @@ def _scale(source: Floats, target: Floats) -> float:
     """
     one, two = np.triu_indices(len(source), 1)
     listed, found = (np.linalg.norm(points[one] - points[two], axis=1) for points in (source, target))
-    apart = listed > NOISE_FLOOR_MM
-    return float(np.median(found[apart] / listed[apart])) if apart.any() else 1.0
+    is_apart = listed > NOISE_FLOOR_MM
+    return float(np.median(found[is_apart] / listed[is_apart])) if is_apart.any() else 1.0
 
 
 def swapped_names(found_mm: Floats, aligned: AlignedList) -> list[tuple[int, int]]:
@@ -121,11 +121,11 @@ def swapped_names(found_mm: Floats, aligned: AlignedList) -> list[tuple[int, int
 
 def _rigid(source: Floats, target: Floats, weights: Floats) -> Floats:
     share = weights / weights.sum()
-    middle, aim = share @ source, share @ target
-    u, _, vt = np.linalg.svd((target - aim).T @ (share[:, None] * (source - middle)))
+    source_centre, target_centre = share @ source, share @ target
+    u, _, vt = np.linalg.svd((target - target_centre).T @ (share[:, None] * (source - source_centre)))
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = rotation, aim - rotation @ middle
+    motion[:3, :3], motion[:3, 3] = rotation, target_centre - rotation @ source_centre
     return pose_matrix(pose_vector(motion))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.cameras.lens import Lens
-from services.calibrate.lights.mirror import Eye
+from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.lights.problem import MIN_HIGHLIGHTS, Problem, SphereView
 from services.calibrate.reweighted import solve_reweighted
 
@@ -51,7 +51,7 @@ class Outlier:
     camera: int
     place: int
     light: int
-    off_px: float
+    residual_px: float
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class LightsFit:
         positions_mm: positions of these lights (M, 3).
         centres_mm: centres of the spheres by place (P, 3).
         edge_shifts_px: edge shift of each camera (K,), positive outside the true outline.
-        eyes: the cameras, estimated from spheres and boards together.
+        cameras: the cameras, estimated from spheres and boards together.
         covariance: joint covariance of lights (3 M, mm), centres (3 P, mm), edge shifts (K, px) and, where the cameras'
             covariance was given, the lens values and pose of each camera in turn.
         highlight_sigma_px: standard deviation of one coordinate of a highlight.
@@ -76,7 +76,7 @@ class LightsFit:
     positions_mm: Floats
     centres_mm: Floats
     edge_shifts_px: Floats
-    eyes: tuple[Eye, ...]
+    cameras: tuple[PosedCamera, ...]
     covariance: Floats
     highlight_sigma_px: float
     outline_sigma_px: float
@@ -93,44 +93,44 @@ class _Weighted:
 
     Attributes:
         problem: residuals of all views.
-        eyes: the cameras at z = 0.
+        cameras: the cameras at z = 0.
         spread: square root (C, z) of the covariance of the cameras' C parameters; no columns for fixed cameras.
         sigmas: σ of a highlight's coordinate and of an edge point, in px (2,).
         good: mask of the highlights that are not outliers (N,).
     """
 
     problem: Problem
-    eyes: tuple[Eye, ...]
+    cameras: tuple[PosedCamera, ...]
     spread: Floats
     sigmas: Floats
     good: NDArray[np.bool_]
 
-    def moved_eyes(self, values: Floats) -> tuple[Eye, ...]:
+    def moved_cameras(self, values: Floats) -> tuple[PosedCamera, ...]:
         """Return the cameras for the given values."""
         off, first, moved = self.spread @ values[self.problem.length :], 0, []
-        for eye in self.eyes:
-            count = len(eye.lens.values)
-            lens = Lens(eye.lens.size, eye.lens.values + off[first : first + count])
-            moved.append(Eye(lens, eye.pose + off[first + count : first + count + 6]))
+        for camera in self.cameras:
+            count = len(camera.lens.values)
+            lens = Lens(camera.lens.size, camera.lens.values + off[first : first + count])
+            moved.append(PosedCamera(lens, camera.pose + off[first + count : first + count + 6]))
             first += count + 6
         return tuple(moved)
 
     def residuals(self, values: Floats) -> Floats:
         """Return the residuals of the highlights, the edges, and the priors of edge shifts and of cameras."""
-        eyes, problem = self.moved_eyes(values), self.problem
-        off = problem.highlights(eyes, values) * self.good[:, None] / self.sigmas[0]
+        cameras, problem = self.moved_cameras(values), self.problem
+        off = problem.highlights(cameras, values) * self.good[:, None] / self.sigmas[0]
         shifts = problem.split(values)[2] / EDGE_SHIFT_SE_PX
         return np.concatenate(
-            [off.ravel(), problem.outlines(eyes, values) / self.sigmas[1], shifts, values[problem.length :]]
+            [off.ravel(), problem.outlines(cameras, values) / self.sigmas[1], shifts, values[problem.length :]]
         )
 
-    def by_own(self, values: Floats) -> Floats:
+    def by_geometry(self, values: Floats) -> Floats:
         """Return the derivative of all residuals with respect to lights, centres and edge shifts.
 
         Each residual depends on at most one light and one centre, so one axis of all lights, or of all centres, is
         changed at once.
         """
-        problem, eyes = self.problem, self.moved_eyes(values)
+        problem, cameras = self.problem, self.moved_cameras(values)
         n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
         derivative = np.zeros((n_highlights + n_edges + len(values) - problem.first_shift, problem.length))
         sides = np.arange(n_highlights).reshape(-1, 2)
@@ -141,12 +141,14 @@ class _Weighted:
             for columns in (lights, centres):
                 step = np.zeros(len(values))
                 step[columns] = STEP
-                slope = (problem.highlights(eyes, values + step) - problem.highlights(eyes, values - step)) / (2 * STEP)
+                slope = (problem.highlights(cameras, values + step) - problem.highlights(cameras, values - step)) / (
+                    2 * STEP
+                )
                 derivative[sides, columns[:, None]] = slope * weight
             edge_columns = problem.first_centre + 3 * problem.edge_place + axis
             step = np.zeros(len(values))
             step[edge_columns] = STEP
-            slope = (problem.outlines(eyes, values + step) - problem.outlines(eyes, values - step)) / (2 * STEP)
+            slope = (problem.outlines(cameras, values + step) - problem.outlines(cameras, values - step)) / (2 * STEP)
             derivative[edges, edge_columns] = slope / self.sigmas[1]
         derivative[edges, problem.first_shift + problem.edge_camera] = -1 / self.sigmas[1]
         shifts = np.arange(problem.n_cameras)
@@ -159,7 +161,7 @@ class _Weighted:
 
         Each residual depends on one camera only, so one parameter of all cameras is changed at once.
         """
-        problem, eyes = self.problem, self.moved_eyes(values)
+        problem, cameras = self.problem, self.moved_cameras(values)
         n_highlights, n_edges = 2 * len(problem.row), len(problem.edge_place)
         count = self.spread.shape[1]
         whole = np.zeros((n_highlights + n_edges + problem.n_cameras + count, count))
@@ -167,13 +169,14 @@ class _Weighted:
             return whole
         own = np.zeros((n_highlights + n_edges, len(self.spread)))
         se = np.sqrt((self.spread**2).sum(axis=1))
-        first = np.cumsum([0, *(_length(eye) for eye in eyes)])
-        cameras = np.concatenate([np.repeat(problem.camera, 2), problem.edge_camera])
-        for value in range(max(map(_length, eyes))):
-            having = [camera for camera, eye in enumerate(eyes) if value < _length(eye)]
-            steps = {camera: STEP_SIGMAS * se[first[camera] + value] for camera in having}
+        first = np.cumsum([0, *(_length(camera) for camera in cameras)])
+        residual_cameras = np.concatenate([np.repeat(problem.camera, 2), problem.edge_camera])
+        for value in range(max(map(_length, cameras))):
+            with_value = [number for number, camera in enumerate(cameras) if value < _length(camera)]
+            steps = {number: STEP_SIGMAS * se[first[number] + value] for number in with_value}
             ahead, back = (
-                [_moved(eye, value, sign * steps.get(k, 0.0)) for k, eye in enumerate(eyes)] for sign in (1, -1)
+                [_moved(camera, value, sign * steps.get(k, 0.0)) for k, camera in enumerate(cameras)]
+                for sign in (1, -1)
             )
             slope = np.concatenate(
                 [
@@ -183,30 +186,30 @@ class _Weighted:
                     (problem.outlines(ahead, values) - problem.outlines(back, values)) / self.sigmas[1],
                 ]
             )
-            for camera in having:
-                mine = np.flatnonzero(cameras == camera)
-                own[mine, first[camera] + value] = slope[mine] / (2 * steps[camera])
+            for number in with_value:
+                mine = np.flatnonzero(residual_cameras == number)
+                own[mine, first[number] + value] = slope[mine] / (2 * steps[number])
         whole[: len(own)] = own @ self.spread
         whole[len(own) + problem.n_cameras :] = np.eye(count)
         return whole
 
 
-def _length(eye: Eye) -> int:
+def _length(camera: PosedCamera) -> int:
     """Return the number of a camera's parameters, those of its lens and its pose."""
-    return len(eye.lens.values) + 6
+    return len(camera.lens.values) + 6
 
 
-def _moved(eye: Eye, value: int, step: float) -> Eye:
+def _moved(camera: PosedCamera, value: int, step: float) -> PosedCamera:
     """Return the camera with one of its parameters changed by a step."""
-    values = np.concatenate([eye.lens.values, eye.pose])
+    values = np.concatenate([camera.lens.values, camera.pose])
     if step:
         values[value] += step
-    return Eye(Lens(eye.lens.size, values[:-6]), values[-6:])
+    return PosedCamera(Lens(camera.lens.size, values[:-6]), values[-6:])
 
 
 def fit_lights(
     views: Sequence[SphereView],
-    eyes: Sequence[Eye],
+    cameras: Sequence[PosedCamera],
     light_names: Sequence[str],
     camera_covariance: Floats | None = None,
 ) -> LightsFit:
@@ -214,7 +217,7 @@ def fit_lights(
 
     Args:
         views: mirror spheres in photographs.
-        eyes: the calibrated cameras.
+        cameras: the calibrated cameras.
         light_names: names of the lights, for messages.
         camera_covariance: covariance (C, C) of the lens values and pose of each camera in turn; exact cameras by
             default.
@@ -222,24 +225,24 @@ def fit_lights(
     Raises:
         CaptureInputError: a light has only one highlight.
     """
-    problem = Problem(views, len(eyes), light_names)
-    spread = _square_root(camera_covariance) if camera_covariance is not None else np.zeros((_states(eyes), 0))
-    weighted = _Weighted(problem, tuple(eyes), spread, np.ones(2), np.ones(len(problem.row), dtype=bool))
-    values, weighted = _without_outliers(weighted, problem.start(eyes))
+    problem = Problem(views, len(cameras), light_names)
+    spread = _square_root(camera_covariance) if camera_covariance is not None else np.zeros((_states(cameras), 0))
+    weighted = _Weighted(problem, tuple(cameras), spread, np.ones(2), np.ones(len(problem.row), dtype=bool))
+    values, weighted = _without_outliers(weighted, problem.start(cameras))
     values = np.concatenate([values, np.zeros(spread.shape[1])])
     # The first plain fit estimates the σ of highlights and edges, the second uses them as weights.
     for _ in range(2):
         values = _solve(weighted, values)
-        moved = weighted.moved_eyes(values)
+        moved = weighted.moved_cameras(values)
         off, edges = problem.highlights(moved, values)[weighted.good], problem.outlines(moved, values)
         highlight = np.sqrt((off**2).sum() / max(off.size - 3 * len(problem.lights), 1))
-        outline = np.sqrt((edges**2).sum() / max(len(edges) - 3 * problem.n_places - len(eyes), 1))
+        outline = np.sqrt((edges**2).sum() / max(len(edges) - 3 * problem.n_places - len(cameras), 1))
         weighted = replace(weighted, sigmas=np.maximum([highlight, outline], SIGMA_FLOOR_PX))
     return _finished(weighted, values, with_cameras=camera_covariance is not None)
 
 
-def _states(eyes: Sequence[Eye]) -> int:
-    return sum(map(_length, eyes))
+def _states(cameras: Sequence[PosedCamera]) -> int:
+    return sum(map(_length, cameras))
 
 
 def _square_root(covariance: Floats) -> Floats:
@@ -259,18 +262,18 @@ def _without_outliers(weighted: _Weighted, values: Floats) -> tuple[Floats, _Wei
         The values, and the problem with its new σ and mask of good highlights.
     """
     problem = weighted.problem
-    held = replace(weighted, spread=np.zeros((len(weighted.spread), 0)))
+    fixed = replace(weighted, spread=np.zeros((len(weighted.spread), 0)))
     for _ in range(ROBUST_ROUNDS):
-        values = _solve(held, values, HUBER_SIGMAS)
-        off, edges = problem.highlights(held.eyes, values), problem.outlines(held.eyes, values)
+        values = _solve(fixed, values, HUBER_SIGMAS)
+        off, edges = problem.highlights(fixed.cameras, values), problem.outlines(fixed.cameras, values)
         medians = [float(np.median(np.abs(off))), float(np.median(np.abs(edges)))]
-        held = replace(held, sigmas=np.maximum(MAD_TO_SIGMA * np.array(medians), SIGMA_FLOOR_PX))
-    good = np.asarray(np.abs(off).max(axis=1) <= OUTLIER_SIGMAS * held.sigmas[0])
+        fixed = replace(fixed, sigmas=np.maximum(MAD_TO_SIGMA * np.array(medians), SIGMA_FLOOR_PX))
+    good = np.asarray(np.abs(off).max(axis=1) <= OUTLIER_SIGMAS * fixed.sigmas[0])
     for row in range(len(problem.lights)):
         mine = problem.row == row
         if np.count_nonzero(good & mine) < MIN_HIGHLIGHTS:
             good |= mine
-    return values, replace(weighted, sigmas=held.sigmas, good=good)
+    return values, replace(weighted, sigmas=fixed.sigmas, good=good)
 
 
 def _solve(weighted: _Weighted, values: Floats, huber: float | None = None) -> Floats:
@@ -278,7 +281,7 @@ def _solve(weighted: _Weighted, values: Floats, huber: float | None = None) -> F
     by_cameras = weighted.by_cameras(values)
     return solve_reweighted(
         weighted.residuals,
-        lambda x: np.concatenate([weighted.by_own(x), by_cameras], axis=1),
+        lambda x: np.concatenate([weighted.by_geometry(x), by_cameras], axis=1),
         values,
         huber,
     )
@@ -287,17 +290,17 @@ def _solve(weighted: _Weighted, values: Floats, huber: float | None = None) -> F
 def _finished(weighted: _Weighted, values: Floats, *, with_cameras: bool) -> LightsFit:
     """Return the result with the covariance (JᵀJ)⁻¹ at the solution, the cameras' parameters in their own units."""
     problem = weighted.problem
-    slope = np.concatenate([weighted.by_own(values), weighted.by_cameras(values)], axis=1)
+    slope = np.concatenate([weighted.by_geometry(values), weighted.by_cameras(values)], axis=1)
     scale = 1 / np.sqrt((slope**2).sum(axis=0))
     inverse = np.linalg.inv((slope * scale).T @ (slope * scale)) * np.outer(scale, scale)
     if with_cameras:
-        cameras, count = weighted.spread, problem.length
-        to_units = np.zeros((count + len(cameras), len(values)))
-        to_units[:count, :count], to_units[count:, count:] = np.eye(count), cameras
+        spread, count = weighted.spread, problem.length
+        to_units = np.zeros((count + len(spread), len(values)))
+        to_units[:count, :count], to_units[count:, count:] = np.eye(count), spread
         inverse = to_units @ inverse @ to_units.T
     lights, centres, shifts = problem.split(values)
-    eyes = weighted.moved_eyes(values)
-    off = problem.highlights(eyes, values)
+    cameras = weighted.moved_cameras(values)
+    off = problem.highlights(cameras, values)
     left_out = np.flatnonzero(~weighted.good)
     named = problem.lights[problem.row]
     return LightsFit(
@@ -305,7 +308,7 @@ def _finished(weighted: _Weighted, values: Floats, *, with_cameras: bool) -> Lig
         positions_mm=lights,
         centres_mm=centres,
         edge_shifts_px=shifts,
-        eyes=eyes,
+        cameras=cameras,
         covariance=(inverse + inverse.T) / 2,
         highlight_sigma_px=float(weighted.sigmas[0]),
         outline_sigma_px=float(weighted.sigmas[1]),

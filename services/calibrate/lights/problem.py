@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.lights.mirror import (
-    Eye,
+    PosedCamera,
     highlight_points,
     mirrored_rays,
     nearest_point,
@@ -53,21 +53,21 @@ class Problem:
 
     def __init__(self, views: Sequence[SphereView], n_cameras: int, light_names: Sequence[str]) -> None:
         self.views = views
-        seen = np.concatenate([view.lights for view in views])
-        self.lights, counts = np.unique(seen, return_counts=True)
+        light_numbers = np.concatenate([view.lights for view in views])
+        self.lights, counts = np.unique(light_numbers, return_counts=True)
         if few := [int(n) for n, count in zip(self.lights, counts, strict=True) if count < MIN_HIGHLIGHTS]:
             raise CaptureInputError(
                 f"Light {light_names[few[0]]} shows on a mirror sphere only once, which tells a direction and no place;"
                 " photograph the sphere in a second place or by a second camera."
             )
         self.n_places, self.n_cameras = max(view.place for view in views) + 1, n_cameras
-        self.row = np.searchsorted(self.lights, seen)
+        self.row = np.searchsorted(self.lights, light_numbers)
         per_view, edges = [len(view.lights) for view in views], [len(view.outline_px) for view in views]
         self.camera, self.edge_camera = (np.repeat([view.camera for view in views], n) for n in (per_view, edges))
         self.place, self.edge_place = (np.repeat([view.place for view in views], n) for n in (per_view, edges))
         self._radius, self._edge_radius = (np.repeat([view.radius_mm for view in views], n) for n in (per_view, edges))
-        self._found = np.concatenate([view.highlights_px for view in views])
-        self._edges = np.concatenate([view.outline_px for view in views])
+        self._highlights_px = np.concatenate([view.highlights_px for view in views])
+        self._edges_px = np.concatenate([view.outline_px for view in views])
 
     @property
     def length(self) -> int:
@@ -89,44 +89,46 @@ class Problem:
         first, second = self.first_centre, self.first_shift
         return values[:first].reshape(-1, 3), values[first:second].reshape(-1, 3), values[second : self.length]
 
-    def start(self, eyes: Sequence[Eye]) -> Floats:
+    def start(self, cameras: Sequence[PosedCamera]) -> Floats:
         """Return first values of the unknowns: each sphere from its outlines alone, and each light at the point nearest
         to its reflected rays; edge shifts are 0.
         """
         centres = np.zeros((self.n_places, 3))
         for place in range(self.n_places):
             here = [view for view in self.views if view.place == place]
-            found = [sphere_from_outline(eyes[view.camera], view.outline_px, view.radius_mm) for view in here]
+            found = [sphere_from_outline(cameras[view.camera], view.outline_px, view.radius_mm) for view in here]
             centres[place] = np.mean(found, axis=0)
         mirrored = [
-            mirrored_rays(eyes[view.camera], view.highlights_px, centres[view.place], view.radius_mm)
+            mirrored_rays(cameras[view.camera], view.highlights_px, centres[view.place], view.radius_mm)
             for view in self.views
         ]
         points, rays = (np.concatenate(parts) for parts in zip(*mirrored, strict=True))
         lights = [nearest_point(points[self.row == row], rays[self.row == row]) for row in range(len(self.lights))]
         return np.concatenate([np.ravel(lights), centres.ravel(), np.zeros(self.n_cameras)])
 
-    def highlights(self, eyes: Sequence[Eye], values: Floats) -> Floats:
+    def highlights(self, cameras: Sequence[PosedCamera], values: Floats) -> Floats:
         """Return detected minus projected highlights (N, 2) in px."""
         lights, centres, _ = self.split(values)
-        where = np.array([eye.centre_mm for eye in eyes])[self.camera]
+        where = np.array([camera.centre_mm for camera in cameras])[self.camera]
         points = highlight_points(where, lights[self.row], centres[self.place], self._radius)
-        off = np.empty_like(self._found)
-        for camera, eye in enumerate(eyes):
-            mine = self.camera == camera
+        off = np.empty_like(self._highlights_px)
+        for number, camera in enumerate(cameras):
+            mine = self.camera == number
             if mine.any():
-                off[mine] = self._found[mine] - eye.project(points[mine])
+                off[mine] = self._highlights_px[mine] - camera.project(points[mine])
         return off
 
-    def outlines(self, eyes: Sequence[Eye], values: Floats) -> Floats:
+    def outlines(self, cameras: Sequence[PosedCamera], values: Floats) -> Floats:
         """Return the distances (E,) in px of detected edges from the projected outlines, positive outside, minus the
         camera's edge shift.
         """
         _, centres, shifts = self.split(values)
-        off = np.empty(len(self._edges))
-        for camera, eye in enumerate(eyes):
-            mine = self.edge_camera == camera
+        off = np.empty(len(self._edges_px))
+        for number, camera in enumerate(cameras):
+            mine = self.edge_camera == number
             if mine.any():
                 where = centres[self.edge_place[mine]]
-                off[mine] = outline_errors(eye, self._edges[mine], where, self._edge_radius[mine]) - shifts[camera]
+                off[mine] = (
+                    outline_errors(camera, self._edges_px[mine], where, self._edge_radius[mine]) - shifts[number]
+                )
         return off

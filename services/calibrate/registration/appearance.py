@@ -23,12 +23,12 @@ middles alone puts an outline up to 1.5 pixels too far in."""
 TOOTH_BINS = 2.0
 """Width in bins of the Gaussian that smooths the tooth's histogram along brightness, because teeth have more shades
 than the few pixels at their rims show."""
-PERHAPS = 0.3
+MAX_OUTSIDE_LIKENESS = 0.3
 """Likeness to tooth from which a pixel outside is no longer used for training, because it may show a tooth that the
 scan does not have."""
-LOOKS = 3
+TRAINING_ROUNDS = 3
 """Number of rounds of training, each without the pixels that the previous round left out."""
-MIN_LEFT = 1 / 3
+MIN_REMAINING_SHARE = 1 / 3
 """Smallest fraction of the pixels outside that must remain for training. Where teeth and their surroundings look alike,
 all of them would be left out."""
 SMOOTH_PX = 1.0
@@ -75,13 +75,13 @@ def learn_appearance(image: NDArray[np.float32], tooth: NDArray[np.bool_], size_
     index = np.clip((features - low) / np.maximum(high - low, 1e-6) * BINS, 0, BINS - 1).astype(np.int64)
     flat = np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), (BINS,) * features.shape[-1])
     tooth_density = _histogram(flat[inside], features.shape[-1], TOOTH_BINS)
-    likeness, fewest = np.zeros(tooth.shape, dtype=np.float32), MIN_LEFT * np.count_nonzero(outside)
-    for _ in range(LOOKS):
+    likeness, fewest = np.zeros(tooth.shape, dtype=np.float32), MIN_REMAINING_SHARE * np.count_nonzero(outside)
+    for _ in range(TRAINING_ROUNDS):
         if np.count_nonzero(outside) < fewest:
             break
         other_density = _histogram(flat[outside], features.shape[-1], SMOOTH_BINS)
         likeness = (tooth_density / (tooth_density + other_density))[flat].astype(np.float32)
-        outside = outside & (likeness < PERHAPS)
+        outside = outside & (likeness < MAX_OUTSIDE_LIKENESS)
     return Appearance(
         cv2.GaussianBlur(likeness, (0, 0), SMOOTH_PX),
         cv2.GaussianBlur(features[..., 0].astype(np.float32), (0, 0), SMOOTH_PX),

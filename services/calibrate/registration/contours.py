@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.registration.pose import Floats
-from services.calibrate.registration.visible import NOTHING, seen_surfaces
+from services.calibrate.registration.visible import NOTHING, visible_surfaces
 from services.core.geometry import Camera, Mesh
 
 SMOOTH_PX = 1.5
@@ -46,7 +46,7 @@ def tooth_contours(
 
     An outline runs midway between the two pixels' centres, so that it has no mean offset from the true outline.
     """
-    label, depth = seen_surfaces(camera, [*teeth, *occluders])
+    label, depth = visible_surfaces(camera, [*teeth, *occluders])
     teeth_alone = np.where(label < len(teeth), label, NOTHING).astype(np.int16)
     parts = [_steps(label, depth, teeth_alone, axis) for axis in (0, 1)]
     x, y, nearer, tooth, between, gums = (np.concatenate([part[k] for part in parts]) for k in range(6))

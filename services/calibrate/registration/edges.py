@@ -47,23 +47,23 @@ def edges_in_light(
         Distances (N,) in px of the edges from the points, outwards, and a mask (N,) of the edges that could be located;
         the others keep ``near_px``.
     """
-    moved, is_told = _looked_at(image, pixels + near_px[:, None] * outward, outward)
+    shift, is_located = _locate(image, pixels + near_px[:, None] * outward, outward)
     # Repeat from the position found, because samples that are not centred on an edge miss more of its blur on one side.
-    again, is_told_again = _looked_at(image, pixels + (near_px + moved)[:, None] * outward, outward)
-    is_told &= is_told_again & (np.abs(moved + again) < FARTHEST_PX)
-    return np.where(is_told, near_px + moved + again, near_px), is_told
+    second_shift, is_located_again = _locate(image, pixels + (near_px + shift)[:, None] * outward, outward)
+    is_located &= is_located_again & (np.abs(shift + second_shift) < FARTHEST_PX)
+    return np.where(is_located, near_px + shift + second_shift, near_px), is_located
 
 
-def _looked_at(image: NDArray[np.float32], pixels: Floats, outward: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    seen, is_within = _sampled(image, pixels[:, None] + SAMPLES[:, None] * outward[:, None])
-    inside, outside = seen[:, INNER].mean(axis=1), seen[:, OUTER].mean(axis=1)
-    share, is_told = _share(seen, outside)
-    unshaded, is_unshaded = _share_in_any_shade(seen, inside, outside)
-    coloured = _away(inside, outside) > COLOURED
-    share, is_told = np.where(coloured[:, None], unshaded, share), np.where(coloured, is_unshaded, is_told)
-    moved = np.trapezoid(share, SAMPLES, axis=1) - HALF_PX
-    is_told &= is_within & (np.abs(moved) < FARTHEST_PX)
-    return np.where(is_told, moved, 0.0), is_told
+def _locate(image: NDArray[np.float32], pixels: Floats, outward: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    profile, is_within = _sampled(image, pixels[:, None] + SAMPLES[:, None] * outward[:, None])
+    inside, outside = profile[:, INNER].mean(axis=1), profile[:, OUTER].mean(axis=1)
+    share, is_located = _inner_share(profile, outside)
+    unshaded, is_unshaded = _inner_share_in_any_shade(profile, inside, outside)
+    coloured = _colour_distance(inside, outside) > COLOURED
+    share, is_located = np.where(coloured[:, None], unshaded, share), np.where(coloured, is_unshaded, is_located)
+    shift = np.trapezoid(share, SAMPLES, axis=1) - HALF_PX
+    is_located &= is_within & (np.abs(shift) < FARTHEST_PX)
+    return np.where(is_located, shift, 0.0), is_located
 
 
 def _sampled(image: NDArray[np.float32], place: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -78,31 +78,31 @@ def _sampled(image: NDArray[np.float32], place: Floats) -> tuple[Floats, NDArray
     return np.stack(found, axis=-1).astype(np.float64), is_within
 
 
-def _share(seen: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _inner_share(profile: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     # A tooth darkens towards its rim, so its light is extrapolated along a line; the light behind it does not depend on
     # the rim and is taken as constant.
     line = np.stack([np.ones_like(SAMPLES), SAMPLES], axis=1)
-    inside = np.einsum("sk,kt,ntc->nsc", line, np.linalg.pinv(line[INNER]), seen[:, INNER])
+    inside = np.einsum("sk,kt,ntc->nsc", line, np.linalg.pinv(line[INNER]), profile[:, INNER])
     # Project on the difference between inner and outer light at the edge.
-    way = inside - outside[:, None]
-    across = way[:, len(SAMPLES) // 2]
-    whole = np.einsum("nsc,nc->ns", way, across)
-    is_told = (whole > 0).all(axis=1)
-    gone = np.einsum("nsc,nc->ns", seen - outside[:, None], across)
-    return gone / np.where(is_told[:, None], whole, 1.0), is_told
+    contrast = inside - outside[:, None]
+    edge_contrast = contrast[:, len(SAMPLES) // 2]
+    full_contrast = np.einsum("nsc,nc->ns", contrast, edge_contrast)
+    is_located = (full_contrast > 0).all(axis=1)
+    projected = np.einsum("nsc,nc->ns", profile - outside[:, None], edge_contrast)
+    return projected / np.where(is_located[:, None], full_contrast, 1.0), is_located
 
 
-def _share_in_any_shade(seen: Floats, inside: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _inner_share_in_any_shade(profile: Floats, inside: Floats, outside: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     # Write the light as a sum of the inner and the outer colour. Shading on both changes only the sum of the two
     # amounts, not their ratio.
     colours = np.stack([inside, outside], axis=2)
-    amounts = np.einsum("nkc,nsc->nsk", np.linalg.pinv(colours), seen)
+    amounts = np.einsum("nkc,nsc->nsk", np.linalg.pinv(colours), profile)
     both = amounts.sum(axis=2)
-    is_told = (both > DARKEST).all(axis=1)
-    return amounts[..., 0] / np.where(is_told[:, None], both, 1.0), is_told
+    is_located = (both > DARKEST).all(axis=1)
+    return amounts[..., 0] / np.where(is_located[:, None], both, 1.0), is_located
 
 
-def _away(inside: Floats, outside: Floats) -> Floats:
+def _colour_distance(inside: Floats, outside: Floats) -> Floats:
     # Return the distance (N,) of the outer light from the colour of the inner light, divided by the inner light.
     size = np.maximum((inside**2).sum(axis=1), np.finfo(np.float64).tiny)
     apart = outside - ((inside * outside).sum(axis=1) / size)[:, None] * inside

@@ -21,7 +21,7 @@ from services.core.geometry import Camera
 CLICK_MM = 0.3
 """Standard error of a click in mm: the accuracy with which people place the tip of a cusp, in a scan and in a
 photograph together."""
-FAR = 4.0
+WRONG_CLICK_SIGMAS = 4.0
 """Error of a click in standard errors from which on it counts as wrong: one in 3,000 good clicks in two dimensions."""
 DRAWS = 60
 """Number of random subsets for starting poses. With a third of the clicks wrong, 60 triples all contain a wrong click
@@ -31,12 +31,12 @@ MIN_CLICKS = 4
 and no way to recognise a wrong click."""
 MIN_POINTS = 3
 """Smallest number of landmarks in several cameras for a starting pose: three points determine a rigid pose."""
-PARALLEL = 1e4
+MAX_CONDITION = 1e4
 """Condition number of the normal equations of lines of sight above which they are too parallel for triangulation."""
-FLAT = 1e-3
+MIN_SPREAD_RATIO = 1e-3
 """Squared ratio of the points' spread across a line to that along it, below which the rotation about the line is
 undetermined."""
-TRIED = 12
+REFINED_STARTS = 12
 """Number of starting poses that are refined over all cameras."""
 MAX_WRONG_SHARE = 1 / 3
 """Largest fraction of wrong clicks: with more of them, another pose may agree with as many clicks."""
@@ -106,51 +106,59 @@ def fit_landmarks(
         )
     # Distant cameras see little perspective, so a start may be tilted to the wrong side. The refinement over all
     # cameras reveals this.
-    best = _best(cameras, clicks, starts, click_mm, TRIED)
+    best = _best(cameras, clicks, starts, click_mm, REFINED_STARTS)
     refined = [_refined(cameras, clicks, start, centre_mm, click_mm)[0] for start in best]
     (best_start,) = _best(cameras, clicks, [*best, *refined], click_mm, 1)
-    kept = np.ones(len(clicks), dtype=bool)
+    inliers = np.ones(len(clicks), dtype=bool)
     pose, covariance = best_start, np.eye(6)
     for _ in range(len(clicks)):
         # Fit all clicks robustly in the first round, then only those within the limit, until the same clicks remain.
         pose, covariance = _refined(
-            cameras, [one for one, good in zip(clicks, kept, strict=True) if good], best_start, centre_mm, click_mm
+            cameras, [one for one, good in zip(clicks, inliers, strict=True) if good], best_start, centre_mm, click_mm
         )
-        good = _errors(cameras, clicks, pose, click_mm) < FAR
-        if (good == kept).all():
+        good = _errors(cameras, clicks, pose, click_mm) < WRONG_CLICK_SIGMAS
+        if (good == inliers).all():
             break
-        kept = good
-        if np.count_nonzero(kept) < MIN_CLICKS:
+        inliers = good
+        if np.count_nonzero(inliers) < MIN_CLICKS:
             break
     error = _errors(cameras, clicks, pose, click_mm)
-    wrong = [one for one, good in zip(clicks, kept, strict=True) if not good]
-    is_believed = len(wrong) <= MAX_WRONG_SHARE * len(clicks) and np.count_nonzero(kept) >= MIN_CLICKS
-    told = tuple(f"{one.name} in camera {one.camera}, {_offset_px(cameras, one, pose):.0f} px off" for one in wrong)
+    wrong = [one for one, good in zip(clicks, inliers, strict=True) if not good]
+    is_plausible = len(wrong) <= MAX_WRONG_SHARE * len(clicks) and np.count_nonzero(inliers) >= MIN_CLICKS
+    wrong_clicks = tuple(
+        f"{one.name} in camera {one.camera}, {_offset_px(cameras, one, pose):.0f} px off" for one in wrong
+    )
     residual_px = {
         name: float(
             np.median(
                 [
                     _offset_px(cameras, one, pose)
-                    for one, good in zip(clicks, kept, strict=True)
+                    for one, good in zip(clicks, inliers, strict=True)
                     if good and one.camera == name
                 ]
             )
         )
         for name in cameras
-        if any(good and one.camera == name for one, good in zip(clicks, kept, strict=True))
+        if any(good and one.camera == name for one, good in zip(clicks, inliers, strict=True))
     }
     step = PoseStep(
-        "landmarks", pose, covariance, residual_px, float(np.median(error[kept]) * click_mm), int(kept.sum()), told
+        "landmarks",
+        pose,
+        covariance,
+        residual_px,
+        float(np.median(error[inliers]) * click_mm),
+        int(inliers.sum()),
+        wrong_clicks,
     )
-    return step, None if is_believed else _contradiction(cameras, clicks, pose, kept)
+    return step, None if is_plausible else _contradiction(cameras, clicks, pose, inliers)
 
 
 def _best(
     cameras: Mapping[str, Camera], clicks: Sequence[Click], poses: Sequence[RigidPose], click_mm: float, count: int
 ) -> list[RigidPose]:
-    # Sort the poses by the sum of squared errors, each limited to FAR, so that a wrong click counts the same however
-    # far off it is.
-    errors = [np.minimum(_errors(cameras, clicks, pose, click_mm), FAR) for pose in poses]
+    # Sort the poses by the sum of squared errors, each limited to WRONG_CLICK_SIGMAS, so that a wrong click counts
+    # the same however far off it is.
+    errors = [np.minimum(_errors(cameras, clicks, pose, click_mm), WRONG_CLICK_SIGMAS) for pose in poses]
     return [poses[k] for k in np.argsort([float((error**2).sum()) for error in errors])[:count]]
 
 
@@ -167,7 +175,7 @@ def _triangulated(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> tup
             origin, direction = cameras[one.camera].rays(one.pixel[:1], one.pixel[1:])
             across = np.eye(3) - np.outer(direction[0], direction[0])
             normal, right = normal + across, right + across @ origin
-        if np.linalg.cond(normal) < PARALLEL:
+        if np.linalg.cond(normal) < MAX_CONDITION:
             scan.append(own[0].point_mm)
             rig.append(np.linalg.solve(normal, right))
     return np.array(scan).reshape(-1, 3), np.array(rig).reshape(-1, 3)
@@ -182,9 +190,9 @@ def _starts_from_points(scan_mm: Floats, rig_mm: Floats) -> Iterator[RigidPose]:
     for chosen in [np.arange(len(scan_mm)), *(draws if len(scan_mm) > MIN_POINTS else [])]:
         one, two = scan_mm[chosen], rig_mm[chosen]
         left, size, right = np.linalg.svd((two - two.mean(axis=0)).T @ (one - one.mean(axis=0)))
-        if size[1] > FLAT * size[0]:
-            turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
-            yield RigidPose(turn, two.mean(axis=0) - turn @ one.mean(axis=0))
+        if size[1] > MIN_SPREAD_RATIO * size[0]:
+            rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+            yield RigidPose(rotation, two.mean(axis=0) - rotation @ one.mean(axis=0))
 
 
 def _starts(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> Iterator[RigidPose]:
@@ -206,9 +214,12 @@ def _starts(cameras: Mapping[str, Camera], clicks: Sequence[Click]) -> Iterator[
                 )
             except cv2.error:
                 continue
-            for turn, shift in zip(found[1], found[2], strict=True):
+            for rotation_vector, translation in zip(found[1], found[2], strict=True):
                 camera_from_scan = np.eye(4)
-                camera_from_scan[:3, :3], camera_from_scan[:3, 3] = cv2.Rodrigues(turn)[0], np.reshape(shift, 3)
+                camera_from_scan[:3, :3], camera_from_scan[:3, 3] = (
+                    cv2.Rodrigues(rotation_vector)[0],
+                    np.reshape(translation, 3),
+                )
                 pose = world_from_camera @ camera_from_scan
                 if np.isfinite(pose).all():
                     yield RigidPose(pose[:3, :3], pose[:3, 3])
@@ -252,15 +263,15 @@ def _refined(
     return pose, np.linalg.inv(normal + 1e-12 * np.trace(normal) * np.eye(6))
 
 
-def _contradiction(cameras: Mapping[str, Camera], clicks: Sequence[Click], pose: RigidPose, kept: np.ndarray) -> str:
+def _contradiction(cameras: Mapping[str, Camera], clicks: Sequence[Click], pose: RigidPose, inliers: np.ndarray) -> str:
     # Say how many clicks are wrong, and name the one that is farthest from its prediction.
-    wrong = [one for one, good in zip(clicks, kept, strict=True) if not good]
+    wrong = [one for one, good in zip(clicks, inliers, strict=True) if not good]
     worst = max(wrong, key=lambda one: _offset_px(cameras, one, pose))
-    said = (
+    message = (
         f"{len(wrong)} of {len(clicks)} landmarks contradict the others; the worst is {worst.name} in camera "
         f"{worst.camera}, {_offset_px(cameras, worst, pose):.0f} px from where the scan has it"
     )
     return (
-        f"{said}; see whether landmarks are exchanged, left with right or tooth with tooth, and whether the scan is"
+        f"{message}; see whether landmarks are exchanged, left with right or tooth with tooth, and whether the scan is"
         " this person's."
     )

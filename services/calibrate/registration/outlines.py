@@ -25,9 +25,9 @@ NARROW_PX = 3.0
 """Distance to which edges are searched in the last rounds, in which their position is then refined in the light."""
 STEP_PX = 0.5
 """Distance between samples across an outline."""
-POINTS = 1500
+MAX_POINTS = 1500
 """Largest number of outline points per camera: neighbouring points give the same information."""
-CLEAR = 0.25
+MIN_STRENGTH = 0.25
 """Smallest strength of an edge, as a fraction of the 90th percentile of the edges' strengths."""
 TUKEY = 2.5
 """Distance in standard errors beyond which a point has no weight (Tukey's biweight). The usual 4.7 would save a fifth
@@ -67,7 +67,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundEdges:
     """Edges of a photograph that were found for the outline points of its view."""
 
     contour: Contour
@@ -100,25 +100,25 @@ def pose_from_outlines(
     """
     pose, prior = start.pose, np.asarray(np.linalg.inv(start.covariance), dtype=np.float64)
     appearances: list[Appearance] = []
-    found: list[Found] = []
+    found: list[FoundEdges] = []
     normal, spread, shifts_px = _with_shifts(prior), {}, np.zeros(len(SHIFT_PX))
     for number in range(ROUNDS):
         # Narrow the search from the uncertainty of the start to a few pixels.
         reach = max(reach_px * 0.75**number, NARROW_PX)
-        moved = [_placed(mesh, pose) for mesh in teeth]
-        hidden = [_placed(mesh, pose) for mesh in occluders]
-        drawn = [tooth_contours(view.camera, moved, hidden) for view in views]
+        moved = [_transformed(mesh, pose) for mesh in teeth]
+        hidden = [_transformed(mesh, pose) for mesh in occluders]
+        predicted = [tooth_contours(view.camera, moved, hidden) for view in views]
         if number % 4 == 0:
             appearances = [
                 learn_appearance(view.image, label >= 0, reach / 2)
-                for view, (_, label) in zip(views, drawn, strict=True)
+                for view, (_, label) in zip(views, predicted, strict=True)
             ]
         found = [
-            _searched(_thinned(contour), appearance, reach)
-            for (contour, _), appearance in zip(drawn, appearances, strict=True)
+            _search_edges(_subsampled(contour), appearance, reach)
+            for (contour, _), appearance in zip(predicted, appearances, strict=True)
         ]
         if reach <= NARROW_PX:
-            found = [_in_light(one, view.image) for one, view in zip(found, views, strict=True)]
+            found = [_refine_in_light(one, view.image) for one, view in zip(found, views, strict=True)]
         centre = pose.apply(centre_mm[None])[0]
         normal = _with_shifts(prior)
         right = normal @ np.concatenate([pose.twist_to(start.pose, centre), -shifts_px])
@@ -134,13 +134,13 @@ def pose_from_outlines(
     _require_edges(found)
     centre = pose.apply(centre_mm[None])[0]
     covariance = _sandwich(views, found, centre, len(teeth), shifts_px, normal, prior)
-    apart = {
+    median_px = {
         view.camera.name: float(np.median(np.abs(one.offset_px[one.is_found])))
         for view, one in zip(views, found, strict=True)
         if one.is_found.any()
     }
-    sizes = [millimetres_a_pixel(view.camera, centre[None])[0] for view in views if view.camera.name in apart]
-    residual_mm = float(np.mean([px * size for px, size in zip(apart.values(), sizes, strict=True)]))
+    sizes = [millimetres_a_pixel(view.camera, centre[None])[0] for view in views if view.camera.name in median_px]
+    residual_mm = float(np.mean([px * size for px, size in zip(median_px.values(), sizes, strict=True)]))
     missing = [
         (
             f"{1 - one.is_found.mean():.0%} of the outlines in camera {view.camera.name}"
@@ -150,7 +150,13 @@ def pose_from_outlines(
         for view, one in zip(views, found, strict=True)
     ]
     return PoseStep(
-        "outlines", pose, covariance, apart, residual_mm, int(sum(one.is_found.sum() for one in found)), tuple(missing)
+        "outlines",
+        pose,
+        covariance,
+        median_px,
+        residual_mm,
+        int(sum(one.is_found.sum() for one in found)),
+        tuple(missing),
     )
 
 
@@ -166,34 +172,34 @@ def outline_misfit_mm(
     distances = []
     for view in views:
         contour, label = tooth_contours(
-            view.camera, [_placed(mesh, pose) for mesh in teeth], [_placed(mesh, pose) for mesh in occluders]
+            view.camera, [_transformed(mesh, pose) for mesh in teeth], [_transformed(mesh, pose) for mesh in occluders]
         )
         if len(contour.pixels) == 0:
             continue
         size_mm = float(np.median(millimetres_a_pixel(view.camera, contour.points_mm)))
         appearance = learn_appearance(view.image, label >= 0, 0.5 * reach_mm / size_mm)
-        found = _searched(_thinned(contour), appearance, reach_mm / size_mm)
+        found = _search_edges(_subsampled(contour), appearance, reach_mm / size_mm)
         off = np.where(found.is_found, np.abs(found.offset_px) * size_mm, reach_mm)
         distances.append(off[~found.contour.between])
     return float(np.median(np.concatenate(distances))) if distances else reach_mm
 
 
-def _placed(mesh: Mesh, pose: RigidPose) -> Mesh:
+def _transformed(mesh: Mesh, pose: RigidPose) -> Mesh:
     return Mesh(pose.apply(mesh.vertices_mm), mesh.faces)
 
 
-def _thinned(contour: Contour) -> Contour:
-    if len(contour.pixels) <= POINTS:
+def _subsampled(contour: Contour) -> Contour:
+    if len(contour.pixels) <= MAX_POINTS:
         return contour
-    chosen = np.sort(np.random.default_rng(0).choice(len(contour.pixels), POINTS, replace=False))
+    chosen = np.sort(np.random.default_rng(0).choice(len(contour.pixels), MAX_POINTS, replace=False))
     return Contour(*(getattr(contour, field)[chosen] for field in Contour.__dataclass_fields__))
 
 
-def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Found:
+def _search_edges(contour: Contour, appearance: Appearance, reach_px: float) -> FoundEdges:
     import cv2
 
     if len(contour.pixels) == 0:
-        return Found(contour, np.zeros(0), np.zeros(0, dtype=bool))
+        return FoundEdges(contour, np.zeros(0), np.zeros(0, dtype=bool))
     # Sample along the line across each point, with additional samples at both ends for the differences.
     steps = np.arange(-np.ceil(reach_px / STEP_PX), np.ceil(reach_px / STEP_PX) + 1) * STEP_PX
     padded = np.concatenate([steps[0] - STEP_PX * np.arange(4, 0, -1), steps, steps[-1] + STEP_PX * np.arange(1, 5)])
@@ -220,13 +226,13 @@ def _searched(contour: Contour, appearance: Appearance, reach_px: float) -> Foun
         best = score.argmax(axis=1)
         top = np.take_along_axis(strength[own], best[:, None], axis=1)[:, 0]
         inner = (best > 0) & (best < len(steps) - 1)
-        clear = inner & np.isfinite(score.max(axis=1)) & (top > CLEAR * np.percentile(top, 90)) & (top > 0)
+        clear = inner & np.isfinite(score.max(axis=1)) & (top > MIN_STRENGTH * np.percentile(top, 90)) & (top > 0)
         offset[own] = steps[best] + STEP_PX * _vertex(strength[own], np.clip(best, 1, len(steps) - 2))
         is_found[own] = clear
-    return Found(contour, offset, is_found)
+    return FoundEdges(contour, offset, is_found)
 
 
-def _in_light(found: Found, image: NDArray[np.float32]) -> Found:
+def _refine_in_light(found: FoundEdges, image: NDArray[np.float32]) -> FoundEdges:
     # A dark line between teeth has the same light on both sides, so its position remains that of the darkest sample.
     contour, offset, is_found = found.contour, found.offset_px.copy(), found.is_found.copy()
     own = np.flatnonzero(is_found & ~contour.between)
@@ -244,21 +250,21 @@ def _vertex(strength: Floats, best: NDArray[np.int64]) -> Floats:
 
 
 def _equations(
-    camera: Camera, found: Found, centre_mm: Floats, shifts_px: Floats
+    camera: Camera, found: FoundEdges, centre_mm: Floats, shifts_px: Floats
 ) -> tuple[Floats, Floats, Floats, float]:
     contour = found.contour
     across = np.einsum("nk,nkj->nj", contour.outward, pixel_derivatives(camera, contour.points_mm, centre_mm))
-    beside = _beside(contour)
-    across = np.concatenate([across, np.eye(len(SHIFT_PX))[beside]], axis=1)
-    residual = np.where(found.is_found, found.offset_px - shifts_px[beside], 0.0)
-    seen = np.abs(residual[found.is_found])
-    spread = max(1.4826 * float(np.median(seen)) if len(seen) else MIN_SPREAD_PX, MIN_SPREAD_PX)
+    neighbours = _neighbour_kinds(contour)
+    across = np.concatenate([across, np.eye(len(SHIFT_PX))[neighbours]], axis=1)
+    residual = np.where(found.is_found, found.offset_px - shifts_px[neighbours], 0.0)
+    found_px = np.abs(residual[found.is_found])
+    spread = max(1.4826 * float(np.median(found_px)) if len(found_px) else MIN_SPREAD_PX, MIN_SPREAD_PX)
     far = np.clip(np.abs(residual) / (TUKEY * spread), 0, 1)
     weight = found.is_found * (1 - far**2) ** 2 * np.where(contour.between, BETWEEN_WEIGHT, 1.0) / spread**2
     return across, residual, weight, spread
 
 
-def _beside(contour: Contour) -> NDArray[np.int64]:
+def _neighbour_kinds(contour: Contour) -> NDArray[np.int64]:
     # Return the index (N,) into ``SHIFT_PX`` of the kind of neighbour of each point.
     return np.where(contour.between, 2, contour.gums.astype(np.int64))
 
@@ -271,7 +277,7 @@ def _with_shifts(prior: Floats) -> Floats:
 
 def _sandwich(
     views: Sequence[View],
-    found: Sequence[Found],
+    found: Sequence[FoundEdges],
     centre_mm: Floats,
     teeth: int,
     shifts_px: Floats,
@@ -288,19 +294,19 @@ def _sandwich(
         side = np.floor((angle + np.pi) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
         np.add.at(scores, one.contour.tooth * SECTORS + side, (weight * residual)[:, None] * jacobian)
         together = np.zeros((len(SHIFT_PX) * SECTORS, len(normal)))
-        np.add.at(together, _beside(one.contour) * SECTORS + side, weight[:, None] * jacobian)
+        np.add.at(together, _neighbour_kinds(one.contour) * SECTORS + side, weight[:, None] * jacobian)
         sides.append(SIDE_PX * together)
     shared, count = np.concatenate(sides), int(scores.any(axis=1).sum())
     middle = scores.T @ scores * max(count, 7) / (max(count, 7) - 6) + shared.T @ shared
     inverse = np.linalg.inv(normal)
-    found_with = np.asarray(inverse @ (middle + _with_shifts(prior)) @ inverse)
-    return found_with[: len(prior), : len(prior)]
+    covariance = np.asarray(inverse @ (middle + _with_shifts(prior)) @ inverse)
+    return covariance[: len(prior), : len(prior)]
 
 
-def _require_edges(found: Sequence[Found]) -> None:
-    total, seen = sum(len(one.is_found) for one in found), sum(int(one.is_found.sum()) for one in found)
-    if total == 0 or seen < MIN_FOUND * total:
-        share = 0.0 if total == 0 else seen / total
+def _require_edges(found: Sequence[FoundEdges]) -> None:
+    total, found_count = sum(len(one.is_found) for one in found), sum(int(one.is_found.sum()) for one in found)
+    if total == 0 or found_count < MIN_FOUND * total:
+        share = 0.0 if total == 0 else found_count / total
         raise CaptureInputError(
             f"Only {share:.0%} of the teeth's outlines are seen as edges in the photographs; see in the overlay"
             " pictures whether the landmarks put the scan on the teeth, and whether the frames are sharp and bright."

@@ -39,14 +39,14 @@ def write_overlay(
 
     picture = displayed(view.image)
     for step in steps:
-        contour, _ = tooth_contours(view.camera, _placed(teeth, step.pose), _placed(occluders, step.pose))
+        contour, _ = tooth_contours(view.camera, _transformed(teeth, step.pose), _transformed(occluders, step.pose))
         column, row = np.floor(contour.pixels).astype(int).T
         picture[np.clip(row, 0, len(picture) - 1), np.clip(column, 0, picture.shape[1] - 1)] = COLOURS[step.name]
     for one in clicks if steps else ():
         if one.camera != view.camera.name:
             continue
-        there = view.camera.project(steps[-1].pose.apply(one.point_mm[None]))[0][0]
-        ends = [tuple(int(value) for value in np.round(place - 0.5)) for place in (one.pixel, there)]
+        predicted = view.camera.project(steps[-1].pose.apply(one.point_mm[None]))[0][0]
+        ends = [tuple(int(value) for value in np.round(place - 0.5)) for place in (one.pixel, predicted)]
         cv2.line(picture, ends[0], ends[1], PREDICTED, 1)
         cv2.circle(picture, ends[0], 4, CLICKED, 1)
         cv2.circle(picture, ends[1], 2, PREDICTED, -1)
@@ -79,11 +79,11 @@ def report_page(record: Registration) -> str:
 
 
 def _errors(covariance: Sequence[Sequence[float]]) -> str:
-    turn, move = np.split(np.sqrt(np.diag(np.asarray(covariance))), 2)
-    return f"{np.degrees(np.linalg.norm(turn)):.3f}°, {np.linalg.norm(move):.3f} mm"
+    rotation_se, translation_se = np.split(np.sqrt(np.diag(np.asarray(covariance))), 2)
+    return f"{np.degrees(np.linalg.norm(rotation_se)):.3f}°, {np.linalg.norm(translation_se):.3f} mm"
 
 
-def _placed(meshes: Sequence[Mesh], pose: RigidPose) -> list[Mesh]:
+def _transformed(meshes: Sequence[Mesh], pose: RigidPose) -> list[Mesh]:
     return [Mesh(pose.apply(mesh.vertices_mm), mesh.faces) for mesh in meshes]
 
 

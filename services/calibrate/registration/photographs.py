@@ -23,7 +23,7 @@ from services.core.raw.records import RawCamera, RawFolder, RawFrame
 
 WIDEST_PX = 2400
 """Largest width of a photograph; wider ones are reduced first. A pixel is then some 0.05 mm at the teeth."""
-CUT_PX = 700
+MAX_CROP_PX = 700
 """Largest width of the part around the teeth in which outlines are searched: a pixel is then 0.1 mm, and edges are
 located to a fraction of it."""
 MARGIN_MM = 4.0
@@ -63,7 +63,7 @@ def mean_photograph(root: Path, folder: RawFolder, name: str, black: float | Non
     Raises:
         CaptureInputError: the camera has no frame of the teeth.
     """
-    frames = folder.frames_of(name, "tracking")[:1] or _some(folder.frames_of(name, "light"))
+    frames = folder.frames_of(name, "tracking")[:1] or _spread_selection(folder.frames_of(name, "light"))
     if not frames:
         raise CaptureInputError(
             f"Camera {name} has no frame of kind tracking or light; add one that shows the teeth, or remove the camera."
@@ -77,17 +77,17 @@ def clicks_of(folder: RawFolder, calibration: Calibration, views: Mapping[str, V
     """Return the clicks of a raw folder's landmarks, with pixels of the undistorted and reduced images of the views."""
     clicks = []
     for landmark in folder.landmark:
-        for seen in landmark.pixels:
-            camera = _calibrated(calibration, seen.camera, folder.camera_named(seen.camera).size)
-            direction = _lens(camera).undistort(np.array([seen.xy_px], dtype=np.float64))
-            pixel = direction @ np.asarray(views[seen.camera].camera.K).T
+        for click in landmark.pixels:
+            camera = _calibrated(calibration, click.camera, folder.camera_named(click.camera).size)
+            direction = _lens(camera).undistort(np.array([click.xy_px], dtype=np.float64))
+            pixel = direction @ np.asarray(views[click.camera].camera.K).T
             name = f"{landmark.tooth} {landmark.point}"
-            clicks.append(Click(name, seen.camera, np.array(landmark.xyz_mm), pixel[0, :2] / pixel[0, 2]))
+            clicks.append(Click(name, click.camera, np.array(landmark.xyz_mm), pixel[0, :2] / pixel[0, 2]))
     return clicks
 
 
-def cut_out(view: View, points_mm: Floats) -> View:
-    """Crop a photograph to points of the rig (N, 3) with a margin, and reduce it to at most ``CUT_PX`` in width.
+def crop_to_points(view: View, points_mm: Floats) -> View:
+    """Crop a photograph to points of the rig (N, 3) with a margin, and reduce it to at most ``MAX_CROP_PX`` in width.
 
     Raises:
         CaptureInputError: the points do not lie in the photograph.
@@ -105,7 +105,7 @@ def cut_out(view: View, points_mm: Floats) -> View:
             " pose."
         )
     part = view.image[low[1] : high[1], low[0] : high[0]]
-    scale = min(1.0, CUT_PX / part.shape[1])
+    scale = min(1.0, MAX_CROP_PX / part.shape[1])
     size = (max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1))
     small = part if scale == 1 else cv2.resize(part, size, interpolation=cv2.INTER_AREA)
     by = np.array(size) / np.array(part.shape[1::-1])
@@ -130,9 +130,9 @@ def require_facing(cameras: Sequence[Camera], pose: RigidPose, arch_from_scan: F
     """
     centre, axes = pose.apply(centre_mm[None])[0], arch_from_scan[:3, :3] @ pose.rotation.T
     for camera in cameras:
-        placed = np.asarray(camera.camera_from_world)
-        towards = -placed[:3, :3].T @ placed[:3, 3] - centre
-        if max(axes[1] @ towards, axes[2] @ towards) > 0:
+        camera_from_world = np.asarray(camera.camera_from_world)
+        to_camera = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3] - centre
+        if max(axes[1] @ to_camera, axes[2] @ to_camera) > 0:
             return
     raise CaptureInputError(
         "The landmarks turn the teeth's back and their roots to every camera; exchange left and right, or give the"
@@ -162,7 +162,7 @@ def _lens(camera: CalibratedCamera) -> Lens:
     return Lens(camera.size, np.array([fx, fy, cx, cy, *(camera.distortion or ())]))
 
 
-def _some(frames: Sequence[RawFrame]) -> Sequence[RawFrame]:
+def _spread_selection(frames: Sequence[RawFrame]) -> Sequence[RawFrame]:
     count = min(len(frames), MAX_LIGHTS)
     return [frames[k * len(frames) // count] for k in range(count)]
 

@@ -40,16 +40,16 @@ class RigidPose:
         """
         from scipy.spatial.transform import Rotation
 
-        turn = Rotation.from_rotvec(twist[:3]).as_matrix()
-        return RigidPose(turn @ self.rotation, turn @ (self.translation_mm - centre_mm) + centre_mm + twist[3:])
+        rotation = Rotation.from_rotvec(twist[:3]).as_matrix()
+        return RigidPose(rotation @ self.rotation, rotation @ (self.translation_mm - centre_mm) + centre_mm + twist[3:])
 
     def twist_to(self, other: RigidPose, centre_mm: Floats) -> Floats:
         """Return the twist (6,) about a point of the rig (3,) that transforms this pose to another."""
         from scipy.spatial.transform import Rotation
 
-        turn = other.rotation @ self.rotation.T
-        shift = other.translation_mm - centre_mm - turn @ (self.translation_mm - centre_mm)
-        return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), shift])
+        rotation = other.rotation @ self.rotation.T
+        shift = other.translation_mm - centre_mm - rotation @ (self.translation_mm - centre_mm)
+        return np.concatenate([Rotation.from_matrix(rotation).as_rotvec(), shift])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,13 @@ from services.anatomy.scans.scanned_jaw import ScannedJaw, jaw_from_scan
 from services.calibrate.registration.landmarks import Click, fit_landmarks
 from services.calibrate.registration.outlines import View, outline_misfit_mm, pose_from_outlines
 from services.calibrate.registration.overlay import report_page, write_overlay
-from services.calibrate.registration.photographs import cameras_of, clicks_of, cut_out, photographs, require_facing
+from services.calibrate.registration.photographs import (
+    cameras_of,
+    clicks_of,
+    crop_to_points,
+    photographs,
+    require_facing,
+)
 from services.calibrate.registration.pose import Floats, PoseStep, RigidPose
 from services.core.calibration.record import Calibration
 from services.core.calibration.state import warnings_of
@@ -95,16 +101,16 @@ def register_folder(
     views = photographs(root, folder, calibration)
     clicks = clicks_of(folder, calibration, views)
     require_on_their_teeth(clicks, scanned)
-    steps, cut, misfit_mm = _registered(views, clicks, scanned, refused or out / PICTURES, max_misfit_mm)
+    steps, cropped, misfit_mm = _fit_pose(views, clicks, scanned, refused or out / PICTURES, max_misfit_mm)
 
     pose = steps[-1].pose
     pictures = []
-    for view in cut:
+    for view in cropped:
         pictures.append(f"{PICTURES}/overlay_{view.camera.name}.png")
         write_overlay(out / pictures[-1], view, scanned.teeth, [scanned.gums], steps, _in_view(clicks, views, view))
     for fdi, mesh in zip(scanned.fdi, scanned.teeth, strict=True):
-        write_mesh(teeth_folder(out, fdi) / "outer.ply", _placed(mesh, pose))
-    write_mesh(out / "gums.ply", _placed(scanned.gums, pose))
+        write_mesh(teeth_folder(out, fdi) / "outer.ply", _transformed(mesh, pose))
+    write_mesh(out / "gums.ply", _transformed(scanned.gums, pose))
     assert folder.scan is not None
     inputs = {
         path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (root / folder.scan.file, calibration_path)
@@ -134,35 +140,37 @@ def scanned_teeth(root: Path, folder: RawFolder) -> ScannedTeeth:
     }
     read = read_scan(root / scan.file, "either", scan.labels, units=scan.units, jaw=scan.jaw, points_mm=points_mm)
     jaw: ScannedJaw = jaw_from_scan(read, "whole")
-    parted = "" if read.is_labelled else f"Teeth parted along creases about landmarks of {len(points_mm)} teeth. "
+    separation = "" if read.is_labelled else f"Teeth parted along creases about landmarks of {len(points_mm)} teeth. "
     scan_from_arch = np.asarray(np.linalg.inv(jaw.arch_from_scan), dtype=np.float64)
-    back = RigidPose(scan_from_arch[:3, :3], scan_from_arch[:3, 3])
-    teeth = tuple(_placed(tooth.outer, back) for tooth in jaw.teeth)
+    arch_pose = RigidPose(scan_from_arch[:3, :3], scan_from_arch[:3, 3])
+    teeth = tuple(_transformed(tooth.outer, arch_pose) for tooth in jaw.teeth)
     fdi = tuple(tooth.fdi for tooth in jaw.teeth)
-    return ScannedTeeth(fdi, teeth, _placed(jaw.gums, back), jaw.arch_from_scan, parted + jaw.repairs.sentence())
+    return ScannedTeeth(
+        fdi, teeth, _transformed(jaw.gums, arch_pose), jaw.arch_from_scan, separation + jaw.repairs.sentence()
+    )
 
 
-def _registered(
+def _fit_pose(
     views: Mapping[str, View], clicks: Sequence[Click], scanned: ScannedTeeth, pictures: Path, max_misfit_mm: float
 ) -> tuple[list[PoseStep], list[View], float]:
     first, contradiction = fit_landmarks(cameras_of(views), clicks, scanned.centre_mm)
     steps = [first]
-    placed = steps[0].pose.apply(np.concatenate([mesh.vertices_mm for mesh in scanned.teeth]))
-    cut = [cut_out(view, placed) for view in views.values()]
+    teeth_mm = steps[0].pose.apply(np.concatenate([mesh.vertices_mm for mesh in scanned.teeth]))
+    cropped = [crop_to_points(view, teeth_mm) for view in views.values()]
     try:
         _require_agreement(contradiction)
         require_facing(list(cameras_of(views).values()), steps[0].pose, scanned.arch_from_scan, scanned.centre_mm)
-        reach_px = REACH_MM / min(view.camera.pixel_mm(placed.mean(axis=0)) for view in cut)
-        steps.append(pose_from_outlines(cut, scanned.teeth, [scanned.gums], steps[0], scanned.centre_mm, reach_px))
-        misfit_mm = outline_misfit_mm(cut, scanned.teeth, [scanned.gums], steps[-1].pose)
+        reach_px = REACH_MM / min(view.camera.pixel_mm(teeth_mm.mean(axis=0)) for view in cropped)
+        steps.append(pose_from_outlines(cropped, scanned.teeth, [scanned.gums], steps[0], scanned.centre_mm, reach_px))
+        misfit_mm = outline_misfit_mm(cropped, scanned.teeth, [scanned.gums], steps[-1].pose)
         _require_small(misfit_mm, max_misfit_mm)
     except CaptureInputError as problem:
         names = []
-        for view in cut:
+        for view in cropped:
             names.append(str(pictures / f"refused_{view.camera.name}.png"))
             write_overlay(Path(names[-1]), view, scanned.teeth, [scanned.gums], steps, _in_view(clicks, views, view))
         raise CaptureInputError(f"{problem.message[:-1]}; {', '.join(names)} show it.") from problem
-    return steps, cut, misfit_mm
+    return steps, cropped, misfit_mm
 
 
 def _require_agreement(contradiction: str | None) -> None:
@@ -209,18 +217,18 @@ def require_on_their_teeth(clicks: Sequence[Click], scanned: ScannedTeeth) -> No
             )
 
 
-def _in_view(clicks: Sequence[Click], views: Mapping[str, View], cut: View) -> list[Click]:
+def _in_view(clicks: Sequence[Click], views: Mapping[str, View], cropped: View) -> list[Click]:
     # Transform the clicks' pixels from the whole photograph to the cropped one.
-    whole, part = np.asarray(views[cut.camera.name].camera.K), np.asarray(cut.camera.K)
+    whole, part = np.asarray(views[cropped.camera.name].camera.K), np.asarray(cropped.camera.K)
     part_from_whole = part @ np.linalg.inv(whole)
     return [
         Click(one.name, one.camera, one.point_mm, (part_from_whole @ [*one.pixel, 1.0])[:2])
         for one in clicks
-        if one.camera == cut.camera.name
+        if one.camera == cropped.camera.name
     ]
 
 
-def _placed(mesh: Mesh, pose: RigidPose) -> Mesh:
+def _transformed(mesh: Mesh, pose: RigidPose) -> Mesh:
     return Mesh(pose.apply(mesh.vertices_mm), mesh.faces)
 
 

@@ -18,7 +18,7 @@ ROUNDING = -1e-9
 triangles."""
 
 
-def seen_surfaces(camera: Camera, meshes: Sequence[Mesh]) -> tuple[NDArray[np.int16], Floats]:
+def visible_surfaces(camera: Camera, meshes: Sequence[Mesh]) -> tuple[NDArray[np.int16], Floats]:
     """Return the number (H, W) of the mesh that is visible at each pixel's centre, -1 for none, and its depth in mm,
     infinite for none.
 

@@ -13,9 +13,9 @@ from services.calibrate.cameras.bundle import BundleFit, fit_bundle
 from services.calibrate.cameras.models import MODEL_FOR_OUTLIERS, ModelChoice, choose_lens
 from services.calibrate.cameras.sightings import View
 from services.calibrate.cameras.start import first_rig, usable
-from services.calibrate.lights.mirror import Eye
+from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.session.missed import why_missed
-from services.calibrate.session.photos import Photos, for_finders
+from services.calibrate.session.photos import Photos, to_eight_bit
 from services.core.errors import CaptureInputError
 from services.core.raw.records import RawFrame
 
@@ -41,10 +41,10 @@ class CamerasStep:
     missed: tuple[tuple[str, str], ...]
 
     @property
-    def eyes(self) -> tuple[Eye, ...]:
+    def posed_cameras(self) -> tuple[PosedCamera, ...]:
         """The calibrated cameras."""
         rig = self.fit.rig
-        return tuple(Eye(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
+        return tuple(PosedCamera(lens, pose) for lens, pose in zip(rig.lenses, rig.cameras, strict=True))
 
     @property
     def camera_covariance(self) -> Floats:
@@ -59,7 +59,7 @@ class CamerasStep:
     def distance_mm(self) -> float:
         """Median distance between cameras and boards."""
         places = self.fit.rig.places[:, 3:]
-        centres = np.array([eye.centre_mm for eye in self.eyes])
+        centres = np.array([camera.centre_mm for camera in self.posed_cameras])
         return float(np.median(np.linalg.norm(places[:, None] - centres[None], axis=2)))
 
 
@@ -118,7 +118,7 @@ def _find(
     places = list(dict.fromkeys(_place(frame) for frame in frames))
     views, missed = [], []
     for frame in frames:
-        image, board = for_finders(photos.grey(frame)), boards[str(frame.board)]
+        image, board = to_eight_bit(photos.grey(frame)), boards[str(frame.board)]
         found = detect(image, board)
         camera, place = names.index(frame.camera), places.index(_place(frame))
         view = View(camera, place, found.corners_mm, found.pixels, found.ids, frame.file)
@@ -142,10 +142,10 @@ def _renumbered(views: Sequence[View]) -> list[View]:
     return [replace(view, place=numbers.index(view.place)) for view in views]
 
 
-def model_told(choice: ModelChoice) -> str:
+def describe_model(choice: ModelChoice) -> str:
     """Return a phrase that says which distortion model was chosen and why."""
     if not choice.held_out_px:
         return f"{choice.lens.model}, held, as there are too few boards to leave any out"
-    told = ", ".join(f"{name} {value:.3f} px" for name, value in choice.held_out_px.items())
+    errors = ", ".join(f"{name} {value:.3f} px" for name, value in choice.held_out_px.items())
     plain = " (OpenCV's default)" if choice.lens.model == MODEL_FOR_OUTLIERS else ""
-    return f"{choice.lens.model}{plain}; on boards that were left out: {told}"
+    return f"{choice.lens.model}{plain}; on boards that were left out: {errors}"

@@ -18,7 +18,7 @@ from services.calibrate.colour.chart import (
 )
 from services.calibrate.colour.cie import delta_e_2000, lab_from_xyz
 from services.calibrate.colour.transform import ColourFit, fit_colour, least_squares_matrix
-from services.calibrate.session.photos import Channels, Photos, for_finders
+from services.calibrate.session.photos import Channels, Photos, to_eight_bit
 from services.core.errors import CaptureInputError
 from services.core.raw.records import RawFrame
 
@@ -65,8 +65,8 @@ def calibrate_colours(photos: Photos) -> ColourStep | None:
         )
     xyz = read_reference(photos.root / charts[str(frames[0].chart)].reference, str(frames[0].chart))
     for camera in dict.fromkeys(frame.camera for frame in frames):
-        mine = [frame for frame in frames if frame.camera == camera]
-        total = [_patches(photos, frame) for frame in mine]
+        own_frames = [frame for frame in frames if frame.camera == camera]
+        total = [_patches(photos, frame) for frame in own_frames]
         usable = np.logical_and.reduce([one.usable for one in total])
         # Sum photographs under single lights, because light is additive.
         summed = Patches(np.sum([one.means for one in total], axis=0), usable)
@@ -86,18 +86,18 @@ def better_order(step: ColourStep) -> dict[str, tuple[str, float, float]]:
         "mirrored left to right": numbers[:, ::-1],
         "mirrored top to bottom": numbers[::-1],
     }
-    told = {}
+    better_orders = {}
     for camera, rgb in step.rgb.items():
         worse = float(step.fits[camera].fitted.mean())
         for name, order in orders.items():
             turned = rgb[order.ravel()]
             usable = np.isfinite(turned).all(axis=1)
             matrix = least_squares_matrix(turned[usable], step.xyz[usable])
-            drawn = lab_from_xyz(turned[usable] @ matrix.T)
-            better = float(delta_e_2000(drawn, lab_from_xyz(step.xyz[usable])).mean())
+            fitted_lab = lab_from_xyz(turned[usable] @ matrix.T)
+            better = float(delta_e_2000(fitted_lab, lab_from_xyz(step.xyz[usable])).mean())
             if better < BETTER * worse:
-                told[camera] = (name, better, worse)
-    return told
+                better_orders[camera] = (name, better, worse)
+    return better_orders
 
 
 def _patches(photos: Photos, frame: RawFrame) -> Patches:
@@ -112,7 +112,7 @@ def _patches(photos: Photos, frame: RawFrame) -> Patches:
 
 
 def _search(channels: Channels) -> Floats | None:
-    bgr = np.stack([for_finders(channels.values[..., k]) for k in (2, 1, 0)], axis=-1)
+    bgr = np.stack([to_eight_bit(channels.values[..., k]) for k in (2, 1, 0)], axis=-1)
     found = find_corners(bgr)
     return None if found is None else found * channels.pixel
 
@@ -120,6 +120,6 @@ def _search(channels: Channels) -> Floats | None:
 def _between(fits: dict[str, ColourFit], rgb: dict[str, Floats]) -> float | None:
     if len(fits) < 2:
         return None
-    seen = np.logical_and.reduce([np.isfinite(one).all(axis=1) for one in rgb.values()])
-    labs = np.array([lab_from_xyz(fit.xyz(rgb[camera][seen])) for camera, fit in fits.items()])
+    common = np.logical_and.reduce([np.isfinite(one).all(axis=1) for one in rgb.values()])
+    labs = np.array([lab_from_xyz(fit.xyz(rgb[camera][common])) for camera, fit in fits.items()])
     return float(np.mean([delta_e_2000(one, labs.mean(axis=0)) for one in labs]))

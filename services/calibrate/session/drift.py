@@ -85,15 +85,15 @@ def _lights(old: Calibration, new: Calibration) -> Iterator[Change]:
     ]
     names = [f"light.{light.name}.{axis}" for light in common for axis in "xyz"]
     for number, light in enumerate(common):
-        (was, back), (now, forth) = (_from_middle(one, number) for one in places)
-        if (se := _joint_se(old, new, names, names, back, forth)) is not None:
+        (was, old_slope), (now, new_slope) = (_from_middle(one, number) for one in places)
+        if (se := _joint_se(old, new, names, names, old_slope, new_slope)) is not None:
             yield Change(f"distance of light {light.name} from the lights' middle", now - was, se, "mm")
         for channel, (dim, bright) in enumerate(zip(before[light.name].intensity, light.intensity, strict=True)):
             gain = [f"light_gain.{light.name}.{new.channels[channel]}"]
             percent = np.array([100.0])
             if (se := _joint_se(old, new, gain, gain, percent, percent)) is not None:
-                told = f"intensity of light {light.name} in {new.channels[channel]}"
-                yield Change(told, 100 * float(np.log(bright / dim)), se, "%")
+                what = f"intensity of light {light.name} in {new.channels[channel]}"
+                yield Change(what, 100 * float(np.log(bright / dim)), se, "%")
 
 
 def _from_middle(places: Floats, number: int) -> tuple[float, Floats]:
@@ -109,7 +109,12 @@ def _from_middle(places: Floats, number: int) -> tuple[float, Floats]:
 
 
 def _joint_se(
-    old: Calibration, new: Calibration, old_names: Sequence[str], new_names: Sequence[str], back: Floats, forth: Floats
+    old: Calibration,
+    new: Calibration,
+    old_names: Sequence[str],
+    new_names: Sequence[str],
+    old_slope: Floats,
+    new_slope: Floats,
 ) -> float | None:
     """Return the standard error of the difference of a quantity between two independent calibrations; None where one of
     them does not state the quantity's uncertainty.
@@ -119,16 +124,16 @@ def _joint_se(
         new: later calibration.
         old_names: names of the earlier calibration's uncertain values on which the quantity depends.
         new_names: the same of the later calibration.
-        back: derivative of the quantity with respect to the earlier values.
-        forth: derivative of the quantity with respect to the later values.
+        old_slope: derivative of the quantity with respect to the earlier values.
+        new_slope: derivative of the quantity with respect to the later values.
     """
     total = 0.0
-    for calibration, names, slope in ((old, old_names, back), (new, new_names, forth)):
+    for calibration, names, slope in ((old, old_names, old_slope), (new, new_names, new_slope)):
         if calibration.uncertainty is None:
             return None
-        place = {name: n for n, name in enumerate(calibration.uncertainty.names)}
-        if not set(names) <= place.keys():
+        index = {name: n for n, name in enumerate(calibration.uncertainty.names)}
+        if not set(names) <= index.keys():
             return None
-        chosen = [place[name] for name in names]
+        chosen = [index[name] for name in names]
         total += float(slope @ calibration.uncertainty.matrix[np.ix_(chosen, chosen)] @ slope)
     return total**0.5 if total > 0 else None

@@ -16,7 +16,7 @@ MIN_LIGHT = 0.05
 even source."""
 
 
-def fall_of_light(photos: Photos, camera: str, principal_px: Floats) -> tuple[float, float, float] | None:
+def measure_vignetting(photos: Photos, camera: str, principal_px: Floats) -> tuple[float, float, float] | None:
     """Fit the vignetting a, b, c of 1 + a q + b q² + c q³ to a camera's flat frames; None without any.
 
     q is the squared distance from the principal point, with half the image's diagonal as unit of length. All channels
@@ -31,19 +31,19 @@ def fall_of_light(photos: Photos, camera: str, principal_px: Floats) -> tuple[fl
     size = photos.folder.camera_named(camera).size
     rows = []
     for frame in frames:
-        seen = photos.channels(frame)
-        if seen.saturated.mean() > 0.001:
+        photo = photos.channels(frame)
+        if photo.saturated.mean() > 0.001:
             raise CaptureInputError(
-                f"Frame {frame.file} (camera {camera}) is saturated in {seen.saturated.mean():.1%} of its pixels;"
+                f"Frame {frame.file} (camera {camera}) is saturated in {photo.saturated.mean():.1%} of its pixels;"
                 " expose the flat field less."
             )
-        q, values = _cells(seen, size, principal_px)
+        q, values = _cells(photo, size, principal_px)
         # Divide by the brightness of the middle, so that all frames and channels have the same weight.
         rows += [(q, values[:, k] / np.median(values[q < np.quantile(q, 0.2), k])) for k in range(values.shape[1])]
-    return fit_fall(rows, camera)
+    return fit_vignetting(rows, camera)
 
 
-def fit_fall(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, float, float]:
+def fit_vignetting(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, float, float]:
     """Fit a, b, c to pairs of q (N,) and brightness (N,), each pair with a factor s of its own.
 
     Raises:
@@ -53,8 +53,8 @@ def fit_fall(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, flo
     # plain mean of a, b, c over the pairs.
     products = []
     for q, brightness in rows:
-        answer = np.linalg.lstsq(np.stack([np.ones_like(q), q, q**2, q**3], axis=1), brightness, rcond=None)[0]
-        products.append(answer[1:] / answer[0])
+        coefficients = np.linalg.lstsq(np.stack([np.ones_like(q), q, q**2, q**3], axis=1), brightness, rcond=None)[0]
+        products.append(coefficients[1:] / coefficients[0])
     a, b, c = (float(one) for one in np.mean(products, axis=0))
     edge = np.linspace(0, max(float(q.max()) for q, _ in rows), 50)
     if (1 + edge * (a + edge * (b + edge * c))).min() < MIN_LIGHT:
@@ -65,14 +65,14 @@ def fit_fall(rows: list[tuple[Floats, Floats]], camera: str) -> tuple[float, flo
     return a, b, c
 
 
-def _cells(seen: Channels, size: tuple[int, int], principal_px: Floats) -> tuple[Floats, Floats]:
+def _cells(photo: Channels, size: tuple[int, int], principal_px: Floats) -> tuple[Floats, Floats]:
     """Return q (N,) and the mean values (N, C) of the cells of an image."""
-    height, width, channels = seen.values.shape
+    height, width, channels = photo.values.shape
     edge = max(width // CELLS, 1)
     rows, columns = height // edge, width // edge
-    parts = seen.values[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge, channels)
+    parts = photo.values[: rows * edge, : columns * edge].reshape(rows, edge, columns, edge, channels)
     means = parts.mean(axis=(1, 3), dtype=np.float64).reshape(-1, channels)
-    x, y = np.meshgrid((np.arange(columns) + 0.5) * edge * seen.pixel, (np.arange(rows) + 0.5) * edge * seen.pixel)
+    x, y = np.meshgrid((np.arange(columns) + 0.5) * edge * photo.pixel, (np.arange(rows) + 0.5) * edge * photo.pixel)
     return relative_square(np.stack([x.ravel(), y.ravel()], axis=1), size, principal_px), means
 
 

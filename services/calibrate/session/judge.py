@@ -31,8 +31,8 @@ MAX_EMPTY = 0.3
 empty."""
 CHANNELS_OF_COLOUR = 3
 """Number of channels for which XYZ is fitted to a chart."""
-AGAIN = {"boards": "boards", "spheres": "spheres, larger or further apart,", "chart": "the chart"}
-PLAN = {
+SUBJECTS = {"boards": "boards", "spheres": "spheres, larger or further apart,", "chart": "the chart"}
+RETAKE_PLANS = {
     "boards": (
         "take boards in ten places and more, tilted by 20° to 40° in several directions, and fill the image with them"
     ),
@@ -54,14 +54,14 @@ class Limit:
         value: its value.
         limit: largest value that keeps the limit.
         unit: unit of value and limit.
-        mended_by: kind of photographs that would improve the figure.
+        improved_by: kind of photographs that would improve the figure.
     """
 
     what: str
     value: float
     limit: float
     unit: str
-    mended_by: Literal["boards", "spheres", "chart"]
+    improved_by: Literal["boards", "spheres", "chart"]
 
     @property
     def is_kept(self) -> bool:
@@ -157,8 +157,8 @@ def covered_cells(fit: BundleFit, camera: int) -> NDArray[np.bool_]:
     """Return a mask (rows · columns,) of the cells of the grid that contain an inlier corner."""
     columns, rows = GRID
     width, height = fit.rig.lenses[camera].size
-    seen = fit.corners.pixels[fit.inliers & (fit.corners.camera == camera)]
-    cell = np.clip((seen / [width, height] * [columns, rows]).astype(int), 0, [columns - 1, rows - 1])
+    corners_px = fit.corners.pixels[fit.inliers & (fit.corners.camera == camera)]
+    cell = np.clip((corners_px / [width, height] * [columns, rows]).astype(int), 0, [columns - 1, rows - 1])
     covered = np.zeros(columns * rows, dtype=bool)
     covered[cell[:, 1] * columns + cell[:, 0]] = True
     return covered
@@ -178,7 +178,7 @@ def _advice(
     """
     worst = max(limits, key=lambda one: one.value / one.limit)
     if not worst.is_kept:
-        return _again(worst, is_anything_wrong=bool(wrong))
+        return _retake_advice(worst, has_suspicions=bool(wrong))
     if lights is None:
         return (
             "Photograph a mirror sphere light by light in three or more places: without it the lights are where the"
@@ -203,19 +203,17 @@ def _advice(
     return "All limits are kept; nothing needs to be photographed again."
 
 
-def _again(worst: Limit, *, is_anything_wrong: bool) -> str:
+def _retake_advice(worst: Limit, *, has_suspicions: bool) -> str:
     """Return a sentence on what would improve the figure that exceeds its limit most."""
-    thing = AGAIN[worst.mended_by]
+    what = SUBJECTS[worst.improved_by]
     if not math.isfinite(worst.value):
-        return (
-            f"Photograph {thing} again: {worst.what} is not known at all, and {worst.limit:g} {worst.unit} are asked."
-        )
+        return f"Photograph {what} again: {worst.what} is not known at all, and {worst.limit:g} {worst.unit} are asked."
     times = math.ceil((worst.value / worst.limit) ** 2)
-    told = (
-        f"Photograph {thing} again: {worst.what} is {worst.value:.2g} {worst.unit} against {worst.limit:g} {worst.unit}"
+    retake = (
+        f"Photograph {what} again: {worst.what} is {worst.value:.2g} {worst.unit} against {worst.limit:g} {worst.unit}"
     )
-    if times > MAX_TIMES and is_anything_wrong:
-        return f"{told}; look at what looks wrong in the report first."
+    if times > MAX_TIMES and has_suspicions:
+        return f"{retake}; look at what looks wrong in the report first."
     if times > MAX_TIMES:
-        return f"{told}; photographs as these would not meet it: {PLAN[worst.mended_by]}."
-    return f"{told}; {times} times as many photographs would meet it, if chance alone is the cause."
+        return f"{retake}; photographs as these would not meet it: {RETAKE_PLANS[worst.improved_by]}."
+    return f"{retake}; {times} times as many photographs would meet it, if chance alone is the cause."

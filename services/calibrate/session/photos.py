@@ -16,7 +16,7 @@ from services.core.raw.records import RawFolder, RawFrame
 Image = NDArray[np.float32]
 Part = tuple[slice, slice]
 WHOLE: Part = (slice(None), slice(None))
-FINDER_VALUES = 2_000_000
+PERCENTILE_VALUES = 2_000_000
 """Approximate number of a photograph's values from which percentiles are taken: those of every n-th value are those of
 all, and sorting twenty million values takes longer than reading them."""
 ROUNDING = 1 / 12
@@ -87,8 +87,8 @@ class Photos:
         mosaic = self.folder.camera_named(frame.camera).mosaic
         code = getattr(cv2, f"COLOR_Bayer{mosaic}2GRAY")
         top = max(float(counts.max()), 1e-12)
-        drawn = cv2.cvtColor((np.maximum(counts, 0) / top * 65535).astype(np.uint16), code)
-        return np.asarray(drawn, dtype=np.float32) * np.float32(top / 65535)
+        interpolated = cv2.cvtColor((np.maximum(counts, 0) / top * 65535).astype(np.uint16), code)
+        return np.asarray(interpolated, dtype=np.float32) * np.float32(top / 65535)
 
     def channels(self, frame: RawFrame, part: Part = WHOLE) -> Channels:
         """Return the light by channel in a part of a photograph; a mosaic at half its size, without interpolation."""
@@ -102,9 +102,7 @@ class Photos:
         full = binned(is_full.astype(np.float32), camera.mosaic) > 0
         return Channels(binned(values, camera.mosaic), 2, np.asarray(full.any(axis=2)), first)
 
-    def _above_black(self, frame: RawFrame, counts: NDArray[np.generic] | None = None) -> Image:
-        if counts is None:
-            counts = read_counts(self.root, self.folder, frame)
+    def _above_black(self, frame: RawFrame, counts: NDArray[np.generic]) -> Image:
         scale = 1 / (frame.exposure_s * frame.gain * frame.level)
         return np.asarray((counts.astype(np.float32) - np.float32(self.black[frame.camera].counts)) * np.float32(scale))
 
@@ -133,9 +131,9 @@ def black_of(frames: Iterable[NDArray[np.generic]]) -> Black:
     return Black(float(np.mean(mean)), max(variance - ROUNDING, 0.0) ** 0.5)
 
 
-def for_finders(grey: Image) -> NDArray[np.uint8]:
+def to_eight_bit(grey: Image) -> NDArray[np.uint8]:
     """Return a photograph (H, W) in 8 bits, with its own range of brightness stretched to the full range."""
-    step = max(round((grey.size / FINDER_VALUES) ** 0.5), 1)
+    step = max(round((grey.size / PERCENTILE_VALUES) ** 0.5), 1)
     low, high = (float(one) for one in np.percentile(grey[::step, ::step], [LOW_PERCENTILE, HIGH_PERCENTILE]))
-    drawn = (grey - low) * (255 / max(high - low, 1e-12))
-    return np.asarray(np.clip(drawn, 0, 255, out=drawn).astype(np.uint8))
+    stretched = (grey - low) * (255 / max(high - low, 1e-12))
+    return np.asarray(np.clip(stretched, 0, 255, out=stretched).astype(np.uint8))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.cameras.rotations import cross_matrix, left_jacobian, pose_matrix, rotation_matrix
-from services.calibrate.lights.mirror import Eye
+from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.charts import ColourStep
 from services.calibrate.session.photos import Black
@@ -30,7 +30,7 @@ up."""
 def record_of(
     folder: RawFolder,
     black: Mapping[str, Black],
-    falls: Mapping[str, tuple[float, float, float]],
+    vignettings: Mapping[str, tuple[float, float, float]],
     cameras: CamerasStep,
     lights: LightsStep | None,
     intensity: IntensityStep | None,
@@ -40,7 +40,7 @@ def record_of(
     inputs: dict[str, str],
 ) -> Calibration:
     """Return the calibration record; lights whose position neither highlights nor a list gives are left out."""
-    eyes = cameras.eyes if lights is None else lights.fit.eyes
+    posed_cameras = cameras.posed_cameras if lights is None else lights.fit.cameras
     positions = light_positions(folder, lights)
     return Calibration(
         units="mm",
@@ -48,12 +48,12 @@ def record_of(
         cameras=tuple(
             _camera(
                 name,
-                eye,
+                camera,
                 black[name],
-                falls.get(name),
+                vignettings.get(name),
                 None if intensity is None else intensity.fit.radiance_per_count[number],
             )
-            for number, (name, eye) in enumerate(zip(cameras.names, eyes, strict=True))
+            for number, (name, camera) in enumerate(zip(cameras.names, posed_cameras, strict=True))
         ),
         lights=tuple(
             _light(folder.light[number].name, where, number, intensity, len(folder.channels), positions)
@@ -104,10 +104,10 @@ def twist_derivative(pose: Floats) -> Floats:
     """
     R = rotation_matrix(pose[:3])
     centre = -R.T @ pose[3:]
-    turn = -R.T @ left_jacobian(pose[:3])
+    rotation = -R.T @ left_jacobian(pose[:3])
     derivative = np.zeros((6, 6))
-    derivative[:3, :3] = turn
-    derivative[3:, :3] = -cross_matrix(centre) @ turn
+    derivative[:3, :3] = rotation
+    derivative[3:, :3] = -cross_matrix(centre) @ rotation
     derivative[3:, 3:] = -R.T
     return derivative
 
@@ -118,8 +118,8 @@ def uncertainty_of(
     """Return the joint covariance of cameras, lights and intensities; errors of the cameras are propagated to the
     lights, and errors of the lights to the intensities.
     """
-    eyes = cameras.eyes if lights is None else lights.fit.eyes
-    names, rows = _camera_rows(cameras.names, eyes)
+    posed_cameras = cameras.posed_cameras if lights is None else lights.fit.cameras
+    names, rows = _camera_rows(cameras.names, posed_cameras)
     covariance = cameras.camera_covariance
     first = 0
     if lights is not None:
@@ -130,17 +130,19 @@ def uncertainty_of(
     noise = np.zeros((len(rows), len(rows)))
     if intensity is not None:
         fit = intensity.fit
-        seen = np.flatnonzero(np.isfinite(fit.intensity[:, 0]))
-        names += [f"light_gain.{folder.light[n].name}.{channel}" for n in seen for channel in folder.channels]
-        moved = np.zeros((len(fit.covariance), covariance.shape[1]))
+        measured = np.flatnonzero(np.isfinite(fit.intensity[:, 0]))
+        names += [f"light_gain.{folder.light[n].name}.{channel}" for n in measured for channel in folder.channels]
+        gain_by_geometry = np.zeros((len(fit.covariance), covariance.shape[1]))
         if lights is not None:
             # A light whose position is estimated too near gets too low an intensity, so gains are correlated with the
             # positions from highlights.
             for place, number in enumerate(lights.fit.lights):
-                moved[:, 3 * place : 3 * place + 3] = fit.by_positions[:, 3 * number : 3 * number + 3]
-        rows = np.concatenate([rows, moved])
+                gain_by_geometry[:, 3 * place : 3 * place + 3] = fit.by_positions[:, 3 * number : 3 * number + 3]
+        rows = np.concatenate([rows, gain_by_geometry])
         noise = np.zeros((len(rows), len(rows)))
-        noise[-len(moved) :, -len(moved) :] = fit.covariance + LIGHT_DRIFT**2 * np.eye(len(moved))
+        noise[-len(gain_by_geometry) :, -len(gain_by_geometry) :] = fit.covariance + LIGHT_DRIFT**2 * np.eye(
+            len(gain_by_geometry)
+        )
     total = rows @ covariance @ rows.T + noise
     if intensity is not None:
         names += [f"gain.{channel}" for channel in folder.channels]
@@ -161,34 +163,34 @@ def gain_covariance(intensity: IntensityStep) -> Floats:
     return np.asarray(shared**2 * np.ones((len(scatter),) * 2) + np.diag(scatter**2 + LIGHT_DRIFT**2))
 
 
-def _camera_rows(names: Sequence[str], eyes: Sequence[Eye]) -> tuple[list[str], Floats]:
+def _camera_rows(names: Sequence[str], posed_cameras: Sequence[PosedCamera]) -> tuple[list[str], Floats]:
     """Return the names of the cameras' errors, and their derivative (10 K, C) with respect to the lens values and pose
     of each camera in turn.
     """
-    told, blocks, width = [], [], sum(len(eye.lens.values) + 6 for eye in eyes)
+    error_names, blocks, width = [], [], sum(len(camera.lens.values) + 6 for camera in posed_cameras)
     first = 0
-    for name, eye in zip(names, eyes, strict=True):
-        count = len(eye.lens.values)
+    for name, camera in zip(names, posed_cameras, strict=True):
+        count = len(camera.lens.values)
         block = np.zeros((10, width))
-        block[:6, first + count : first + count + 6] = twist_derivative(eye.pose)
-        block[6:, first : first + 4] = np.diag([1 / eye.lens.values[0], 1 / eye.lens.values[1], 1, 1])
-        told += [f"camera.{name}.{axis}" for axis in TWIST + LENS]
+        block[:6, first + count : first + count + 6] = twist_derivative(camera.pose)
+        block[6:, first : first + 4] = np.diag([1 / camera.lens.values[0], 1 / camera.lens.values[1], 1, 1])
+        error_names += [f"camera.{name}.{axis}" for axis in TWIST + LENS]
         blocks.append(block)
         first += count + 6
-    return told, np.concatenate(blocks)
+    return error_names, np.concatenate(blocks)
 
 
 def _camera(
-    name: str, eye: Eye, black: Black, fall: tuple[float, float, float] | None, scale: Floats | None
+    name: str, camera: PosedCamera, black: Black, vignetting: tuple[float, float, float] | None, scale: Floats | None
 ) -> CalibratedCamera:
     return CalibratedCamera.model_validate(
         {
             "name": name,
-            "size": eye.lens.size,
-            "K": eye.lens.matrix.tolist(),
-            "distortion": eye.lens.distortion.tolist() or None,
-            "camera_from_world": pose_matrix(eye.pose).tolist(),
-            "vignetting": fall,
+            "size": camera.lens.size,
+            "K": camera.lens.matrix.tolist(),
+            "distortion": camera.lens.distortion.tolist() or None,
+            "camera_from_world": pose_matrix(camera.pose).tolist(),
+            "vignetting": vignetting,
             "radiance_per_count": None if scale is None else scale.tolist(),
             "black_counts": black.counts,
             "read_noise_counts": black.noise,

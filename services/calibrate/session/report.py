@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from services.calibrate.session.boards import model_told
+from services.calibrate.session.boards import describe_model
 from services.calibrate.session.drawings import (
     ARROW_PX,
     chart_drawing,
@@ -61,11 +61,13 @@ def _camera(session: Session, number: int) -> dict[str, Any]:
     errors = np.sqrt(np.diag(fit.covariance)[fit.layout.lens_columns(number)])
     mine = fit.corners.camera == number
     drawing, largest = uncertainty_drawing(fit, number, session.cameras.distance_mm)
-    told = {key: f"{values[place]:.2f} ± {errors[place]:.2f}" for place, key in enumerate(("fx", "fy", "cx", "cy"))}
+    intrinsics = {
+        key: f"{values[place]:.2f} ± {errors[place]:.2f}" for place, key in enumerate(("fx", "fy", "cx", "cy"))
+    }
     return {
-        **told,
+        **intrinsics,
         "name": name,
-        "model": model_told(session.cameras.choices[name]),
+        "model": describe_model(session.cameras.choices[name]),
         "corners": int(mine.sum()),
         "left_out": int((mine & ~fit.inliers).sum()),
         "sigma": f"{fit.sigma_px[number]:.3f}",
@@ -87,7 +89,7 @@ def _lights(session: Session) -> dict[str, Any] | None:
             mine = [place[f"light.{light.name}.{axis}"] for axis in "xyz" if f"light.{light.name}.{axis}" in place]
             errors[number] = np.sqrt(variances[mine].sum()) if mine else np.nan
     where = np.array([light.position_mm for light in record.lights])
-    cameras = np.array([eye.centre_mm for eye in session.cameras.eyes])
+    cameras = np.array([camera.centre_mm for camera in session.cameras.posed_cameras])
     names = [light.name for light in record.lights]
     rows = [
         {
@@ -98,32 +100,32 @@ def _lights(session: Session) -> dict[str, Any] | None:
         }
         for light, error in zip(record.lights, errors, strict=True)
     ]
-    told = []
+    sentences = []
     if session.lights is not None:
         fit = session.lights.fit
-        told.append(
+        sentences.append(
             f"Highlights scatter by {fit.highlight_sigma_px:.3f} px and outlines by {fit.outline_sigma_px:.3f} px about"
             " the fit."
         )
     if session.intensity is not None:
         scatter = ", ".join(f"{100 * one:.2f} %" for one in session.intensity.fit.sigma)
-        told.append(f"Photographs of white spheres scatter by {scatter} about the fit.")
+        sentences.append(f"Photographs of white spheres scatter by {scatter} about the fit.")
     drawing = lights_drawing(where, names, cameras, errors if np.isfinite(errors).all() else None)
-    return {"drawing": _markup(drawing), "rows": rows, "told": " ".join(told)}
+    return {"drawing": _markup(drawing), "rows": rows, "summary": " ".join(sentences)}
 
 
 def _colours(session: Session) -> list[dict[str, Any]]:
     step = session.colours
     if step is None:
         return []
-    told = []
+    rows = []
     for name, fit in step.fits.items():
         rgb = step.rgb[name]
         drawing = chart_drawing(srgb(step.xyz), rgb, srgb(fit.xyz(np.nan_to_num(rgb))))
         models = ", ".join(f"{model} {value:.2f}" for model, value in fit.held_out_by_model.items())
         sentence = f"ΔE2000 of patches that were left out, mean by model: {models}."
-        told.append({"name": name, "drawing": _markup(drawing), "told": sentence})
-    return told
+        rows.append({"name": name, "drawing": _markup(drawing), "summary": sentence})
+    return rows
 
 
 def _assumed(session: Session) -> Iterator[str]:

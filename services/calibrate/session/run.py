@@ -14,7 +14,7 @@ import numpy as np
 
 from services.calibrate.session.boards import CamerasStep, calibrate_cameras
 from services.calibrate.session.charts import ColourStep, calibrate_colours
-from services.calibrate.session.flats import fall_of_light
+from services.calibrate.session.flats import measure_vignetting
 from services.calibrate.session.judge import Judgement, judge
 from services.calibrate.session.photos import Photos
 from services.calibrate.session.record import light_positions, record_of
@@ -40,12 +40,14 @@ class Session:
     judgement: Judgement
 
 
-def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_days: float = VALID_DAYS) -> Session:
+def calibrate(
+    root: Path, report_step: Callable[[str], None] = lambda _: None, valid_days: float = VALID_DAYS
+) -> Session:
     """Calibrate cameras, lights and colours from the frames of a raw folder.
 
     Args:
         root: folder with ``raw.toml``.
-        tell: called with a description of each step as it begins.
+        report_step: called with a description of each step as it begins.
         valid_days: validity in days that the record states.
 
     Raises:
@@ -53,22 +55,22 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
     """
     folder = read_raw_folder(root)
     photos = Photos(root, folder)
-    tell("cameras: boards, lenses, poses")
+    report_step("cameras: boards, lenses, poses")
     cameras = calibrate_cameras(photos)
-    tell("lights: mirror spheres")
-    lights = find_lights(photos, cameras.eyes, cameras.camera_covariance, cameras.distance_mm)
-    eyes = cameras.eyes if lights is None else lights.fit.eyes
-    tell("intensities: white spheres")
+    report_step("lights: mirror spheres")
+    lights = find_lights(photos, cameras.posed_cameras, cameras.camera_covariance, cameras.distance_mm)
+    posed_cameras = cameras.posed_cameras if lights is None else lights.fit.cameras
+    report_step("intensities: white spheres")
     positions = np.full((len(folder.light), 3), np.nan)
     for number, where in light_positions(folder, lights).items():
         positions[number] = where
-    falls = {
-        name: fall
-        for name, eye in zip(cameras.names, eyes, strict=True)
-        if (fall := fall_of_light(photos, name, eye.lens.values[2:4])) is not None
+    vignettings = {
+        name: vignetting
+        for name, camera in zip(cameras.names, posed_cameras, strict=True)
+        if (vignetting := measure_vignetting(photos, name, camera.lens.values[2:4])) is not None
     }
-    intensity = measure_intensity(photos, eyes, positions, cameras.distance_mm, falls)
-    tell("colours: charts")
+    intensity = measure_intensity(photos, posed_cameras, positions, cameras.distance_mm, vignettings)
+    report_step("colours: charts")
     colours = calibrate_colours(photos)
     used = [root / DESCRIPTION, *(root / frame.file for frame in folder.frame if _is_used(frame.kind))]
     used += [
@@ -76,7 +78,7 @@ def calibrate(root: Path, tell: Callable[[str], None] = lambda _: None, valid_da
     ]
     inputs = {path.relative_to(root).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in used}
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    record = record_of(folder, photos.black, falls, cameras, lights, intensity, colours, made, valid_days, inputs)
+    record = record_of(folder, photos.black, vignettings, cameras, lights, intensity, colours, made, valid_days, inputs)
     judgement = judge(folder, cameras, lights, intensity, colours, record.uncertainty, photos.black, inputs)
     record = record.model_copy(update={"limits": judgement.recorded})
     return Session(record, cameras, lights, intensity, colours, judgement)
@@ -96,7 +98,7 @@ def _is_used(kind: str) -> bool:
 def _residuals(session: Session) -> dict[str, Any]:
     """Return the residuals of each step, by photograph."""
     fit = session.cameras.fit
-    told: dict[str, Any] = {
+    residuals: dict[str, Any] = {
         "corners": [
             {
                 "file": view.name,
@@ -110,15 +112,15 @@ def _residuals(session: Session) -> dict[str, Any]:
     }
     if session.lights is not None:
         first = 0
-        told["highlights"] = []
+        residuals["highlights"] = []
         for name, view in zip(session.lights.view_names, session.lights.views, strict=True):
             off = session.lights.fit.highlight_errors_px[first : first + len(view.lights)]
             first += len(view.lights)
-            told["highlights"].append(
+            residuals["highlights"].append(
                 {"of": name, "lights": view.lights.tolist(), "seen_minus_drawn_px": np.round(off, 4).tolist()}
             )
     if session.intensity is not None:
-        told["white_spheres"] = np.round(session.intensity.fit.residuals, 6).tolist()
+        residuals["white_spheres"] = np.round(session.intensity.fit.residuals, 6).tolist()
     if session.colours is not None:
-        told["patches_delta_e_2000"] = {name: one.fitted.tolist() for name, one in session.colours.fits.items()}
-    return told
+        residuals["patches_delta_e_2000"] = {name: one.fitted.tolist() for name, one in session.colours.fits.items()}
+    return residuals

@@ -14,7 +14,7 @@ from services.calibrate.lights.centres import OutlineView, fit_centres
 from services.calibrate.lights.images import Outline, about_outline, find_highlight, find_outline
 from services.calibrate.lights.intensity import IntensityFit, WhitePhoto, WhiteSphere, fit_intensity
 from services.calibrate.lights.listed import AlignedList, align_list
-from services.calibrate.lights.mirror import Eye
+from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.lights.positions import LightsFit, fit_lights
 from services.calibrate.lights.problem import SphereView
 from services.calibrate.session.flats import relative_square
@@ -23,7 +23,7 @@ from services.core.errors import CaptureInputError
 from services.core.raw.records import FrameKind, RawFrame
 
 Floats = NDArray[np.float64]
-Fall = tuple[float, float, float]
+Vignetting = tuple[float, float, float]
 WHITE_PIXELS_ACROSS = 60
 """Approximate number of samples across a white sphere: more add no information, because paint and lens limit it."""
 
@@ -74,12 +74,14 @@ class IntensityStep:
     reflectance_se: float | None = None
 
 
-def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distance_mm: float) -> LightsStep | None:
+def find_lights(
+    photos: Photos, cameras: Sequence[PosedCamera], covariance: Floats, distance_mm: float
+) -> LightsStep | None:
     """Find the positions of the lights from the folder's mirror spheres; None without any.
 
     Args:
         photos: the folder's frames.
-        eyes: the calibrated cameras.
+        cameras: the calibrated cameras.
         covariance: covariance (C, C) of the lens values and pose of each camera in turn.
         distance_mm: approximate distance of the spheres from the cameras.
 
@@ -90,15 +92,15 @@ def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distanc
     if not groups:
         return None
     folder = photos.folder
-    cameras, lights = [camera.name for camera in folder.camera], [light.name for light in folder.light]
+    camera_names, light_names = [one.name for one in folder.camera], [light.name for light in folder.light]
     places = list(dict.fromkeys(place for _, place in groups))
     radii = {sphere.name: sphere.radius_mm for sphere in folder.sphere}
-    views, names, missed = [], [], []
-    for (camera, place), frames in groups.items():
-        radius, eye = radii[str(frames[0].sphere)], eyes[cameras.index(camera)]
-        outline = _outline(photos, frames, eye, radius, distance_mm)
+    views, view_names, missed = [], [], []
+    for (camera_name, place), frames in groups.items():
+        radius, camera = radii[str(frames[0].sphere)], cameras[camera_names.index(camera_name)]
+        outline = _outline(photos, frames, camera, radius, distance_mm)
         found = {}
-        width, height = folder.camera_named(camera).size
+        width, height = folder.camera_named(camera_name).size
         part = about_outline(outline.points_px, (height, width))
         first = np.array([part[1].start, part[0].start])
         for frame in frames:
@@ -106,20 +108,22 @@ def find_lights(photos: Photos, eyes: Sequence[Eye], covariance: Floats, distanc
             if where is None:
                 missed.append(frame.file)
             else:
-                found[lights.index(str(frame.light))] = where + first
+                found[light_names.index(str(frame.light))] = where + first
         numbers = np.array(sorted(found), dtype=np.int64)
         pixels = np.array([found[number] for number in numbers]).reshape(-1, 2)
-        views.append(SphereView(cameras.index(camera), places.index(place), radius, outline.points_px, numbers, pixels))
-        names.append(f"camera {camera}, {place}")
+        views.append(
+            SphereView(camera_names.index(camera_name), places.index(place), radius, outline.points_px, numbers, pixels)
+        )
+        view_names.append(f"camera {camera_name}, {place}")
     listed = np.array([light.position_mm or (np.nan,) * 3 for light in folder.light], dtype=np.float64)
-    return place_lights(views, names, eyes, lights, covariance, listed, tuple(missed))
+    return place_lights(views, view_names, cameras, light_names, covariance, listed, tuple(missed))
 
 
 def place_lights(
     views: Sequence[SphereView],
     view_names: Sequence[str],
-    eyes: Sequence[Eye],
-    lights: Sequence[str],
+    cameras: Sequence[PosedCamera],
+    light_names: Sequence[str],
     covariance: Floats,
     listed_mm: Floats,
     missed: tuple[str, ...] = (),
@@ -129,8 +133,8 @@ def place_lights(
     Args:
         views: mirror spheres in photographs.
         view_names: names of the views, for messages.
-        eyes: the calibrated cameras.
-        lights: names of the lights.
+        cameras: the calibrated cameras.
+        light_names: names of the lights.
         covariance: covariance (C, C) of the lens values and pose of each camera in turn.
         listed_mm: positions that raw.toml lists (L, 3), NaN where it lists none.
         missed: files in which no highlight was found.
@@ -138,10 +142,10 @@ def place_lights(
     Raises:
         CaptureInputError: a light has only one highlight.
     """
-    fit = fit_lights(views, eyes, lights, covariance)
+    fit = fit_lights(views, cameras, light_names, covariance)
     aligned = None
     if np.isfinite(listed_mm).all():
-        found = np.full((len(lights), 3), np.nan)
+        found = np.full((len(light_names), 3), np.nan)
         found[fit.lights] = fit.positions_mm
         aligned = align_list(listed_mm, found)
     return LightsStep(fit, tuple(views), tuple(view_names), aligned, missed)
@@ -149,19 +153,19 @@ def place_lights(
 
 def measure_intensity(
     photos: Photos,
-    eyes: Sequence[Eye],
+    cameras: Sequence[PosedCamera],
     lights_mm: Floats,
     distance_mm: float,
-    falls: Mapping[str, Fall] = MappingProxyType({}),
+    vignettings: Mapping[str, Vignetting] = MappingProxyType({}),
 ) -> IntensityStep | None:
     """Measure the intensities of the lights from the folder's white spheres; None without any.
 
     Args:
         photos: the folder's frames.
-        eyes: calibrated cameras.
+        cameras: calibrated cameras.
         lights_mm: positions of the lights (L, 3), NaN where unknown.
         distance_mm: approximate distance of the spheres from the cameras.
-        falls: vignetting a, b, c by camera.
+        vignettings: vignetting a, b, c by camera.
 
     Raises:
         CaptureInputError: no outline is found in a photograph, a sphere is saturated or dark, or no photograph has
@@ -171,33 +175,33 @@ def measure_intensity(
     if not groups:
         return None
     folder = photos.folder
-    cameras, lights = [camera.name for camera in folder.camera], [light.name for light in folder.light]
+    camera_names, light_names = [one.name for one in folder.camera], [light.name for light in folder.light]
     places = list(dict.fromkeys(place for _, place in groups))
-    things = {sphere.name: sphere for sphere in folder.sphere}
+    spheres_by_name = {sphere.name: sphere for sphere in folder.sphere}
     outlines: list[OutlineView] = []
     found: list[WhitePhoto] = []
-    thing_of = {place: things[str(frames[0].sphere)] for (_, place), frames in groups.items()}
-    for (camera, place), frames in groups.items():
-        eye, radius = eyes[cameras.index(camera)], thing_of[place].radius_mm
-        outline = _outline(photos, frames, eye, radius, distance_mm)
-        outlines.append(OutlineView(cameras.index(camera), places.index(place), radius, outline.points_px))
+    sphere_at = {place: spheres_by_name[str(frames[0].sphere)] for (_, place), frames in groups.items()}
+    for (camera_name, place), frames in groups.items():
+        camera, radius = cameras[camera_names.index(camera_name)], sphere_at[place].radius_mm
+        outline = _outline(photos, frames, camera, radius, distance_mm)
+        outlines.append(OutlineView(camera_names.index(camera_name), places.index(place), radius, outline.points_px))
         for frame in frames:
-            number = lights.index(str(frame.light))
+            number = light_names.index(str(frame.light))
             pixels, values = _sampled(photos, frame, outline)
-            if (fall := falls.get(camera)) is not None:
-                q = relative_square(pixels, eye.lens.size, eye.lens.values[2:4])
-                values = values / (1 + q * (fall[0] + q * (fall[1] + q * fall[2])))[:, None]
-            found.append(WhitePhoto(cameras.index(camera), places.index(place), number, pixels, values))
-    centres = fit_centres(outlines, eyes)
+            if (vignetting := vignettings.get(camera_name)) is not None:
+                q = relative_square(pixels, camera.lens.size, camera.lens.values[2:4])
+                values = values / (1 + q * (vignetting[0] + q * (vignetting[1] + q * vignetting[2])))[:, None]
+            found.append(WhitePhoto(camera_names.index(camera_name), places.index(place), number, pixels, values))
+    centres = fit_centres(outlines, cameras)
     spheres = [
-        WhiteSphere(centre, thing_of[place].radius_mm, np.array(thing_of[place].reflectance))
+        WhiteSphere(centre, sphere_at[place].radius_mm, np.array(sphere_at[place].reflectance))
         for centre, place in zip(centres, places, strict=True)
     ]
     middle = np.mean([sphere.centre_mm for sphere in spheres], axis=0)
-    told = [thing.reflectance_se for thing in thing_of.values()]
+    stated_se = [sphere.reflectance_se for sphere in sphere_at.values()]
     # Among several spheres the largest standard error counts; if one sphere has none, there is none for all.
-    se = None if None in told else max(one for one in told if one is not None)
-    return IntensityStep(fit_intensity(found, eyes, spheres, lights_mm, lights), tuple(found), middle, se)
+    se = None if None in stated_se else max(one for one in stated_se if one is not None)
+    return IntensityStep(fit_intensity(found, cameras, spheres, lights_mm, light_names), tuple(found), middle, se)
 
 
 def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFrame]]:
@@ -209,7 +213,9 @@ def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFr
     return groups
 
 
-def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: float, distance_mm: float) -> Outline:
+def _outline(
+    photos: Photos, frames: Sequence[RawFrame], camera: PosedCamera, radius_mm: float, distance_mm: float
+) -> Outline:
     """Find a sphere's outline in the mean of photographs under lights from all sides, because each light alone leaves a
     part of the outline dark.
     """
@@ -217,7 +223,7 @@ def _outline(photos: Photos, frames: Sequence[RawFrame], eye: Eye, radius_mm: fl
     total = photos.grey(chosen[0]).copy()
     for frame in chosen[1:]:
         total += photos.grey(frame)
-    outline = find_outline(total / np.float32(len(chosen)), eye, radius_mm, distance_mm)
+    outline = find_outline(total / np.float32(len(chosen)), camera, radius_mm, distance_mm)
     if outline is None:
         first = frames[0]
         raise CaptureInputError(

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.calibrate.cameras.bundle import draw
+from services.calibrate.cameras.bundle import project_corners
 from services.calibrate.lights.listed import swapped_names
 from services.calibrate.lights.mirror import outline_errors
 from services.calibrate.session.boards import CamerasStep
@@ -134,20 +134,22 @@ def _of_a_bad_view(cameras: CamerasStep, number: int, name: str) -> str:
     else that something moved.
     """
     fit = cameras.fit
-    corners = fit.corners.kept(fit.corners.view == number)
+    corners = fit.corners.selected(fit.corners.view == number)
     limit = 10 * float(fit.sigma_px.max())
 
-    def off(camera: int, place: int) -> float:
-        tried = replace(corners, camera=np.full_like(corners.camera, camera), place=np.full_like(corners.place, place))
-        return float(np.median(np.abs(corners.pixels - draw(fit.rig, tried))))
+    def median_error_px(camera: int, place: int) -> float:
+        described = replace(
+            corners, camera=np.full_like(corners.camera, camera), place=np.full_like(corners.place, place)
+        )
+        return float(np.median(np.abs(corners.pixels - project_corners(fit.rig, described))))
 
     camera, place = int(corners.camera[0]), int(corners.place[0])
     for other in range(len(fit.rig.places)):
-        if other != place and off(camera, other) < limit:
+        if other != place and median_error_px(camera, other) < limit:
             there = next(view.name for view in cameras.views if view.place == other)
             return f"Frame {name} shows the board as it lay for {there}; frames of two places are interchanged."
     for other in range(len(cameras.names)):
-        if other != camera and off(other, place) < limit:
+        if other != camera and median_error_px(other, place) < limit:
             return (
                 f"Frame {name} is what camera {cameras.names[other]} sees and not {cameras.names[camera]}; "
                 "frames of two cameras are interchanged."
@@ -168,7 +170,7 @@ def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
             )
     rms = np.empty(len(lights.views))
     for number, view in enumerate(lights.views):
-        off = outline_errors(fit.eyes[view.camera], view.outline_px, fit.centres_mm[view.place], view.radius_mm)
+        off = outline_errors(fit.cameras[view.camera], view.outline_px, fit.centres_mm[view.place], view.radius_mm)
         rms[number] = np.sqrt(np.mean((off - fit.edge_shifts_px[view.camera]) ** 2))
     moved = {
         view.place: name
@@ -186,7 +188,7 @@ def _about_highlights(names: list[str], cameras: CamerasStep, lights: LightsStep
     for outlier in lights.fit.outliers:
         yield (
             f"The highlight of light {names[outlier.light]} in camera {cameras.names[outlier.camera]} is"
-            f" {outlier.off_px:.1f} px off: something else may shine there, so it was left out."
+            f" {outlier.residual_px:.1f} px off: something else may shine there, so it was left out."
         )
     if lights.no_highlight:
         yield (
@@ -221,7 +223,7 @@ def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
                 " interchanged."
             )
         else:
-            off = aligned.off_mm[number]
+            off = aligned.distances_mm[number]
             yield f"Light {names[number]} lies {off:.0f} mm from where the list has it; measure it again."
 
 

@@ -113,9 +113,9 @@ class SimulatedCameras:
         at_start = self._observer.outputs()
         self._wait(self._exposure_s)
         levels = (at_start + self._observer.outputs()) / 2
-        return tuple(self._see(camera, levels) for camera in range(len(self._stills.description.cameras)))
+        return tuple(self._expose(camera, levels) for camera in range(len(self._stills.description.cameras)))
 
-    def _see(self, camera: int, levels: NDArray[np.float64]) -> NDArray[np.uint16]:
+    def _expose(self, camera: int, levels: NDArray[np.float64]) -> NDArray[np.uint16]:
         height, width, channels = self._stills.shape(camera)
         radiance = np.zeros((height, width, channels), dtype=np.float32)
         # Give a channel that is not red, green or blue the mean of the three LEDs.

@@ -24,8 +24,8 @@ def dome_address(address: str, lights: int, watchdog_s: float) -> Iterator[tuple
     if address == SIMULATED_DOME:
         from services.capture.dome.simulator import simulated_dome
 
-        with simulated_dome(lights, watchdog_s) as place:
-            yield place
+        with simulated_dome(lights, watchdog_s) as address_of_server:
+            yield address_of_server
         return
     host, separator, port = address.rpartition(":")
     if not (separator and host and port.isdigit()):

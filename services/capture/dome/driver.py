@@ -61,7 +61,7 @@ class ModbusDome:
         self._lit: tuple[range, float, float] | None = None
         self._previous_handlers: dict[int, object] = {}
         self._interrupted = threading.Event()
-        self._why_interrupted: Exception | None = None
+        self._interruption: Exception | None = None
 
     def __enter__(self) -> Self:
         try:
@@ -78,7 +78,7 @@ class ModbusDome:
             self._keepalive.stop()
             self._link.close()
             raise
-        atexit.register(self._last_resort)
+        atexit.register(self._darken_at_exit)
         self._catch_signals()
         return self
 
@@ -90,8 +90,8 @@ class ModbusDome:
             if kind is not None:
                 self._link.close()
             self.dark()
-            if self._why_interrupted is not None and isinstance(problem, RigError):
-                raise self._why_interrupted from problem
+            if self._interruption is not None and isinstance(problem, RigError):
+                raise self._interruption from problem
         except RigError:
             # Report that a light may still be on rather than a cancel; if another rig error is on its way, that one has
             # reported it already.
@@ -100,7 +100,7 @@ class ModbusDome:
         finally:
             self._keepalive.stop()
             self._link.close()
-            atexit.unregister(self._last_resort)
+            atexit.unregister(self._darken_at_exit)
             self._release_signals()
 
     @property
@@ -112,8 +112,8 @@ class ModbusDome:
         """Switch one light on, or all for None; see ``Dome.light``."""
         lights = range(self._light_count) if index is None else range(index, index + 1)
         with self._dark_on_error():
-            self._account()
-            self._require_wanted()
+            self._record_dose()
+            self._require_uninterrupted()
             if not lights or lights.stop > self._light_count or lights.start < 0:
                 raise RigError(
                     f"Light {index} does not exist, the dome at {self.address} has {self._light_count}; correct the"
@@ -131,7 +131,7 @@ class ModbusDome:
             # Send the order once. If its answer is lost or wrong, the read-back decides whether the light was set.
             with suppress(NoReplyError, WrongReplyError):
                 self._link.write(reg.STROBE_MS, [strobe_ms, active, *[reg.level_word(level)] * 3])
-            self._require_wanted()
+            self._require_uninterrupted()
             return self._confirmed()
 
     def confirm(self) -> Rgb:
@@ -162,12 +162,12 @@ class ModbusDome:
                 problem = failure
                 continue
             if not len(emitting):
-                self._account()
+                self._record_dose()
                 return
             problem = LinkError(f"light {int(emitting[0])} still emits after all-off")
         # Stop feeding the watchdog as a last resort, which makes the controller open the supply relay.
         self._keepalive.stop()
-        self._account()
+        self._record_dose()
         raise ReadbackError(
             f"The dome at {self.address} is not confirmed dark ({problem}); its watchdog cuts the supply within"
             f" {self.watchdog_s:g} s, switch the dome off."
@@ -177,12 +177,12 @@ class ModbusDome:
         """Let time pass with the light as it is; see ``Dome.pause``."""
         self._interrupted.wait(seconds)
         with self._dark_on_error():
-            self._require_wanted()
+            self._require_uninterrupted()
 
-    def interrupt(self, why: Exception) -> None:
+    def interrupt(self, reason: Exception) -> None:
         """Go dark at once, from any thread; see ``Dome.interrupt``."""
         # Set the reason before the order, so that a light that the driver sends meanwhile is found unwanted afterwards.
-        self._why_interrupted = why
+        self._interruption = reason
         self._interrupted.set()
         with suppress(LinkError):
             self._keepalive.darken()
@@ -215,9 +215,9 @@ class ModbusDome:
             with suppress(RigError):
                 self.dark()
                 is_dark = True
-            if is_dark and self._why_interrupted is not None and isinstance(problem, (LinkError, RigError)):
+            if is_dark and self._interruption is not None and isinstance(problem, (LinkError, RigError)):
                 # Report the interruption: a light that is dark because of it is not a fault of the dome.
-                raise self._why_interrupted from problem
+                raise self._interruption from problem
             if isinstance(problem, LinkError):
                 # Report ALL OFF or an open interlock as the cause of a refusal rather than the exception code.
                 if isinstance(problem, RefusedError):
@@ -233,21 +233,22 @@ class ModbusDome:
     def _confirmed(self) -> Rgb:
         self._require_safe()
         self._require_no_fault()
-        lit, wanted = self._lit, np.zeros((self._light_count, 3), dtype=np.int64)
+        lit, commanded = self._lit, np.zeros((self._light_count, 3), dtype=np.int64)
         if lit is not None:
-            wanted[lit[0]] = reg.level_word(lit[1])
+            commanded[lit[0]] = reg.level_word(lit[1])
         for register in (reg.LEVELS, reg.OUTPUTS):
-            held = self._rgb(register)
-            wrong = np.flatnonzero((held != wanted).any(axis=1))
+            read_back = self._rgb(register)
+            wrong = np.flatnonzero((read_back != commanded).any(axis=1))
             if len(wrong):
                 self._require_armed()
                 light = int(wrong[0])
                 raise ReadbackError(
-                    f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {held[light].tolist()} instead of"
-                    f" {wanted[light].tolist()}; all lights were switched off, check that light and the controller."
+                    f"Light {light} {'holds' if register is reg.LEVELS else 'emits'} {read_back[light].tolist()}"
+                    f" instead of {commanded[light].tolist()}; all lights were switched off, check that light and the"
+                    " controller."
                 )
         first = lit[0].start if lit else 0
-        return int(held[first, 0]), int(held[first, 1]), int(held[first, 2])
+        return int(read_back[first, 0]), int(read_back[first, 1]), int(read_back[first, 2])
 
     def _require_dome(self) -> None:
         try:
@@ -284,9 +285,9 @@ class ModbusDome:
         if not closed:
             raise InterlockError(f"The interlock of the dome at {self.address} is open; close it and run again.")
 
-    def _require_wanted(self) -> None:
-        if self._why_interrupted is not None:
-            raise self._why_interrupted
+    def _require_uninterrupted(self) -> None:
+        if self._interruption is not None:
+            raise self._interruption
 
     def _require_armed(self) -> None:
         if self._link.read(reg.WATCHDOG_MS)[0] == reg.STOPPED_MS:
@@ -310,20 +311,20 @@ class ModbusDome:
     def _write_checked(self, register: reg.Register, values: list[int]) -> None:
         with suppress(NoReplyError, WrongReplyError):
             self._link.write(register, values)
-        held = self._link.read(register)
-        if held != values:
+        read_back = self._link.read(register)
+        if read_back != values:
             raise ReadbackError(
-                f"The dome at {self.address} holds {register.name} = {held} instead of {values}; restart the"
+                f"The dome at {self.address} holds {register.name} = {read_back} instead of {values}; restart the"
                 " controller."
             )
 
-    def _account(self) -> None:
+    def _record_dose(self) -> None:
         lit, self._lit = self._lit, None
         if lit is not None:
             lights, level, since_s = lit
             self._budget.spend(lights, level, time.monotonic() - since_s)
 
-    def _last_resort(self) -> None:
+    def _darken_at_exit(self) -> None:
         self._link.close()
         self.give_up()
 
@@ -331,7 +332,7 @@ class ModbusDome:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGHUP):
                 if signal.getsignal(number) is signal.SIG_DFL:
-                    self._previous_handlers[number] = signal.signal(number, _unwind)
+                    self._previous_handlers[number] = signal.signal(number, _exit_on_signal)
 
     def _release_signals(self) -> None:
         for number in self._previous_handlers:
@@ -339,6 +340,6 @@ class ModbusDome:
         self._previous_handlers.clear()
 
 
-def _unwind(number: int, _frame: FrameType | None) -> None:
+def _exit_on_signal(number: int, _frame: FrameType | None) -> None:
     """Turn a terminating signal into an exception, so that every context manager on the stack runs."""
     raise SystemExit(128 + number)

@@ -39,10 +39,10 @@ class FaultOrder:
 
     def take(self, space: Space, address: int, count: int) -> FaultKind:
         """Return the fault for this request, NONE if there is none, and count it."""
-        meant = self.space == reg.ANY_SPACE or (
+        is_affected = self.space == reg.ANY_SPACE or (
             self.space == reg.SPACE_CODE[space] and address <= self.address < address + count
         )
-        if self.times == 0 or not meant:
+        if self.times == 0 or not is_affected:
             return FaultKind.NONE
         self.times -= 1
         return self.kind
@@ -54,11 +54,11 @@ class DomeModel:
     def __init__(self, lights: int, watchdog_s: float) -> None:
         self.lights = lights
         self.order = FaultOrder()
-        self._held = {r.name: [0] * r.count for r in reg.TABLE if r.space == "holding"}
-        self._held[reg.WATCHDOG_MS.name] = [round(1000 * watchdog_s)]
-        self._held[reg.ACTIVE_LIGHT.name] = [reg.NO_LIGHT]
+        self._holding = {r.name: [0] * r.count for r in reg.TABLE if r.space == "holding"}
+        self._holding[reg.WATCHDOG_MS.name] = [round(1000 * watchdog_s)]
+        self._holding[reg.ACTIVE_LIGHT.name] = [reg.NO_LIGHT]
         self._latched = FaultBit(0)
-        self._interlock_open = self._stop_pressed = self._hot = False
+        self._interlock_open = self._stop_pressed = self._too_hot = False
         self._stuck: dict[int, int] = {}
         self._dead: set[int] = set()
         self._triggers = 0
@@ -67,7 +67,7 @@ class DomeModel:
 
     @property
     def _levels(self) -> list[int]:
-        return self._held[reg.LEVELS.name]
+        return self._holding[reg.LEVELS.name]
 
     @property
     def supply_on(self) -> bool:
@@ -99,7 +99,7 @@ class DomeModel:
     def values(self, register: Register) -> list[int]:
         """Present values of a register."""
         if register.space == "holding":
-            return self._held[register.name]
+            return self._holding[register.name]
         if register.space == "coil":
             return [0]
         sensors: dict[Register, Callable[[], list[int]]] = {
@@ -119,36 +119,38 @@ class DomeModel:
 
     def write(self, space: str, address: int, values: list[int]) -> int:
         """Carry out a write and return a Modbus exception code, 0 for none. A refused write changes nothing."""
-        held = {name: list(old) for name, old in self._held.items()}
+        holding = {name: list(old) for name, old in self._holding.items()}
         touched: set[str] = set()
         for register in (r for r in reg.TABLE if r.space == space):
             first, last = max(address, register.address), min(address + len(values), register.end)
             if first < last:
                 touched.add(register.name)
                 if space == "holding":
-                    held[register.name][first - register.address : last - register.address] = values[
+                    holding[register.name][first - register.address : last - register.address] = values[
                         first - address : last - address
                     ]
         if space == "coil":
             return self._pulse(touched) if values[0] else 0
         if reg.ACTIVE_LIGHT.name in touched:
-            active = held[reg.ACTIVE_LIGHT.name][0]
+            active = holding[reg.ACTIVE_LIGHT.name][0]
             if active >= self.lights and active not in {reg.ALL_LIGHTS, reg.NO_LIGHT}:
                 return ILLEGAL_VALUE
-            held[reg.LEVELS.name] = self._fast_path(active, held[reg.ACTIVE_LEVEL.name])
+            holding[reg.LEVELS.name] = self._fast_path(active, holding[reg.ACTIVE_LEVEL.name])
             touched.add(reg.LEVELS.name)
-        if any(held[reg.LEVELS.name][3 * self.lights :]):
+        if any(holding[reg.LEVELS.name][3 * self.lights :]):
             return ILLEGAL_VALUE
-        if reg.LEVELS.name in touched and any(held[reg.LEVELS.name]):
+        if reg.LEVELS.name in touched and any(holding[reg.LEVELS.name]):
             if not self.supply_on:
                 return DEVICE_FAILURE
-            strobe_ms = held[reg.STROBE_MS.name][0]
+            strobe_ms = holding[reg.STROBE_MS.name][0]
             self._strobe_until_s = self._now_s + strobe_ms / 1000 if strobe_ms else float("inf")
-        self._held = held
+        self._holding = holding
         if reg.KEEPALIVE.name in touched:
-            self._fed_until_s = self._now_s + held[reg.WATCHDOG_MS.name][0] / 1000
+            self._fed_until_s = self._now_s + holding[reg.WATCHDOG_MS.name][0] / 1000
         if reg.FAULT_ORDER.name in touched:
-            self._obey(FaultOrder(FaultKind(held[reg.FAULT_ORDER.name][0]), *held[reg.FAULT_ORDER.name][1:]))
+            self._apply_order(
+                FaultOrder(FaultKind(holding[reg.FAULT_ORDER.name][0]), *holding[reg.FAULT_ORDER.name][1:])
+            )
         return 0
 
     def _fast_path(self, active: int, rgb: list[int]) -> list[int]:
@@ -167,22 +169,22 @@ class DomeModel:
         return 0
 
     def _go_dark(self) -> None:
-        self._held[reg.LEVELS.name] = [0] * reg.LEVELS.count
+        self._holding[reg.LEVELS.name] = [0] * reg.LEVELS.count
         self._strobe_until_s = float("inf")
 
     def _causes(self) -> FaultBit:
         causes = FaultBit(0)
         causes |= FaultBit.INTERLOCK if self._interlock_open else causes
         causes |= FaultBit.EMERGENCY_STOP if self._stop_pressed else causes
-        causes |= FaultBit.TEMPERATURE if self._hot else causes
+        causes |= FaultBit.TEMPERATURE if self._too_hot else causes
         return causes
 
-    def _obey(self, order: FaultOrder) -> None:
+    def _apply_order(self, order: FaultOrder) -> None:
         self.order = FaultOrder()
         if order.kind is FaultKind.NONE:
             self._stuck.clear()
             self._dead.clear()
-            self._interlock_open = self._stop_pressed = self._hot = False
+            self._interlock_open = self._stop_pressed = self._too_hot = False
         elif order.kind is FaultKind.STUCK_LIGHT:
             self._stuck[order.argument] = reg.FULL_SCALE
         elif order.kind is FaultKind.DEAD_LIGHT:
@@ -194,7 +196,7 @@ class DomeModel:
         elif order.kind is FaultKind.EMERGENCY_STOP:
             self._stop_pressed = True
         elif order.kind is FaultKind.OVER_TEMPERATURE:
-            self._hot = True
+            self._too_hot = True
         else:
             self.order = order
         self.advance(self._now_s)

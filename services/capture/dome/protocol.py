@@ -43,10 +43,10 @@ class Dome(Protocol):
     def pause(self, seconds: float) -> None:
         """Wait with the light unchanged; when ``interrupt`` is called meanwhile, raise its exception at once."""
 
-    def interrupt(self, why: Exception) -> None:
+    def interrupt(self, reason: Exception) -> None:
         """Go dark at once; any thread may call it.
 
-        The thread that drives the dome gets no further light; its next call raises ``why``.
+        The thread that drives the dome gets no further light; its next call raises ``reason``.
         """
 
     def status(self) -> DomeStatus:

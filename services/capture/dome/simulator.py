@@ -72,12 +72,12 @@ def simulated_dome(lights: int, watchdog_s: float = 2.0, host: str = "127.0.0.1"
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True) as process:  # noqa: S603
         assert process.stdin is not None
         assert process.stdout is not None
-        impatience = threading.Timer(START_TIMEOUT_S, process.kill)
-        impatience.start()
+        start_timer = threading.Timer(START_TIMEOUT_S, process.kill)
+        start_timer.start()
         try:
             line = process.stdout.readline()
         finally:
-            impatience.cancel()
+            start_timer.cancel()
         try:
             if not line:
                 raise RigError("The simulated dome did not start; run 'dentine dome-sim' to see why.")
@@ -106,23 +106,23 @@ def order_fault(
         RigError: the simulator does not accept the order.
     """
     link = ModbusLink(host, port, timeout_s=2.0)
-    place = [reg.ANY_SPACE, 0] if on is None else [reg.SPACE_CODE[on.space], on.address]
+    target = [reg.ANY_SPACE, 0] if on is None else [reg.SPACE_CODE[on.space], on.address]
     try:
-        link.write(reg.FAULT_ORDER, [kind, argument, times, *place])
+        link.write(reg.FAULT_ORDER, [kind, argument, times, *target])
     except LinkError as problem:
         raise RigError(f"The fault cannot be ordered: {problem}; is a simulated dome running there?") from problem
     finally:
         link.close()
 
 
-class _Shell:
+class _RequestHandler:
     """Adapter between the model and pymodbus: updates the registers before every request, and applies the ordered
     faults.
     """
 
     def __init__(self, model: DomeModel) -> None:
         self._model = model
-        self._spoil_reply = FaultKind.NONE
+        self._reply_fault = FaultKind.NONE
 
     async def action(
         self,
@@ -138,7 +138,7 @@ class _Shell:
         is_order = space == "holding" and address == reg.FAULT_ORDER.address
         fault = FaultKind.NONE if is_order else self._model.order.take(space, address, span)
         if fault in {FaultKind.DROP_REPLY, FaultKind.DROP_REQUEST, FaultKind.WRONG_REPLY}:
-            self._spoil_reply = fault
+            self._reply_fault = fault
         if fault is FaultKind.DELAY:
             await asyncio.sleep(self._model.order.argument / 1000)
         if fault is FaultKind.EXCEPTION:
@@ -155,10 +155,10 @@ class _Shell:
 
     def packet(self, sending: bool, data: bytes) -> bytes:
         """Return a packet as it is or spoiled; pymodbus calls this with every packet on the wire."""
-        if not sending or self._spoil_reply is FaultKind.NONE:
+        if not sending or self._reply_fault is FaultKind.NONE:
             return data
-        spoil, self._spoil_reply = self._spoil_reply, FaultKind.NONE
-        if spoil is FaultKind.WRONG_REPLY:
+        fault, self._reply_fault = self._reply_fault, FaultKind.NONE
+        if fault is FaultKind.WRONG_REPLY:
             return data[:-1] + bytes([data[-1] ^ 0x5A])
         return b""
 
@@ -176,7 +176,7 @@ class _Shell:
 async def _serve(
     host: str, port: int, model: DomeModel, announce: Callable[[str, int], None] | None, *, with_parent: bool
 ) -> None:
-    shell, loop, stop = _Shell(model), asyncio.get_running_loop(), asyncio.Event()
+    handler, loop, stop = _RequestHandler(model), asyncio.get_running_loop(), asyncio.Event()
     coils, discretes = ([SimData(0, values=[False] * 16, datatype=DataType.BITS)] for _ in range(2))
     holdings, inputs = (
         [
@@ -186,8 +186,8 @@ async def _serve(
         ]
         for space in ("holding", "input")
     )
-    device = SimDevice(id=UNIT, simdata=(coils, discretes, holdings, inputs), action=shell.action)
-    server = ModbusTcpServer(device, address=(host, port), trace_packet=shell.packet)
+    device = SimDevice(id=UNIT, simdata=(coils, discretes, holdings, inputs), action=handler.action)
+    server = ModbusTcpServer(device, address=(host, port), trace_packet=handler.packet)
     try:
         await server.serve_forever(background=True)
     except RuntimeError as problem:

@@ -18,14 +18,14 @@ from services.core.errors import CaptureInputError
 from services.core.files.scans import FORMATS
 from services.core.raw.decoding import CAMERA_RAW, Decoded, decode
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
-from services.core.raw.records import THING_OF, RawFolder
+from services.core.raw.records import TARGET_KEYS, RawFolder
 from services.core.raw.toml_writing import description_toml, toml_value
 from services.core.store import read_record, write_atomic
 
 IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
 DEPTHS = (8, 10, 12, 14, 16)
 """Numbers of bits of cameras' analogue-to-digital converters."""
-LOOKED_AT = 8
+FRAMES_READ = 8
 """Largest number of a camera's frames that are read to find its number of bits."""
 MIN_TRACKING = 4
 """Smallest number of tracking frames from which a smooth motion can be followed."""
@@ -33,7 +33,7 @@ MAX_NAMED = 5
 """Largest number of lights that a sentence lists by name."""
 Entry = dict[str, Any]
 """Keys and values of one table of ``raw.toml``."""
-_THINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+_TARGET_TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "board": (
             "[[board]]",
@@ -95,17 +95,21 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         )
     if calibration is not None:
         read_record(calibration, Calibration)
-    told = {file: named_frame(file) for file in files}
-    frames = [one for one in told.values() if isinstance(one, NamedFrame)]
+    interpreted = {file: named_frame(file) for file in files}
+    frames = [one for one in interpreted.values() if isinstance(one, NamedFrame)]
     unnamed = [
         f"File {file} {why}, so it is left out; rename it, such as left_L07_0.05s.tif."
-        for file, why in told.items()
+        for file, why in interpreted.items()
         if isinstance(why, str)
     ]
     if not frames:
         raise CaptureInputError(unnamed[0].replace(", so it is left out", ""))
-    if exposure_s is None and (silent := [one.file for one in frames if one.exposure_s is None]):
-        which = f"File {silent[0]} does" if len(silent) == 1 else f"File {silent[0]} and {len(silent) - 1} more do"
+    if exposure_s is None and (incomplete := [one.file for one in frames if one.exposure_s is None]):
+        which = (
+            f"File {incomplete[0]} does"
+            if len(incomplete) == 1
+            else f"File {incomplete[0]} and {len(incomplete) - 1} more do"
+        )
         raise CaptureInputError(
             f"{which} not say the exposure; rename them, such as left_L07_0.05s.tif, or give --exposure-s for all of"
             " those."
@@ -113,18 +117,18 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
     scans = sorted(p.name for p in root.iterdir() if p.suffix.lower() in FORMATS)
     content = (
         description_toml(_tree(root, frames, exposure_s, mosaic, calibration))
-        + _to_complete(frames, exposure_s)
-        + b"".join(_of_a_scan(scan, frames[0].camera) for scan in scans[:1])
+        + _target_template(frames, exposure_s)
+        + b"".join(_scan_template(scan, frames[0].camera) for scan in scans[:1])
     )
     folder = parse_raw_folder(content, str(root / DESCRIPTION))
     write_atomic(root / DESCRIPTION, content)
-    things = sorted({THING_OF[one.kind] for one in frames if one.kind in THING_OF})
-    of_things = [
-        f"Frames of a {thing} are written as comments, since its measures are not known; give them in raw.toml and take"
-        " the # away."
-        for thing in things
+    targets = sorted({TARGET_KEYS[one.kind] for one in frames if one.kind in TARGET_KEYS})
+    target_notes = [
+        f"Frames of a {target} are written as comments, since its measures are not known; give them in raw.toml and"
+        " take the # away."
+        for target in targets
     ]
-    return Imported(folder, (*unnamed, *of_things, *_missing(root, folder, scans)))
+    return Imported(folder, (*unnamed, *target_notes, *_missing(root, folder, scans)))
 
 
 def _tree(
@@ -137,7 +141,7 @@ def _tree(
         tree["calibration"] = {"file": os.path.relpath(calibration, root)}
     tree["camera"] = [_camera(root, name, [one for one in frames if one.camera == name], mosaic) for name in cameras]
     tree["light"] = [{"name": name} for name in lights]
-    tree["frame"] = [_frame(one, exposure_s) for one in frames if one.kind not in THING_OF]
+    tree["frame"] = [_frame(one, exposure_s) for one in frames if one.kind not in TARGET_KEYS]
     return tree
 
 
@@ -156,7 +160,7 @@ def _frame(one: NamedFrame, exposure_s: float | None) -> Entry:
 def _camera(root: Path, name: str, frames: Sequence[NamedFrame], mosaic: str | None) -> Entry:
     """Entry of a camera with its size, bits, mosaic and channels, from some of its files."""
     # Read the frames with the most light, because they use the most bits.
-    bright = sorted(frames, key=lambda one: (one.kind == "black", -(one.exposure_s or 0) * one.gain))[:LOOKED_AT]
+    bright = sorted(frames, key=lambda one: (one.kind == "black", -(one.exposure_s or 0) * one.gain))[:FRAMES_READ]
     decoded = [_decoded(root, one) for one in bright]
     first = decoded[0]
     height, width = first.values.shape[:2]
@@ -217,8 +221,10 @@ def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[st
                 " were taken, and motion would be followed wrongly: put the [[frame]] entries in the order taken, or"
                 " give each its time_s."
             )
-        if lacking := sorted(str(one) for one in lit - {frame.light for frame in folder.frames_of(name, "light")}):
-            shown = ", ".join(lacking[:MAX_NAMED]) + (" and more" if len(lacking) > MAX_NAMED else "")
+        if missing_lights := sorted(
+            str(one) for one in lit - {frame.light for frame in folder.frames_of(name, "light")}
+        ):
+            shown = ", ".join(missing_lights[:MAX_NAMED]) + (" and more" if len(missing_lights) > MAX_NAMED else "")
             yield f"Camera {name} has no frame of light {shown}, which another camera has."
     if not lit:
         yield "No frame shows teeth under a light (kind light)."
@@ -239,7 +245,7 @@ def _is_out_of_order(folder: RawFolder, camera: str) -> bool:
     return changes == 1 and any(frame.time_s is None for frame in own)
 
 
-def _of_a_scan(file: str, camera: str) -> bytes:
+def _scan_template(file: str, camera: str) -> bytes:
     """Comment lines with the entry of a scan and of one landmark, to be filled in."""
     lines = ["", "[scan]", f'file = "{file}"', 'units = "mm"', 'jaw = "upper"', ""]
     lines += ["[[landmark]]", "tooth = ?", 'point = "edge"', "xyz_mm = [?, ?, ?]"]
@@ -247,13 +253,13 @@ def _of_a_scan(file: str, camera: str) -> bytes:
     return _commented(lines)
 
 
-def _to_complete(frames: Sequence[NamedFrame], exposure_s: float | None) -> bytes:
+def _target_template(frames: Sequence[NamedFrame], exposure_s: float | None) -> bytes:
     """Comment lines with the calibration targets that frames show, to be filled in, and with those frames."""
-    shown = [one for one in frames if one.kind in THING_OF]
-    templates = {kind: _THINGS[kind] for kind in dict.fromkeys(one.kind for one in shown)}
+    shown = [one for one in frames if one.kind in TARGET_KEYS]
+    templates = {kind: _TARGET_TABLES[kind] for kind in dict.fromkeys(one.kind for one in shown)}
     lines = [line for template in templates.values() for line in ("", *template)]
     for one in shown:
-        entry = _frame(one, exposure_s) | {THING_OF[one.kind]: one.kind}
+        entry = _frame(one, exposure_s) | {TARGET_KEYS[one.kind]: one.kind}
         lines += ["", "[[frame]]", *(f"{name} = {toml_value(value)}" for name, value in entry.items())]
     return _commented(lines)
 

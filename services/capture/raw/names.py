@@ -73,8 +73,8 @@ def named_frame(file: str) -> NamedFrame | str:
         if (seconds := _SECONDS.fullmatch(word)) is not None:
             over, under, whole, unit = seconds.groups()
             exposure_s = (float(over) / float(under) if over else float(whole)) * _UNITS[unit]
-        elif (told := _GAIN.fullmatch(word)) is not None:
-            gain = float(told[1])
+        elif (stated_gain := _GAIN.fullmatch(word)) is not None:
+            gain = float(stated_gain[1])
         elif _DECIMAL.fullmatch(word) is not None:
             return f"says {part} without a unit, such as {part}s"
         elif (found := KINDS.get(word.rstrip("0123456789").rstrip("-"))) is not None and kind is None:

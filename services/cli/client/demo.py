@@ -34,9 +34,9 @@ def demo(
 
     spec = JobSpec.model_validate(find_preset("demo").options)
     if server is None:
-        from services.cli.run import run_and_tell
+        from services.cli.run import run_and_report
 
-        run_and_tell(spec, out, None, as_json=as_json)
+        run_and_report(spec, out, None, as_json=as_json)
         return
     with connect(server) as client:
         job_id = client.submit(spec, name=name)["id"]

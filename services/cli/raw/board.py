@@ -24,11 +24,11 @@ def board_command(
     from services.core.raw.targets import Board
     from services.core.store import write_atomic
 
-    told: dict[str, object] = {"name": "board", "type": kind, "squares": squares, "square_mm": square_mm}
+    fields: dict[str, object] = {"name": "board", "type": kind, "squares": squares, "square_mm": square_mm}
     if kind != "chessboard":
-        told |= {"marker_mm": marker_mm or 0.75 * square_mm, "dictionary": dictionary}
+        fields |= {"marker_mm": marker_mm or 0.75 * square_mm, "dictionary": dictionary}
     try:
-        board = Board.model_validate(told)
+        board = Board.model_validate(fields)
     except ValidationError as problem:
         first = problem.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the board"

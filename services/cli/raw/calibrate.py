@@ -33,15 +33,15 @@ def calibrate_command(
     session = calibrate(raw, print, valid_days)
     write_session(session, out)
     write_report(session, out)
-    _tell(session)
+    _print_limits(session)
     if earlier is not None:
-        _tell_drift(session, earlier, against)
+        _print_drift(session, earlier, against)
     print(f"calibration: {out / 'calibration.json'}, report: {out / 'report.html'}")
     if session.judgement.broken and not accept:
         raise typer.Exit(9)
 
 
-def _tell_drift(session: Session, earlier: Calibration, against: Path | None) -> None:
+def _print_drift(session: Session, earlier: Calibration, against: Path | None) -> None:
     from services.calibrate.session.drift import changes
 
     found = changes(earlier, session.record)
@@ -51,7 +51,7 @@ def _tell_drift(session: Session, earlier: Calibration, against: Path | None) ->
         print(f"  {one.sentence}")
 
 
-def _tell(session: Session) -> None:
+def _print_limits(session: Session) -> None:
     for limit in session.judgement.limits:
         kept = "" if limit.is_kept else ", beyond its limit"
         print(f"{limit.what}: {limit.value:.3g} {limit.unit} (limit {limit.limit:g}){kept}")

@@ -59,13 +59,13 @@ class CalibratedCamera(Camera):
         if self.distortion is not None and len(self.distortion) not in DISTORTION_LENGTHS:
             lengths = ", ".join(map(str, sorted(DISTORTION_LENGTHS)))
             raise ValueError(f"distortion has {len(self.distortion)} numbers, and OpenCV's models have {lengths}")
-        if self.vignetting is not None and min(self.fall_of_light(k / 100) for k in range(201)) <= 0:
+        if self.vignetting is not None and min(self.vignetting_factor(k / 100) for k in range(201)) <= 0:
             raise ValueError("vignetting leaves no light at some distance from the principal point; fit it again")
         if self.crosstalk is not None and {len(row) for row in self.crosstalk} != {len(self.crosstalk)}:
             raise ValueError("crosstalk has not as many columns as rows; give one row and one column a channel")
         return self
 
-    def fall_of_light(self, q: float) -> float:
+    def vignetting_factor(self, q: float) -> float:
         """Relative brightness of a uniform source at squared relative distance q from the principal point.
 
         It is 1 at q = 0.

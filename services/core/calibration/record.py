@@ -165,10 +165,10 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
 
 def _require_each_channel(camera: CalibratedCamera, channels: int, origin: str) -> None:
     for key in ("radiance_per_count", "crosstalk"):
-        told = getattr(camera, key)
-        if told is not None and len(told) != channels:
+        value = getattr(camera, key)
+        if value is not None and len(value) != channels:
             raise CaptureInputError(
-                f"{origin}: camera {camera.name} has {key} of {len(told)} channels, and there are {channels}; give one"
+                f"{origin}: camera {camera.name} has {key} of {len(value)} channels, and there are {channels}; give one"
                 " per channel."
             )
 

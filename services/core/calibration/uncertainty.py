@@ -82,7 +82,7 @@ class CalibrationUncertainty(Record):
 def error_names(channels: Sequence[str], cameras: Sequence[Camera], lights: Sequence[Light]) -> Iterator[str]:
     """Every error that a calibration of these channels, cameras and lights may name."""
     yield from (f"gain.{channel}" for channel in channels)
-    yield from (f"{thing}.{axis}" for thing in ("teeth", "dome") for axis in TWIST)
+    yield from (f"{body}.{axis}" for body in ("teeth", "dome") for axis in TWIST)
     for light in lights:
         yield f"light_gain.{light.name}"
         yield from (f"light_gain.{light.name}.{channel}" for channel in channels)
@@ -107,8 +107,8 @@ def require_known_names(
     if uncertainty is None:
         return
     known = frozenset(error_names(channels, cameras, lights))
-    if strange := [name for name in uncertainty.names if name not in known]:
+    if unknown := [name for name in uncertainty.names if name not in known]:
         raise CaptureInputError(
-            f"{origin}: uncertainty names {strange[0]}, which is no error of its channels, cameras and lights; "
+            f"{origin}: uncertainty names {unknown[0]}, which is no error of its channels, cameras and lights; "
             "correct the name, such as gain.red, light_gain.LIGHT or flare.CAMERA.red."
         )

@@ -54,7 +54,7 @@ _FAULTS: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 """Kind of fault -> what is wrong and what to do, as the parts of an error message."""
-_SIGNS: Mapping[str, re.Pattern[str]] = MappingProxyType(
+_FAULT_PATTERNS: Mapping[str, re.Pattern[str]] = MappingProxyType(
     {
         "credentials": re.compile(
             r" 401 |InvalidAccessKeyId|SignatureDoesNotMatch|ExpiredToken|InvalidToken|[Cc]redential|AccessKey"
@@ -65,7 +65,7 @@ _SIGNS: Mapping[str, re.Pattern[str]] = MappingProxyType(
     }
 )
 """Kind of fault -> words of the server or the library by which it is recognised."""
-_OF_THE_MACHINE = re.compile(r"//[^/ ]+/latest/(api/token|meta-data)")
+_METADATA_SERVICE = re.compile(r"//[^/ ]+/latest/(api/token|meta-data)")
 """URL of the metadata service of Amazon machines, which the library asks for credentials if the environment has
 none."""
 
@@ -96,7 +96,7 @@ class RemoteFolder(Record):
         Raises:
             StoreError: the server refuses or does not answer.
         """
-        with _telling(self.url):
+        with _translate_server_errors(self.url):
             batches = list(_library().list(_opened(self.url).store, prefix=prefix or None))
         return {
             one["path"]: StoredObject(bytes=one["size"], etag=one["e_tag"] or "") for batch in batches for one in batch
@@ -109,12 +109,12 @@ class RemoteFolder(Record):
             CorruptStoreError: an object is not as it was written; the message names the first one. StoreError: as
                 ``listed``.
         """
-        there = self.listed()
+        present = self.listed()
         for name, expected in self.objects.items():
-            if there.get(name) != expected:
-                what = "is missing" if name not in there else "is not the object that was written there"
+            if present.get(name) != expected:
+                what = "is missing" if name not in present else "is not the object that was written there"
                 raise CorruptStoreError(f"{self.url}/{name} {what}; {remedy}.")
-        return there
+        return present
 
     def remove(self) -> None:
         """Remove all objects below the URL; a second call does no harm.
@@ -123,7 +123,7 @@ class RemoteFolder(Record):
             StoreError: as ``listed``.
         """
         names = list(self.listed())
-        with _telling(self.url):
+        with _translate_server_errors(self.url):
             _library().delete(_opened(self.url).store, names)
 
 
@@ -169,8 +169,8 @@ def new_remote_folder(path: Path, below: str) -> RemoteFolder:
     return RemoteFolder(url=f"{below}/{secrets.token_hex(16)}/{path.name}")
 
 
-def place_of(path: Path) -> Path | StorePath:
-    """Place of an array: its path, or the place on a server if a file stands in place of the array's folder.
+def array_location(path: Path) -> Path | StorePath:
+    """Location of an array: its path, or the place on a server if a file stands in place of the array's folder.
 
     Raises:
         CorruptStoreError: as ``remote_folder``. PlatformError: the library is not installed.
@@ -203,29 +203,29 @@ def discard_remote(folder: Path, pattern: str = "*.zarr") -> None:
             remote.remove()
 
 
-class _TellingStore(ObjectStore[Any]):
+class _ErrorTranslatingStore(ObjectStore[Any]):
     """Zarr's store on an object store that raises this project's errors."""
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:  # fmt: skip
         """See zarr."""
-        with _telling(_url_of(self.store)):
+        with _translate_server_errors(_url_of(self.store)):
             return await super().get(key, prototype, byte_range)
 
     async def set(self, key: str, value: Buffer) -> None:
         """See zarr."""
-        with _telling(_url_of(self.store)):
+        with _translate_server_errors(_url_of(self.store)):
             await super().set(key, value)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
         """See zarr."""
-        with _telling(_url_of(self.store)):
+        with _translate_server_errors(_url_of(self.store)):
             await super().set_if_not_exists(key, value)
 
     async def delete(self, key: str) -> None:
         """See zarr."""
-        with _telling(_url_of(self.store)):
+        with _translate_server_errors(_url_of(self.store)):
             await super().delete(key)
 
 
@@ -235,10 +235,10 @@ def _library(part: str = "") -> Any:
 
 
 @lru_cache(maxsize=8)
-def _opened(url: str) -> _TellingStore:
+def _opened(url: str) -> _ErrorTranslatingStore:
     """A client with its connections. Making one takes a tenth of a second, so each process keeps the last few."""
     bucket, _, prefix = url.removeprefix("s3://").partition("/")
-    with _telling(url):
+    with _translate_server_errors(url):
         client = _library(".store").S3Store(
             bucket,
             prefix=prefix,
@@ -247,7 +247,7 @@ def _opened(url: str) -> _TellingStore:
             # it.
             client_options={"connect_timeout": CONNECT_S, "timeout": ANSWER_S, "allow_http": True},
         )
-    return _TellingStore(client)
+    return _ErrorTranslatingStore(client)
 
 
 def _url_of(client: Any) -> str:
@@ -255,7 +255,7 @@ def _url_of(client: Any) -> str:
 
 
 @contextmanager
-def _telling(url: str) -> Iterator[None]:
+def _translate_server_errors(url: str) -> Iterator[None]:
     """Replace an error of the server, or of a server that does not answer, by a ``StoreError`` of one sentence.
 
     Raises:
@@ -265,8 +265,8 @@ def _telling(url: str) -> Iterator[None]:
         yield
     except (_library(".exceptions").BaseError, FileNotFoundError) as problem:
         # The library's message reads "<request> <URL> in <time> - <result>", followed by the same in detail.
-        did, _, came = str(problem).partition("Debug source:")[0].partition(" - ")
-        said = "credentials" if _OF_THE_MACHINE.search(did) else came or did
-        kind = next((kind for kind, sign in _SIGNS.items() if sign.search(said)), "silence")
+        request, _, result = str(problem).partition("Debug source:")[0].partition(" - ")
+        reason = "credentials" if _METADATA_SERVICE.search(request) else result or request
+        kind = next((kind for kind, pattern in _FAULT_PATTERNS.items() if pattern.search(reason)), "silence")
         what, remedy = _FAULTS[kind]
         raise StoreError(f"The S3 server of {url} {what}; {remedy}.") from problem

@@ -46,7 +46,7 @@ def read_scan_file(path: Path) -> ScanFile:
         raise CaptureInputError(f"Scan {path} is neither .vtp, .ply, .stl nor .obj; export it as one of these.")
     if not path.is_file():
         raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
-    require_few_triangles(path, _announced_triangles(path))
+    require_few_triangles(path, _declared_triangles(path))
     found = _read_polydata(path) if suffix == ".vtp" else _read_by_trimesh(path)
     if len(found.mesh.faces) == 0:
         raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
@@ -91,7 +91,7 @@ def read_sidecar(path: Path) -> NDArray[np.float64]:
         ) from problem
 
 
-def _announced_triangles(path: Path) -> int:
+def _declared_triangles(path: Path) -> int:
     # Number of triangles that the file's header declares, so that a file that is too large is refused before it is
     # read; 0 where the header does not tell.
     with path.open("rb") as file:

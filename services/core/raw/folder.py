@@ -76,7 +76,7 @@ def parse_raw_folder(content: bytes, origin: str) -> RawFolder:
     try:
         return RawFolder.model_validate(tree)
     except ValidationError as problem:
-        raise CaptureInputError(f"{origin}: {_told(problem, tree)}.") from problem
+        raise CaptureInputError(f"{origin}: {_error_text(problem, tree)}.") from problem
 
 
 def require_files(root: Path, folder: RawFolder) -> None:
@@ -121,26 +121,26 @@ def require_inside(root: Path, file: str, what: str) -> Path:
     return path
 
 
-def _told(problem: ValidationError, tree: Mapping[str, Any]) -> str:
+def _error_text(problem: ValidationError, tree: Mapping[str, Any]) -> str:
     first = problem.errors()[0]
-    place, kind = _place(first["loc"], tree)
+    entry, kind = _entry_at(first["loc"], tree)
     key = str(first["loc"][-1]) if first["loc"] else ""
     if first["type"] == "extra_forbidden":
-        return f"{place}unknown key '{key}'; known keys are {', '.join(sorted(kind.model_fields))}"
+        return f"{entry}unknown key '{key}'; known keys are {', '.join(sorted(kind.model_fields))}"
     if first["type"] == "missing" and not key.isdecimal():
-        return f"{place}'{key}' is missing; add it"
+        return f"{entry}'{key}' is missing; add it"
     message = first["msg"].removeprefix("Value error, ")
     remedy = "" if "; " in message else "; correct it"
-    return f"{place}{_key(first['loc'])}{message[:1].lower()}{message[1:]}{remedy}"
+    return f"{entry}{_key(first['loc'])}{message[:1].lower()}{message[1:]}{remedy}"
 
 
-def _place(location: Sequence[int | str], tree: Mapping[str, Any]) -> tuple[str, type[Record]]:
+def _entry_at(location: Sequence[int | str], tree: Mapping[str, Any]) -> tuple[str, type[Record]]:
     """The entry in which a validation error lies, in words, and the record whose keys are known there."""
     parts: list[str] = []
     kind: type[Record] = RawFolder
     node: Any = tree
     for depth, step in enumerate(location):
-        node = _below(node, step)
+        node = _child(node, step)
         if isinstance(step, str) and step in _KINDS and (depth + 1 < len(location) or isinstance(node, Mapping)):
             kind = _KINDS[step]
             parts.append(step)
@@ -149,7 +149,7 @@ def _place(location: Sequence[int | str], tree: Mapping[str, Any]) -> tuple[str,
     return " ".join(parts) + (": " if parts else ""), kind
 
 
-def _below(node: Any, step: int | str) -> Any:
+def _child(node: Any, step: int | str) -> Any:
     try:
         return node[step]
     except (KeyError, IndexError, TypeError):

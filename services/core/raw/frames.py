@@ -14,14 +14,14 @@ from services.core.raw.records import RawCamera, RawFolder, RawFrame
 
 Counts = NDArray[np.uint16] | NDArray[np.float32]
 _LETTERS = {"red": "R", "green": "G", "blue": "B"}
-GREENS_APART = 4.0
+MAX_GREEN_RATIO = 4.0
 """Largest ratio of the difference between a mosaic's two green pixels to the difference between its red and blue ones.
 Above it the mosaic is taken to begin with another colour."""
 BRIGHT_PERCENT = 75
 """Percentile of brightness above which cells of 2 x 2 pixels are compared; the other cells may be black."""
 MIN_CELLS = 32
 """Least number of cells to compare; with fewer, the pattern is not judged."""
-CLEARLY_APART = 0.05
+MIN_GREEN_DIFFERENCE = 0.05
 """Half of the relative difference of a cell's green pixels up to which the pattern is not judged. The two greens of
 real sensors differ by 1 or 2 %."""
 
@@ -41,7 +41,7 @@ def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
     camera = folder.camera_named(frame.camera)
     try:
         decoded = decode(path)
-        counts = _significant(_shaped(decoded, camera), camera)
+        counts = _significant_bits(_in_camera_shape(decoded, camera), camera)
         _require_pattern(decoded, counts, camera)
     except OSError as problem:
         raise CaptureInputError(
@@ -57,7 +57,7 @@ def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
     return counts
 
 
-def _shaped(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]:
+def _in_camera_shape(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]:
     """The file's values in the shape of the camera, (H, W) or (H, W, C), with channels in the camera's order."""
     values, names = decoded.values, decoded.names
     if names is not None and len(names) == len(camera.channels) and camera.mosaic == "none":
@@ -87,12 +87,12 @@ def _shaped(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]:
     return values if camera.mosaic != "none" else values.reshape(height, width, in_file)
 
 
-def _significant(values: NDArray[np.generic], camera: RawCamera) -> Counts:
+def _significant_bits(values: NDArray[np.generic], camera: RawCamera) -> Counts:
     """Counts without the unused low bits of the file (``shift``), checked against the camera's depth."""
     if np.issubdtype(values.dtype, np.floating) and values.dtype.itemsize <= 4:
         numbers = np.array(values, dtype=np.float32)
-        if broken := int(np.count_nonzero(~np.isfinite(numbers))):
-            raise ValueError(f"has {broken} values that are no finite numbers; export it again")
+        if non_finite := int(np.count_nonzero(~np.isfinite(numbers))):
+            raise ValueError(f"has {non_finite} values that are no finite numbers; export it again")
         return numbers
     if values.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise ValueError(
@@ -100,10 +100,10 @@ def _significant(values: NDArray[np.generic], camera: RawCamera) -> Counts:
         )
     if camera.bits is None:
         raise ValueError("holds whole numbers, and how many of their bits count is not said; give the camera its bits")
-    held = 8 * values.dtype.itemsize
-    if camera.bits + camera.shift > held:
+    file_bits = 8 * values.dtype.itemsize
+    if camera.bits + camera.shift > file_bits:
         raise ValueError(
-            f"has {held} bits a count, but its camera has"
+            f"has {file_bits} bits a count, but its camera has"
             f" {camera.bits}{f' moved up by {camera.shift}' if camera.shift else ''}; export it at the camera's depth,"
             " or correct bits and shift"
         )
@@ -137,12 +137,12 @@ def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> Non
     cells = [counts[k // 2 : height : 2, k % 2 : width : 2].astype(np.float32) for k in range(4)]
     bright = sum(cells) >= np.percentile(sum(cells), BRIGHT_PERCENT)
     greens, others = (
-        [cell[bright] for cell, letter in zip(cells, camera.mosaic, strict=True) if (letter == "G") == wanted]
-        for wanted in (True, False)
+        [cell[bright] for cell, letter in zip(cells, camera.mosaic, strict=True) if (letter == "G") == is_green]
+        for is_green in (True, False)
     )
     # Medians are compared, because edges in the image make single cells differ in either direction.
-    apart, expected = (abs(float(np.median((a - b) / np.maximum(a + b, 1)))) for a, b in (greens, others))
-    if len(greens[0]) >= MIN_CELLS and apart > GREENS_APART * expected and apart > CLEARLY_APART:
+    deviation, expected = (abs(float(np.median((a - b) / np.maximum(a + b, 1)))) for a, b in (greens, others))
+    if len(greens[0]) >= MIN_CELLS and deviation > MAX_GREEN_RATIO * expected and deviation > MIN_GREEN_DIFFERENCE:
         raise ValueError(
-            f"has green pixels that differ by {2 * apart:.0%}, so it does not begin {camera.mosaic}; correct mosaic"
+            f"has green pixels that differ by {2 * deviation:.0%}, so it does not begin {camera.mosaic}; correct mosaic"
         )

@@ -21,7 +21,7 @@ Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 FrameKind = Literal[
     "black", "tracking", "light", "flat", "dark-room", "board", "mirror-sphere", "white-sphere", "chart"
 ]
-THING_OF: Mapping[str, str] = MappingProxyType(
+TARGET_KEYS: Mapping[str, str] = MappingProxyType(
     {"board": "board", "mirror-sphere": "sphere", "white-sphere": "sphere", "chart": "chart"}
 )
 """Kind of frame that shows a board, sphere or chart -> key of the frame that names it."""
@@ -64,7 +64,7 @@ class RawCamera(Record):
         return None if self.bits is None else float(2**self.bits - 1)
 
     @model_validator(mode="after")
-    def _possible(self) -> RawCamera:
+    def _require_consistent_bits(self) -> RawCamera:
         if self.bits is not None and self.bits + self.shift > MAX_BITS:
             raise ValueError(f"bits = {self.bits} and shift = {self.shift} go beyond the {MAX_BITS} bits of a file")
         if self.bits is not None and self.saturation_counts is not None and self.saturation_counts > 2**self.bits - 1:
@@ -113,23 +113,23 @@ class RawFrame(Record):
     )
 
     @property
-    def thing(self) -> str | None:
+    def target(self) -> str | None:
         """Name of the board, sphere or chart that the frame shows; None for other kinds."""
         return self.board or self.sphere or self.chart
 
     @property
     def label(self) -> str:
         """The frame's camera and light, or its kind, in words for a message."""
-        seen = f"light {self.light}" if self.light is not None else self.kind
-        return f"camera {self.camera}, {seen}"
+        shown = f"light {self.light}" if self.light is not None else self.kind
+        return f"camera {self.camera}, {shown}"
 
     @model_validator(mode="after")
-    def _of_its_kind(self) -> RawFrame:
+    def _require_fields_of_its_kind(self) -> RawFrame:
         for key in ("board", "sphere", "chart"):
-            wanted = THING_OF.get(self.kind) == key
-            if wanted and getattr(self, key) is None:
+            is_required = TARGET_KEYS.get(self.kind) == key
+            if is_required and getattr(self, key) is None:
                 raise ValueError(f"a frame of kind {self.kind} must name its {key}")
-            if not wanted and getattr(self, key) is not None:
+            if not is_required and getattr(self, key) is not None:
                 raise ValueError(f"a frame of kind {self.kind} has no {key}; leave it out")
         if self.kind in LIT_BY_ONE and self.light is None:
             raise ValueError(f"a frame of kind {self.kind} must name its light")
@@ -209,12 +209,12 @@ class RawFolder(Record):
                     f"sphere {sphere.name} has {len(sphere.reflectance)} reflectances for {len(self.channels)} channels"
                 )
         for landmark in self.landmark:
-            for seen in landmark.pixels:
-                if seen.camera not in known["camera"]:
+            for click in landmark.pixels:
+                if click.camera not in known["camera"]:
                     raise ValueError(
-                        f"landmark {landmark.tooth} {landmark.point} names camera {seen.camera}, which is not listed"
+                        f"landmark {landmark.tooth} {landmark.point} names camera {click.camera}, which is not listed"
                     )
-            if twice := _repeated(seen.camera for seen in landmark.pixels):
+            if twice := _repeated(click.camera for click in landmark.pixels):
                 raise ValueError(f"landmark {landmark.tooth} {landmark.point} names camera {twice} twice")
         if twice := _repeated(f"{landmark.tooth} {landmark.point}" for landmark in self.landmark):
             raise ValueError(f"landmark {twice} is listed twice; keep one of them")

@@ -67,8 +67,8 @@ class Sphere(Record):
     @model_validator(mode="after")
     def _reflectance_of_white(self) -> Sphere:
         if (self.kind == "white") != (self.reflectance is not None):
-            told = "needs its reflectance, one number a channel" if self.kind == "white" else "has no reflectance here"
-            raise ValueError(f"a {self.kind} sphere {told}")
+            fault = "needs its reflectance, one number a channel" if self.kind == "white" else "has no reflectance here"
+            raise ValueError(f"a {self.kind} sphere {fault}")
         return self
 
 

@@ -33,7 +33,7 @@ class SlabExposure(Record):
     )
 
     @model_validator(mode="after")
-    def _of_its_kind(self) -> SlabExposure:
+    def _require_fields_of_its_kind(self) -> SlabExposure:
         if (self.kind == "light") != (self.light is not None):
             what = "must name its light" if self.kind == "light" else "has no light on; leave light out"
             raise ValueError(f"exposure {self.file} of kind {self.kind} {what}")

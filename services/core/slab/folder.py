@@ -59,9 +59,9 @@ class Beam(Record):
 
     @model_validator(mode="after")
     def _size_of_its_profile(self) -> Beam:
-        wanted, other = ("sigma_mm", "radius_mm") if self.profile == "gaussian" else ("radius_mm", "sigma_mm")
-        if getattr(self, wanted) is None or getattr(self, other) is not None:
-            raise ValueError(f"a {self.profile} beam is given by {wanted} alone")
+        required, other = ("sigma_mm", "radius_mm") if self.profile == "gaussian" else ("radius_mm", "sigma_mm")
+        if getattr(self, required) is None or getattr(self, other) is not None:
+            raise ValueError(f"a {self.profile} beam is given by {required} alone")
         return self
 
     @property
@@ -140,8 +140,8 @@ class SlabFolder(Record):
 
     @model_validator(mode="after")
     def _names_agree(self) -> SlabFolder:
-        for what, things in (("light", self.lights), ("camera", self.cameras)):
-            names = [thing.name for thing in things]
+        for what, entries in (("light", self.lights), ("camera", self.cameras)):
+            names = [entry.name for entry in entries]
             if twice := {name for name in names if names.count(name) > 1}:
                 raise ValueError(f"{what} {min(twice)} is listed twice; give each {what} a name of its own")
         self._require_index()
@@ -173,14 +173,14 @@ class SlabFolder(Record):
                 raise ValueError(f"{what}; measure one at an angle, or leave it out")
         if self.cell.boundary == "matched" or self.cell.index is not None:
             return
-        told = {beam.wavelength_nm for beam in self.through_beam}
-        if lacking := [nm for nm in self.wavelengths_nm if not told & {nm, None}]:
-            what = f"cell.index is null, and no through_beam at {lacking[0]:g} nm tells it"
+        stated_nm = {beam.wavelength_nm for beam in self.through_beam}
+        if missing_nm := [nm for nm in self.wavelengths_nm if not stated_nm & {nm, None}]:
+            what = f"cell.index is null, and no through_beam at {missing_nm[0]:g} nm tells it"
             raise ValueError(f"{what}; add one, or give the sample's index")
 
     def _require_known(self, image: SlabImage) -> None:
-        for what, name, things in (("camera", image.camera, self.cameras), ("light", image.light, self.lights)):
-            if name not in {thing.name for thing in things}:
+        for what, name, entries in (("camera", image.camera, self.cameras), ("light", image.light, self.lights)):
+            if name not in {entry.name for entry in entries}:
                 raise ValueError(
                     f"image {image.file} names {what} {name}, which is not among the {what}s; correct the name"
                 )

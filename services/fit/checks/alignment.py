@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from services.core.records import MaskBit
 from services.fit.checks.evaluate import Evaluation
-from services.fit.checks.offset import Comparison, FoundOffset, Slide, best_offset
+from services.fit.checks.offset import Comparison, FoundOffset, ShiftedRender, best_offset
 from services.fit.inputs.levels import LevelReader, whole_squares
 from services.fit.inputs.observations import Observations, ViewStack
 
-LOOKED_AT = 0.05
+TESTED_ERROR = 0.05
 """Relative image error above which a fit is tested for an offset: below it, a shift does not matter."""
 MIN_MM = 0.5
 """Least offset that is reported, in mm; a registration of scan and photographs is accurate to about 0.1 mm."""
@@ -102,7 +102,7 @@ def clearest_offset(
 def _compared(
     evaluation: Evaluation, observations: Observations, views: tuple[ViewStack, ...], channel: str
 ) -> list[tuple[ViewStack, float, list[Comparison]]]:  # fmt: skip
-    seen = np.flatnonzero(np.any([view.valid.any(axis=1) for view in views], axis=0))
+    valid_lights = np.flatnonzero(np.any([view.valid.any(axis=1) for view in views], axis=0))
     store, index = observations.folder / "prepared.zarr", observations.manifest.channels.index(channel)
     cameras = {camera.name: camera for camera in observations.manifest.cameras}
     names = [camera.name for camera in observations.manifest.cameras]
@@ -115,7 +115,7 @@ def _compared(
         for (camera, shown), (pixels, values) in evaluation.renders.items():
             if camera != view.camera.name:
                 continue
-            light = int(seen[shown])
+            light = int(valid_lights[shown])
             # Compare pixels beside the teeth, too: a mask that was drawn from a wrong pose hides exactly those pixels
             # that show the offset.
             usable = whole_squares(
@@ -133,10 +133,10 @@ def _compared(
 
 def _offset(view: ViewStack, pixel_mm: float, images: list[Comparison], tooth: int | None) -> Offset | None:
     chosen = view.pixels if tooth is None or view.parts is None else view.pixels[view.parts.shown == tooth]
-    return told_offset(view.camera.name, images, chosen.astype(np.int64), pixel_mm)
+    return reported_offset(view.camera.name, images, chosen.astype(np.int64), pixel_mm)
 
 
-def told_offset(camera: str, images: list[Comparison], pixels: NDArray[np.int64], pixel_mm: float) -> Offset | None:
+def reported_offset(camera: str, images: list[Comparison], pixels: NDArray[np.int64], pixel_mm: float) -> Offset | None:
     """Offset of a camera's photographs from their renders, if it is clear and large enough to be reported.
 
     Args:
@@ -147,7 +147,7 @@ def told_offset(camera: str, images: list[Comparison], pixels: NDArray[np.int64]
     """
     if len(pixels) < MIN_PIXELS or not images:
         return None
-    found = best_offset(Slide(images, pixels), pixel_mm)
+    found = best_offset(ShiftedRender(images, pixels), pixel_mm)
     return None if found is None or not _is_clear(found, pixel_mm) else _in_mm(camera, found, pixel_mm)
 
 
@@ -162,7 +162,7 @@ def _in_mm(camera: str, found: FoundOffset, pixel_mm: float) -> Offset:
     )
 
 
-def offsets_told(
+def offset_sentences(
     evaluations: Mapping[str, Evaluation],
     errors: Mapping[str, float],
     observations: Observations,
@@ -183,6 +183,6 @@ def offsets_told(
     found = {
         c: clearest_offset(evaluations[c], observations, views[c], c, tooth)
         for c, error in errors.items()
-        if error > LOOKED_AT
+        if error > TESTED_ERROR
     }
     return [f"{channel}: {offset.sentence(what)}" for channel, offset in found.items() if offset is not None]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from services.fit.execution.blocks import BlockTask, read_block
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import Passes, TraceRow, trace_row
-from services.fit.instrument.columns import photographed
+from services.fit.instrument.photographs import photographed
 from services.fit.optics.parameters import Mouth, Tissue
 
 Array = NDArray[np.float64]
@@ -101,9 +101,9 @@ class FrameSums:
     @property
     def errors(self) -> Array:
         """Relative error (L, L) of each photograph against each render; infinite where there is no signal."""
-        seen = self.signal > 0
-        square = np.where(seen, self.product, 0.0) / np.where(seen, self.signal, 1.0)
-        return np.where(seen, np.sqrt(np.maximum(square, 0.0)), np.inf)
+        has_signal = self.signal > 0
+        square = np.where(has_signal, self.product, 0.0) / np.where(has_signal, self.signal, 1.0)
+        return np.where(has_signal, np.sqrt(np.maximum(square, 0.0)), np.inf)
 
 
 def frame_sums(first: Array, second: Array, reference: Array, variance: Array, valid: NDArray[np.bool_]) -> FrameSums:
@@ -221,9 +221,9 @@ def evaluate_task(
         else {int(part): sums(block.parts.shown == part) for part in np.unique(block.parts.shown)}
     )
     camera = block.view.camera.name
-    seen = [(name, light) for name, light in shown if name == camera]
-    renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in seen}
-    spreads = {(name, light): 0.5 * np.abs(first[light] - second[light]) for name, light in seen}
+    own_images = [(name, light) for name, light in shown if name == camera]
+    renders = {(name, light): 0.5 * (first[light] + second[light]) for name, light in own_images}
+    spreads = {(name, light): 0.5 * np.abs(first[light] - second[light]) for name, light in own_images}
     valid = (block.fit_weight > 0) | block.held_out
     # Use the media's renders without the instrument's errors: gains that adapted to a wrong frame would hide it.
     frames = frame_sums(stacks[0].mean, stacks[1].mean, block.reference, block.variance, valid) if by_frame else None

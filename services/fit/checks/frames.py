@@ -19,17 +19,17 @@ from services.fit.inputs.observations import Observations, ViewStack
 
 Array = NDArray[np.float64]
 
-LOOKED_AT = 0.1
+TESTED_ERROR = 0.1
 """Relative error of a photograph above which other lights are tried: below it, the renders of neighbouring lights
 hardly differ from its own."""
-BETTER = 0.5
+MAX_OTHER_ERROR = 0.5
 """Largest error of another light's render, as a part of the error of the photograph's own light. Renders of lights 10
 degrees apart differ by more than those of lights that are misplaced by 10 mm."""
-EXCHANGED = 0.75
+MAX_EXCHANGED_ERROR = 0.75
 """Largest joint error of two exchanged photographs with lights swapped, as a part of their joint error; each has to be
 better explained by the other's light. The limit is weaker than for a single photograph, because a fit biases its media
 towards exchanged ones; by chance two photographs do not explain each other at all."""
-ODD = 0.3
+MIN_ODD_ERROR = 0.3
 """Relative error above which a photograph is reported although no other light explains it."""
 ODD_RATIO = 5.0
 """Factor by which the error of an odd photograph must exceed the median of its camera's: where all are poorly
@@ -61,40 +61,42 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
         sums: sums over the camera's frames.
     """
     errors = sums.errors
-    own, told = np.diag(errors), set[int]()
+    own, reported = np.diag(errors), set[int]()
     shown = own[np.isfinite(own)]
     if not len(shown):
         return
     for first, second in combinations(range(len(lights)), 2):
-        if {first, second} & told or not _are_exchanged(errors, first, second):
+        if {first, second} & reported or not _are_exchanged(errors, first, second):
             continue
-        told |= {first, second}
+        reported |= {first, second}
         yield WrongFrame(camera, lights[first], float(own[first]), lights[second], exchanged=True)
-    looks_like = {
+    best_lights = {
         photo: int(errors[:, photo].argmin())
         for photo in range(len(lights))
-        if np.isfinite(own[photo]) and own[photo] > LOOKED_AT and errors[:, photo].min() <= BETTER * own[photo]
+        if np.isfinite(own[photo])
+        and own[photo] > TESTED_ERROR
+        and errors[:, photo].min() <= MAX_OTHER_ERROR * own[photo]
     }
-    for photo, light in looks_like.items():
-        if photo in told:
+    for photo, light in best_lights.items():
+        if photo in reported:
             continue
-        told.add(photo)
+        reported.add(photo)
         yield WrongFrame(camera, lights[photo], float(own[photo]), lights[light])
-    limit = max(ODD, ODD_RATIO * float(np.median(shown)))
+    limit = max(MIN_ODD_ERROR, ODD_RATIO * float(np.median(shown)))
     odd = np.flatnonzero(np.isfinite(own) & (own > limit)).tolist() if len(shown) >= MIN_FRAMES else []
     for photo in odd:
-        if photo not in told:
+        if photo not in reported:
             yield WrongFrame(camera, lights[photo], float(own[photo]))
 
 
 def _are_exchanged(errors: Array, first: int, second: int) -> bool:
     own, others = (errors[first, first], errors[second, second]), (errors[second, first], errors[first, second])
-    if not np.isfinite([*own, *others]).all() or np.hypot(*own) <= np.sqrt(2) * LOOKED_AT:
+    if not np.isfinite([*own, *others]).all() or np.hypot(*own) <= np.sqrt(2) * TESTED_ERROR:
         return False
-    return bool(others[0] < own[0] and others[1] < own[1] and np.hypot(*others) <= EXCHANGED * np.hypot(*own))
+    return bool(others[0] < own[0] and others[1] < own[1] and np.hypot(*others) <= MAX_EXCHANGED_ERROR * np.hypot(*own))
 
 
-def photographs_told(
+def photograph_sentences(
     evaluations: Mapping[str, Evaluation],
     observations: Observations,
     views: Mapping[str, tuple[ViewStack, ...]],
@@ -107,7 +109,7 @@ def photographs_told(
         evaluations: by channel, evaluation of the final solution with sums over frames.
         observations: the fit's observations.
         views: by channel, the observed views.
-        is_placed: whether the mesh lies where the photographs show it; see ``frames_told``.
+        is_placed: whether the mesh lies where the photographs show it; see ``report_frames``.
     """
     lights = {
         channel: [
@@ -119,10 +121,10 @@ def photographs_told(
         ]
         for channel, own in views.items()
     }
-    return frames_told({channel: one.frames for channel, one in evaluations.items()}, lights, is_placed=is_placed)[0]
+    return report_frames({channel: one.frames for channel, one in evaluations.items()}, lights, is_placed=is_placed)[0]
 
 
-def frames_told(
+def report_frames(
     sums: Mapping[str, Mapping[str, FrameSums]], lights: Mapping[str, Sequence[str]], *, is_placed: bool = True
 ) -> tuple[list[str], tuple[WrongFrame, ...]]:
     """One sentence for each wrong frame, with one common sentence where several cameras show the same fault; and the
@@ -143,9 +145,9 @@ def frames_told(
                     continue
                 # Report odd photographs by camera, because a fault in one camera need not occur in another.
                 key = frame.camera if not frame.other else "", frame.light, frame.other, frame.exchanged
-                seen = found.setdefault(key, (frame, []))[1]
-                if camera not in seen:
-                    seen.append(camera)
+                cameras_shown = found.setdefault(key, (frame, []))[1]
+                if camera not in cameras_shown:
+                    cameras_shown.append(camera)
     return [_sentence(frame, cameras) for frame, cameras in found.values()], tuple(frame for frame, _ in found.values())
 
 

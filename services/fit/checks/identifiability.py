@@ -10,42 +10,48 @@ import numpy as np
 from services.core.results import Correlation, Estimate
 from services.fit.solve.covariance import Uncertainty
 
-NOTHING = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."
+NOT_EXPLAINED = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."
 QUANTITIES = {"sigma_s_reduced": "scattering", "sigma_a": "absorption"}
 COORDINATES = {"sigma": ("scattering", 1), "alpha": ("absorption", -1)}
 """Quantity that changes with a coordinate, and the sign of the change."""
-TOLD = 0.5
+MAX_RELATIVE_SE = 0.5
 """Largest relative standard error of a quantity that counts as determined in these sentences."""
 EXCHANGEABLE = 0.9
 """Absolute correlation from which two quantities count as exchangeable."""
 
 
-def correlation(known: Uncertainty) -> Correlation:
+def correlation(uncertainty: Uncertainty) -> Correlation:
     """Correlation of the errors of the tissue's coordinates, without the remaining step to the minimum. A coordinate
     without error is uncorrelated with the others.
     """
-    count = known.domain.tissue_count
-    covariance = (known.covariance if known.sandwich is None else known.sandwich.covariance)[:count, :count]
+    count = uncertainty.domain.tissue_count
+    covariance = (uncertainty.covariance if uncertainty.sandwich is None else uncertainty.sandwich.covariance)[
+        :count, :count
+    ]
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(errors > 0, errors, np.inf)
     matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
-    return Correlation(names=known.domain.names[:count], matrix=tuple(tuple(float(v) for v in row) for row in matrix))
+    return Correlation(
+        names=uncertainty.domain.names[:count], matrix=tuple(tuple(float(v) for v in row) for row in matrix)
+    )
 
 
-def told(tables: Mapping[str, Mapping[str, Estimate]], correlations: Mapping[str, Correlation]) -> str:
+def determined_sentences(tables: Mapping[str, Mapping[str, Estimate]], correlations: Mapping[str, Correlation]) -> str:
     """One or more sentences: the determined quantities with unit and standard error, the others with their limits, and
     the pair of quantities that is hardest to distinguish.
     """
     groups: dict[tuple[str, ...], list[str]] = {}
     for channel, table in tables.items():
-        groups.setdefault(tuple(name for name in _quantities(table) if _is_told(table[name])), []).append(channel)
-    sentences = [_sentence(seen, channels, tables, alone=len(tables) == 1) for seen, channels in groups.items()]
-    alike = _alike(correlations)
-    return " ".join(sentences + ([alike] if alike else []))
+        groups.setdefault(tuple(name for name in _quantities(table) if _is_determined(table[name])), []).append(channel)
+    sentences = [
+        _sentence(determined, channels, tables, alone=len(tables) == 1) for determined, channels in groups.items()
+    ]
+    exchangeable = _exchangeable_pair(correlations)
+    return " ".join(sentences + ([exchangeable] if exchangeable else []))
 
 
-def in_words(name: str) -> str:
+def quantity_in_words(name: str) -> str:
     """Name of a quantity in words: ``enamel.sigma_a`` becomes *enamel absorption*."""
     part, _, leaf = name.rpartition(".")
     return f"{part} {QUANTITIES[leaf]}"
@@ -55,12 +61,12 @@ def _quantities(table: Mapping[str, Estimate]) -> list[str]:
     return [f"{part}.{leaf}" for part in ("enamel", "dentin") for leaf in QUANTITIES if f"{part}.{leaf}" in table]
 
 
-def _is_told(estimate: Estimate) -> bool:
-    return estimate.determined and estimate.se is not None and estimate.se <= TOLD * abs(estimate.value)
+def _is_determined(estimate: Estimate) -> bool:
+    return estimate.determined and estimate.se is not None and estimate.se <= MAX_RELATIVE_SE * abs(estimate.value)
 
 
 def _sentence(
-    seen: Sequence[str], channels: Sequence[str], tables: Mapping[str, Mapping[str, Estimate]], *, alone: bool
+    determined: Sequence[str], channels: Sequence[str], tables: Mapping[str, Mapping[str, Estimate]], *, alone: bool
 ) -> str:
     def values(name: str, what: str) -> str:
         found = [(channel, tables[channel][name]) for channel in channels]
@@ -71,12 +77,14 @@ def _sentence(
         return ", ".join(texts)
 
     opening = "This capture" if alone else f"In {_listed(channels)} this capture"
-    unseen = [name for name in _quantities(tables[channels[0]]) if name not in seen]
-    known = _listed([f"{in_words(name)} ({values(name, 'value')})" for name in seen])
-    open_ = _listed([f"{in_words(name)} ({values(name, 'limits')} fits)" for name in unseen], "or")
-    if not seen:
-        return f"{opening} does not tell {open_}."
-    return f"{opening} tells {known}" + (f", but not {open_}." if unseen else ".")
+    undetermined = [name for name in _quantities(tables[channels[0]]) if name not in determined]
+    determined_text = _listed([f"{quantity_in_words(name)} ({values(name, 'value')})" for name in determined])
+    undetermined_text = _listed(
+        [f"{quantity_in_words(name)} ({values(name, 'limits')} fits)" for name in undetermined], "or"
+    )
+    if not determined:
+        return f"{opening} does not tell {undetermined_text}."
+    return f"{opening} tells {determined_text}" + (f", but not {undetermined_text}." if undetermined else ".")
 
 
 def _value(estimate: Estimate) -> str:
@@ -93,7 +101,7 @@ def _limits(estimate: Estimate) -> str:
     return f"anything from {low:.2g} to {high:.2g} per mm" if low > 0 else f"anything up to {high:.2g} per mm"
 
 
-def _alike(correlations: Mapping[str, Correlation]) -> str:
+def _exchangeable_pair(correlations: Mapping[str, Correlation]) -> str:
     # The pair with the largest correlation of errors, over all channels.
     found: list[tuple[float, str]] = []
     for one in correlations.values():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera
 from services.core.results import Estimate
-from services.fit.checks.identifiability import QUANTITIES, in_words
+from services.fit.checks.identifiability import QUANTITIES, quantity_in_words
 from services.fit.execution.blocks import (
     Block,
     BlockInstrument,
@@ -28,13 +28,13 @@ from services.fit.execution.blocks import (
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
-from services.fit.instrument.columns import columns
 from services.fit.instrument.errors import DEFAULT_SE
 from services.fit.instrument.moves import rigid
+from services.fit.instrument.photographs import error_derivatives
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import estimates
-from services.fit.solve.information import Addition, addition, covariance_after
+from services.fit.solve.information import AddedInformation, added_information, covariance_after
 from services.fit.solve.sandwich import Sandwich
 from services.fit.transport.scene.recipe import SceneRecipe, View
 
@@ -44,7 +44,7 @@ PIXELS = 100
 """Number of pixels of each view, spread evenly."""
 VIEW_ANGLE = np.radians(60)
 """Angle in rad by which candidate views are turned from the first camera."""
-WORTH = 0.1
+MIN_REDUCTION = 0.1
 """Least relative reduction of an error, including the prediction's own uncertainty, for which a candidate is
 recommended."""
 LIGHTS = {
@@ -62,10 +62,10 @@ class Candidate:
     """A planned light or view; the halves are predictions from two sets of pixels."""
 
     words: str
-    halves: tuple[Addition, Addition]
+    halves: tuple[AddedInformation, AddedInformation]
 
     @property
-    def whole(self) -> Addition:
+    def whole(self) -> AddedInformation:
         """Prediction from all pixels."""
         return self.halves[0] + self.halves[1]
 
@@ -97,9 +97,9 @@ class Probe:
     exact."""
 
 
-def advice(
+def capture_advice(
     problem: StackProblem[Tissue],
-    known: Uncertainty,
+    uncertainty: Uncertainty,
     folder: Path,
     parts: Sequence[str],
     sensor: Sensor,
@@ -111,66 +111,79 @@ def advice(
 
     Args:
         problem: the least-squares problem at the solution, which is its base.
-        known: uncertainty at the solution.
+        uncertainty: uncertainty at the solution.
         folder: receives the scenes and blocks of the planned images.
         parts: names of the media, such as ``enamel``.
         sensor: expected noise of the planned images.
         weight: weight of a measurement in the fit.
         samples: paths per pixel and seed, as in the fit's last measurement.
     """
-    assert known.sandwich is not None
+    assert uncertainty.sandwich is not None
     recipe, probes = probes_of(problem, folder)
-    _, similar, how = problem.jacobian_media(known.x)
+    _, similar, differentiation = problem.jacobian_media(uncertainty.x)
     seeds = problem.seed(0, "advice-1"), problem.seed(0, "advice-2")
     images = problem.seed(0, "advice-image-1"), problem.seed(0, "advice-image-2")
     run, label, pending = problem.passes.executor, f"{problem.passes.seeds.channel}-advice", []
     for index, probe in enumerate(probes):
         task = BlockTask(probe.block, index, recipe, label, similar, samples)
         pending.append(
-            run.submit(f"{label}-{index}", advice_task, task, how, seeds, known.sandwich, images, probe, sensor, weight)
+            run.submit(
+                f"{label}-{index}",
+                advice_task,
+                task,
+                differentiation,
+                seeds,
+                uncertainty.sandwich,
+                images,
+                probe,
+                sensor,
+                weight,
+            )
         )
-    parts_found: list[tuple[dict[str, tuple[Addition, Addition]], TraceRow]] = run.gather(pending)
+    parts_found: list[tuple[dict[str, tuple[AddedInformation, AddedInformation]], TraceRow]] = run.gather(pending)
     problem.passes.record([row for _, row in parts_found])
-    sums: dict[str, tuple[Addition, Addition]] = {}
+    sums: dict[str, tuple[AddedInformation, AddedInformation]] = {}
     for found, _ in parts_found:
         for words, (first, second) in found.items():
             sums[words] = (sums[words][0] + first, sums[words][1] + second) if words in sums else (first, second)
     candidates = tuple(Candidate(words, halves) for words, halves in sums.items())
-    return sentence(problem.base, parts, known, candidates), candidates
+    return sentence(problem.base, parts, uncertainty, candidates), candidates
 
 
-def sentence(tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidates: Sequence[Candidate]) -> str:
+def sentence(tissue: Tissue, parts: Sequence[str], uncertainty: Uncertainty, candidates: Sequence[Candidate]) -> str:
     """Sentence on the best candidate, judged by the quantity with the largest relative error, or by the next ones where
     no candidate reduces that one.
     """
-    before = relative_errors(estimates(tissue, parts, known))
+    before = relative_errors(estimates(tissue, parts, uncertainty))
     if not before or not candidates:
         return ""
     names = sorted(before, key=lambda name: -before[name])
-    found = [(candidate, predicted(tissue, parts, known, candidate)) for candidate in candidates]
+    found = [(candidate, predicted(tissue, parts, uncertainty, candidate)) for candidate in candidates]
     for name in names:
-        candidate, (after, unsure) = min(((c, p[name]) for c, p in found), key=lambda entry: sum(entry[1]))
-        if after + unsure <= (1 - WORTH) * min(before[name], 1.0):
-            was = in_percent(before[name]) if before[name] <= 1 else "more than 100 %"
+        candidate, (after, prediction_se) = min(((c, p[name]) for c, p in found), key=lambda entry: sum(entry[1]))
+        if after + prediction_se <= (1 - MIN_REDUCTION) * min(before[name], 1.0):
+            initial = in_percent(before[name]) if before[name] <= 1 else "more than 100 %"
             return (
-                f"{candidate.words} would help most: it would cut the error of {in_words(name)} from {was} to"
-                f" {in_percent(after)}."
+                f"{candidate.words} would help most: it would cut the error of {quantity_in_words(name)} from {initial}"
+                f" to {in_percent(after)}."
             )
     return (
         f"None of the {len(candidates)} further lights and views that were tried would cut the error of"
-        f" {in_words(names[0])} by more than a tenth."
+        f" {quantity_in_words(names[0])} by more than a tenth."
     )
 
 
 def predicted(
-    tissue: Tissue, parts: Sequence[str], known: Uncertainty, candidate: Candidate
+    tissue: Tissue, parts: Sequence[str], uncertainty: Uncertainty, candidate: Candidate
 ) -> dict[str, tuple[float, float]]:
     """Relative errors with a candidate's images, and the uncertainty of these predictions: two predictions from half
     the pixels each, counted twice, differ by noise alone.
     """
 
-    def after(added: Addition) -> dict[str, float]:
-        return relative_errors(estimates(tissue, parts, replace(known, covariance=covariance_after(known, added))))
+    def after(added: AddedInformation) -> dict[str, float]:
+        return relative_errors(
+            estimates(tissue, parts, replace(uncertainty, covariance=covariance_after(uncertainty, added)))
+        )
 
     whole, *halves = (after(added) for added in (candidate.whole, *(half.scaled(2) for half in candidate.halves)))
     return {name: (value, 0.5 * abs(halves[0][name] - halves[1][name])) for name, value in whole.items()}
@@ -213,8 +226,8 @@ def probes_of(problem: StackProblem[Tissue], folder: Path) -> tuple[StoredFile, 
         pixels = np.concatenate([block.view.pixels for block in own])
         probes.append(_probe(folder, camera, pixels, ("",) * lights + light_words, own[0].instrument, "light_gain"))
     for words, axis in VIEWS.items():
-        camera = turned(first, centre, np.asarray(axis, dtype=float) @ axes)
-        pixels = seen_pixels(camera, more, 1)
+        camera = rotated_camera(first, centre, np.asarray(axis, dtype=float) @ axes)
+        pixels = visible_pixels(camera, more, 1)
         if len(pixels):
             probes.append(
                 _probe(
@@ -234,7 +247,7 @@ def _probe(
     camera: Camera,
     pixels: NDArray[np.int32],
     words: tuple[str, ...],
-    known: BlockInstrument | None,
+    instrument: BlockInstrument | None,
     own_error: str,
 ) -> Probe:
     chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, min(PIXELS, len(pixels))).astype(int))]
@@ -246,25 +259,25 @@ def _probe(
         np.ones(shape),
         np.where(counted[:, None], np.ones(shape), 0.0),
         np.zeros(shape, dtype=bool),
-        instrument=None if known is None else _of_new_images(known, len(words), own_error),
+        instrument=None if instrument is None else _of_new_images(instrument, len(words), own_error),
     )
-    return Probe(write_block(folder, block), words, len(pixels) / len(chosen), "" if known is None else own_error)
+    return Probe(write_block(folder, block), words, len(pixels) / len(chosen), "" if instrument is None else own_error)
 
 
-def _of_new_images(known: BlockInstrument, lights: int, own_error: str) -> BlockInstrument:
+def _of_new_images(instrument: BlockInstrument, lights: int, own_error: str) -> BlockInstrument:
     # Errors of the fit that also act on planned images: gains of its lights, and flares of its cameras.
-    flare = "" if own_error == "flare" else known.flare
-    return replace(known, lights=known.lights + ("",) * (lights - len(known.lights)), flare=flare)
+    flare = "" if own_error == "flare" else instrument.flare
+    return replace(instrument, lights=instrument.lights + ("",) * (lights - len(instrument.lights)), flare=flare)
 
 
-def turned(camera: Camera, centre_mm: Array, axis: Array) -> Camera:
+def rotated_camera(camera: Camera, centre_mm: Array, axis: Array) -> Camera:
     """The camera turned around a point about an axis by ``VIEW_ANGLE``, still looking at the point as before."""
-    turn = rigid(np.concatenate([VIEW_ANGLE * axis, np.zeros(3)]), centre_mm)
-    moved = np.asarray(camera.camera_from_world) @ np.linalg.inv(turn)
+    rotation = rigid(np.concatenate([VIEW_ANGLE * axis, np.zeros(3)]), centre_mm)
+    moved = np.asarray(camera.camera_from_world) @ np.linalg.inv(rotation)
     return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, moved.tolist()))})
 
 
-def seen_pixels(camera: Camera, recipe: SceneRecipe, step: int) -> NDArray[np.int32]:
+def visible_pixels(camera: Camera, recipe: SceneRecipe, step: int) -> NDArray[np.int32]:
     """Every ``step``-th pixel (N, 2) in whose cell a point of the tooth's surface appears."""
     outer = recipe.teeth[0].outer
     corners = outer.vertices_mm[outer.faces]
@@ -278,14 +291,14 @@ def seen_pixels(camera: Camera, recipe: SceneRecipe, step: int) -> NDArray[np.in
 def advice_task(
     host: EngineHost,
     task: BlockTask,
-    how: Differentiation,
+    differentiation: Differentiation,
     seeds: tuple[int, int],
-    known: Sandwich,
+    sandwich: Sandwich,
     image_seeds: tuple[int, int],
     probe: Probe,
     sensor: Sensor,
     weight: float,
-) -> tuple[dict[str, tuple[Addition, Addition]], TraceRow]:
+) -> tuple[dict[str, tuple[AddedInformation, AddedInformation]], TraceRow]:
     """Information that one view adds, by candidate, from its even and its odd pixels, and the task's trace."""
     start, block = time.time(), read_block(task.block)
     view, half = block.fitted_view, max(task.samples // 2, 1)
@@ -294,10 +307,10 @@ def advice_task(
         for seed in image_seeds
     ]
     expected = 0.5 * (images[0] + images[1])
-    seen = columns(expected, block, how.errors)
+    error_rows = error_derivatives(expected, block, differentiation.errors)
     slopes = [
-        np.concatenate([rows, seen]).reshape(-1, *expected.shape)
-        for rows in how.render(host, task, view, seeds, block.parts)
+        np.concatenate([rows, error_rows]).reshape(-1, *expected.shape)
+        for rows in differentiation.render(host, task, view, seeds, block.parts)
     ]
     variance = sensor.variance(expected)
     out = {}
@@ -307,13 +320,13 @@ def advice_task(
         for odd in (0, 1):
             first, second = (rows[:, lights, odd::2].reshape(len(rows), -1) for rows in slopes)
             renders = [image[lights, odd::2].reshape(-1) for image in images]
-            one = addition(
-                known,
+            one = added_information(
+                sandwich,
                 (first, second),
                 (renders[0], renders[1]),
                 variance[lights, odd::2].reshape(-1),
                 weight,
-                _own_errors(probe, expected, block.instrument, how.errors)[:, lights, odd::2].reshape(
+                _own_errors(probe, expected, block.instrument, differentiation.errors)[:, lights, odd::2].reshape(
                     -1, renders[0].size
                 ),
             )
@@ -322,13 +335,13 @@ def advice_task(
     return out, trace_row("advice", task, start)
 
 
-def _own_errors(probe: Probe, image: Array, acting: BlockInstrument | None, fitted: tuple[str, ...]) -> Array:
+def _own_errors(probe: Probe, image: Array, instrument: BlockInstrument | None, fitted: tuple[str, ...]) -> Array:
     """Change (K, L, N) of new images by one standard error of the error that they add; empty where the fit has no
     errors of the instrument.
     """
-    if not probe.own_error or acting is None or not fitted:
+    if not probe.own_error or instrument is None or not fitted:
         return np.zeros((0, *image.shape))
-    changed = image if probe.own_error == "light_gain" else np.full(image.shape, acting.brightest)
+    changed = image if probe.own_error == "light_gain" else np.full(image.shape, instrument.brightest)
     return np.asarray(DEFAULT_SE[probe.own_error] * changed[None])
 
 

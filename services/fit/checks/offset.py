@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Shift = tuple[int, int]
 """Shift in pixels to the right and down."""
 
-REACH_MM = 4.0
+MAX_OFFSET_MM = 4.0
 """Largest offset of the search, half of a small tooth."""
 GRID = 8
 """Number of grid steps to each side in the first search."""
@@ -81,14 +81,14 @@ class _Match:
 
 
 @dataclass(frozen=True)
-class Slide:
+class ShiftedRender:
     """Pixels of a render that are shifted over the photographs of one camera."""
 
     images: Sequence[Comparison]
     pixels: NDArray[np.int64]
     """Compared pixels (N, 2) of the render."""
 
-    def cropped(self, margin_px: int) -> Slide:
+    def cropped(self, margin_px: int) -> ShiftedRender:
         """The images cropped to a margin around the render's pixels, because large images would need much memory."""
         height, width = self.images[0].photo.shape
         low = np.maximum(self.pixels.min(axis=0) - margin_px, 0)
@@ -97,9 +97,9 @@ class Slide:
         images = [
             Comparison(i.photo[window], i.variance[window], i.render[window], i.spread[window]) for i in self.images
         ]
-        return Slide(images, self.pixels - low)
+        return ShiftedRender(images, self.pixels - low)
 
-    def unlikeness(self, shift: Shift) -> float:
+    def mismatch(self, shift: Shift) -> float:
         """Unexplained share at a shift, noise included, as the objective of the search; 1 where photograph and render
         have nothing in common.
 
@@ -196,38 +196,40 @@ class FoundOffset:
         return float(np.hypot(along[0] * self.right_se_px, along[1] * self.down_se_px))
 
 
-def best_offset(slide: Slide, pixel_mm: float) -> FoundOffset | None:
+def best_offset(shifted_render: ShiftedRender, pixel_mm: float) -> FoundOffset | None:
     """Best offset by search over a grid of shifts, then with ever smaller steps around the best one.
 
     None where nothing can be compared or no difference is unexplained.
     """
-    slide = slide.cropped(2 * math.ceil(REACH_MM / pixel_mm))
-    best = _most_alike(slide, pixel_mm)
+    shifted_render = shifted_render.cropped(2 * math.ceil(MAX_OFFSET_MM / pixel_mm))
+    best = _best_shift(shifted_render, pixel_mm)
     if best is None:
         return None
     # Take the smaller of the two noise estimates: at a wrong shift the tooth's edges are in the residuals and enlarge
     # it.
-    noise = min(slide.noise((0, 0)), slide.noise(best))
-    in_place, there = (slide.unexplained(shift, noise) for shift in ((0, 0), best))
-    if in_place is None or there is None or in_place.value <= 0:
+    noise = min(shifted_render.noise((0, 0)), shifted_render.noise(best))
+    unshifted, shifted = (shifted_render.unexplained(shift, noise) for shift in ((0, 0), best))
+    if unshifted is None or shifted is None or unshifted.value <= 0:
         return None
-    right, down = (_vertex(slide, best, there, noise, direction) for direction in ((1, 0), (0, 1)))
-    less = in_place.value - there.value
-    se = float(np.linalg.norm(in_place.slopes - there.slopes))
-    gain, z = less / in_place.value, less / se if se > 0 else 0.0
+    right, down = (_vertex(shifted_render, best, shifted, noise, direction) for direction in ((1, 0), (0, 1)))
+    removed = unshifted.value - shifted.value
+    se = float(np.linalg.norm(unshifted.slopes - shifted.slopes))
+    gain, z = removed / unshifted.value, removed / se if se > 0 else 0.0
     return FoundOffset(best[0] + right.px, best[1] + down.px, right.se_px, down.se_px, gain, z)
 
 
-def _most_alike(slide: Slide, pixel_mm: float) -> Shift | None:
-    step = max(round(REACH_MM / pixel_mm / GRID), 1)
-    reach = round(REACH_MM / pixel_mm / step)
-    tried = {shift: slide.unlikeness(shift) for shift in _around((0, 0), step, reach)}
-    best = min(tried, key=tried.__getitem__)
+def _best_shift(shifted_render: ShiftedRender, pixel_mm: float) -> Shift | None:
+    step = max(round(MAX_OFFSET_MM / pixel_mm / GRID), 1)
+    reach = round(MAX_OFFSET_MM / pixel_mm / step)
+    mismatches = {shift: shifted_render.mismatch(shift) for shift in _around((0, 0), step, reach)}
+    best = min(mismatches, key=mismatches.__getitem__)
     while step > 1:
         step = max(step // 2, 1)
-        tried |= {shift: slide.unlikeness(shift) for shift in _around(best, step, 1) if shift not in tried}
-        best = min(tried, key=tried.__getitem__)
-    return best if np.isfinite(tried[best]) and np.isfinite(tried[0, 0]) else None
+        mismatches |= {
+            shift: shifted_render.mismatch(shift) for shift in _around(best, step, 1) if shift not in mismatches
+        }
+        best = min(mismatches, key=mismatches.__getitem__)
+    return best if np.isfinite(mismatches[best]) and np.isfinite(mismatches[0, 0]) else None
 
 
 def _around(centre: Shift, step: int, reach: int) -> list[Shift]:
@@ -240,14 +242,16 @@ class _Vertex(NamedTuple):
     se_px: float
 
 
-def _vertex(slide: Slide, best: Shift, there: Unexplained, noise: float, direction: Shift) -> _Vertex:
+def _vertex(
+    shifted_render: ShiftedRender, best: Shift, shifted: Unexplained, noise: float, direction: Shift
+) -> _Vertex:
     # Minimum of the parabola through the values at -1, 0 and 1, with its standard error; (0, infinite) where the
     # parabola has no minimum or a value is unknown.
     steps = [(best[0] + k * direction[0], best[1] + k * direction[1]) for k in (-1, 1)]
-    before, after = (slide.unexplained(step, noise) for step in steps)
-    if before is None or after is None or before.value + after.value <= 2 * there.value:
+    before, after = (shifted_render.unexplained(step, noise) for step in steps)
+    if before is None or after is None or before.value + after.value <= 2 * shifted.value:
         return _Vertex(0.0, np.inf)
-    curvature = before.value - 2 * there.value + after.value
+    curvature = before.value - 2 * shifted.value + after.value
     vertex = float(np.clip(0.5 * (before.value - after.value) / curvature, -0.5, 0.5))
-    bending = before.slopes - 2 * there.slopes + after.slopes
+    bending = before.slopes - 2 * shifted.slopes + after.slopes
     return _Vertex(vertex, float(np.linalg.norm(0.5 * (before.slopes - after.slopes) - vertex * bending)) / curvature)

@@ -97,13 +97,13 @@ def thickness_map(
                 image, None, Estimate(value=mean, se=None, unit="mm", determined=len(shape.modes_mm) == 0)
             )
         )
-    seen, points_mm = _seen(outer, camera)
-    if not seen.any():
+    visible, points_mm = _visible_points(outer, camera)
+    if not visible.any():
         return None
     found = uncertain_thickness(points_mm, shape, np.asarray(weights), covariance)
     return ThicknessMap(
-        _image(seen, found.values_mm, camera),
-        _image(seen, found.errors_mm, camera),
+        _image(visible, found.values_mm, camera),
+        _image(visible, found.errors_mm, camera),
         Estimate(
             value=found.mean_mm, se=found.mean_error_mm, unit="mm", determined=found.mean_error_mm < found.mean_mm / 2
         ),
@@ -112,17 +112,17 @@ def thickness_map(
 
 def thickness_image(outer: Mesh, dentin: Mesh, camera: Camera) -> NDArray[np.float64]:
     """Enamel thickness in mm at the surface point that each pixel shows, (H, W); NaN off the tooth."""
-    seen, points_mm = _seen(outer, camera)
-    return _image(seen, enamel_thickness_mm(points_mm, dentin) if seen.any() else np.zeros(0), camera)
+    visible, points_mm = _visible_points(outer, camera)
+    return _image(visible, enamel_thickness_mm(points_mm, dentin) if visible.any() else np.zeros(0), camera)
 
 
-def _seen(outer: Mesh, camera: Camera) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _visible_points(outer: Mesh, camera: Camera) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     # Mask (H W,) of the pixels that show the tooth, and the surface points (N, 3) that they show.
     hits = RayScene(outer).first_hits(*pixel_rays(camera))
     return hits.hit, hits.points_mm[hits.hit]
 
 
-def _image(seen: NDArray[np.bool_], values: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    image = np.full(len(seen), np.nan)
-    image[seen] = values
+def _image(visible: NDArray[np.bool_], values: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    image = np.full(len(visible), np.nan)
+    image[visible] = values
     return image.reshape(camera.size[1], camera.size[0])

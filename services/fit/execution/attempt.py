@@ -20,7 +20,7 @@ from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
 from services.core.verdict import MAX_ERROR
 from services.fit.checks.evaluate import ErrorSums, Evaluation
-from services.fit.execution.channel_fit import ChannelFit, StepReport, history_key, told_place
+from services.fit.execution.channel_fit import ChannelFit, StepReport, history_key, message_prefix
 from services.fit.execution.executors import Executor, executor
 from services.fit.execution.journal import Journal
 from services.fit.execution.numerics import numerics_name
@@ -31,10 +31,10 @@ from services.fit.inputs.observations import ChannelFiles, Observations, ViewSta
 
 CHECKPOINT = "fit-checkpoint"
 """Folder, in the job's folder, of the journal and of the input files of the fit's tasks."""
-NOT_OF_THE_ANSWER = frozenset({"workers", "capture", "rig", "priority", "store", *SLAB_OPTIONS})
+RESULT_NEUTRAL_OPTIONS = frozenset({"workers", "capture", "rig", "priority", "store", *SLAB_OPTIONS})
 """Options that do not change a fit's result; the capture's content enters the fingerprint by the digests of
 its files."""
-ALWAYS_NAMED = frozenset(
+FIRST_VERSION_OPTIONS = frozenset(
     [
         "kind",
         "calibration",
@@ -65,7 +65,7 @@ ALWAYS_NAMED = frozenset(
 )
 """Options of version 0.1, which its checkpoints always name. A later option is named only where it differs from its
 default, so it must not be added here: fits that were begun before the option existed then continue."""
-PREVIEW_EVERY = 3
+STEPS_PER_PREVIEW = 3
 """Number of steps between two previews; the first follows the first step."""
 
 Views = Mapping[str, tuple[ViewStack, ...]]
@@ -110,8 +110,8 @@ class Attempt:
     @contextmanager
     def workers(self) -> Iterator[Executor]:
         """Executor of the fit's tasks; the tasks' keys begin with a prefix that is unique to this attempt."""
-        place = self.context.root / CHECKPOINT
-        prefix = hashlib.sha256(f"{place / 'journal.json'}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[
+        folder = self.context.root / CHECKPOINT
+        prefix = hashlib.sha256(f"{folder / 'journal.json'}/{self.context.attempt}/{os.getpid()}".encode()).hexdigest()[
             :12
         ]
         with executor(self.context.root / CANCEL_FLAG, self.engine, prefix, WEIGHTS[self.spec.priority]) as run_on:
@@ -121,7 +121,7 @@ class Attempt:
         """Passes of one fit; ``scope`` separates its seeds and keys from those of other fits."""
         return Passes(run_on, files.coarse.blocks, files.recipe, Seeds(self.spec.seed, scope), self.trace.extend)
 
-    def teller(
+    def step_reporter(
         self, observations: Observations, views: tuple[ViewStack, ...], journal: Journal, done: Callable[[int], float]
     ) -> Callable[[StepReport, Evaluation], None]:
         """Function that records and reports each step of one channel's fit, with a preview every few steps.
@@ -133,17 +133,17 @@ class Attempt:
             done: returns the fraction of the job that is done after a number of steps of this channel.
         """
 
-        def tell(step: StepReport, evaluation: Evaluation) -> None:
+        def report(step: StepReport, evaluation: Evaluation) -> None:
             data = asdict(step)
-            place = told_place(step.channel, step.tooth)
-            message = f"{place} {step.stage} step {step.stage_step}: loss {step.loss:.3e}, {step.verdict}."
-            journal.once(history_key(step.channel, step.step), lambda: data)
+            prefix = message_prefix(step.channel, step.tooth)
+            message = f"{prefix} {step.stage} step {step.stage_step}: loss {step.loss:.3e}, {step.verdict}."
+            journal.get_or_compute(history_key(step.channel, step.step), lambda: data)
             self.context.report(StageEvent(stage="fit", kind="step", message=message, done=done(step.step), data=data))
-            if step.step % PREVIEW_EVERY == 1 and step.tooth is None:
+            if step.step % STEPS_PER_PREVIEW == 1 and step.tooth is None:
                 for preview in write_preview(self.context.root, step, evaluation, observations.manifest, views):
                     self.context.report(StageEvent(stage="fit", kind="preview", data=preview))
 
-        return tell
+        return report
 
     def write_records(
         self, journal: Journal, observations: Observations, evaluations: Mapping[str, Evaluation], views: Views
@@ -166,13 +166,13 @@ def standard_errors(sums: Mapping[str, ErrorSums]) -> dict[str, float]:
     return {channel: se for channel, own in sums.items() if (se := own.error_se) is not None}
 
 
-def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
+def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
     """Whether the fits of these channels count as converged, and advice where they do not."""
     advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
-    off = {c: worst_error(fit) for c, fit in fits.items()}
-    unexplained = [c for c, error in off.items() if error > MAX_ERROR]
+    errors = {c: worst_error(fit) for c, fit in fits.items()}
+    unexplained = [c for c, error in errors.items() if error > MAX_ERROR]
     advice += [
-        f"{c}: the images are still {100 * off[c]:.0f} % off; check mesh, lights and boundary model, or raise the"
+        f"{c}: the images are still {100 * errors[c]:.0f} % off; check mesh, lights and boundary model, or raise the"
         " samples."
         for c in unexplained
     ]
@@ -181,8 +181,8 @@ def judge(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:
     """Digest of everything that determines a fit's result; a journal with another fingerprint is not continued."""
-    asked = (ALWAYS_NAMED | spec.changed_options) - NOT_OF_THE_ANSWER
-    parts = [numerics_name(), engine, spec.model_dump_json(include=set(asked))]
+    named = (FIRST_VERSION_OPTIONS | spec.changed_options) - RESULT_NEUTRAL_OPTIONS
+    parts = [numerics_name(), engine, spec.model_dump_json(include=set(named))]
     for channel in files:
         parts += [
             channel.channel,

@@ -147,8 +147,8 @@ def split_pixels(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDA
     There are enough blocks for two workers, none too small to fill a kernel and none too large to travel; the partition
     does not depend on the number of workers.
     """
-    wanted = min(-(-MIN_BLOCKS // views), max(1, len(pixels) // MIN_BLOCK_PIXELS))
-    return np.array_split(pixels, max(wanted, -(-len(pixels) // pixels_per_block(lights))))
+    preferred = min(-(-MIN_BLOCKS // views), max(1, len(pixels) // MIN_BLOCK_PIXELS))
+    return np.array_split(pixels, max(preferred, -(-len(pixels) // pixels_per_block(lights))))
 
 
 def write_block(folder: Path, block: Block) -> StoredFile:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from services.core.records import JobSpec
 from services.fit.checks.evaluate import Evaluation, Shown, evaluate
-from services.fit.execution.closing import Held, measure_closing
+from services.fit.execution.closing import HeldCosines, measure_closing
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, StackProblem
 from services.fit.inputs.observations import ChannelFiles, Level
@@ -25,7 +25,7 @@ from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.solve import adam, gauss_newton
 from services.fit.solve.closing import ClosingSums
 from services.fit.solve.covariance import ClosingModel, Uncertainty, closing_model, uncertainty, whitening
-from services.fit.solve.gauss_newton import LAST_STEP_Z, Judged, Options, Result, Solution, State
+from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State, StepTest
 from services.fit.solve.normal_equations import NormalEquations
 
 Array = NDArray[np.float64]
@@ -37,13 +37,13 @@ takes this place."""
 SLOPE_ERROR = 0.5
 """Relative error of the change that Jacobians of similar media predict for one tooth's exact images, however short the
 step; the errors of several teeth are independent."""
-CLOSING_SHARE = 2
+CLOSING_DIVISOR = 2
 """Divisor of the paths for the closing measurement, which is combined with all equations of the exact steps."""
 CLOSING_TRIALS = 2
 """Number of lengths that are tried for the step after the closing measurement."""
 CLOSING_MIN_SHARE = 0.1
 """Shortest length that is tried, as a share of the one before."""
-AGAIN = "again"
+REPEAT_STAGE = "again"
 """Name of the stage that continues a fit from its first solution, where the prior of the instrument's errors moved that
 solution far."""
 MIN_SAMPLES = 4
@@ -72,7 +72,7 @@ class StepReport:
     """FDI number of the tooth, while a jaw's fit treats one tooth alone."""
 
 
-def told_place(channel: str, tooth: int | None) -> str:
+def message_prefix(channel: str, tooth: int | None) -> str:
     """Start of a fit's messages: the channel, and the tooth while a jaw's fit treats one tooth alone."""
     return channel if tooth is None else f"{channel}, tooth {tooth}"
 
@@ -92,15 +92,15 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
     """
     step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
     for trial in range(CLOSING_TRIALS):
-        promised, promised_se = model.promise(step)
-        if promised >= 0:
+        predicted, predicted_se = model.predicted_change(step)
+        if predicted >= 0:
             break
         compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
         change = compared.change + problem.domain.prior_change(x, x + step)
-        judged = Judged(change, compared.se, promised, math.hypot(promised_se, slope_error * promised))
-        if judged.is_better(LAST_STEP_Z):
+        step_test = StepTest(change, compared.se, predicted, math.hypot(predicted_se, slope_error * predicted))
+        if step_test.is_better(LAST_STEP_Z):
             return step
-        if not (judged.is_worse or judged.contradicted):
+        if not (step_test.is_worse or step_test.is_contradicted):
             break
         # Go to the minimum of the parabola through slope and comparison (Nocedal and Wright 2006, section 3.5).
         slope = model.slope(step)
@@ -116,7 +116,7 @@ class ChannelFit(Generic[Optics]):
     domain: Domain
     solution: Solution
     equations: NormalEquations
-    known: Uncertainty
+    uncertainty: Uncertainty
     fit_error: float
     held_out_error: float | None
     steps: int
@@ -138,9 +138,9 @@ class Stages(ABC, Generic[Optics]):
     spec: JobSpec
     journal: Journal
     report: Callable[[StepReport, Evaluation], None]
-    say: Callable[[str], None]
+    log: Callable[[str], None]
     """Reports one sentence to the job's event log."""
-    pause: Callable[[], None]
+    raise_if_cancelled: Callable[[], None]
     """Called between steps; raises when the job is cancelled."""
     shown: Shown = ()
     steps: int = 0
@@ -154,15 +154,15 @@ class Stages(ABC, Generic[Optics]):
         """Media that the reports of steps list."""
 
     @abstractmethod
-    def _others(self, tissue: Optics) -> dict[str, float]:
+    def _other_values(self, tissue: Optics) -> dict[str, float]:
         """Values, by name, that the reports of steps list beside the media."""
 
-    def _told_name(self, name: str) -> str:
+    def _reported_name(self, name: str) -> str:
         """Name of a parameter in the reports of steps."""
         return name
 
     @abstractmethod
-    def _held(self, domain: Domain) -> Held:
+    def _held_cosines(self, domain: Domain) -> HeldCosines:
         """Mean cosines that this domain holds, as input of the closing measurement."""
 
     @property
@@ -176,45 +176,45 @@ class Stages(ABC, Generic[Optics]):
         return self.passes.seeds.channel
 
     @property
-    def is_told(self) -> bool:
+    def is_reported(self) -> bool:
         """Whether the last step is in the history; a step that was interrupted before its report is not."""
         return history_key(self.files.channel, self.steps) in self.journal.entries
 
     def options(self, level: Level) -> Options:
         """Solver limits of a stage on images of this resolution; it has converged within ``image_tolerance``."""
         most = self.spec.max_samples_per_pixel
-        samples = self.fewer(most) if level is self.files.full else most
+        samples = self.full_image_samples(most) if level is self.files.full else most
         return Options(
             max_steps=self.spec.max_steps,
             max_samples=samples,
             tolerance=0.5 * self.spec.image_tolerance**2 * level.signal,
-            parts=self.part_count,
+            part_count=self.part_count,
         )
 
-    def short(self, steps: int) -> Options:
+    def preparatory_options(self, steps: int) -> Options:
         """Solver limits of a stage that only prepares the next: at most ``steps`` steps, with few samples."""
         options = self.options(self.files.coarse)
         samples = min(2 * self.spec.samples_per_pixel, options.max_samples)
         return replace(options, max_steps=min(steps, options.max_steps), max_samples=samples)
 
-    def in_similar_media(self, options: Options) -> Options:
+    def similar_media_options(self, options: Options) -> Options:
         """Solver limits of a stage in similar media, which only finds the neighbourhood of the solution, because the
         images' bias is larger than the noise of a few samples.
         """
         most = min(2 * self.spec.samples_per_pixel, options.max_samples)
         return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
 
-    def at_full_resolution(self) -> Options:
+    def switch_to_full_resolution(self) -> Options:
         """Continue with images of full resolution; returns the solver limits there."""
         self.passes = replace(self.passes, blocks=self.files.full.blocks)
         return self.options(self.files.full)
 
-    def fewer(self, samples: int) -> int:
+    def full_image_samples(self, samples: int) -> int:
         """Paths per pixel of full images that cost as much in all as ``samples`` per pixel of coarse images."""
         return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), MIN_SAMPLES)
 
     def _iterate(
-        self, problem: StackProblem[Optics], options: Options, samples: int, before: Solution | None = None
+        self, problem: StackProblem[Optics], options: Options, samples: int, previous: Solution | None = None
     ) -> tuple[Optics, Solution]:
         if problem.jacobian_g != problem.image_g:
             options = replace(options, slope_error=SLOPE_ERROR)
@@ -223,54 +223,57 @@ class Stages(ABC, Generic[Optics]):
             solver,
             gauss_newton,
             problem,
-            solver.init(self._start_of(problem), min(samples, options.max_samples), before),
+            solver.init(self._start_of(problem), min(samples, options.max_samples), previous),
         )
 
     def _start_of(self, problem: StackProblem[Optics]) -> Array:
         # Start of a stage: its tissue, and the instrument's errors as the last stage left them.
         return problem.domain.x_of(problem.base, dict(self.passes.errors))
 
-    def _see(self, domain: Domain, x: Array) -> None:
+    def _apply_errors(self, domain: Domain, x: Array) -> None:
         # Apply the instrument's errors in x to the renders of later passes.
         if domain.errors.names:
             self.passes = replace(self.passes, errors=domain.errors_at(x))
 
     def _run(
-        self, solver: Any, kind: Any, problem: StackProblem[Optics], state: Any, burst: int = 1
+        self, solver: Any, solver_module: Any, problem: StackProblem[Optics], state: Any, steps_per_entry: int = 1
     ) -> tuple[Optics, Solution]:
-        # Run a solver from its first state. Every ``burst`` steps are one journal entry, written and read by the
-        # solver's module ``kind``, and one report.
+        # Run a solver from its first state. Every ``steps_per_entry`` steps are one journal entry, written and read by
+        # ``solver_module``, and one report.
         def advance(state: Any) -> Any:
-            for _ in range(burst):
+            for _ in range(steps_per_entry):
                 state = state if solver.terminate(state) else solver.step(problem, state)
-            return kind.state_record(state)
+            return solver_module.state_record(state)
 
         while not solver.terminate(state):
-            self.pause()
-            entry, _ = self.journal.once(f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state))
+            self.raise_if_cancelled()
+            entry, _ = self.journal.get_or_compute(
+                f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state)
+            )
             self.steps -= state.step
-            state = kind.state_from(entry)
+            state = solver_module.state_from(entry)
             self.steps += state.step
-            self._see(problem.domain, state.x)
-            if not self.is_told:
-                self._tell(problem, state)
+            self._apply_errors(problem.domain, state.x)
+            if not self.is_reported:
+                self._report_step(problem, state)
         solution = solver.finish(state)
         return problem.domain.tissue_at(solution.x, problem.base), solution
 
     def _finish(self, problem: StackProblem[Optics], solution: Solution) -> ChannelFit[Optics]:
         # Uncertainty at the solution, and the errors that are reported.
         samples = max(
-            solution.samples, self.fewer(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel))
+            solution.samples,
+            self.full_image_samples(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)),
         )
-        problem, solution, equations, known = self._close(problem, solution, samples)
-        if not known.is_whole:
+        problem, solution, equations, known = self._with_uncertainty(problem, solution, samples)
+        if not known.is_full_step:
             # The move is too long for one linear model: fit once more from its end.
-            self._see(problem.domain, solution.x)
-            again = replace(problem, passes=self.passes, stage=AGAIN)
+            self._apply_errors(problem.domain, solution.x)
+            again = replace(problem, passes=self.passes, stage=REPEAT_STAGE)
             base, solution = self._iterate(again, self.options(self.files.full), samples)
-            problem, solution, equations, known = self._close(replace(again, base=base), solution, samples)
-        self._see(problem.domain, solution.x)
-        samples_shown = self.fewer(self.spec.max_samples_per_pixel)
+            problem, solution, equations, known = self._with_uncertainty(replace(again, base=base), solution, samples)
+        self._apply_errors(problem.domain, solution.x)
+        samples_shown = self.full_image_samples(self.spec.max_samples_per_pixel)
         evaluation = self._evaluate("final", problem.base, samples_shown, self.files.full, by_frame=True)
         fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
         return ChannelFit(
@@ -287,15 +290,15 @@ class Stages(ABC, Generic[Optics]):
             samples,
         )
 
-    def _close(
+    def _with_uncertainty(
         self, problem: StackProblem[Optics], solution: Solution, samples: int
     ) -> tuple[StackProblem[Optics], Solution, NormalEquations, Uncertainty]:
         # Uncertainty at a solution, moved where the instrument's errors use their prior in full. Curvature and noise
         # are rendered anew only where the solver ended without them.
-        again, equations = f".{AGAIN}" if problem.stage == AGAIN else "", solution.equations
+        again, equations = f".{REPEAT_STAGE}" if problem.stage == REPEAT_STAGE else "", solution.equations
         if equations is None:
-            self.pause()
-            stored, _ = self.journal.once(
+            self.raise_if_cancelled()
+            stored, _ = self.journal.get_or_compute(
                 f"{self.scope}/final{again}",
                 lambda: problem.linearise(solution.x, samples=samples, step=0).record(),
             )
@@ -305,23 +308,23 @@ class Stages(ABC, Generic[Optics]):
             if not problem.domain.errors.names:
                 return problem, solution, equations, known
         else:
-            known = self._measured(f"{self.scope}/closing{again}", problem, solution.x, equations, samples)
+            known = self._measure_uncertainty(f"{self.scope}/closing{again}", problem, solution.x, equations, samples)
         base = problem.domain.tissue_at(known.x, problem.base)
         return replace(problem, base=base), replace(solution, x=known.x), equations, known
 
-    def _measured(
+    def _measure_uncertainty(
         self, key: str, problem: StackProblem[Optics], x: Array, equations: NormalEquations, samples: int
     ) -> Uncertainty:
         # Measure the response of the exact images where Jacobians came from similar media. Make one more step with it
         # where the predicted gain exceeds noise, and prediction and comparison combined are better.
         domain = problem.domain
-        known, moves = whitening(domain, equations), self.files.moves
+        whitened, moves = whitening(domain, equations), self.files.moves
 
         def compute() -> dict[str, Any]:
-            place = told_place(self.files.channel, self.tooth)
-            self.say(f"{place}: renders around the answer tell its ±, which may take as long as all steps.")
+            prefix = message_prefix(self.files.channel, self.tooth)
+            self.log(f"{prefix}: renders around the answer tell its ±, which may take as long as all steps.")
             sums = measure_closing(
-                problem, x, known.transform, self._held(domain), max(samples // CLOSING_SHARE, 1), moves
+                problem, x, whitened.transform, self._held_cosines(domain), max(samples // CLOSING_DIVISOR, 1), moves
             )
             return {
                 "sums": sums.record(),
@@ -330,8 +333,8 @@ class Stages(ABC, Generic[Optics]):
                 ).tolist(),
             }
 
-        self.pause()
-        entry, _ = self.journal.once(key, compute)
+        self.raise_if_cancelled()
+        entry, _ = self.journal.get_or_compute(key, compute)
         step = np.array(entry["step"])
         sums = ClosingSums.of(entry["sums"])
         bodies = [move.body for move in moves]
@@ -342,7 +345,7 @@ class Stages(ABC, Generic[Optics]):
     ) -> tuple[Optics, Solution]:
         # Fit a stage in similar media.
         problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
-        return self._iterate(problem, self.in_similar_media(options), samples)
+        return self._iterate(problem, self.similar_media_options(options), samples)
 
     def _evaluate(
         self, label: str, tissue: Tissue | Mouth, samples: int, level: Level, *, by_frame: bool = False
@@ -350,12 +353,12 @@ class Stages(ABC, Generic[Optics]):
         passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)
         return evaluate(passes, label, tissue, samples, self.shown, by_frame=by_frame)
 
-    def _tell(self, problem: StackProblem[Optics], state: State | adam.State) -> None:
+    def _report_step(self, problem: StackProblem[Optics], state: State | adam.State) -> None:
         stage, tissue = problem.stage, problem.domain.tissue_at(state.x, problem.base)
         shown = tissue if problem.image_g is None else similar_tissue(tissue, problem.image_g)
-        self._announce(stage, state.step, tissue, state.samples, state.verdict, shown)
+        self._evaluate_and_report(stage, state.step, tissue, state.samples, state.verdict, shown)
 
-    def _announce(
+    def _evaluate_and_report(
         self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None
     ) -> None:
         # Evaluate ``shown``, which is the tissue itself unless it is fitted through other media, and report.
@@ -366,8 +369,8 @@ class Stages(ABC, Generic[Optics]):
         leaves = ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
         values = {
             f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves
-        } | self._others(tissue)
-        values = {self._told_name(name): value for name, value in values.items()}
+        } | self._other_values(tissue)
+        values = {self._reported_name(name): value for name, value in values.items()}
         loss = fitted.loss or 0.0
         self.report(
             StepReport(

@@ -16,25 +16,25 @@ from services.fit.execution.blocks import BlockTask, read_block
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
-from services.fit.instrument.columns import columns, photographed
 from services.fit.instrument.moves import Move, by_scene, moves_task
+from services.fit.instrument.photographs import error_derivatives, photographed
 from services.fit.optics.domain import Domain, similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
 from services.fit.solve.closing import ClosingSums, closing_sums
 
 Array = NDArray[np.float64]
-Held = Mapping[tuple[str, ...], tuple[float, float]]
+HeldCosines = Mapping[tuple[str, ...], tuple[float, float]]
 """Media whose mean cosine was held, and the mean and standard deviation of its prior in the unbounded domain; the error
 of one entry's media is common to them."""
 
-MOVE_SAMPLES = 4
+MOVE_DIVISOR = 4
 """Divisor of the paths for images of moved scans and domes, because there are thirteen of them."""
-SHIFT_SAMPLES = 2
+SHIFT_DIVISOR = 2
 """Divisor of the paths for images of changed media, because they enter a variance only and not the solution."""
 
 
 def measure_closing(
-    problem: StackProblem[Optics], x: Array, whiten: Array, held: Held, samples: int, moves: Sequence[Move] = ()
+    problem: StackProblem[Optics], x: Array, whiten: Array, held: HeldCosines, samples: int, moves: Sequence[Move] = ()
 ) -> ClosingSums:
     """Closing sums of all blocks at x (F,), added in block order.
 
@@ -47,17 +47,17 @@ def measure_closing(
         moves: moves of scan and dome; each costs two images, and their changes follow those of ``held`` in the sums.
     """
     run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
-    tissue, similar, how = problem.jacobian_media(x)
+    tissue, similar, differentiation = problem.jacobian_media(x)
     first, second = (tuple(problem.seed(0, f"closing-{name}-{k}") for k in (1, 2)) for name in ("similar", "exact"))
     images = problem.seed(0, "closing-image-1"), problem.seed(0, "closing-image-2")
-    slopes, borrowed = problem.slopes(x), _borrowed(problem.domain)
+    slopes, copied = problem.exact_differentiation(x), _copied_rows(problem.domain)
     ends = tuple(
         (_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd))
         for parts, (mean, sd) in held.items()
     )
     tasks = problem.passes_at(x).tasks(label, tissue, samples)
     changes = _changes_by_moves(problem, tasks, moves, label)
-    common = (similar, how, first, whiten, slopes, borrowed, second, images, ends)
+    common = (similar, differentiation, first, whiten, slopes, copied, second, images, ends)
     pending = [
         run.submit(f"{label}-{task.index}", closing_task, task, *common, *own)
         for task, own in zip(tasks, changes, strict=True)
@@ -76,7 +76,7 @@ def _changes_by_moves(
     # Results of ``moves_task`` by block and scene. All blocks of one scene come before the next scene, because a worker
     # keeps few scenes.
     seeds = problem.seed(0, "closing-moves-1"), problem.seed(0, "closing-moves-2")
-    few = [replace(task, samples=max(task.samples // MOVE_SAMPLES, 1)) for task in tasks]
+    few = [replace(task, samples=max(task.samples // MOVE_DIVISOR, 1)) for task in tasks]
     by_moves = [
         [
             problem.passes.executor.submit(
@@ -93,11 +93,11 @@ def closing_task(
     host: EngineHost,
     task: BlockTask,
     similar: Tissue | Mouth,
-    how: Differentiation,
+    differentiation: Differentiation,
     similar_seeds: tuple[int, int],
     whiten: Array,
     slopes: Differentiation,
-    borrowed: NDArray[np.bool_],
+    copied: NDArray[np.bool_],
     seeds: tuple[int, int],
     image_seeds: tuple[int, int],
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
@@ -105,7 +105,7 @@ def closing_task(
 ) -> tuple[ClosingSums, TraceRow]:
     """One block's closing sums and trace, with the changes by moves (K, 2, L, N) of each scene.
 
-    Rows of ``slopes`` that are ``borrowed`` are copied from the similar media's Jacobian.
+    Rows of ``slopes`` that are ``copied`` are taken from the similar media's Jacobian.
     """
     start, block = time.time(), read_block(task.block)
     view, errors = block.fitted_view, dict(task.errors)
@@ -116,26 +116,26 @@ def closing_task(
         ).reshape(-1)
 
     renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]
-    few = max(task.samples // SHIFT_SAMPLES, 1)
+    few = max(task.samples // SHIFT_DIVISOR, 1)
     size = renders[0].size
     moved = [[0.5 * (image(high, seed, few) - image(low, seed, few)) for seed in image_seeds] for low, high in ends]
 
-    seen = [columns(render.reshape(block.reference.shape), block, slopes.errors) for render in renders]
+    error_rows = [error_derivatives(render.reshape(block.reference.shape), block, slopes.errors) for render in renders]
 
     def derivatives(of: Differentiation, of_task: BlockTask, pair: tuple[int, int]) -> list[Array]:
         rows = of.render(host, of_task, view, pair, block.parts)
-        return [np.concatenate([own, more]) for own, more in zip(rows, seen, strict=True)]
+        return [np.concatenate([own, more]) for own, more in zip(rows, error_rows, strict=True)]
 
     def residual(render: Array) -> Array:
         return (photographed(render.reshape(block.reference.shape), block, errors) - block.reference).reshape(-1)
 
-    believed = derivatives(how, replace(task, tissue=similar), similar_seeds)
-    exact = believed if borrowed.all() else derivatives(slopes, task, seeds)
+    similar_rows = derivatives(differentiation, replace(task, tissue=similar), similar_seeds)
+    exact = similar_rows if copied.all() else derivatives(slopes, task, seeds)
     sums = closing_sums(
         whiten,
-        (believed[0], believed[1]),
+        (similar_rows[0], similar_rows[1]),
         (exact[0], exact[1]),
-        borrowed,
+        copied,
         (residual(renders[0]), residual(renders[1])),
         np.concatenate([np.array(moved).reshape(len(ends), 2, size), *(one.reshape(-1, 2, size) for one in changes)]),
         block.fit_weight.reshape(-1),
@@ -145,7 +145,7 @@ def closing_task(
     return sums, trace_row("closing", task, start)
 
 
-def _borrowed(domain: Domain) -> NDArray[np.bool_]:
+def _copied_rows(domain: Domain) -> NDArray[np.bool_]:
     # Mask (F,) of derivatives copied from the similar media: those of the dentin's shape, which are not rendered again,
     # and those of the instrument's errors.
     shapes = [coordinate.kind == "shape" for coordinate in domain.coordinates]

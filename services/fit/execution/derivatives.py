@@ -27,29 +27,29 @@ Array = NDArray[np.float64]
 
 WITHOUT_SCORES = frozenset({"shape", "cosine"})
 """Kinds of coordinates whose derivatives are always computed as differences."""
-SCORES_SHARE = 4
+SCORES_DIVISOR = 4
 """Divisor of the paths for scores where the derivatives to sigma are differences: the remaining scores have little
 noise."""
 
 
 @dataclass(frozen=True)
-class Reach:
+class DifferenceStep:
     """Distances below and above a coordinate's value, in the unbounded domain, at which the two images of a difference
     are rendered, and the divisor of the task's paths for each image.
     """
 
     below: float
     above: float
-    share: int
+    path_divisor: int
 
 
-REACH: Mapping[str, Reach] = MappingProxyType(
-    {"shape": Reach(0.2, 0.2, 1), "sigma": Reach(0.7, 0.7, 4), "cosine": Reach(1.0, 0.0, 8)}
+DIFFERENCE_STEPS: Mapping[str, DifferenceStep] = MappingProxyType(
+    {"shape": DifferenceStep(0.2, 0.2, 1), "sigma": DifferenceStep(0.7, 0.7, 4), "cosine": DifferenceStep(1.0, 0.0, 8)}
 )
 """Reach by kind of coordinate. The noise falls in proportion to the width. That a wide difference is not the exact
 derivative hardly changes the zero of J'Wr, and so the solution."""
 
-SLOPE_REACH = Reach(0.35, 0.35, 4)
+COSINE_STEP = DifferenceStep(0.35, 0.35, 4)
 """Reach of a cosine in the closing measurement, which needs the derivative itself."""
 
 
@@ -64,7 +64,7 @@ class Secant:
     high: Tissue | Mouth
     widths: tuple[float, ...]
     """Width of the difference for each coordinate: the distance between both ends."""
-    share: int
+    path_divisor: int
     teeth: tuple[int, ...] | None = None
     """Teeth in whose pixels, and their neighbours' pixels, each coordinate's derivative is read; None where one
     coordinate applies to all pixels."""
@@ -80,13 +80,13 @@ class Differentiation:
     chain: Array
     """Chain rule d parameter / d x, (P, F)."""
     secants: tuple[Secant, ...] = ()
-    share: int = 1
+    path_divisor: int = 1
     """Divisor of the task's paths for scores."""
     neighbours: Neighbours | None = None
     """Neighbourhood of a jaw's teeth; None for a single tooth."""
     errors: tuple[str, ...] = ()
     """The instrument's errors. Their derivatives follow from the images and are not rendered, see
-    ``instrument.columns``."""
+    ``instrument.photographs``."""
 
     def render(
         self, host: EngineHost, task: BlockTask, view: View, seeds: Sequence[int], parts: PixelParts | None = None
@@ -111,19 +111,19 @@ class Differentiation:
 
         slopes: list[dict[int, Array]] = [{} for _ in seeds]
         for secant in self.secants:
-            samples = max(task.samples // secant.share, 1)
+            samples = max(task.samples // secant.path_divisor, 1)
             for found, low, high in zip(
                 slopes, rendered(secant.low, samples), rendered(secant.high, samples), strict=True
             ):
-                for coordinate, width, seen in zip(
-                    secant.coordinates, secant.widths, self._seen(secant, parts), strict=True
+                for coordinate, width, mask in zip(
+                    secant.coordinates, secant.widths, self._pixel_masks(secant, parts), strict=True
                 ):
-                    found[coordinate] = ((high - low) * seen / width).reshape(-1)
+                    found[coordinate] = ((high - low) * mask / width).reshape(-1)
 
-        every = []
+        by_seed = []
         for seed, found in zip(seeds, slopes, strict=True):
             if self.parameters:
-                samples = max(task.samples // self.share, 1)
+                samples = max(task.samples // self.path_divisor, 1)
                 estimate: JacobianEstimate = host.call(
                     "jacobian", task.recipe, task.tissue, view, self.parameters, samples=samples, seed=seed
                 )
@@ -134,10 +134,10 @@ class Differentiation:
                 rows = np.zeros((self.chain.shape[1], next(iter(found.values())).size))
             for coordinate, slope in found.items():
                 rows[coordinate] = slope
-            every.append(rows)
-        return tuple(every)
+            by_seed.append(rows)
+        return tuple(by_seed)
 
-    def _seen(self, secant: Secant, parts: PixelParts | None) -> Sequence[NDArray[np.bool_] | float]:
+    def _pixel_masks(self, secant: Secant, parts: PixelParts | None) -> Sequence[NDArray[np.bool_] | float]:
         # Mask (N,), by coordinate, of the pixels in which its derivative is read.
         if secant.teeth is None:
             return [1.0]
@@ -167,21 +167,25 @@ def differentiation(
     names = own if jacobian_g is None else tuple(dict.fromkeys(n for p in own for n in _similar_parameters(p)))
     groups = _groups(domain, np.flatnonzero(is_secant), neighbours)
     secants = [
-        _secant(domain, x, group, base, tissue, jacobian_g, REACH[domain.coordinates[group[0]].kind])
+        _secant(domain, x, group, base, tissue, jacobian_g, DIFFERENCE_STEPS[domain.coordinates[group[0]].kind])
         for group in groups
     ]
-    share = SCORES_SHARE if any(domain.coordinates[one.coordinates[0]].kind == "sigma" for one in secants) else 1
+    path_divisor = (
+        SCORES_DIVISOR if any(domain.coordinates[one.coordinates[0]].kind == "sigma" for one in secants) else 1
+    )
     chain = _chain(domain, x, base, names, jacobian_g)
-    return Differentiation(names, chain, tuple(secants), share, neighbours, domain.errors.names)
+    return Differentiation(names, chain, tuple(secants), path_divisor, neighbours, domain.errors.names)
 
 
-def slopes(domain: Domain, x: Array, base: Optics, neighbours: Neighbours | None = None) -> Differentiation:
+def exact_differentiation(
+    domain: Domain, x: Array, base: Optics, neighbours: Neighbours | None = None
+) -> Differentiation:
     """Differentiation of the images in their own media at x (F,), without blend weights."""
     x = x[: domain.tissue_count]
     tissue, cosines = domain.tissue_at(x, base), [k for k, c in enumerate(domain.coordinates) if c.kind == "cosine"]
     scored = _scored_parameters(domain)
     secants = tuple(
-        _secant(domain, x, group, base, tissue, None, SLOPE_REACH) for group in _groups(domain, cosines, neighbours)
+        _secant(domain, x, group, base, tissue, None, COSINE_STEP) for group in _groups(domain, cosines, neighbours)
     )
     chain = _chain(domain, x, base, scored, None)
     return Differentiation(scored, chain, secants, neighbours=neighbours, errors=domain.errors.names)
@@ -201,8 +205,8 @@ def _chain(domain: Domain, x: Array, base: Optics, names: tuple[str, ...], g: fl
     # The map is smooth and in closed form, so its central differences are accurate to rounding.
     def values(at: Array) -> Array:
         tissue = domain.tissue_at(at, base)
-        seen = tissue if g is None else similar_tissue(tissue, g)
-        return np.array([seen.value(name) for name in names])
+        media = tissue if g is None else similar_tissue(tissue, g)
+        return np.array([media.value(name) for name in names])
 
     shifts = 1e-5 * np.eye(len(x))
     return np.stack([(values(x + s) - values(x - s)) / 2e-5 for s in shifts], axis=1)
@@ -243,20 +247,20 @@ def _secant(
     base: Optics,
     tissue: Optics,
     jacobian_g: float | None,
-    reach: Reach,
+    step: DifferenceStep,
 ) -> Secant:
     # Difference that is one-sided near a bound. A cosine's ends use the images' own media, because similar media fix
     # the cosine.
     own = list(group)
     kind, (lower, upper) = domain.coordinates[own[0]].kind, (bound[own] for bound in domain.bounds)
-    low = np.clip(x[own] - reach.below, lower, upper)
-    high = np.maximum(np.clip(x[own] + reach.above, lower, upper), low + 0.5 * (reach.below + reach.above))
+    low = np.clip(x[own] - step.below, lower, upper)
+    high = np.maximum(np.clip(x[own] + step.above, lower, upper), low + 0.5 * (step.below + step.above))
 
     def media(ends: Array) -> Optics:
         moved = x.copy()
         moved[own] = ends
-        there = tissue if np.array_equal(moved, x) else domain.tissue_at(moved, base)
-        return there if kind == "cosine" or jacobian_g is None else similar_tissue(there, jacobian_g)
+        tissue_there = tissue if np.array_equal(moved, x) else domain.tissue_at(moved, base)
+        return tissue_there if kind == "cosine" or jacobian_g is None else similar_tissue(tissue_there, jacobian_g)
 
     # Measure a cosine's width in the cosine itself, in which images are linear over a longer range than in its
     # coordinate.
@@ -268,4 +272,4 @@ def _secant(
         ]
         widths = np.array(natural)
     teeth = tuple(tooth for k in own if (tooth := domain.coordinates[k].tooth) is not None)
-    return Secant(group, media(low), media(high), tuple(widths.tolist()), reach.share, teeth or None)
+    return Secant(group, media(low), media(high), tuple(widths.tolist()), step.path_divisor, teeth or None)

@@ -29,7 +29,7 @@ from services.fit.execution.engine_process import EngineProcess
 
 ENGINE = "services.fit.transport.engine:Engine"
 """Default engine, as ``module:class``; imported only in the process that renders."""
-SCENES_KEPT = 4
+MAX_SCENES = 4
 """Largest number of built scenes that a process keeps."""
 WATCH_S = 0.25
 """Interval in seconds at which a waiting task checks the child's memory and the cancel flag."""
@@ -59,7 +59,7 @@ class InProcessHost:
             module, name = self._factory.split(":")
             engine = getattr(importlib.import_module(module), name)(read_recipe(recipe), self._threads)
             self._engines[recipe.digest] = engine
-            while len(self._engines) > SCENES_KEPT:
+            while len(self._engines) > MAX_SCENES:
                 self._engines.popitem(last=False)
         self._engines.move_to_end(recipe.digest)
         return getattr(engine, method)(*args, **options)
@@ -125,7 +125,7 @@ class ChildHost:
                     self._end()
                     self._require_open()
                     if is_last or process.was_out_of_memory:
-                        raise process.death() from None
+                        raise process.exit_error() from None
                     continue
                 except ResourceError:
                     self._end()

@@ -61,7 +61,7 @@ class EngineProcess:
         self._process.wait()
         self.was_out_of_memory = self._process.returncode == -signal.SIGKILL and memory_kills() > self._kills_before
 
-    def death(self) -> ResourceError:
+    def exit_error(self) -> ResourceError:
         """The error that says how the process ended."""
         status, evidence = self._process.returncode, self._evidence()
         if self.was_out_of_memory:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol
 from distributed import WorkerPlugin
 
 from services.fit.execution.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
-from services.fit.execution.fair_shares import Board, Share
+from services.fit.execution.fair_shares import PublishedLevels, Share
 
 Task = Callable[..., Any]
 Call = tuple[str, Task, tuple[Any, ...]]
@@ -36,7 +36,7 @@ class Executor(Protocol):
     def gather(self, pending: Sequence[Any]) -> list[Any]:
         """Results in the order of ``pending``. Raises what a task raised."""
 
-    def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
+    def as_completed(self, calls: Sequence[Call]) -> Iterator[Any]:
         """Run tasks that depend on no other task, and yield the result of each as soon as it has ended.
 
         Raises what a task raised.
@@ -62,7 +62,7 @@ class LocalExecutor:
         """See Executor."""
         return list(pending)
 
-    def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
+    def as_completed(self, calls: Sequence[Call]) -> Iterator[Any]:
         """See Executor; runs one after the other."""
         for key, task, args in calls:
             yield self.submit(key, task, *args)
@@ -82,7 +82,7 @@ class DaskExecutor:
         factory: the engine, as ``module:class``.
         prefix: begins the keys of this fit's tasks.
         flag: file whose existence cancels the tasks.
-        needs: Dask resources that a worker must have to run the tasks.
+        resources: Dask resources that a worker must have to run the tasks.
         share: worker time that this fit has used.
     """
 
@@ -92,17 +92,17 @@ class DaskExecutor:
         factory: str,
         prefix: str,
         flag: Path,
-        needs: Mapping[str, float] | None = None,
+        resources: Mapping[str, float] | None = None,
         share: Share | None = None,
     ) -> None:
         from distributed import as_completed
 
         self._client, self._factory, self._prefix, self._submitted = client, factory, prefix, itertools.count()
-        self._flag, self._needs, self._share = flag, dict(needs or {}), share or Share()
-        self._board = Board(client, prefix, self._share)
-        self._board.join()
+        self._flag, self._resources, self._share = flag, dict(resources or {}), share or Share()
+        self._levels = PublishedLevels(client, prefix, self._share)
+        self._levels.join()
         self._waiting: deque[_Planned] = deque()
-        self._flying: dict[Any, _Planned] = {}
+        self._running: dict[Any, _Planned] = {}
         self._ended = as_completed(loop=client.loop)
 
     def submit(self, key: str, task: Task, *args: Any) -> _Planned:
@@ -122,7 +122,7 @@ class DaskExecutor:
             pass
         return [planned.timed.value for planned in pending]
 
-    def as_they_end(self, calls: Sequence[Call]) -> Iterator[Any]:
+    def as_completed(self, calls: Sequence[Call]) -> Iterator[Any]:
         """See Executor."""
         for planned in self._ending([self.submit(key, task, *args) for key, task, args in calls]):
             yield planned.timed.value
@@ -131,11 +131,11 @@ class DaskExecutor:
         """Yield tasks as they end, and send waiting tasks meanwhile."""
         most, missing = TASKS_AHEAD * self.threads(), set(pending)
         while missing:
-            while self._waiting and len(self._flying) < most:
+            while self._waiting and len(self._running) < most:
                 self._send(self._waiting.popleft())
-            self._board.tell()
+            self._levels.publish()
             for future in self._ended.next_batch():
-                planned = self._flying.pop(future)
+                planned = self._running.pop(future)
                 if future.status != "finished":
                     future.result()  # raises
                 if planned in missing:  # else its result goes to another task, which counts its time
@@ -146,26 +146,26 @@ class DaskExecutor:
 
     def close(self) -> None:
         """Release this fit's place among those that share the workers."""
-        self._board.leave()
+        self._levels.leave()
 
     def _send(self, planned: _Planned) -> None:
         # Pass futures as arguments, so that results of earlier tasks go from worker to worker.
         args = [arg.future if isinstance(arg, _Planned) else arg for arg in planned.args]
-        options = {"resources": self._needs, "priority": self._share.begin(), "key": planned.key, "pure": False}
+        options = {"resources": self._resources, "priority": self._share.begin(), "key": planned.key, "pure": False}
         planned.future = self._client.submit(run_on_worker, self._factory, self._flag, planned.task, *args, **options)
         planned.args = ()
-        self._flying[planned.future] = planned
+        self._running[planned.future] = planned
         self._ended.add(planned.future)
 
     def threads(self, expected: int = 1) -> int:
         """See Executor."""
-        able = self._client.scheduler_info(n_workers=-1)["workers"].values()
-        there = sum(
+        workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+        present = sum(
             int(worker["nthreads"])
-            for worker in able
-            if all(worker["resources"].get(name, 0) >= amount for name, amount in self._needs.items())
+            for worker in workers
+            if all(worker["resources"].get(name, 0) >= amount for name, amount in self._resources.items())
         )
-        return max(there, expected)
+        return max(present, expected)
 
 
 @dataclass(eq=False)
@@ -223,21 +223,21 @@ def run_on_worker(factory: str, flag: Path, task: Task, *args: Any) -> Timed:
     worker = get_worker()
     plugin: _EnginePlugin = sync(worker.loop, _prepare_worker, worker, factory)
     began_s, earlier = time.monotonic(), [arg for arg in args if isinstance(arg, Timed)]
-    given = [arg.value if isinstance(arg, Timed) else arg for arg in args]
-    value = task(CancellableHost(plugin.host, flag), *given)
+    values = [arg.value if isinstance(arg, Timed) else arg for arg in args]
+    value = task(CancellableHost(plugin.host, flag), *values)
     seconds = time.monotonic() - began_s
     return Timed(value, seconds + sum(one.seconds for one in earlier), 1 + sum(one.tasks for one in earlier))
 
 
-class Surroundings(NamedTuple):
+class EnclosingTask(NamedTuple):
     """Key and resources of the Dask task in which this code runs."""
 
     key: str
-    needs: Mapping[str, float]
+    resources: Mapping[str, float]
     """Dask resources that a worker must have to run the task."""
 
 
-def _surroundings() -> Surroundings | None:
+def _enclosing_task() -> EnclosingTask | None:
     from distributed import get_worker
 
     try:
@@ -245,7 +245,7 @@ def _surroundings() -> Surroundings | None:
     except ValueError:
         return None
     key = worker.get_current_task()
-    return Surroundings(str(key), worker.state.tasks[key].resource_restrictions or {})
+    return EnclosingTask(str(key), worker.state.tasks[key].resource_restrictions or {})
 
 
 @contextmanager
@@ -262,8 +262,8 @@ def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: flo
         prefix: follows the enclosing task's key in the keys of the tasks.
         weight: share of the workers' time relative to other fits'.
     """
-    surroundings = _surroundings()
-    if surroundings is None:
+    enclosing = _enclosing_task()
+    if enclosing is None:
         host = InProcessHost(factory)
         try:
             yield LocalExecutor(host)
@@ -272,9 +272,9 @@ def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: flo
         return
     from distributed import worker_client
 
-    name, share = f"{surroundings.key}-{prefix}", Share(weight)
+    name, share = f"{enclosing.key}-{prefix}", Share(weight)
     with (
         worker_client() as client,
-        closing(DaskExecutor(client, factory, name, flag, surroundings.needs, share)) as run_on,
+        closing(DaskExecutor(client, factory, name, flag, enclosing.resources, share)) as run_on,
     ):
         yield run_on

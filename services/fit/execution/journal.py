@@ -1,9 +1,9 @@
 """Durable execution: the results of a fit are recorded, and a new attempt reads them instead of computing them again.
 
-The driver is a deterministic function. Each costly part runs as ``journal.once(key, compute)``; its JSON result is on
-disk before the next part starts. A later attempt runs the same function, gets the recorded results back in the same
-order, and continues where the record ends. Every part depends only on recorded results and on seeds, so an interrupted
-fit has the same result as an uninterrupted one.
+The driver is a deterministic function. Each costly part runs as ``journal.get_or_compute(key, compute)``; its JSON
+result is on disk before the next part starts. A later attempt runs the same function, gets the recorded results back in
+the same order, and continues where the record ends. Every part depends only on recorded results and on seeds, so an
+interrupted fit has the same result as an uninterrupted one.
 
 ::
 
@@ -63,7 +63,7 @@ class Journal:
                 self._earlier.rename(self.set_aside)
         self.resumed = len(self.entries)
 
-    def once(self, key: str, compute: Callable[[], Any]) -> tuple[Any, bool]:
+    def get_or_compute(self, key: str, compute: Callable[[], Any]) -> tuple[Any, bool]:
         """The recorded result of ``key``; without a record, compute and record it. The flag says whether it is new.
 
         Floats survive exactly.

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.execution.blocks import Block, BlockTask, StoredFile, read_block
-from services.fit.execution.derivatives import Differentiation, differentiation, slopes
+from services.fit.execution.derivatives import Differentiation, differentiation, exact_differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.executors import Executor
 from services.fit.execution.seeds import Seeds
-from services.fit.instrument.columns import columns, photographed
+from services.fit.instrument.photographs import error_derivatives, photographed
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
@@ -88,17 +88,17 @@ def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Res
 def jacobian_task(
     host: EngineHost,
     task: BlockTask,
-    how: Differentiation,
+    differentiation: Differentiation,
     seeds: tuple[int, int],
     residual: Residual,
     near: Near | None,
 ) -> Products:
     """Render a block's derivatives with two seeds and multiply them by each other and by the residual."""
     start, block = time.time(), read_block(task.block)
-    j1, j2 = how.render(host, task, block.fitted_view, seeds, block.parts)
+    j1, j2 = differentiation.render(host, task, block.fitted_view, seeds, block.parts)
     if residual.images is not None:
         j1, j2 = (
-            np.concatenate([own, columns(image, block, how.errors)])
+            np.concatenate([own, error_derivatives(image, block, differentiation.errors)])
             for own, image in zip((j1, j2), residual.images, strict=True)
         )
     rendered, start = trace_row("jacobian", task, start), time.time()
@@ -106,7 +106,9 @@ def jacobian_task(
         a.reshape(-1) for a in (residual.first, residual.second, block.variance, block.fit_weight)
     )
     regions = None if near is None else _regions(block, near)
-    equations = normal_equations(j1, j2, r1, r2, variance, weight, len(block.reference), regions, len(how.errors))
+    equations = normal_equations(
+        j1, j2, r1, r2, variance, weight, len(block.reference), regions, len(differentiation.errors)
+    )
     return Products(equations, (residual.trace, rendered, trace_row("products", task, start)))
 
 
@@ -117,7 +119,7 @@ def _regions(block: Block, near: Near) -> list[Region]:
 
 
 def gradient_task(
-    host: EngineHost, task: BlockTask, similar: Tissue, how: Differentiation, seeds: tuple[int, int]
+    host: EngineHost, task: BlockTask, similar: Tissue, differentiation: Differentiation, seeds: tuple[int, int]
 ) -> tuple[Gradient, TraceRow]:
     """One block's stochastic gradient: residual from one seed, derivatives from another."""
     start, block = time.time(), read_block(task.block)
@@ -125,7 +127,7 @@ def gradient_task(
         "images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0]
     )
     residual, weight = stack.mean - block.reference, block.fit_weight
-    (rows,) = how.render(host, replace(task, tissue=similar), block.fitted_view, seeds[1:], block.parts)
+    (rows,) = differentiation.render(host, replace(task, tissue=similar), block.fitted_view, seeds[1:], block.parts)
     loss = 0.5 * float((weight * (residual**2 - stack.variance)).sum())
     return Gradient(rows @ (weight * residual).reshape(-1), loss), trace_row("gradient", task, start)
 
@@ -223,7 +225,7 @@ class StackProblem(Generic[Optics]):
     def linearise(self, x: Array, *, samples: int, step: int) -> NormalEquations:
         """See Problem: an image and a Jacobian task per block, summed in block order."""
         run, label = self.passes.executor, f"{self._prefix}-{step}"
-        tissue, similar, how = self.jacobian_media(x)
+        tissue, similar, differentiation = self.jacobian_media(x)
         seeds = self.seed(step, "jacobian-1"), self.seed(step, "jacobian-2")
         near = None if self.neighbours is None else self.neighbours.near(self.domain)
         pending = []
@@ -239,7 +241,7 @@ class StackProblem(Generic[Optics]):
                     f"{label}-jacobian-{task.index}",
                     jacobian_task,
                     replace(task, tissue=similar),
-                    how,
+                    differentiation,
                     seeds,
                     image,
                     near,
@@ -254,9 +256,11 @@ class StackProblem(Generic[Optics]):
 
     def gradient(self, x: Array, *, samples: int, step: int) -> Gradient:
         """See adam.Problem: one task per block, summed in block order."""
-        tissue, similar, how = self.jacobian_media(x)
+        tissue, similar, differentiation = self.jacobian_media(x)
         seeds = self.seed(step, "image"), self.seed(step, "jacobian")
-        parts = self.passes.run(f"{self._prefix}-{step}", tissue, samples, gradient_task, similar, how, seeds)
+        parts = self.passes.run(
+            f"{self._prefix}-{step}", tissue, samples, gradient_task, similar, differentiation, seeds
+        )
         self.passes.record([row for _, row in parts])
         total: Gradient = parts[0][0]
         for part, _ in parts[1:]:
@@ -294,9 +298,9 @@ class StackProblem(Generic[Optics]):
             differentiation(self.domain, x, self.base, self.jacobian_g, self.neighbours),
         )
 
-    def slopes(self, x: Array) -> Differentiation:
+    def exact_differentiation(self, x: Array) -> Differentiation:
         """Differentiation of the images in their own media, without blend weights."""
-        return slopes(self.domain, x, self.base, self.neighbours)
+        return exact_differentiation(self.domain, x, self.base, self.neighbours)
 
     @property
     def _prefix(self) -> str:

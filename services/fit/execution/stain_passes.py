@@ -26,11 +26,11 @@ from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, compare_task, trace_row
 from services.fit.inputs.stain_uv import StainLayout
-from services.fit.instrument.columns import photographed
+from services.fit.instrument.photographs import photographed
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.normal_equations import LossChange
-from services.fit.solve.stains import StainSolver, StainState, StainSums, clean
+from services.fit.solve.stains import StainSolver, StainState, StainSums, clean_state
 from services.fit.transport.scene.recipe import StackEstimate, StainGradient
 
 RATIO_STEPS, PATTERN_STEPS = 2, 3
@@ -39,7 +39,7 @@ EXACT_STEPS = (3, 2)
 """Numbers of exact steps before the media's second and third refit."""
 GRADIENT_G = 0.0
 """Mean cosine of the similar media in which gradients are rendered, as Jacobians are."""
-SURE_Z = 3.0
+SIGNIFICANCE_Z = 3.0
 """Standard errors by which the gain of a texture has to exceed that of fitted noise."""
 
 
@@ -61,9 +61,9 @@ def stain_task(
         assert texels is not None
         return texels
 
-    seen = photographed(image.mean, block, dict(task.errors))
-    squares = float((weight * ((seen - block.reference) ** 2 - image.variance)).sum())
-    return gradient(weight * block.reference), gradient(weight * seen), squares, trace_row("stain", task, start)
+    rendered = photographed(image.mean, block, dict(task.errors))
+    squares = float((weight * ((rendered - block.reference) ** 2 - image.variance)).sum())
+    return gradient(weight * block.reference), gradient(weight * rendered), squares, trace_row("stain", task, start)
 
 
 @dataclass
@@ -75,8 +75,8 @@ class StainStage:
     layout: StainLayout
     samples: int
     """Paths per pixel of every pass."""
-    pause: Callable[[], None]
-    tell: Callable[[str, int, Tissue, str], None]
+    raise_if_cancelled: Callable[[], None]
+    report: Callable[[str, int, Tissue, str], None]
     """Called after every step with the stage, the number of the step in it, the tissue and a sentence on
     the outcome."""
 
@@ -92,17 +92,19 @@ class StainStage:
             The tissue with its stain, or None where a clean surface explains the images equally well.
         """
         solver = StainSolver(self.layout.neighbours, len(self.layout.points_mm))
-        state, stained = clean(solver.texels), tissue
+        state, stained = clean_state(solver.texels), tissue
         for step, solve in enumerate((solver.ratio_step,) * RATIO_STEPS + (solver.pattern_step,) * PATTERN_STEPS):
             state = self._step("stain.0", step, stained, state, solve)
-            stained = self._with(stained, state)
+            stained = self._with_stain(stained, state)
         stained = refit(stained, 0, False)
         done = 0
-        for turn, steps in enumerate(EXACT_STEPS, 1):
+        for refit_number, steps in enumerate(EXACT_STEPS, 1):
             for step in range(steps):
-                state = self._step(f"stain.{turn}", step, stained, state, partial(solver.exact_step, number=done))
-                stained, done = self._with(stained, state), done + 1
-            stained = refit(stained, turn, turn == len(EXACT_STEPS))
+                state = self._step(
+                    f"stain.{refit_number}", step, stained, state, partial(solver.exact_step, number=done)
+                )
+                stained, done = self._with_stain(stained, state), done + 1
+            stained = refit(stained, refit_number, refit_number == len(EXACT_STEPS))
         return stained if self._is_better(tissue, stained, state) else None
 
     def sums(self, label: str, tissue: Tissue, seeds: tuple[int, int]) -> StainSums:
@@ -130,16 +132,16 @@ class StainStage:
 
         def compute() -> dict[str, object]:
             seeds = self.passes.seeds(stage, step, "image"), self.passes.seeds(stage, step, "gradient")
-            return solve(state, self.sums(f"{stage}-{step}", self._with(tissue, state), seeds)).record()
+            return solve(state, self.sums(f"{stage}-{step}", self._with_stain(tissue, state), seeds)).record()
 
-        self.pause()
-        entry, _ = self.journal.once(f"{self.passes.seeds.channel}/{stage}/{step}", compute)
+        self.raise_if_cancelled()
+        entry, _ = self.journal.get_or_compute(f"{self.passes.seeds.channel}/{stage}/{step}", compute)
         moved = StainState.of(entry)
         size = float(np.sqrt(np.mean((moved.depth - state.depth) ** 2)))
-        self.tell(stage, step + 1, self._with(tissue, moved), f"texels moved by {size:.3f}")
+        self.report(stage, step + 1, self._with_stain(tissue, moved), f"texels moved by {size:.3f}")
         return moved
 
-    def _with(self, tissue: Tissue, state: StainState) -> Tissue:
+    def _with_stain(self, tissue: Tissue, state: StainState) -> Tissue:
         return replace(tissue, stain=self.layout.texture(state.depth))
 
     def _is_better(self, plain: Tissue, stained: Tissue, state: StainState) -> bool:
@@ -156,6 +158,6 @@ class StainStage:
                 total = total + change
             return {"change": total.change, "se": total.se}
 
-        self.pause()
-        found, _ = self.journal.once(f"{self.passes.seeds.channel}/stain.compare", compute)
-        return bool(found["change"] + int(state.seen.sum()) + SURE_Z * found["se"] < 0)
+        self.raise_if_cancelled()
+        found, _ = self.journal.get_or_compute(f"{self.passes.seeds.channel}/stain.compare", compute)
+        return bool(found["change"] + int(state.determined.sum()) + SIGNIFICANCE_Z * found["se"] < 0)

@@ -82,15 +82,15 @@ def mouth_scene(
         return surface_dict(path, {"type": "null"} if contrast == 1 else boundary_dict(boundary, contrast)) | sides
 
     for name, path in files.items():
-        kind, _, whose = name.partition("_")
+        kind, _, suffix = name.partition("_")
         if kind == "crown":
-            scene[name] = between(path, ior, f"enamel_{whose}")
+            scene[name] = between(path, ior, f"enamel_{suffix}")
         elif kind == "root":
-            scene[name] = between(path, ior / gums_ior, f"enamel_{whose}", "gums")
+            scene[name] = between(path, ior / gums_ior, f"enamel_{suffix}", "gums")
         elif kind == "dentin":
-            scene[name] = between(path, 1.0, f"dentin_{whose}", f"enamel_{whose}")
+            scene[name] = between(path, 1.0, f"dentin_{suffix}", f"enamel_{suffix}")
         elif kind == "contact":
-            scene[name] = between(path, 1.0, *(f"enamel_{number}" for number in whose.split("_")))
+            scene[name] = between(path, 1.0, *(f"enamel_{number}" for number in suffix.split("_")))
         elif kind == "gums":
             scene[name] = between(path, gums_ior, "gums")
         else:

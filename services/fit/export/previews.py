@@ -39,11 +39,11 @@ def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
     """Images to show: for each camera the brightest fitted and the brightest held-out image, as camera name and index
     among the lights with a valid pixel.
     """
-    seen = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views], axis=0))
+    valid_lights = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views], axis=0))
     shown = []
     for view in views:
-        brightness = np.where(view.valid, view.reference, 0.0).sum(axis=1)[seen]
-        for group in (~view.held_out[seen], view.held_out[seen]):
+        brightness = np.where(view.valid, view.reference, 0.0).sum(axis=1)[valid_lights]
+        for group in (~view.held_out[valid_lights], view.held_out[valid_lights]):
             lit = np.flatnonzero(group & (brightness > 0))
             if len(lit):
                 shown.append((view.camera.name, int(lit[np.argmax(brightness[lit])])))
@@ -61,10 +61,10 @@ def pictures_of(
     channels = list(evaluations)
     images: dict[tuple[str, str], Picture] = {}
     for index, channel in enumerate(channels):
-        seen = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views[channel]], axis=0))
+        valid_lights = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views[channel]], axis=0))
         by_camera = {v.camera.name: v for v in views[channel]}
         for (camera, light), (pixels, values) in evaluations[channel].renders.items():
-            view, number = by_camera[camera], int(seen[light])
+            view, number = by_camera[camera], int(valid_lights[light])
             key = (camera, manifest.lights[number].name)
             if key not in images:
                 width, height = (-(-size // every) for size in view.camera.size)
@@ -163,7 +163,12 @@ def read_pictures(
             )
     if tooth is None:
         return ReportPictures(channels, tuple(pictures))
-    seen = None if stains is None else stain_image(tooth.outer, stains, cameras[0])
+    stain_map = None if stains is None else stain_image(tooth.outer, stains, cameras[0])
     return ReportPictures(
-        channels, tuple(pictures), thickness, cameras[0].name, seen, () if stains is None else tuple(stains.textures)
+        channels,
+        tuple(pictures),
+        thickness,
+        cameras[0].name,
+        stain_map,
+        () if stains is None else tuple(stains.textures),
     )

@@ -125,7 +125,8 @@ def write_report(
         parameters=_parameter_rows(report.parameters),
         teeth=_tooth_rows(report.teeth),
         tooth_sentences=[
-            (fdi, [said for said in (tooth.sentence, tooth.told) if said]) for fdi, tooth in report.teeth.items()
+            (fdi, [sentence for sentence in (tooth.sentence, tooth.told) if sentence])
+            for fdi, tooth in report.teeth.items()
         ],
         thickness=_thickness(pictures),
         thickness_bar=gradient(SEQUENTIAL),
@@ -218,14 +219,14 @@ def _stages(history: list[dict[str, Any]]) -> list[dict[str, str]]:
     rows = []
     for (channel, stage), entry in last.items():
         error, se = entry.get("held_out_error"), entry.get("held_out_se")
-        told = "" if error is None else _percent(error) if se is None else f"{100 * error:.1f} ± {100 * se:.1f} %"
+        error_text = "" if error is None else _percent(error) if se is None else f"{100 * error:.1f} ± {100 * se:.1f} %"
         rows.append(
             {
                 "channel": channel,
                 "stage": stage,
                 "step": str(entry["step"]),
                 "loss": f"{entry['loss']:.3g}",
-                "error": told,
+                "error": error_text,
             }
         )
     return rows

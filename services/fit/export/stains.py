@@ -17,14 +17,14 @@ STAINS = "stains.npz"
 """File of the stain textures, in the fit's folder."""
 
 
-def keep_stains(folder: Path, stains: ToothStains) -> None:
+def store_stains(folder: Path, stains: ToothStains) -> None:
     """Store stain textures in a fit's folder."""
     arrays = {f"texture.{channel}": stain.transmittance for channel, stain in stains.textures.items()}
     np.savez_compressed(folder / STAINS, allow_pickle=False, corners_uv=stains.corners_uv, **arrays)
 
 
-def kept_stains(folder: Path) -> ToothStains | None:
-    """Stain textures that ``keep_stains`` stored; None where there are none."""
+def read_stains(folder: Path) -> ToothStains | None:
+    """Stain textures that ``store_stains`` wrote; None where there are none."""
     if not (folder / STAINS).is_file():
         return None
     with np.load(folder / STAINS, allow_pickle=False) as stored:

@@ -154,9 +154,9 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
         )
     teeth = read_teeth(folder, manifest.fdi)
     if spec.dentin == "known" and not any(tooth.dentin is not None for tooth in teeth):
-        whose = f"tooth {teeth[0].fdi}" if len(teeth) == 1 else "no tooth"
+        owner = f"tooth {teeth[0].fdi}" if len(teeth) == 1 else "no tooth"
         raise SettingsError(
-            f"dentin = 'known' but {whose} has {'no' if len(teeth) == 1 else 'a'} dentin.ply; add it, or set dentin to"
+            f"dentin = 'known' but {owner} has {'no' if len(teeth) == 1 else 'a'} dentin.ply; add it, or set dentin to"
             " 'fit' or 'none'."
         )
     for channel in spec.channels or ():
@@ -280,8 +280,8 @@ def write_channel(
         instrument: the instrument; None for one without errors.
     """
     fitted = [v.fitted for v in views]
-    used = np.any([f.any(axis=1) for f in fitted], axis=0)
-    seen = np.any([v.valid.any(axis=1) for v in views], axis=0)
+    fitted_lights = np.any([f.any(axis=1) for f in fitted], axis=0)
+    valid_lights = np.any([v.valid.any(axis=1) for v in views], axis=0)
     noise = np.concatenate([v.variance[f] for v, f in zip(views, fitted, strict=True)])
     values = np.concatenate([v.reference[f] for v, f in zip(views, fitted, strict=True)])
     weight = first_weights(loss, values, noise)
@@ -293,7 +293,7 @@ def write_channel(
     coarse_pixels = COARSE_PIXELS * len(scene.teeth)
     cells = {v.camera.name: comparison_cells(v, coarse_pixels) for v in views}
     brightest = {v.camera.name: float(np.where(v.valid, v.reference, 0.0).max(initial=0.0)) for v in views}
-    seeing = [v.camera.name for v, f in zip(views, fitted, strict=True) if f.any()]
+    fitted_cameras = [v.camera.name for v, f in zip(views, fitted, strict=True) if f.any()]
 
     def under(lights: NDArray[np.bool_]) -> SceneRecipe:
         return replace(
@@ -304,72 +304,76 @@ def write_channel(
 
     def block(view: ViewStack, weight: Array, lights: NDArray[np.bool_], pixels: NDArray[np.int64]) -> StoredFile:
         cut = np.ix_(np.flatnonzero(lights), pixels)
-        held = view.valid[cut] & view.held_out[lights][:, None]
+        held_out = view.valid[cut] & view.held_out[lights][:, None]
         measured = View(view.camera, view.pixels[pixels]), view.reference[cut], view.variance[cut]
         parts = None if view.parts is None else view.parts.of(pixels)
-        acting = (
+        instrument_of_block = (
             None
             if instrument is None
-            else instrument.acting(channel, view.camera.name, brightest[view.camera.name], lights)
+            else instrument.block_instrument(channel, view.camera.name, brightest[view.camera.name], lights)
         )
-        block = Block(*measured, weight[cut], held, parts, cells[view.camera.name][pixels], acting)
+        block = Block(*measured, weight[cut], held_out, parts, cells[view.camera.name][pixels], instrument_of_block)
         return write_block(folder, block)
 
-    def level(most: int | None) -> Level:
+    def level(max_pixels: int | None) -> Level:
         fits, compares, pixels, signal = list[StoredFile](), list[StoredFile](), 0, 0.0
         for view, weight, fit in zip(views, weights, fitted, strict=True):
             counted = np.asarray(fit.any(axis=0))
-            kept = np.ones(len(view.pixels), dtype=bool) if most is None else on_coarse_grid(view.pixels, counted, most)
+            kept = (
+                np.ones(len(view.pixels), dtype=bool)
+                if max_pixels is None
+                else on_coarse_grid(view.pixels, counted, max_pixels)
+            )
             relevant = np.flatnonzero(counted & kept)
             pixels, signal = pixels + len(relevant), signal + float((weight * view.reference**2)[:, kept].sum())
             fits += [
-                block(view, weight, used, part)
-                for part in split_pixels(relevant, int(used.sum()), len(views))
+                block(view, weight, fitted_lights, part)
+                for part in split_pixels(relevant, int(fitted_lights.sum()), len(views))
                 if len(part)
             ]
-            seen_pixels = np.flatnonzero(view.valid.any(axis=0) & kept)
+            valid_pixels = np.flatnonzero(view.valid.any(axis=0) & kept)
             compares += [
-                block(view, weight, seen, part)
-                for part in split_pixels(seen_pixels, int(seen.sum()), len(views))
+                block(view, weight, valid_lights, part)
+                for part in split_pixels(valid_pixels, int(valid_lights.sum()), len(views))
                 if len(part)
             ]
         return Level(tuple(fits), tuple(compares), pixels, signal)
 
-    few = [_spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views)) for fit in fitted]
+    search_pixels = [_spread(np.flatnonzero(fit.any(axis=0)), SEARCH_PIXELS // len(views)) for fit in fitted]
     return ChannelFiles(
         channel=channel,
-        recipe=write_recipe(folder, under(used)),
+        recipe=write_recipe(folder, under(fitted_lights)),
         coarse=level(coarse_pixels),
         full=level(None),
         search_blocks=tuple(
-            block(view, weight, used, pixels)
-            for view, weight, pixels in zip(views, weights, few, strict=True)
+            block(view, weight, fitted_lights, pixels)
+            for view, weight, pixels in zip(views, weights, search_pixels, strict=True)
             if len(pixels)
         ),
-        evaluation_recipe=write_recipe(folder, under(seen)),
+        evaluation_recipe=write_recipe(folder, under(valid_lights)),
         weight=float(weight.mean()),
         quality=float(values @ values / noise.sum()),
-        errors=NO_ERRORS if instrument is None else instrument.errors(channel, seeing, used),
-        moves=() if instrument is None else instrument.moves(folder, under(used)),
+        errors=NO_ERRORS if instrument is None else instrument.errors(channel, fitted_cameras, fitted_lights),
+        moves=() if instrument is None else instrument.moves(folder, under(fitted_lights)),
     )
 
 
-def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], most: int) -> NDArray[np.bool_]:
-    """Mask (N,) of the pixels (N, 2) on a grid of every n-th in x and y, with the least n that leaves at most ``most``
-    of the counted pixels.
+def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], max_pixels: int) -> NDArray[np.bool_]:
+    """Mask (N,) of the pixels (N, 2) on a grid of every n-th in x and y, with the least n that leaves at most
+    ``max_pixels`` of the counted pixels.
     """
     every = 1
-    while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > most:
+    while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > max_pixels:
         every += 1
     return np.asarray(kept)
 
 
-def comparison_cells(view: ViewStack, most: int) -> NDArray[np.int32]:
+def comparison_cells(view: ViewStack, max_pixels: int) -> NDArray[np.int32]:
     """Index (N,) of each pixel's comparison cell. Cells are squares of a few pixels of the coarse grid, which has at
-    most ``most`` fitted pixels; each cell shows one part only.
+    most ``max_pixels`` fitted pixels; each cell shows one part only.
     """
     counted = np.asarray(view.fitted.any(axis=0))
-    coarse = view.pixels[counted & on_coarse_grid(view.pixels, counted, most)]
+    coarse = view.pixels[counted & on_coarse_grid(view.pixels, counted, max_pixels)]
     if not len(coarse):
         return np.zeros(len(view.pixels), dtype=np.int32)
     pitch = max(1, int(np.gcd.reduce((coarse - coarse[0]).ravel())))

@@ -15,7 +15,7 @@ from services.fit.execution.blocks import BlockTask, StoredFile, read_block, wri
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, trace_row
-from services.fit.instrument.columns import photographed
+from services.fit.instrument.photographs import photographed
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.losses import weights
 from services.fit.transport.scene.recipe import StackEstimate
@@ -76,6 +76,6 @@ def reweighted(passes: Passes, journal: Journal, loss: Loss, tissue: Tissue, *, 
             files.append((file.path.name, file.digest))
         return files
 
-    files, _ = journal.once(key, compute)
+    files, _ = journal.get_or_compute(key, compute)
     folder = passes.blocks[0].path.parent
     return replace(passes, blocks=tuple(StoredFile(folder / name, digest) for name, digest in files))

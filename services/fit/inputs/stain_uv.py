@@ -19,10 +19,10 @@ TEXEL_MM = (0.5, 1.0)
 """Least and greatest edge of a texel, in mm."""
 TEXEL_PIXELS = 1.5
 """Edge of a texel in pixels of the capture: one pixel does not determine two texels."""
-REACH = 1.6
+NEIGHBOUR_DISTANCE = 1.6
 """Largest distance between neighbouring texels, in edges: it covers the eight around a texel and those across
 a seam."""
-SAME_SIDE = 0.3
+MIN_NORMAL_COSINE = 0.3
 """Least cosine between the normals of neighbours, so that texels on the two sides of an incisal edge are not
 neighbours."""
 SAMPLES_PER_TEXEL = 4
@@ -92,7 +92,7 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
     carried = (bilinear * shares[:, None]).reshape(-1)
     area = np.bincount(texels.reshape(-1), carried, height * width)
     touched = area > 1e-9 * texel_mm**2
-    place: Array = np.einsum("sc,scd->sd", weights, outer.vertices_mm[outer.faces[faces]])
+    positions: Array = np.einsum("sc,scd->sd", weights, outer.vertices_mm[outer.faces[faces]])
 
     def mean(values: Array) -> Array:
         sums = [
@@ -103,14 +103,14 @@ def stain_layout(outer: Mesh, texel_mm: float) -> StainLayout:
 
     normals = mean(_normals(outer)[faces])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    points = mean(place)
+    points = mean(positions)
     index = np.where(touched, np.cumsum(touched) - 1, -1).reshape(height, width)
     return StainLayout(
         corners_uv,
         index,
         points,
         np.asarray(area[touched], dtype=np.float64),
-        _neighbours(points, normals, REACH * texel_mm),
+        _neighbours(points, normals, NEIGHBOUR_DISTANCE * texel_mm),
     )
 
 
@@ -160,6 +160,6 @@ def _neighbours(points_mm: Array, normals: Array, reach_mm: float) -> NDArray[np
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(points_mm).query_pairs(reach_mm, output_type="ndarray").astype(np.int64)
-    facing = np.einsum("ec,ec->e", normals[pairs[:, 0]], normals[pairs[:, 1]]) > SAME_SIDE
+    facing = np.einsum("ec,ec->e", normals[pairs[:, 0]], normals[pairs[:, 1]]) > MIN_NORMAL_COSINE
     found: NDArray[np.int64] = pairs[facing][np.lexsort(pairs[facing].T[::-1])]
     return found

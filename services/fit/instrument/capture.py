@@ -14,8 +14,8 @@ from services.core.geometry import Light
 from services.core.records import JobSpec, PreparedManifest
 from services.fit.execution.blocks import BlockInstrument
 from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names
-from services.fit.instrument.irradiance import at_the_teeth
-from services.fit.instrument.moves import Move, is_dome_placed, move_covariance, write_moves
+from services.fit.instrument.irradiance import uncertainty_at_teeth
+from services.fit.instrument.moves import Move, is_dome_given_by_lights, move_covariance, write_moves
 from services.fit.transport.scene.recipe import SceneRecipe
 
 MAX_JAW_LIGHTS = 12
@@ -32,7 +32,7 @@ class Instrument:
     lights: tuple[Light, ...]
     """Lights in the order of the views' images."""
     stated: CalibrationUncertainty | None
-    knows_distances: bool = False
+    has_irradiance_gains: bool = False
     """Whether the gain of a single light is the error of its irradiance at the teeth."""
     max_light_gains: int | None = None
     """Largest number of fitted lights under which gains of single lights are coordinates; None for no limit."""
@@ -41,28 +41,30 @@ class Instrument:
         """Moves of scan and dome under the lights of a recipe, with their scenes."""
         covariance, _ = move_covariance(self.stated, self.lights)
         centre_mm = np.mean([light.position_mm for light in self.lights], axis=0)
-        known = self.knows_distances and is_dome_placed(self.stated, self.lights)
+        known = self.has_irradiance_gains and is_dome_given_by_lights(self.stated, self.lights)
         return write_moves(folder, recipe, covariance, centre_mm, keep_irradiance=known)
 
     def errors(self, channel: str, cameras: Sequence[str], used: NDArray[np.bool_]) -> InstrumentErrors:
         """Errors of one channel that act on the fitted photographs of some cameras under the lights of the mask
         ``used`` (L,).
         """
-        lights = self._chosen(used)
+        lights = self._light_names(used)
         if self.max_light_gains is not None and len(lights) > self.max_light_gains:
             lights = []
         return errors_of(channel, lights, cameras, self.stated)
 
-    def acting(self, channel: str, camera: str, brightest: float, chosen: NDArray[np.bool_]) -> BlockInstrument:
+    def block_instrument(
+        self, channel: str, camera: str, brightest: float, chosen: NDArray[np.bool_]
+    ) -> BlockInstrument:
         """Errors that act on one camera's photographs under the chosen lights (L,).
 
         Args:
             brightest: largest radiance among the camera's valid pixels in this channel.
         """
-        names = light_names(self._chosen(chosen), channel, self.stated)
+        names = light_names(self._light_names(chosen), channel, self.stated)
         return BlockInstrument(gain_name(channel), names, flare_name(camera, channel), brightest)
 
-    def _chosen(self, lights: NDArray[np.bool_]) -> list[str]:
+    def _light_names(self, lights: NDArray[np.bool_]) -> list[str]:
         return [light.name for light, is_chosen in zip(self.lights, lights, strict=True) if is_chosen]
 
 
@@ -78,5 +80,5 @@ def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[n
     if spec.instrument == "off" or spec.solver == "adam":
         return None
     max_gains = MAX_JAW_LIGHTS if spec.kind == "jaw" else None
-    stated = at_the_teeth(manifest.uncertainty, manifest.lights, manifest.channels, teeth_mm)
+    stated = uncertainty_at_teeth(manifest.uncertainty, manifest.lights, manifest.channels, teeth_mm)
     return Instrument(manifest.lights, stated, stated is not manifest.uncertainty, max_gains)

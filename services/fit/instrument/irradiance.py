@@ -18,7 +18,7 @@ DRIFT = 1e-4
 covariance invertible, which that of errors with mean 0 is not."""
 
 
-def at_the_teeth(
+def uncertainty_at_teeth(
     stated: CalibrationUncertainty | None, lights: Sequence[Light], channels: Sequence[str], centre_mm: Array
 ) -> CalibrationUncertainty | None:
     """The calibration's uncertainty with ``light_gain`` as the error of a light's irradiance at the teeth.
@@ -42,33 +42,33 @@ def at_the_teeth(
     """
     if stated is None:
         return None
-    place = {name: k for k, name in enumerate(stated.names)}
-    gains = [k for name, k in place.items() if name.startswith("light_gain.")]
-    transform, common = np.eye(len(place)), np.eye(len(place))
-    seen: list[int] = []
+    index = {name: k for k, name in enumerate(stated.names)}
+    gains = [k for name, k in index.items() if name.startswith("light_gain.")]
+    transform, common = np.eye(len(index)), np.eye(len(index))
+    gain_rows: list[int] = []
     for channel, suffix in ((None, ""), *((k, f".{name}") for k, name in enumerate(channels))):
-        own = [light for light in lights if f"light_gain.{light.name}{suffix}" in place]
-        axes = [_axes(place, light) for light in own]
+        own = [light for light in lights if f"light_gain.{light.name}{suffix}" in index]
+        axes = [_axes(index, light) for light in own]
         if not own or not all(axes):
             continue
-        rows = [place[f"light_gain.{light.name}{suffix}"] for light in own]
+        rows = [index[f"light_gain.{light.name}{suffix}"] for light in own]
         for row, light, columns in zip(rows, own, axes, strict=True):
-            away = np.array(light.position_mm) - centre_mm
-            transform[row, columns] = -2 * away / (away @ away)
+            offset_mm = np.array(light.position_mm) - centre_mm
+            transform[row, columns] = -2 * offset_mm / (offset_mm @ offset_mm)
         weights = np.array([np.mean(light.intensity) if channel is None else light.intensity[channel] for light in own])
         common[np.ix_(rows, rows)] -= weights / weights.sum()
-        seen += rows
-    if not seen or set(seen) != set(gains):
+        gain_rows += rows
+    if not gain_rows or set(gain_rows) != set(gains):
         return stated
     whole = common @ transform
     covariance = whole @ stated.matrix @ whole.T
-    covariance[seen, seen] += DRIFT**2
+    covariance[gain_rows, gain_rows] += DRIFT**2
     # Make the covariance exactly symmetric: rounding leaves its halves different in their last digits.
     table = ((covariance + covariance.T) / 2).tolist()
     return CalibrationUncertainty(names=stated.names, covariance=tuple(map(tuple, table)))
 
 
-def _axes(place: Mapping[str, int], light: Light) -> list[int]:
+def _axes(index: Mapping[str, int], light: Light) -> list[int]:
     """Indices of the three errors of a light's place; empty where they are not stated."""
     names = [f"light.{light.name}.{axis}" for axis in "xyz"]
-    return [place[name] for name in names] if all(name in place for name in names) else []
+    return [index[name] for name in names] if all(name in index for name in names) else []

@@ -33,9 +33,9 @@ from services.fit.transport.scene.recipe import SceneRecipe, View
 
 Array = NDArray[np.float64]
 
-MOVED = tuple(DEFAULT_MOVE_SE)
+MOVING_BODIES = tuple(DEFAULT_MOVE_SE)
 """Bodies that move rigidly: ``teeth`` and ``dome``."""
-REACH = 2.0
+DIFFERENCE_WIDTH = 2.0
 """Standard deviations between the two images of a difference. A wider difference has less noise, and images 0.1 mm or 4
 mm apart are still about linear."""
 MAX_LIGHTS = 80
@@ -45,7 +45,7 @@ more lights would need more memory for their maps."""
 
 @dataclass(frozen=True)
 class Move:
-    """A move by ``REACH`` standard deviations, as a change of lights and cameras."""
+    """A move by ``DIFFERENCE_WIDTH`` standard deviations, as a change of lights and cameras."""
 
     body: str
     """``teeth`` or ``dome``."""
@@ -57,7 +57,7 @@ class Move:
     camera_move: tuple[tuple[float, ...], ...]
     """Rigid transform (4, 4) that multiplies camera_from_world from the right."""
 
-    def seen_by(self, camera: Camera) -> Camera:
+    def moved_camera(self, camera: Camera) -> Camera:
         """The camera after the move."""
         pose = np.asarray(camera.camera_from_world) @ np.array(self.camera_move)
         return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, pose.tolist()))})
@@ -74,13 +74,13 @@ def rigid(twist: Array, centre_mm: Array) -> Array:
     return move
 
 
-def is_dome_placed(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> bool:
+def is_dome_given_by_lights(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> bool:
     """Whether the place of every light is stated, which determines the dome's uncertainty, and no move of the dome is
     stated.
     """
     if stated is None or any(f"dome.{axis}" in stated.names for axis in TWIST):
         return False
-    return all(name in stated.names for name in _places(lights))
+    return all(name in stated.names for name in _position_names(lights))
 
 
 def move_covariance(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> tuple[Array, tuple[str, ...]]:
@@ -90,34 +90,34 @@ def move_covariance(stated: CalibrationUncertainty | None, lights: Sequence[Ligh
         stated: the calibration's uncertainty.
         lights: all lights of the capture.
     """
-    names = [f"{body}.{axis}" for body in MOVED for axis in TWIST]
-    covariance = np.diag([se**2 for body in MOVED for se in DEFAULT_MOVE_SE[body]])
+    names = [f"{body}.{axis}" for body in MOVING_BODIES for axis in TWIST]
+    covariance = np.diag([se**2 for body in MOVING_BODIES for se in DEFAULT_MOVE_SE[body]])
     own = [name for name in names if stated is not None and name in stated.names]
     if stated is not None:
         covariance[np.ix_(*2 * [[names.index(name) for name in own]])] = _stated(stated, own)
-    if stated is not None and is_dome_placed(stated, lights):
+    if stated is not None and is_dome_given_by_lights(stated, lights):
         nearest = np.linalg.pinv(_twist_derivative(np.array([light.position_mm for light in lights])))
-        covariance[len(TWIST) :, len(TWIST) :] = nearest @ _stated(stated, _places(lights)) @ nearest.T
+        covariance[len(TWIST) :, len(TWIST) :] = nearest @ _stated(stated, _position_names(lights)) @ nearest.T
         own += [name for name in names if name.startswith("dome.")]
     assumed = {name.partition(".")[0] for name in names if name not in own}
-    return covariance, tuple(body for body in MOVED if body in assumed)
+    return covariance, tuple(body for body in MOVING_BODIES if body in assumed)
 
 
-def _places(lights: Sequence[Light]) -> list[str]:
+def _position_names(lights: Sequence[Light]) -> list[str]:
     return [f"light.{light.name}.{axis}" for light in lights for axis in "xyz"]
 
 
 def _stated(stated: CalibrationUncertainty, names: Sequence[str]) -> Array:
-    places = [stated.names.index(name) for name in names]
-    return np.asarray(stated.matrix[np.ix_(places, places)])
+    indices = [stated.names.index(name) for name in names]
+    return np.asarray(stated.matrix[np.ix_(indices, indices)])
 
 
-def _twist_derivative(places_mm: Array) -> Array:
+def _twist_derivative(positions_mm: Array) -> Array:
     # Derivative (3 L, 6) of places (L, 3) with respect to a rotation w and a translation t about their mean, w x r + t.
     # Its pseudo-inverse gives the rigid move nearest to any errors of the places.
-    arms_mm = places_mm - places_mm.mean(axis=0)
-    turned = np.cross(np.eye(3)[:, None], arms_mm).transpose(1, 2, 0)
-    return np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2).reshape(-1, 6)
+    arms_mm = positions_mm - positions_mm.mean(axis=0)
+    rotated = np.cross(np.eye(3)[:, None], arms_mm).transpose(1, 2, 0)
+    return np.concatenate([rotated, np.broadcast_to(np.eye(3), rotated.shape)], axis=2).reshape(-1, 6)
 
 
 def write_moves(
@@ -137,8 +137,8 @@ def write_moves(
     lights, moves = recipe.light_positions_mm, list[tuple[str, Array, Array, Array]]()
     values, vectors = np.linalg.eigh(covariance)
     for value, vector in zip(values, vectors.T, strict=True):
-        twist = REACH * np.sqrt(max(value, 0.0)) * vector
-        body = MOVED[int(np.abs(vector[6:]).max() > np.abs(vector[:6]).max())]
+        twist = DIFFERENCE_WIDTH * np.sqrt(max(value, 0.0)) * vector
+        body = MOVING_BODIES[int(np.abs(vector[6:]).max() > np.abs(vector[:6]).max())]
         forth = rigid(twist[:6], teeth_centre_mm)
         back, moved = np.linalg.inv(forth), _moved(rigid(twist[6:], dome_centre_mm), lights)
         farther = ((moved - teeth_centre_mm) ** 2).sum(axis=1) / ((lights - teeth_centre_mm) ** 2).sum(axis=1)
@@ -185,9 +185,9 @@ def moves_task(
     base = [image(moves[0].recipe, view.camera, 0, seed) for seed in seeds]
     changes = [
         [
-            image(move.recipe, move.seen_by(view.camera), move.first, seed) - still
-            for seed, still in zip(seeds, base, strict=True)
+            image(move.recipe, move.moved_camera(view.camera), move.first, seed) - unmoved
+            for seed, unmoved in zip(seeds, base, strict=True)
         ]
         for move in moves
     ]
-    return (np.array(changes) / REACH).astype(np.float32)
+    return (np.array(changes) / DIFFERENCE_WIDTH).astype(np.float32)

@@ -114,7 +114,7 @@ def _exact_lights(errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
 def _faults(errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]]) -> Iterator[str]:
     for channel, own in faults.items():
         for fault in own:
-            name, before = errors[channel].names[fault.place], errors[channel].se[fault.place]
+            name, before = errors[channel].names[fault.index], errors[channel].se[fault.index]
             yield (
                 f"In {channel} the images put {name} off by {100 * fault.size:+.1f} %, {abs(fault.z):.1f} times what "
                 f"their own error and its ± of {100 * before:.2g} % allow together: the calibration seems at fault; "

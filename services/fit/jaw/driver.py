@@ -34,8 +34,8 @@ from services.fit.inputs.observations import (
 from services.fit.instrument.capture import Instrument, instrument_of
 from services.fit.jaw.report import JawFit, report
 from services.fit.jaw.schedule import JawSchedule
-from services.fit.jaw.starts import GUMS_START, MIN_TOOTH_PIXELS, TOOTH_FAULTS, start_mouth, start_tooth
-from services.fit.jaw.views import fitted_pixels, label_views, showing, without
+from services.fit.jaw.starts import GUMS_START, MIN_TOOTH_PIXELS, TOOTH_ERRORS, start_mouth, start_tooth
+from services.fit.jaw.views import fitted_pixels, label_views, views_of_parts, views_without_teeth
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import SHAPE
 from services.fit.tooth.driver import blend_shape, viewpoints_mm
@@ -95,7 +95,7 @@ class JawDriver:
                 )
             )
         journal = attempt.journal(channel.files for channel in channels)
-        begun, _ = journal.once("begun", lambda: started_s)
+        begun, _ = journal.get_or_compute("begun", lambda: started_s)
 
         # Fit the channel with the most signal first; where blend weights are fitted, the others take them from it.
         order = sorted(channels, key=lambda channel: -channel.files.quality)
@@ -124,9 +124,9 @@ def require_jaw_options(spec: JobSpec) -> None:
         SettingsError: names the option and its required value.
     """
     for option, usual in job_kinds()["jaw"].fixed_options.items():
-        if (asked := getattr(spec, option)) != usual:
+        if (value := getattr(spec, option)) != usual:
             raise SettingsError(
-                f"A jaw is fitted with {option} = {usual!r}, not {asked!r}; leave it out, or fit its teeth one by one"
+                f"A jaw is fitted with {option} = {usual!r}, not {value!r}; leave it out, or fit its teeth one by one"
                 " with kind 'tooth'."
             )
 
@@ -145,7 +145,7 @@ def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSp
     def blended(tooth: Tooth, frame: ToothFrame) -> DentinShape | None:
         try:
             return blend_shape(tooth, frame)
-        except TOOTH_FAULTS:
+        except TOOTH_ERRORS:
             return None
 
     return [
@@ -168,7 +168,7 @@ class _ChannelRun:
     channel: Channel
     journal: Journal
     run_on: Executor
-    place: tuple[int, int]
+    channel_position: tuple[int, int]
     """Index of this channel, and the number of channels."""
     instrument: Instrument | None
     """Instrument whose errors all teeth share; None for one without errors."""
@@ -180,11 +180,11 @@ class _ChannelRun:
         observations, views = self.observations, self.channel.views
         starts = []
         for k, tooth in enumerate(observations.teeth):
-            own = showing(views, k)
-            starts.append(start_tooth(tooth.fdi, fitted_pixels(own), partial(self._alone, k, own)))
+            own = views_of_parts(views, k)
+            starts.append(start_tooth(tooth.fdi, fitted_pixels(own), partial(self._fit_alone, k, own)))
             if starts[-1].sentence:
                 self.attempt.log(f"{self.channel.name}: {starts[-1].sentence}")
-        mouth = start_mouth(starts, self._gums(), has_cavity=observations.cavity is not None)
+        mouth = start_mouth(starts, self._gums_start(), has_cavity=observations.cavity is not None)
         shapes = [() if start.drops_dentin else self._shape(k) for k, start in enumerate(starts)]
         mouth = replace(
             mouth, teeth=tuple(replace(tooth, shape=shape) for tooth, shape in zip(mouth.teeth, shapes, strict=True))
@@ -200,7 +200,7 @@ class _ChannelRun:
         if failed:
             scene, views = (
                 channel_scene(observations, self.channel.name, dentins, self.attempt.spec),
-                without(views, failed),
+                views_without_teeth(views, failed),
             )
             files = write_channel(self.attempt.inputs, scene, self.channel.name, views, instrument=self.instrument)
         self.attempt.log(f"{self.channel.name}: all {len(starts)} teeth together.")
@@ -209,9 +209,9 @@ class _ChannelRun:
             passes=self.attempt.passes(self.run_on, files, self.channel.name),
             spec=self.attempt.spec,
             journal=self.journal,
-            report=self.attempt.teller(observations, views, self.journal, self._done),
-            say=self.attempt.log,
-            pause=self.attempt.context.raise_if_cancelled,
+            report=self.attempt.step_reporter(observations, views, self.journal, self._progress),
+            log=self.attempt.log,
+            raise_if_cancelled=self.attempt.context.raise_if_cancelled,
             shown=shown_images(views),
             steps=self.steps,
             start=mouth,
@@ -221,7 +221,7 @@ class _ChannelRun:
         )
         return JawFit(tuple(starts), tuple(schedule.dentin), schedule.run(), views)
 
-    def _alone(self, k: int, views: tuple[ViewStack, ...]) -> Tissue:
+    def _fit_alone(self, k: int, views: tuple[ViewStack, ...]) -> Tissue:
         tooth = self.observations.teeth[k]
         alone = replace(self.observations, teeth=(tooth,), gums=None, cavity=None)
         return self._start(f"{tooth.fdi}", alone, self.dentins[k], self._shape(k), views, tooth.fdi)
@@ -231,9 +231,9 @@ class _ChannelRun:
         dentin, known = self.dentins[k], () if self.shapes is None else self.shapes[k]
         return known or (() if dentin is None else (SHAPE[0],) * len(dentin.modes_mm))
 
-    def _gums(self) -> Medium | None:
+    def _gums_start(self) -> Medium | None:
         # Start of the gums, fitted like a tooth without dentin.
-        gums, views = self.observations.gums, showing(self.channel.views, GUMS)
+        gums, views = self.observations.gums, views_of_parts(self.channel.views, GUMS)
         if gums is None:
             return None
         if fitted_pixels(views) < MIN_TOOTH_PIXELS:
@@ -244,7 +244,7 @@ class _ChannelRun:
         try:
             alone = replace(self.observations, teeth=(Tooth(0, gums),), gums=None, cavity=None)
             return self._start("gums", alone, None, (), views, None).enamel
-        except TOOTH_FAULTS as problem:
+        except TOOTH_ERRORS as problem:
             self.attempt.log(f"{self.channel.name}: gums start from the literature: {problem.message}")
             return GUMS_START
 
@@ -271,9 +271,9 @@ class _ChannelRun:
             has_dentin=dentin is not None,
             modes=0,
             shape=shape,
-            report=self.attempt.teller(self.observations, self.channel.views, self.journal, self._done),
-            say=self.attempt.log,
-            pause=self.attempt.context.raise_if_cancelled,
+            report=self.attempt.step_reporter(self.observations, self.channel.views, self.journal, self._progress),
+            log=self.attempt.log,
+            raise_if_cancelled=self.attempt.context.raise_if_cancelled,
             steps=self.steps,
             tooth=fdi,
         )
@@ -282,9 +282,9 @@ class _ChannelRun:
         finally:
             self.steps = schedule.steps
 
-    def _done(self, step: int) -> float:
+    def _progress(self, step: int) -> float:
         expected = (
             START_STEPS * len(self.observations.teeth)
             + (3 if self.attempt.spec.dentin == "fit" else 2) * self.attempt.spec.max_steps
         )
-        return (self.place[0] + min(step / expected, 0.99)) / self.place[1]
+        return (self.channel_position[0] + min(step / expected, 0.99)) / self.channel_position[1]

@@ -26,7 +26,7 @@ class Neighbours:
     @staticmethod
     def of(fdi: Sequence[int]) -> Neighbours:
         """Neighbours of teeth by their FDI numbers."""
-        return Neighbours(tuple(sorted(range(len(fdi)), key=lambda k: (is_upper(fdi[k]), arch_place(fdi[k])))))
+        return Neighbours(tuple(sorted(range(len(fdi)), key=lambda k: (is_upper(fdi[k]), arch_position(fdi[k])))))
 
     def colour(self, tooth: int) -> int:
         """Colour of a tooth, from 0 to ``COLOURS`` - 1, in turn along the arch."""
@@ -36,8 +36,8 @@ class Neighbours:
         """Positions of a tooth and its one or two neighbours: the teeth that are nearer to it than to any other tooth
         of its colour.
         """
-        place = self.order.index(tooth)
-        return self.order[max(place - 1, 0) : place + 2]
+        position = self.order.index(tooth)
+        return self.order[max(position - 1, 0) : position + 2]
 
     def pixels(self, tooth: int, parts: PixelParts) -> NDArray[np.bool_]:
         """Mask (N,) of the pixels that show a tooth or its neighbours, or gums and wall nearest to them."""
@@ -54,9 +54,9 @@ class Neighbours:
         return tuple(found)
 
 
-def arch_place(fdi: int) -> int:
+def arch_position(fdi: int) -> int:
     """Signed place along the arch from the midline: negative for the patient's right (quadrants 1, 4 and milk teeth's
     5, 8), positive for the left.
     """
-    quadrant, place = divmod(fdi, 10)
-    return -place if quadrant in {1, 4, 5, 8} else place
+    quadrant, position = divmod(fdi, 10)
+    return -position if quadrant in {1, 4, 5, 8} else position

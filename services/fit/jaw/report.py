@@ -11,15 +11,15 @@ from services.anatomy.dentin_shape import DentinShape
 from services.core.records import JobSpec
 from services.core.results import Estimate, FitReport, ToothReport
 from services.core.verdict import MAX_ERROR
-from services.fit.checks.alignment import offsets_told
+from services.fit.checks.alignment import offset_sentences
 from services.fit.checks.evaluate import ErrorSums, Evaluation
-from services.fit.checks.frames import photographs_told
-from services.fit.checks.identifiability import told
+from services.fit.checks.frames import photograph_sentences
+from services.fit.checks.identifiability import determined_sentences
 from services.fit.checks.thickness import thickness_map
-from services.fit.execution.attempt import judge, standard_errors, worst_error
+from services.fit.execution.attempt import assess_convergence, standard_errors, worst_error
 from services.fit.execution.channel_fit import ChannelFit
 from services.fit.inputs.observations import Observations, ViewStack
-from services.fit.instrument.found import instrument_report
+from services.fit.instrument.report import instrument_report
 from services.fit.jaw.starts import ToothStart
 from services.fit.optics.parameters import Mouth
 from services.fit.solve.estimates import estimates
@@ -60,15 +60,15 @@ def report(
         seconds: duration of the fit.
     """
     first = fits[shaped_by]
-    converged, advice = judge({c: jaw.fit for c, jaw in fits.items()})
-    misplaced = offsets_told(
+    converged, advice = assess_convergence({c: jaw.fit for c, jaw in fits.items()})
+    misplaced = offset_sentences(
         _evaluations(fits),
         {c: worst_error(jaw.fit) for c, jaw in fits.items()},
         observations,
         _views(fits),
         "the jaw's meshes",
     )
-    wrong = photographs_told(_evaluations(fits), observations, _views(fits), is_placed=not misplaced)
+    wrong = photograph_sentences(_evaluations(fits), observations, _views(fits), is_placed=not misplaced)
     advice = misplaced + wrong + advice
     teeth = {
         str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced)
@@ -80,7 +80,7 @@ def report(
         converged=converged and not unexplained and not misplaced and not wrong,
         advice=" ".join(advice),
         parameters={
-            c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.known) for c, jaw in fits.items()
+            c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.uncertainty) for c, jaw in fits.items()
         },
         fit_error={c: jaw.fit.fit_error for c, jaw in fits.items()},
         held_out_error={c: jaw.fit.held_out_error for c, jaw in fits.items() if jaw.fit.held_out_error is not None},
@@ -89,7 +89,7 @@ def report(
         steps=sum(jaw.fit.steps for jaw in fits.values()),
         seconds=seconds,
         teeth=teeth,
-        **instrument_report(spec, {c: jaw.fit.known for c, jaw in fits.items()}, observations.manifest),
+        **instrument_report(spec, {c: jaw.fit.uncertainty for c, jaw in fits.items()}, observations.manifest),
     )
 
 
@@ -126,22 +126,24 @@ def _tooth(
             errors = {c: max(fit_error.get(c, 0.0), held_out_error.get(c, 0.0)) for c in fits}
             sentence = " ".join(
                 [
-                    *offsets_told(
+                    *offset_sentences(
                         _evaluations(fits), errors, observations, _views(fits), f"the mesh of tooth {start.fdi}", k
                     ),
                     sentence,
                 ]
             )
-    shape, covariance = first.fit.tissue.teeth[k].shape, shape_covariance(first.fit.known, k)
-    seen = shape, np.array(covariance) if covariance else None, observations.manifest.cameras[0]
+    shape, covariance = first.fit.tissue.teeth[k].shape, shape_covariance(first.fit.uncertainty, k)
+    thickness_arguments = shape, np.array(covariance) if covariance else None, observations.manifest.cameras[0]
     thickness = (
-        None if dentin is None or not first.dentin[k] else thickness_map(observations.teeth[k].outer, dentin, *seen)
+        None
+        if dentin is None or not first.dentin[k]
+        else thickness_map(observations.teeth[k].outer, dentin, *thickness_arguments)
     )
     tables = {c: _table(k, jaw, first) for c, jaw in fits.items()}
     return ToothReport(
         state=start.state,
         sentence=sentence,
-        told=told(tables, {}),
+        told=determined_sentences(tables, {}),
         pixels=max(jaw.starts[k].pixels for jaw in fits.values()),
         parameters=tables,
         fit_error=fit_error,
@@ -153,10 +155,10 @@ def _tooth(
 
 def _table(k: int, jaw: JawFit, first: JawFit) -> dict[str, Estimate]:
     parts = (f"{k}.enamel", f"{k}.dentin", f"{k}.shape") if jaw.dentin[k] else (f"{k}.enamel",)
-    shaped = first.fit.known if shape_covariance(first.fit.known, k) else None
+    shaped = first.fit.uncertainty if shape_covariance(first.fit.uncertainty, k) else None
     return {
         name.removeprefix(f"{k}."): estimate
-        for name, estimate in estimates(jaw.fit.tissue, parts, jaw.fit.known, shaped).items()
+        for name, estimate in estimates(jaw.fit.tissue, parts, jaw.fit.uncertainty, shaped).items()
     }
 
 

@@ -34,10 +34,10 @@ from functools import partial
 import numpy as np
 
 from services.fit.execution.channel_fit import ChannelFit, Stages
-from services.fit.execution.closing import Held
+from services.fit.execution.closing import HeldCosines
 from services.fit.execution.passes import StackProblem
 from services.fit.jaw.neighbours import Neighbours
-from services.fit.jaw.starts import ToothStart, typical
+from services.fit.jaw.starts import ToothStart, median_tissue
 from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.optics.priors import COSINE, SHAPE, WEAK, priors_of
@@ -67,16 +67,20 @@ class JawSchedule(Stages[Mouth]):
     def run(self) -> ChannelFit[Mouth]:
         """Fit the channel."""
         samples = self.spec.samples_per_pixel
-        options = self.in_similar_media(self.options(self.files.coarse))
+        options = self.similar_media_options(self.options(self.files.coarse))
         mouth = self._best_starts() if any(self.dentin) else self.start
         mouth, solution = self._iterate(self._problem(mouth, "joint", SIMILAR_G), options, 2 * samples)
         if self._shaped:
             mouth, solution = self._iterate(
-                self._problem(self._retied(mouth), "shape", None), self.options(self.files.coarse), solution.samples
+                self._problem(self._with_updated_ties(mouth), "shape", None),
+                self.options(self.files.coarse),
+                solution.samples,
             )
-        options = self.at_full_resolution()
-        exact = self._problem(self._retied(mouth), "exact", None)
-        mouth, solution = self._iterate(exact, options, self.fewer(min(solution.samples, EXACT_SAMPLES * samples)))
+        options = self.switch_to_full_resolution()
+        exact = self._problem(self._with_updated_ties(mouth), "exact", None)
+        mouth, solution = self._iterate(
+            exact, options, self.full_image_samples(min(solution.samples, EXACT_SAMPLES * samples))
+        )
         return self._finish(replace(exact, base=mouth, stage="final"), solution)
 
     def _problem(self, mouth: Mouth, stage: str, image_g: float | None) -> StackProblem[Mouth]:
@@ -93,7 +97,9 @@ class JawSchedule(Stages[Mouth]):
             start = replace(self.start, teeth=tuple(map(partial(_layered, ratio), self.start.teeth, self.dentin)))
             ends.append(
                 self._iterate(
-                    self._problem(start, f"start.{k}", SIMILAR_G), self.short(START_STEPS), self.spec.samples_per_pixel
+                    self._problem(start, f"start.{k}", SIMILAR_G),
+                    self.preparatory_options(START_STEPS),
+                    self.spec.samples_per_pixel,
                 )[0]
             )
         samples = min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)
@@ -111,8 +117,8 @@ class JawSchedule(Stages[Mouth]):
                 for k in range(len(self.teeth))
             ]
 
-        self.pause()
-        losses, _ = self.journal.once(f"{self.scope}/starts", compute)
+        self.raise_if_cancelled()
+        losses, _ = self.journal.get_or_compute(f"{self.scope}/starts", compute)
         best = [ends[int(np.argmin(own))].teeth[k] for k, own in enumerate(losses)]
         return replace(ends[int(np.argmin(np.sum(losses, axis=0)))], teeth=tuple(best))
 
@@ -131,27 +137,27 @@ class JawSchedule(Stages[Mouth]):
         """See Stages."""
         return len(self.teeth)
 
-    def _held(self, domain: Domain) -> Held:
+    def _held_cosines(self, domain: Domain) -> HeldCosines:
         # The mean cosines of one tissue's media share one error: with errors of their own, 29 media would cost more
         # than the fit.
         kinds = {"enamel": WEAK["enamel.g1"], "dentin": WEAK["dentin.g1"], "gums": WEAK["enamel.g1"]}
         held = [part for part in self.media if part not in domain.cosines]
-        alike = {
+        by_kind = {
             tuple(part for part in held if part.rpartition(".")[2] == kind): prior for kind, prior in kinds.items()
         }
-        return {parts: prior for parts, prior in alike.items() if parts}
+        return {parts: prior for parts, prior in by_kind.items() if parts}
 
-    def _others(self, tissue: Mouth) -> dict[str, float]:
+    def _other_values(self, tissue: Mouth) -> dict[str, float]:
         shapes = {f"{k}.shape.{mode}": c for k, tooth in enumerate(tissue.teeth) for mode, c in enumerate(tooth.shape)}
         return shapes | ({} if tissue.reflectance is None else {"cavity.reflectance": tissue.reflectance})
 
-    def _told_name(self, name: str) -> str:
+    def _reported_name(self, name: str) -> str:
         # Name with the tooth's FDI number, where the fit uses its position in the list.
-        place, _, own = name.partition(".")
-        return f"{self.teeth[int(place)].fdi}.{own}" if place.isdigit() else name
+        position, _, own = name.partition(".")
+        return f"{self.teeth[int(position)].fdi}.{own}" if position.isdigit() else name
 
     def _domain(self, mouth: Mouth) -> Domain:
-        common = Mouth((self._typical(mouth),))
+        common = Mouth((self._median_tissue(mouth),))
         coordinates = []
         for part in self.media:
             tooth, _, medium = part.rpartition(".")
@@ -196,9 +202,9 @@ class JawSchedule(Stages[Mouth]):
             if tooth.shape and self.fits_shape and self.teeth[k].state == "fitted"
         ]
 
-    def _retied(self, mouth: Mouth) -> Mouth:
+    def _with_updated_ties(self, mouth: Mouth) -> Mouth:
         # Start the next stage of tied teeth at the median of the others, with the mean cosine that all enamel shares.
-        common = self._typical(mouth)
+        common = self._median_tissue(mouth)
         cosine = next(
             tooth.enamel.mean_cosine
             for tooth, start in zip(mouth.teeth, self.teeth, strict=True)
@@ -212,8 +218,8 @@ class JawSchedule(Stages[Mouth]):
         )
         return replace(mouth, teeth=tuple(chosen))
 
-    def _typical(self, mouth: Mouth) -> Tissue:
-        return typical(self.teeth, mouth.teeth)
+    def _median_tissue(self, mouth: Mouth) -> Tissue:
+        return median_tissue(self.teeth, mouth.teeth)
 
 
 def _layered(ratio: tuple[float, float], tooth: Tissue, has_dentin: bool) -> Tissue:

@@ -17,9 +17,9 @@ from services.fit.optics.parameters import Medium, Mouth, Tissue
 MIN_TOOTH_PIXELS = 16
 """Least number of fitted pixels of a tooth over all views. A tooth with fewer is tied to the others, because so few do
 not determine four parameters of media and their misfit."""
-FRONT_PLACES = (1, 2, 3)
+FRONT_DIGITS = (1, 2, 3)
 """Last digits of the FDI numbers of incisors and canines, which are lit and seen best (teeth 2018, section 7)."""
-TOOTH_FAULTS = (InputError, NonFiniteError)
+TOOTH_ERRORS = (InputError, NonFiniteError)
 """Errors that the data or meshes of one tooth can cause. Any other error has its cause in the machine or in its
 operation and ends the job."""
 GUMS_START = Medium(8.5, 0.97, g1=HELD_G)
@@ -43,7 +43,7 @@ class ToothStart:
     @property
     def is_front(self) -> bool:
         """Whether the tooth is an incisor or a canine."""
-        return self.fdi % 10 in FRONT_PLACES
+        return self.fdi % 10 in FRONT_DIGITS
 
 
 def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
@@ -51,18 +51,22 @@ def start_tooth(fdi: int, pixels: int, fit: Callable[[], Tissue]) -> ToothStart:
     its state.
     """
     if pixels < MIN_TOOTH_PIXELS:
-        seen = f"shows in {pixels} usable pixels" if pixels else "is hidden or masked in every image"
+        visibility = f"shows in {pixels} usable pixels" if pixels else "is hidden or masked in every image"
         return ToothStart(
-            fdi, "tied", f"Tooth {fdi} {seen}, so its optics are held near those of the other teeth.", pixels, None
+            fdi,
+            "tied",
+            f"Tooth {fdi} {visibility}, so its optics are held near those of the other teeth.",
+            pixels,
+            None,
         )
     try:
         return ToothStart(fdi, "fitted", "", pixels, fit())
-    except TOOTH_FAULTS as problem:
+    except TOOTH_ERRORS as problem:
         sentence = f"Tooth {fdi} could not be fitted and takes the optics of the other teeth: {problem.message}"
         return ToothStart(fdi, "failed", sentence, pixels, None, drops_dentin=isinstance(problem, MeshError))
 
 
-def typical(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tissue:
+def median_tissue(starts: Sequence[ToothStart], teeth: Sequence[Tissue | None]) -> Tissue:
     """Median tissue of the front teeth that were fitted, coordinate by coordinate, at mean cosine ``HELD_G``; where
     none of them was fitted, of all fitted teeth.
 
@@ -98,6 +102,6 @@ def start_mouth(starts: Sequence[ToothStart], gums: Medium | None, *, has_cavity
     """Start of all parts of a mouth; the cavity's wall reflects like a half space of the gums (teeth 2018, section
     4.3).
     """
-    common = typical(starts, [start.tissue for start in starts])
+    common = median_tissue(starts, [start.tissue for start in starts])
     teeth = tuple(start.tissue or common for start in starts)
     return Mouth(teeth, gums, half_space_reflectance(gums or GUMS_START) if has_cavity else None)

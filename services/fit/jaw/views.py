@@ -49,16 +49,16 @@ def label_views(views: Sequence[ViewStack], observations: Observations) -> tuple
     return tuple(labelled)
 
 
-def showing(views: Sequence[ViewStack], *parts: int) -> tuple[ViewStack, ...]:
+def views_of_parts(views: Sequence[ViewStack], *parts: int) -> tuple[ViewStack, ...]:
     """Pixels that show one of some parts (position of a tooth, GUMS, CAVITY); views without such pixels are
     left out.
     """
-    return _cut(views, [np.isin(_parts(view).shown, parts) for view in views])
+    return _select(views, [np.isin(_parts(view).shown, parts) for view in views])
 
 
-def without(views: Sequence[ViewStack], teeth: Sequence[int]) -> tuple[ViewStack, ...]:
+def views_without_teeth(views: Sequence[ViewStack], teeth: Sequence[int]) -> tuple[ViewStack, ...]:
     """Pixels that show none of these teeth."""
-    return _cut(views, [~np.isin(_parts(view).shown, teeth) for view in views])
+    return _select(views, [~np.isin(_parts(view).shown, teeth) for view in views])
 
 
 def fitted_pixels(views: Sequence[ViewStack]) -> int:
@@ -71,5 +71,5 @@ def _parts(view: ViewStack) -> PixelParts:
     return view.parts
 
 
-def _cut(views: Sequence[ViewStack], chosen: Sequence[NDArray[np.bool_]]) -> tuple[ViewStack, ...]:
+def _select(views: Sequence[ViewStack], chosen: Sequence[NDArray[np.bool_]]) -> tuple[ViewStack, ...]:
     return tuple(view.of(pixels) for view, pixels in zip(views, chosen, strict=True) if pixels.any())

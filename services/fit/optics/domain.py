@@ -264,11 +264,11 @@ class Domain:
         """Coordinates (F,) of a tissue; a shared coordinate takes its first parameter's value, an error that is not
         given is 0.
         """
-        held = _at_cosines(tissue, dict.fromkeys(self.cosines, HELD_G))
+        at_held_cosines = _at_cosines(tissue, dict.fromkeys(self.cosines, HELD_G))
 
         def value(name: str) -> float:
             part, _, leaf = name.rpartition(".")
-            return tissue.medium(part).mean_cosine if leaf == "cosine" else held.value(name)
+            return tissue.medium(part).mean_cosine if leaf == "cosine" else at_held_cosines.value(name)
 
         own = [to_dual(c.kind, value(c.targets[0])) for c in self.coordinates]
         return np.array(own + [errors.get(name, 0.0) for name in self.errors.names])

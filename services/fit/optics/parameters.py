@@ -125,8 +125,8 @@ class Mouth:
         if part == "gums":
             assert self.gums is not None
             return self.gums
-        tooth, own = part.split(".")
-        return self.teeth[int(tooth)].medium(own)
+        tooth, tissue = part.split(".")
+        return self.teeth[int(tooth)].medium(tissue)
 
     def value(self, name: str) -> float:
         """The parameter called ``name``."""

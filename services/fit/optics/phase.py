@@ -38,7 +38,7 @@ def sample_deviation(g: mi.Float, u: mi.Float) -> mi.Float:
     return (1 - a) * (1 - u) * ((1 - a) * (1 + a) / r + (1 - a)) / r
 
 
-def turn(omega: mi.Vector3f, g: mi.Float, m: mi.Float, u: mi.Float) -> mi.Vector3f:
+def deflected(omega: mi.Vector3f, g: mi.Float, m: mi.Float, u: mi.Float) -> mi.Vector3f:
     """Direction of deviation m about omega, azimuth 2 pi u."""
     sine, cosine = dr.sincos(2 * dr.pi * u)
     radius = dr.sqrt(dr.maximum(m * (2 - m), 0))

@@ -76,10 +76,10 @@ def towards(part: str, media: Iterable[Medium]) -> Priors:
         part: ``enamel`` or ``dentin``, or with a tooth's number before it.
         media: at least one.
     """
-    seen = [similar_medium(medium, HELD_G) for medium in media]
+    similar_media = [similar_medium(medium, HELD_G) for medium in media]
     priors = {}
     for leaf, least in MIN_SD.items():
-        x = np.array([to_dual(leaf, getattr(medium, leaf)) for medium in seen])
+        x = np.array([to_dual(leaf, getattr(medium, leaf)) for medium in similar_media])
         spread = float(x.std(ddof=1)) if len(x) > 1 else 0.0
         priors[f"{part}.{leaf}"] = (float(x.mean()), max(spread, least))
     return priors

@@ -63,7 +63,7 @@ class ChannelMedia:
             [PhaseFunction(self._media, index).density(omega, omega_out) for index in self._indices(part)]
         )
 
-    def turn(
+    def sample_direction(
         self, part: mi.UInt32, leader: mi.UInt32, omega: mi.Vector3f, u_lobe: mi.Float | None, u: mi.Point2f
     ) -> mi.Vector3f:
         """A direction from the leader's phase function."""
@@ -81,19 +81,19 @@ class ChannelMedia:
             result = dr.select(leader == k, values[k], result)
         return result
 
-    def rival(self, likely: mi.Spectrum, density: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
-        """Multiply the channels' relative densities ``likely`` by those of one more choice, and scale the largest to
-        1.
+    def multiply_densities(self, leader_densities: mi.Spectrum, density: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
+        """Multiply the channels' relative densities ``leader_densities`` by those of one more choice, and scale the
+        largest to 1.
         """
         if self.channels == 1:
-            return likely
-        product = likely * density
-        return dr.select(active, product / dr.max(product), likely)
+            return leader_densities
+        product = leader_densities * density
+        return dr.select(active, product / dr.max(product), leader_densities)
 
-    def share(self, likely: mi.Spectrum) -> mi.Spectrum:
+    def channel_weights(self, leader_densities: mi.Spectrum) -> mi.Spectrum:
         """Weight of a path of unit throughput for each channel."""
-        return likely / dr.mean(likely) if self.channels > 1 else mi.Spectrum(1)
+        return leader_densities / dr.mean(leader_densities) if self.channels > 1 else mi.Spectrum(1)
 
-    def mean(self, likely: mi.Spectrum, values: mi.Spectrum) -> mi.Float:
+    def mean_density(self, leader_densities: mi.Spectrum, values: mi.Spectrum) -> mi.Float:
         """Mean density over all possible leaders of a choice that each makes with density ``values``."""
-        return dr.mean(self.share(likely) * values)
+        return dr.mean(self.channel_weights(leader_densities) * values)

@@ -180,7 +180,7 @@ def register_integrator() -> None:
             medium: Any = None,  # noqa: ARG002
             active: Any = True,
         ) -> Any:
-            if self._teeth is None or not self._teeth.describe(scene):
+            if self._teeth is None or not self._teeth.is_unchanged(scene):
                 self._teeth = SceneTeeth(scene, self.properties.shapes)
             paths = ScenePaths(scene, self._teeth, self.properties.optics, self.properties.max_depth)
             radiance, valid = paths.radiance(sampler, ray, mi.Bool(active))

@@ -19,6 +19,7 @@ from services.fit.optics.free_flight import minus_log1m
 from services.fit.plugin.channel_media import ChannelMedia, ToothOptics
 from services.fit.plugin.gloss import Gloss
 from services.fit.plugin.scene_teeth import SceneTeeth
+from services.fit.transport.lighting.light_maps import DARK_DEPTH
 from services.fit.transport.paths.walk import ROULETTE_WEIGHT
 from services.fit.transport.scene.geometry import ENAMEL
 
@@ -28,8 +29,6 @@ CONNECTION_FLOOR = 0.02
 ``CONNECTION_FLOOR``, 1), as in the walk."""
 SCALE_SAMPLES = 4096
 """Number of samples for the mean light that the emitters bring to the teeth."""
-DARK_DEPTH = 40.0
-"""Optical depth beyond which a straight line is dark in single precision."""
 
 
 @dataclass
@@ -49,7 +48,7 @@ class Path:
     """Whether no emitter connection could have made that choice (camera, mirror)."""
     leader: mi.UInt32
     """Colour channel by which the path samples its flights and directions."""
-    likely: mi.Spectrum
+    leader_densities: mi.Spectrum
     """Density of the same path with each channel as leader, relative to the largest; ``throughput`` does not contain
     this factor."""
     from_tooth: mi.Bool
@@ -85,7 +84,7 @@ class Flight:
     """Reflectance of the outer face that the flight meets."""
 
     @property
-    def turns(self) -> mi.Bool:
+    def samples_direction(self) -> mi.Bool:
         """Whether the flight ends at a vertex with a choice of directions."""
         return self.scatters | self.ordinary | self.glossy
 
@@ -148,7 +147,7 @@ class ScenePaths:
             place=mi.UInt32(0),
             throughput=mi.Spectrum(1),
             leader=self.media.pick_leader(sampler.next_1d(active)),
-            likely=mi.Spectrum(1),
+            leader_densities=mi.Spectrum(1),
             radiance=mi.Spectrum(0),
             last=dr.zeros(mi.Interaction3f),
             density=mi.Float(1),
@@ -172,14 +171,14 @@ class ScenePaths:
             self._reflect(path, flight, self.ior)
 
         vertex = self._vertex(path, flight)
-        ends = flight.turns & (path.depth + 1 >= self.max_depth)
-        choice = self._join_and_turn(path, flight, vertex, (flight.turns | flight.shines) & ~ends)
-        self._go_on(path, flight, vertex, choice)
+        ends = flight.samples_direction & (path.depth + 1 >= self.max_depth)
+        choice = self._connect_and_sample(path, flight, vertex, (flight.samples_direction | flight.shines) & ~ends)
+        self._continue_path(path, flight, vertex, choice)
 
         # Let faded paths survive in proportion to their throughput.
-        left = dr.max(path.throughput * self.media.share(path.likely)) / ROULETTE_WEIGHT
-        path.active &= ~ends & (path.sampler.next_1d(path.active) < left)
-        path.throughput *= dr.select(left < 1, dr.rcp(dr.maximum(left, 1e-20)), 1)
+        survival = dr.max(path.throughput * self.media.channel_weights(path.leader_densities)) / ROULETTE_WEIGHT
+        path.active &= ~ends & (path.sampler.next_1d(path.active) < survival)
+        path.throughput *= dr.select(survival < 1, dr.rcp(dr.maximum(survival, 1e-20)), 1)
         return path
 
     def _fly(self, path: Path) -> Flight:
@@ -198,19 +197,19 @@ class ScenePaths:
 
         # Multiply by the density of this flight under each channel, relative to the leader's.
         length = dr.select(meets, found.t, distance)
-        path.likely = self.media.rival(
-            path.likely, dr.exp((sigma - sigmas) * length) * dr.select(scatters, sigmas / sigma, 1), inside
+        path.leader_densities = self.media.multiply_densities(
+            path.leader_densities, dr.exp((sigma - sigmas) * length) * dr.select(scatters, sigmas / sigma, 1), inside
         )
-        met = self.teeth.part(found, meets)
+        hit_part = self.teeth.part(found, meets)
         never = mi.Bool(False)
         return Flight(
             si,
-            met,
+            hit_part,
             dr.dot(path.ray.d, si.n),
             distance,
             meets,
             scatters,
-            meets & (met == 0),
+            meets & (hit_part == 0),
             never,
             never,
             never,
@@ -222,9 +221,9 @@ class ScenePaths:
         active = flight.ordinary | (path.active & ~flight.meets & ~flight.scatters)
         emitter = flight.si.emitter(self.scene, active)
         there = mi.DirectionSample3f(self.scene, flight.si, path.last)
-        joined = self.scene.pdf_emitter_direction(path.last, there, active & ~path.certain)
-        share = dr.select(path.certain, 1, power(path.density, joined))
-        carried = path.throughput * self.media.share(path.likely)
+        emitter_density = self.scene.pdf_emitter_direction(path.last, there, active & ~path.certain)
+        share = dr.select(path.certain, 1, power(path.density, emitter_density))
+        carried = path.throughput * self.media.channel_weights(path.leader_densities)
         path.radiance += dr.select(active, carried * emitter.eval(flight.si, active) * share, 0)
 
     def _reflect(self, path: Path, flight: Flight, ior: mi.Float) -> None:
@@ -235,15 +234,15 @@ class ScenePaths:
         """
         face, enters = flight.meets & (flight.part == ENAMEL), flight.cosine < 0
         flight.reflected = fresnel.reflectance(dr.abs(flight.cosine), ior)
-        turned = face & (path.sampler.next_1d(face) < flight.reflected)
+        is_reflected = face & (path.sampler.next_1d(face) < flight.reflected)
         if self.gloss is None:
             hidden = enters & ~path.from_tooth
             path.throughput *= dr.select(face & hidden, 1 - flight.reflected, 1)
-            flight.mirrors = turned & ~hidden
+            flight.mirrors = is_reflected & ~hidden
         else:
             flight.shines = face & enters & (flight.si.wi.z > 0)
-            flight.glossy = turned & flight.shines
-            flight.mirrors = turned & ~enters
+            flight.glossy = is_reflected & flight.shines
+            flight.mirrors = is_reflected & ~enters
 
     def _vertex(self, path: Path, flight: Flight) -> mi.Interaction3f:
         # Here 1 - alpha below single precision is lost, unlike in the walk, because a picture does not show 1e-7.
@@ -254,15 +253,17 @@ class ScenePaths:
         vertex.time, vertex.wavelengths = path.ray.time, path.ray.wavelengths
         return vertex
 
-    def _join_and_turn(self, path: Path, flight: Flight, vertex: mi.Interaction3f, joins: mi.Bool) -> OnwardChoice:
+    def _connect_and_sample(
+        self, path: Path, flight: Flight, vertex: mi.Interaction3f, connects: mi.Bool
+    ) -> OnwardChoice:
         """Join the vertex to one emitter, and choose where the path goes; stock surfaces do both in one call."""
         sampler, si, scatters, ordinary = path.sampler, flight.si, flight.scatters, flight.ordinary
-        light, brought = self.scene.sample_emitter_direction(vertex, sampler.next_2d(joins), False, joins)
+        light, brought = self.scene.sample_emitter_direction(vertex, sampler.next_2d(connects), False, connects)
 
         # Evaluate and sample a scattering in a tooth.
         part = self.teeth.medium(path.place)
         u_lobe = sampler.next_1d(scatters) if self.media.two_lobes else None
-        onward = self.media.turn(part, path.leader, path.ray.d, u_lobe, sampler.next_2d(scatters))
+        onward = self.media.sample_direction(part, path.leader, path.ray.d, u_lobe, sampler.next_2d(scatters))
         to_light, to_onward = self.media.phase(part, path.ray.d, light.d), self.media.phase(part, path.ray.d, onward)
 
         # Evaluate and sample an ordinary surface.
@@ -270,10 +271,10 @@ class ScenePaths:
             mi.BSDFContext(), si, si.to_local(light.d), sampler.next_1d(ordinary), sampler.next_2d(ordinary), ordinary
         )
         value = dr.select(scatters, to_light, value)
-        density = dr.select(scatters, self.media.mean(path.likely, to_light), density)
+        density = dr.select(scatters, self.media.mean_density(path.leader_densities, to_light), density)
         choice = OnwardChoice(
             dr.select(scatters, onward, si.to_world(bounce.wo)),
-            dr.select(scatters, self.media.mean(path.likely, to_onward), bounce.pdf),
+            dr.select(scatters, self.media.mean_density(path.leader_densities, to_onward), bounce.pdf),
             dr.select(scatters, 1, weight),
             ordinary & mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta),
         )
@@ -293,11 +294,11 @@ class ScenePaths:
                 flight.glossy, dr.select(chance > 0, shine / (flight.reflected * chance), 0), choice.weight
             )
 
-        self._join(path, flight, vertex, light, value * brought, density, joins)
-        path.likely = self.media.rival(path.likely, to_onward, scatters)
+        self._connect(path, flight, vertex, light, value * brought, density, connects)
+        path.leader_densities = self.media.multiply_densities(path.leader_densities, to_onward, scatters)
         return choice
 
-    def _join(
+    def _connect(
         self,
         path: Path,
         flight: Flight,
@@ -305,34 +306,34 @@ class ScenePaths:
         light: mi.DirectionSample3f,
         value: mi.Spectrum,
         density: mi.Float,
-        joins: mi.Bool,
+        connects: mi.Bool,
     ) -> None:
         # In a tooth, join only with a probability in proportion to the light that the emitter could bring.
-        value = path.throughput * self.media.share(path.likely) * value
+        value = path.throughput * self.media.channel_weights(path.leader_densities) * value
         chance = dr.clip(CONNECTION_GAIN * dr.max(value) * self.inverse_irradiance, CONNECTION_FLOOR, 1)
         chance = dr.select(flight.scatters, chance, 1)
-        joins &= (light.pdf > 0) & (dr.max(value) > 0) & (path.sampler.next_1d(joins) < chance)
+        connects &= (light.pdf > 0) & (dr.max(value) > 0) & (path.sampler.next_1d(connects) < chance)
         line = flight.si.spawn_ray(light.d)
         line.o = dr.select(flight.scatters, vertex.p, line.o)
         line.maxt = light.dist * (1 - mi.math.ShadowEpsilon)
         share = dr.select(light.delta, 1, power(light.pdf, density)) / chance
-        path.radiance += dr.select(joins, value * share * self._transmittance(line, path.place, joins), 0)
+        path.radiance += dr.select(connects, value * share * self._transmittance(line, path.place, connects), 0)
 
-    def _go_on(self, path: Path, flight: Flight, vertex: mi.Interaction3f, choice: OnwardChoice) -> None:
-        turns, mirrors = flight.turns, flight.mirrors
-        crosses = flight.meets & ~turns & ~mirrors
+    def _continue_path(self, path: Path, flight: Flight, vertex: mi.Interaction3f, choice: OnwardChoice) -> None:
+        samples_direction, mirrors = flight.samples_direction, flight.mirrors
+        crosses = flight.meets & ~samples_direction & ~mirrors
         path.place = dr.select(crosses, self.teeth.beyond(path.place, flight.part, flight.cosine), path.place)
         mirrored = path.ray.d - mi.Vector3f(flight.si.n) * (2 * flight.cosine)
-        direction = dr.select(turns, choice.direction, dr.select(mirrors, mirrored, path.ray.d))
+        direction = dr.select(samples_direction, choice.direction, dr.select(mirrors, mirrored, path.ray.d))
         onward = flight.si.spawn_ray(direction)
         onward.o = dr.select(flight.scatters, vertex.p, onward.o)
         path.ray = onward
-        path.throughput *= dr.select(turns, choice.weight, 1)
-        path.last = dr.select(turns, vertex, path.last)
-        path.density = dr.select(turns, choice.density, path.density)
-        path.certain = dr.select(turns, choice.certain, path.certain | mirrors)
-        path.from_tooth = dr.select(turns, flight.scatters, path.from_tooth)
-        path.depth += dr.select(turns, mi.UInt32(1), 0)
+        path.throughput *= dr.select(samples_direction, choice.weight, 1)
+        path.last = dr.select(samples_direction, vertex, path.last)
+        path.density = dr.select(samples_direction, choice.density, path.density)
+        path.certain = dr.select(samples_direction, choice.certain, path.certain | mirrors)
+        path.from_tooth = dr.select(samples_direction, flight.scatters, path.from_tooth)
+        path.depth += dr.select(samples_direction, mi.UInt32(1), 0)
 
     def _transmittance(self, ray: mi.Ray3f, place: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Transmittance of the straight line along ``ray``, through teeth as far as its maxt."""

@@ -56,7 +56,7 @@ class SceneTeeth:
         dr.eval(self._parts)
         self._clearance = _clearance(outer, inner, [shape.bbox() for shape in scene.shapes() if shape.id() not in part])
 
-    def describe(self, scene: Any) -> bool:
+    def is_unchanged(self, scene: Any) -> bool:
         """Whether a scene is unchanged: its shapes are the same and none has moved."""
         now = _state(scene, self._shapes)
         return len(now) == len(self._state) and all(np.array_equal(a, b) for a, b in zip(now, self._state, strict=True))

@@ -48,10 +48,10 @@ def main(
             f" {100 * fit.errors.fit_error:.2f} %"
         )
         quantities = {name: getattr(fit.parameters, name) for name in type(fit.parameters).model_fields}
-        for name, told in (quantities | {name: atom for name, atom in fit.atoms.items() if atom.value > 0}).items():
+        for name, quantity in (quantities | {name: atom for name, atom in fit.atoms.items() if atom.value > 0}).items():
             print(
-                f"  {name:22} {told.value:9.5f} ± {told.se:.5f}"
-                f" {told.unit}{'' if told.determined else '  not determined'}"
+                f"  {name:22} {quantity.value:9.5f} ± {quantity.se:.5f}"
+                f" {quantity.unit}{'' if quantity.determined else '  not determined'}"
             )
         for note in fit.notes:
             print(f"  {note}")

@@ -33,7 +33,7 @@ MAX_MISFIT_SIGMAS = 5.0
 chance is 3e-7 a fit."""
 MIN_LIT = 0.5
 """Smallest share of an image's maximum at which a pixel counts for the position of the beam."""
-MAX_OFF = 1.0
+MAX_BEAM_OFFSET = 1.0
 """Largest distance of the beam from y = 0, in pixels and in sizes of the beam, whichever is more."""
 
 
@@ -60,7 +60,7 @@ def _off_axis(name: str, image: Array, largest: float, pixels: PixelGrid, beam: 
     y_mm = low + pitch_mm * (np.arange(pixels.rows) + 0.5)
     lit = np.where(image >= MIN_LIT * largest, image, 0.0)
     centre_mm = float(lit.sum(axis=1) @ y_mm / lit.sum())
-    if abs(centre_mm) <= MAX_OFF * max(pitch_mm, beam.size_mm):
+    if abs(centre_mm) <= MAX_BEAM_OFFSET * max(pitch_mm, beam.size_mm):
         return ()
     return (
         (
@@ -85,20 +85,20 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
     thickness = material.extinction_per_mm * width_mm
     albedo = material.scattering_per_mm / material.extinction_per_mm
     known = f"σt·w is about {thickness:.2g}, and images tell a phase function from {THINNEST:g} to {THICKEST:g}"
-    told = []
+    faults = []
     if thickness < THINNEST:
         what = f"concentrate it {BEST / thickness:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
-        told.append(f"The sample is too thin: {known}; {what}.")
+        faults.append(f"The sample is too thin: {known}; {what}.")
     if thickness > THICKEST:
         what = f"dilute it {thickness / BEST:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
-        told.append(f"The sample is too thick: {known}; {what}.")
+        faults.append(f"The sample is too thick: {known}; {what}.")
     if albedo < MIN_ALBEDO:
-        told.append(
+        faults.append(
             f"The sample absorbs too much: about {100 * (1 - albedo):.0f} % of what meets a particle is absorbed, and"
             " little but single scattering leaves the cell; measure at a wavelength that is absorbed less, or take a"
             " thinner cell."
         )
-    return tuple(told)
+    return tuple(faults)
 
 
 def similarity_faults(material: Material, width_mm: float, *, scattering: bool, reduced: bool) -> tuple[str, ...]:

@@ -26,10 +26,10 @@ from services.core.slab.folder import SlabFolder, SlabImage
 Array = NDArray[np.float64]
 Counts = NDArray[np.float32]
 
-ASSUMED = NoiseModel(read_counts=2.0, counts_per_electron=1.0)
+ASSUMED_NOISE = NoiseModel(read_counts=2.0, counts_per_electron=1.0)
 """Noise by which exposures are weighted where no frames measure it; variances are then assumed as for images that come
 without."""
-ABOVE_BLACK = 5.0
+MIN_ABOVE_BLACK_SE = 5.0
 """Number of standard errors of its mean by which a frame must be brighter than black; otherwise the beam was off."""
 SIGMA_OF_MEDIAN = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
@@ -62,7 +62,7 @@ def merged_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Merge
         is_known &= noise is not None
         for image in folder.images_at(wavelength_nm):
             if image.camera == camera:
-                rate, variance, lost = merge(stack.exposures_of(image, noise or ASSUMED), noise or ASSUMED)
+                rate, variance, lost = merge(stack.exposures_of(image, noise or ASSUMED_NOISE), noise or ASSUMED_NOISE)
                 key = camera, image.light
                 values[key] = np.where(lost, np.nan, rate.astype(np.float64)) / folder.beam.power
                 variances[key] = np.where(lost, np.nan, variance.astype(np.float64)) / folder.beam.power**2
@@ -107,9 +107,9 @@ class _Stack:
         counts, (black, averaged) = self.counts(frame), self.black(frame)
         full = frame.saturation_counts if frame.bits is None else frame.saturation_counts or 2**frame.bits - 1
         assert full is not None
-        of_black = float(noise.variance(np.zeros((), np.float32), frame.gain)) / averaged
+        black_variance = float(noise.variance(np.zeros((), np.float32), frame.gain)) / averaged
         return Exposure(
-            counts - black, of_black, np.float32(full) - counts, frame.exposure_s * frame.gain, frame.gain
+            counts - black, black_variance, np.float32(full) - counts, frame.exposure_s * frame.gain, frame.gain
         )  # fmt: skip
 
     def exposures_of(self, image: SlabImage, noise: NoiseModel) -> list[Exposure]:
@@ -121,7 +121,7 @@ class _Stack:
         found = []
         for frame in (one for one in self.frames if one.light == image.light):
             exposure = self.exposure(frame, noise)
-            if float(np.mean(exposure.signal)) <= ABOVE_BLACK * _error_of_mean(exposure.signal):
+            if float(np.mean(exposure.signal)) <= MIN_ABOVE_BLACK_SE * _error_of_mean(exposure.signal):
                 raise CaptureInputError(
                     f"Frame {self.root / frame.file} (camera {frame.camera}, light {frame.light}) is no brighter than"
                     " the camera's black frames; expose it for longer, or leave it out."

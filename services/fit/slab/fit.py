@@ -22,8 +22,8 @@ from services.fit.slab.next_measurement import next_measurement
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.atoms import atoms_of
 from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
+from services.fit.slab.solve.checkpoint import CheckpointFile
 from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
-from services.fit.slab.solve.standing import StandingFile
 from services.fit.slab.solve.start import start
 from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
@@ -31,7 +31,7 @@ from services.fit.slab.through_beam import index_of
 STEPS_OF_ATOMS = 20
 """Largest number of steps of a search by the weights of atoms: narrow lobes are noisy and their steps damped, and a
 start that was 30 % off took 11."""
-LAST_LOOK = 2**30
+FINAL_RENDER = 2**30
 """Number of the render from which image errors are taken, apart from those of the solver."""
 
 
@@ -59,10 +59,10 @@ def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = ma
     """
     options = options or SlabOptions()
     folder = read_folder(root)
-    everything = [(wavelength, read_images(root, folder, wavelength)) for wavelength in folder.wavelengths_nm]
+    images = [(wavelength, read_images(root, folder, wavelength)) for wavelength in folder.wavelengths_nm]
     return tuple(
         fit_images(folder, wavelength, measured, options, blocks, dictionary_of(root, folder, wavelength, options)).fit
-        for wavelength, measured in everything
+        for wavelength, measured in images
     )
 
 
@@ -73,18 +73,25 @@ def fit_images(
     options: SlabOptions,
     blocks: Blocks,
     dictionary: ChosenDictionary,
-    kept: StandingFile | None = None,
+    checkpoint_file: CheckpointFile | None = None,
 ) -> Wavelength:
     """Fit the images of one wavelength by the dictionary that the options name; see ``fit_slab``.
 
     Args:
-        kept: file from which an interrupted fit continues, and which stores its state before each of the last steps.
+        checkpoint_file: file from which an interrupted fit continues, and which stores its state before each of the
+            last steps.
     """
     begun_s = time.process_time()
     index = index_of(folder, wavelength_nm)
     rig = rig_of(folder, wavelength_nm, index.value)
     solver = GaussNewton(
-        rig, measured, options.seed, _budget(options, dictionary), blocks, dictionary.coordinates, kept=kept
+        rig,
+        measured,
+        options.seed,
+        _budget(options, dictionary),
+        blocks,
+        dictionary.coordinates,
+        checkpoint_file=checkpoint_file,
     )
     solution = solver.solve(lambda: start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)
@@ -94,7 +101,7 @@ def fit_images(
         else ""
     )
     parameters, phase = parameters_of(material, uncertainty, index), phase_of(material, uncertainty)
-    first, second = last_look(rig, material, solver.budget, options.seed, blocks)
+    first, second = final_renders(rig, material, solver.budget, options.seed, blocks)
     fit = SlabFit(
         wavelength_nm=wavelength_nm,
         parameters=parameters,
@@ -119,8 +126,8 @@ def fit_images(
         atoms=atoms_of(dictionary, material, uncertainty),
     )
     shape = len(measured.values), rig.grid.rows, rig.grid.columns
-    seen = np.where(np.isfinite(measured.variances), measured.values, np.nan).reshape(shape)
-    return Wavelength(fit, seen, (0.5 * (first + second)).reshape(shape), measured.held_out, measured.names)
+    measured_images = np.where(np.isfinite(measured.variances), measured.values, np.nan).reshape(shape)
+    return Wavelength(fit, measured_images, (0.5 * (first + second)).reshape(shape), measured.held_out, measured.names)
 
 
 def _budget(options: SlabOptions, dictionary: ChosenDictionary) -> Budget:
@@ -128,20 +135,22 @@ def _budget(options: SlabOptions, dictionary: ChosenDictionary) -> Budget:
     return plain.scaled(options.effort)
 
 
-def last_look(rig: Rig, material: Material, budget: Budget, seed: int, blocks: Blocks) -> NDArray[np.float64]:
+def final_renders(rig: Rig, material: Material, budget: Budget, seed: int, blocks: Blocks) -> NDArray[np.float64]:
     """Two independent renders of the fit's final material (2, images, pixels)."""
     paths = 4 * budget.last[-1][0]
-    return render(rig, material, seed=seed, step=LAST_LOOK, batches=2, paths=paths, scores=False, blocks=blocks).images
+    return render(
+        rig, material, seed=seed, step=FINAL_RENDER, batches=2, paths=paths, scores=False, blocks=blocks
+    ).images
 
 
 def _errors(measured: Measurements, first: NDArray[np.float64], second: NDArray[np.float64]) -> Errors:
     """Errors of the images that were fitted, and of those that were held out."""
-    told = []
+    errors = []
     for chosen in (~measured.held_out, measured.held_out):
         arrays = (image[chosen] for image in (first, second, measured.values, measured.variances))
-        told.append(image_error(*arrays) if chosen.any() else None)
-    assert told[0] is not None
-    return Errors(fit_error=told[0], held_out_error=told[1])
+        errors.append(image_error(*arrays) if chosen.any() else None)
+    assert errors[0] is not None
+    return Errors(fit_error=errors[0], held_out_error=errors[1])
 
 
 def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> tuple[str, ...]:
@@ -153,9 +162,9 @@ def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> 
     if lost := int(np.count_nonzero(~np.isfinite(measured.variances))):
         notes.append(f"{lost} values are not finite or have no variance and were left out.")
     if bands := [f"from {low:.1f} to {high:.1f}" for low, high in phase.undetermined_bands_deg()]:
-        told = " and ".join([", ".join(bands[:-1]), bands[-1]] if bands[1:] else bands)
+        ranges = " and ".join([", ".join(bands[:-1]), bands[-1]] if bands[1:] else bands)
         notes.append(
-            f"The images do not determine the phase function {told} degrees; what is given there is the prior's."
+            f"The images do not determine the phase function {ranges} degrees; what is given there is the prior's."
         )
     if not converged:
         notes.append("The search spent its steps before they stopped to help; the last steps were made all the same.")
@@ -166,8 +175,8 @@ def write_results(fits: tuple[SlabFit, ...], out: Path) -> None:
     """Write ``parameters.json``, ``phase.json`` and ``errors.json``, by wavelength."""
     out.mkdir(parents=True, exist_ok=True)
     for name in ("parameters", "phase", "errors"):
-        told = {f"{fit.wavelength_nm:g}": getattr(fit, name).model_dump() for fit in fits}
+        content = {f"{fit.wavelength_nm:g}": getattr(fit, name).model_dump() for fit in fits}
         if name == "parameters":
             for fit in fits:
-                told[f"{fit.wavelength_nm:g}"] |= {atom: one.model_dump() for atom, one in fit.atoms.items()}
-        write_atomic(out / f"{name}.json", json.dumps(told, indent=1).encode())
+                content[f"{fit.wavelength_nm:g}"] |= {atom: one.model_dump() for atom, one in fit.atoms.items()}
+        write_atomic(out / f"{name}.json", json.dumps(content, indent=1).encode())

@@ -60,9 +60,9 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
                 f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again."
             )
         faults += image_faults(f"{entry.camera} under {entry.light}", image, folder.pixels, folder.beam)
-        value, of_value = folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
+        value, value_variance = folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
         values.append(value)
-        variances.append(of_value)
+        variances.append(value_variance)
     held_out = np.array([entry.held_out for entry in entries])
     if held_out.all():
         raise CaptureInputError(f"All images at {wavelength_nm:g} nm are held out; leave some to be fitted.")
@@ -94,22 +94,22 @@ def shot_noise(image: Array, share: float = DEFAULT_NOISE) -> Array:
 
 
 def _read(root: Path, folder: SlabFolder, entry: SlabImage, file: str) -> Array:
-    place = f"Image file {root / file} (camera {entry.camera}, light {entry.light})"
+    subject = f"Image file {root / file} (camera {entry.camera}, light {entry.light})"
     if Path(file).suffix.lower() != ".npy":
         raise CaptureInputError(
-            f"{place} is no .npy file, the only format read here; convert it with numpy.save, linear and as float."
+            f"{subject} is no .npy file, the only format read here; convert it with numpy.save, linear and as float."
         )
     try:
         image = np.load(root / file, allow_pickle=False)
     except (ValueError, EOFError, OSError) as problem:
         raise CaptureInputError(
-            f"{place} cannot be read ({problem}); it may be truncated, so copy or export it again."
+            f"{subject} cannot be read ({problem}); it may be truncated, so copy or export it again."
         ) from problem
     expected = folder.pixels.rows, folder.pixels.columns
     if not isinstance(image, np.ndarray) or image.shape != expected or not np.issubdtype(image.dtype, np.floating):
         found = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else "an archive"
         raise CaptureInputError(
-            f"{place} holds {found} instead of floats {expected} (rows, columns); export it on the folder's grid."
+            f"{subject} holds {found} instead of floats {expected} (rows, columns); export it on the folder's grid."
         )
     return image.astype(np.float64)
 

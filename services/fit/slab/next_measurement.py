@@ -21,8 +21,8 @@ from services.fit.slab.images import Measurements
 from services.fit.slab.model.dictionary import KNOTS, Material
 from services.fit.slab.model.forward import Blocks
 from services.fit.slab.model.rig import rig_of
+from services.fit.slab.solve.measured_directions import measured_directions
 from services.fit.slab.solve.prior import THICK, precision
-from services.fit.slab.solve.seen import seen_of
 from services.fit.slab.solve.uncertainty import phase_chain, slopes
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ PATHS = 1000
 """Paths per batch, light and candidate: a hundredth of what a fit spends in all."""
 UNKNOWN_LN_F = 10.0
 """Standard deviation of ln f at a knot where images determine nothing."""
-WORTH = 0.2
+MIN_IMPROVEMENT = 0.2
 """Smallest part by which a measurement must cut the error to be named."""
 
 
@@ -46,7 +46,7 @@ WORTH = 0.2
 class Candidate:
     """A possible further measurement."""
 
-    words: str
+    description: str
     folder: SlabFolder
     dilution: float = 1.0
     """Factor on f and sigma_a."""
@@ -78,24 +78,24 @@ def next_measurement(
     prior[-1, -1] += material.extinction_per_mm**-2
     rig = rig_of(folder, wavelength_nm, index)
     noise = _noise_share(measured, 2 if rig.grid.folded else 1)
-    now = seen_of(
+    present = measured_directions(
         curvature_of(rig, material, noise=0.0, variances=variances, seed=seed, paths=PATHS, blocks=blocks), prior
     ).curvature
-    before = errors_of(material, _inverse(now + prior))
+    before = errors_of(material, _inverse(present + prior))
     worst = max(before, key=lambda name: before[name])
     after = {}
     for candidate in candidates(folder, wavelength_nm, material):
         other = Material(candidate.dilution * material.scattering, candidate.dilution * material.absorption_per_mm)
-        of_other = rig_of(candidate.folder, wavelength_nm, index)
-        told = curvature_of(of_other, other, noise=noise, seed=seed, paths=PATHS, blocks=blocks)
+        other_rig = rig_of(candidate.folder, wavelength_nm, index)
+        quadratic = curvature_of(other_rig, other, noise=noise, seed=seed, paths=PATHS, blocks=blocks)
         # Convert to ln f of the sample as it is, and to its own absorption.
         unit = np.append(np.ones(KNOTS), candidate.dilution)
-        added = seen_of(told, prior).curvature * np.outer(unit, unit)
-        after[candidate.words] = errors_of(material, _inverse(now + added + prior))[worst]
+        added = measured_directions(quadratic, prior).curvature * np.outer(unit, unit)
+        after[candidate.description] = errors_of(material, _inverse(present + added + prior))[worst]
     if not after:
         return ""
-    best = min(after, key=lambda words: after[words])
-    if after[best] > (1 - WORTH) * before[worst]:
+    best = min(after, key=lambda name: after[name])
+    if after[best] > (1 - MIN_IMPROVEMENT) * before[worst]:
         return ""
     return (
         f"What would help most: {best}. The error of {worst}, as far as noise and smoothness make it, would fall from "
@@ -169,11 +169,11 @@ def _beside_a_beam(folder: SlabFolder, wavelength_nm: float) -> Candidate | None
         for one in dict.fromkeys(image.light for image in entries)
     )
     other = folder.model_copy(update={"cameras": (*folder.cameras, more), "images": images, "exposures": ()})
-    words = (
+    description = (
         f"add a camera at the {side} at {angle_deg:g} degrees, {BESIDE_DEG:g} degrees beside the beam of light"
         f" {first.name}"
     )
-    return Candidate(words, other)
+    return Candidate(description, other)
 
 
 def _noise_share(measured: Measurements, averaged: int) -> float:

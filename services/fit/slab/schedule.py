@@ -20,8 +20,8 @@ from services.fit.slab.images import read_images
 from services.fit.slab.model.dictionary import KNOTS
 from services.fit.slab.model.forward import Block, Blocks, BlockSums
 from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.kept import fingerprint, keep, read_kept
-from services.fit.slab.solve.standing import Standing, StandingFile
+from services.fit.slab.results.stored import fingerprint, read_result, store_result
+from services.fit.slab.solve.checkpoint import Checkpoint, CheckpointFile
 
 MAX_TRAVELLING_BYTES = 32 * 2**20
 """Largest size of a block's sums that may be sent to another worker: its paths take seconds, in which any network
@@ -41,12 +41,12 @@ class WavelengthTask:
     """File whose existence means that the job is cancelled."""
 
 
-Told = Callable[[float, Standing], None]
+CheckpointCallback = Callable[[float, Checkpoint], None]
 """Callback that takes a wavelength in nm and the state of its fit."""
 
 
 def run_wavelengths(
-    run_on: Executor, tasks: Sequence[WavelengthTask], workers: int, told: Told = lambda *_: None
+    run_on: Executor, tasks: Sequence[WavelengthTask], workers: int, on_checkpoint: CheckpointCallback = lambda *_: None
 ) -> Iterator[Path]:
     """Fit the wavelengths that no earlier attempt has fitted; gives the folder of each as soon as it is done.
 
@@ -56,16 +56,16 @@ def run_wavelengths(
 
     Args:
         workers: number of workers that the job asked for; some may still be starting.
-        told: called before each of the last steps of a wavelength whose blocks run on all workers.
+        on_checkpoint: called before each of the last steps of a wavelength whose blocks run on all workers.
 
     Raises:
         JobCancelledError: between two blocks of paths.
     """
     if len(tasks) >= run_on.threads(workers) or not all(_may_travel(read_folder(task.root)) for task in tasks):
-        yield from run_on.as_they_end([(f"{task.wavelength_nm:g}", wavelength_task, (task,)) for task in tasks])
+        yield from run_on.as_completed([(f"{task.wavelength_nm:g}", wavelength_task, (task,)) for task in tasks])
         return
     for task in tasks:
-        yield fit_wavelength(task, _spread(run_on, task), partial(told, task.wavelength_nm))
+        yield fit_wavelength(task, _spread(run_on, task), partial(on_checkpoint, task.wavelength_nm))
 
 
 def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
@@ -85,20 +85,22 @@ def block_task(_host: Any, trace: Callable[[Block], BlockSums], block: Block, fl
     return trace(block)
 
 
-def fit_wavelength(task: WavelengthTask, blocks: Blocks, told: Callable[[Standing], None] = lambda _: None) -> Path:
+def fit_wavelength(
+    task: WavelengthTask, blocks: Blocks, on_checkpoint: Callable[[Checkpoint], None] = lambda _: None
+) -> Path:
     """Fit one wavelength into its folder, unless an earlier attempt has; a fit that was cut short continues before the
     last step that it saved.
     """
-    mark = fingerprint(task.root, task.wavelength_nm, task.options)
-    kept = read_kept(task.place)
-    if kept is None or kept.of != mark:
+    digest = fingerprint(task.root, task.wavelength_nm, task.options)
+    stored = read_result(task.place)
+    if stored is None or stored.of != digest:
         folder = read_folder(task.root)
         measured = read_images(task.root, folder, task.wavelength_nm)
         dictionary = dictionary_of(task.root, folder, task.wavelength_nm, task.options)
-        standing = StandingFile(task.place, mark, told)
-        fit = fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary, standing)
-        keep(task.place, mark, fit)
-        standing.remove()
+        checkpoint_file = CheckpointFile(task.place, digest, on_checkpoint)
+        fit = fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary, checkpoint_file)
+        store_result(task.place, digest, fit)
+        checkpoint_file.remove()
     return task.place
 
 

@@ -182,9 +182,9 @@ def simulate_slab(
         (R, T), (R_se, T_se) = mean[0][0], error[0][0]
         worst = max(R_se / (max(R, 1e-30) * rel_error), T_se / (max(T, 1e-3) * rel_error))
         rules = ((GRADIENT_ERROR, GRADIENT_FLOOR), (rel_error, EXIT_FLOOR), (rel_error, EXIT_FLOOR))
-        for values, errors, (asked, floor) in zip(mean[1:], error[1:], rules, strict=True):
+        for values, errors, (limit, floor) in zip(mean[1:], error[1:], rules, strict=True):
             sizes = np.abs(values)
-            allowed = asked * np.maximum(sizes, floor * sizes.max(initial=0))
+            allowed = limit * np.maximum(sizes, floor * sizes.max(initial=0))
             worst = max(worst, np.max(errors / np.maximum(allowed, 1e-30), initial=0))
         return float(worst)
 
@@ -284,8 +284,8 @@ def accumulate(
         # Trace as many paths as the error asks for, but no pass far beyond the time that is left.
         elapsed_s = time.monotonic() - begun_s
         affordable = sums.samples / LANES * (max_seconds - elapsed_s) / elapsed_s
-        wanted = min(sums.samples * (missing**2 * 1.05 - 1) / LANES, affordable, 4 * samples, MAX_SAMPLES)
-        samples = max(FIRST_SAMPLES, int(wanted))
+        required = min(sums.samples * (missing**2 * 1.05 - 1) / LANES, affordable, 4 * samples, MAX_SAMPLES)
+        samples = max(FIRST_SAMPLES, int(required))
     return (*names, "c") if border else names, sums
 
 

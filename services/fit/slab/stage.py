@@ -20,7 +20,7 @@ from services.core.verdict import VERDICT
 
 if TYPE_CHECKING:
     from services.fit.slab.results.result import SlabReport
-    from services.fit.slab.solve.standing import Standing
+    from services.fit.slab.solve.checkpoint import Checkpoint
 
 CHECKPOINT = "fit-checkpoint"
 """Folder within the job's folder, with one folder per wavelength: its result once it is done, until then the state of
@@ -38,8 +38,8 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     from services.fit.slab.dictionaries.chosen import dictionary_of
     from services.fit.slab.images import read_images
     from services.fit.slab.options import SlabOptions
-    from services.fit.slab.results.kept import IMAGES, read_kept
     from services.fit.slab.results.result import SlabReport
+    from services.fit.slab.results.stored import IMAGES, read_result
     from services.fit.slab.schedule import WavelengthTask, run_wavelengths
 
     context.report(StageEvent(stage="fit", kind="started"))
@@ -52,28 +52,32 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
             context.report(StageEvent(stage="fit", kind="log", message=f"{wavelength_nm:g} nm: {fault}"))
     writer = StageWriter(context.root, "fit", context.attempt)
     flag = context.root / CANCEL_FLAG
-    places = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
+    result_folders = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
     prefix = hashlib.sha256(f"{context.root}/{context.attempt}".encode()).hexdigest()[:12]
-    tasks = [WavelengthTask(root, nm, options, place, flag) for nm, place in places.items()]
+    tasks = [WavelengthTask(root, nm, options, result_folder, flag) for nm, result_folder in result_folders.items()]
 
-    def told(wavelength_nm: float, standing: Standing) -> None:
-        where = f"before step {standing.step + 1} of stage {standing.stage + 1}"
-        message = f"{wavelength_nm:g} nm: {where}, σs {standing.material.scattering_per_mm:.4g} per mm."
+    def report_checkpoint(wavelength_nm: float, checkpoint: Checkpoint) -> None:
+        where = f"before step {checkpoint.step + 1} of stage {checkpoint.stage + 1}"
+        message = f"{wavelength_nm:g} nm: {where}, σs {checkpoint.material.scattering_per_mm:.4g} per mm."
         context.report(StageEvent(stage="fit", kind="log", message=message))
 
     with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
-        for number, place in enumerate(run_wavelengths(run_on, tasks, spec.workers, told), 1):
-            kept = read_kept(place)
-            assert kept is not None
-            which = {"wavelength_nm": kept.fit.wavelength_nm, "wavelengths": len(places)}
-            done = number / len(places)
-            context.report(StageEvent(stage="fit", kind="progress", done=done, message=_told(kept.fit), data=which))
+        for number, result_folder in enumerate(run_wavelengths(run_on, tasks, spec.workers, report_checkpoint), 1):
+            stored = read_result(result_folder)
+            assert stored is not None
+            progress = {"wavelength_nm": stored.fit.wavelength_nm, "wavelengths": len(result_folders)}
+            done = number / len(result_folders)
+            context.report(
+                StageEvent(
+                    stage="fit", kind="progress", done=done, message=_progress_message(stored.fit), data=progress
+                )
+            )
     fits = []
-    for place in places.values():
-        kept = read_kept(place)
-        assert kept is not None
-        fits.append(kept.fit)
-        write_atomic(writer.folder / f"{place.name}.npz", (place / IMAGES).read_bytes())
+    for result_folder in result_folders.values():
+        stored = read_result(result_folder)
+        assert stored is not None
+        fits.append(stored.fit)
+        write_atomic(writer.folder / f"{result_folder.name}.npz", (result_folder / IMAGES).read_bytes())
     report = SlabReport(fits=tuple(fits))
     writer.publish(report)
     verdict = report.verdict()
@@ -92,9 +96,9 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     """
     from services.fit.slab.fit import write_results
     from services.fit.slab.results.chart import phase_picture
-    from services.fit.slab.results.kept import read_images_of
     from services.fit.slab.results.report import write_report
     from services.fit.slab.results.result import SlabReport
+    from services.fit.slab.results.stored import read_result_images
     from services.fit.slab.results.tabphase import scene_xml, values_text
 
     context.report(StageEvent(stage="export", kind="started"))
@@ -111,7 +115,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         ):
             write_atomic(writer.folder / file, text.encode())
             files.append(file)
-    images = {fit.wavelength_nm: read_images_of(fit_folder / f"{fit.wavelength_nm:g}.npz") for fit in report.fits}
+    images = {fit.wavelength_nm: read_result_images(fit_folder / f"{fit.wavelength_nm:g}.npz") for fit in report.fits}
     verdict = report.verdict()
     provenance = {"Source": root.name, "Seed": str(spec.seed)}
     write_report(context.root / "report.html", report, verdict, images, provenance)
@@ -142,11 +146,11 @@ def _folder(spec: JobSpec) -> tuple[Path, SlabFolder]:
     return spec.capture, read_folder(spec.capture)
 
 
-def _told(fit: Any) -> str:
-    told = fit.parameters
+def _progress_message(fit: Any) -> str:
+    parameters = fit.parameters
     parts = (
         f"{label} {value.value:.4g} ± {value.se:.1g}"
-        for label, value in (("σs", told.sigma_s), ("σs′", told.sigma_s_reduced))
+        for label, value in (("σs", parameters.sigma_s), ("σs′", parameters.sigma_s_reduced))
     )
     return (
         f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images"

@@ -17,7 +17,7 @@ from services.core.errors import CaptureInputError
 from services.core.slab.folder import Cell, SlabFolder, ThroughBeam
 
 SMALLEST_INDEX, LARGEST_INDEX = 1.0, 4.0
-MAX_APART = 4.0
+MAX_DIFFERENCE_SE = 4.0
 """Largest difference of one beam's index from the mean of all, in standard errors: more is no noise of the peaks."""
 
 
@@ -44,7 +44,7 @@ def index_of(folder: SlabFolder, wavelength_nm: float) -> Index:
     total = sum(weights.values())
     mean = sum(weights[light] * one.value for light, one in found.items()) / total
     for light, one in found.items():
-        if abs(one.value - mean) > MAX_APART * one.se:
+        if abs(one.value - mean) > MAX_DIFFERENCE_SE * one.se:
             raise CaptureInputError(
                 f"The through-beam of light {light} at {wavelength_nm:g} nm gives an index of {one.value:.3f} ±"
                 f" {one.se:.1g} and all together {mean:.3f}; measure its peak_x_mm again, or correct the light's"

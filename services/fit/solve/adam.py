@@ -5,8 +5,8 @@ Each step renders one gradient J'W r in the unbounded domain, J and r from two i
 number of paths per pixel (64 in the paper), and moves by Kingma and Ba's rule with their decay rates. Priors are added
 to the gradient; bounds are met by projection. The paper states neither its learning rate nor its stopping rule: here
 the rate is constant, in units of the domain's step scale, and a fit ends after ``max_steps``, or when two running means
-of x, over the last ``window`` steps and over three times as many, differ by less than ``still`` rates. The solver
-estimates no errors, so the reported standard errors come from normal equations that are rendered at the end.
+of x, over the last ``window`` steps and over three times as many, differ by less than ``drift_tolerance`` rates. The
+solver estimates no errors, so the reported standard errors come from normal equations that are rendered at the end.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Options:
     """Kingma and Ba's epsilon, relative to the largest running gradient, because the loss has no natural unit."""
     max_steps: int = 300
     window: int = 40
-    still: float = 2.0
+    drift_tolerance: float = 2.0
     """Largest difference of the two running means of x, in rates, at which the fit has converged. Steady progress would
     separate them by twice ``window`` rates."""
 
@@ -147,11 +147,13 @@ class Adam:
             old + (new - old) / span
             for old, span in ((state.lately, options.window), (state.before, 3 * options.window))
         )
-        is_still = (
+        has_converged = (
             number > 3 * options.window
-            and float(np.abs((lately - before) / scale).max()) < options.still * options.rate
+            and float(np.abs((lately - before) / scale).max()) < options.drift_tolerance * options.rate
         )
-        result = Result.CONVERGED if is_still else Result.MAX_STEPS if number >= options.max_steps else Result.RUNNING
+        result = (
+            Result.CONVERGED if has_converged else Result.MAX_STEPS if number >= options.max_steps else Result.RUNNING
+        )
         verdict = f"moved by {float(np.linalg.norm((new - x) / scale)):.3f}"
         state = replace(state, x=new, mean=mean, square=square, lately=lately, before=before)
         return replace(state, step=number, loss=found.loss, result=result, verdict=verdict)

@@ -79,7 +79,7 @@ def closing_sums(
     whiten: Array,
     similar: tuple[Array, Array],
     exact: tuple[Array, Array],
-    borrowed: NDArray[np.bool_],
+    copied: NDArray[np.bool_],
     residuals: tuple[Array, Array],
     moved: Array,
     weight: Array,
@@ -92,7 +92,7 @@ def closing_sums(
         whiten: T (F, F).
         similar: J~ (F, M) from two seeds.
         exact: J (F, M) from two further seeds.
-        borrowed: mask (F,) of the rows of J that are not rendered but copied from J~.
+        copied: mask (F,) of the rows of J that are not rendered but copied from J~.
         residuals: render minus reference (M,) from two further seeds.
         moved: changes dC of the render (K, 2, M), by change and seed.
         weight: weights (M,) of the measurements.
@@ -102,8 +102,8 @@ def closing_sums(
     """
     mean, spread = 0.5 * (similar[0] + similar[1]), 0.5 * (similar[0] - similar[1])
     true, true_spread = 0.5 * (exact[0] + exact[1]), 0.5 * (exact[0] - exact[1])
-    true, true_spread = np.where(borrowed[:, None], mean, true), np.where(borrowed[:, None], spread, true_spread)
-    own = np.where(borrowed[:, None], spread, 0.0)
+    true, true_spread = np.where(copied[:, None], mean, true), np.where(copied[:, None], spread, true_spread)
+    own = np.where(copied[:, None], spread, 0.0)
     m, d, e, f, o = (whiten.T @ rows for rows in (mean, spread, true, true_spread, own))
 
     # Derivatives with respect to errors share the noise of the residuals' renders; all others have independent noise.
@@ -173,18 +173,18 @@ def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors
     noise = np.maximum(sums.response_variance, 1e-30)
     between = np.zeros_like(excess)
     for kind in np.unique(relation[:, :tissue]):
-        alike = relation == kind
-        between[alike] = _between_variance(excess[alike], noise[alike])
-    shrunk, left = excess * between / (between + noise), noise * between / (between + noise)
+        same_kind = relation == kind
+        between[same_kind] = _between_variance(excess[same_kind], noise[same_kind])
+    shrunk, remaining = excess * between / (between + noise), noise * between / (between + noise)
 
     # Singular values are raised to the noise level, because noise alone could have made smaller ones.
     own = np.eye(tissue) + shrunk[:tissue, :tissue]
     u, values, v = np.linalg.svd(own)
-    floor = 2 * np.sqrt(tissue * float(left[:tissue, :tissue].mean()))
+    floor = 2 * np.sqrt(tissue * float(remaining[:tissue, :tissue].mean()))
     inverse = np.eye(size)
     inverse[:tissue, :tissue] = v.T @ ((u / np.maximum(values, max(floor, 1e-6))).T)
     inverse[tissue:, :tissue] = -shrunk[tissue:, :tissue] @ inverse[:tissue, :tissue]
-    return Response(np.asarray(inverse), left, shrunk)
+    return Response(np.asarray(inverse), remaining, shrunk)
 
 
 def _between_variance(values: Array, noise: Array) -> float:

@@ -32,7 +32,7 @@ from services.fit.solve.closing import ClosingSums, Response, response
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import NormalEquations
 from services.fit.solve.recombination import Fault
-from services.fit.solve.sandwich import Sandwich, settle
+from services.fit.solve.sandwich import Sandwich, combine_with_prior
 
 Array = NDArray[np.float64]
 NOISE_FACTOR = 3.0
@@ -48,7 +48,7 @@ class Uncertainty:
     domain: Domain
     x: Array
     covariance: Array
-    open_directions: Array
+    undetermined_directions: Array
     posterior: Array
     """(J'WJ + Lambda)^-1, (F, F)."""
     sandwich: Sandwich | None = None
@@ -57,7 +57,7 @@ class Uncertainty:
     """Covariances (F, F) that add up to the whole, by their source (``results.Estimate``)."""
     faults: tuple[Fault, ...] = ()
     """Instrument errors that the images show to be faults of the calibration."""
-    is_whole: bool = True
+    is_full_step: bool = True
     """Whether the full use of the prior of the instrument's errors moved x no farther than one linear model
     is valid."""
 
@@ -79,15 +79,17 @@ class Uncertainty:
         size = float(scaled @ scaled)
         if size == 0.0:
             return False
-        along_open = float(((self.open_directions.T @ scaled) ** 2).sum())
+        along_undetermined = float(((self.undetermined_directions.T @ scaled) ** 2).sum())
         low, high = self.domain.bounds
         on_bound = (self.x <= low) | (self.x >= high)
 
         # a'C Lambda C a / a'C a is the prior's share of the information: lambda / (d + lambda) for one coordinate.
-        seen = self.posterior @ slope
-        prior_share = float((precision * seen) @ seen) / max(float(slope @ seen), 1e-300)
+        posterior_slope = self.posterior @ slope
+        prior_share = float((precision * posterior_slope) @ posterior_slope) / max(
+            float(slope @ posterior_slope), 1e-300
+        )
         return (
-            along_open < 0.1 * size
+            along_undetermined < 0.1 * size
             and float((scaled[on_bound] ** 2).sum()) < 0.1 * size
             and prior_share < 1 - MIN_DATA_SHARE
         )
@@ -100,7 +102,7 @@ class Whitening:
     """
 
     transform: Array
-    open_directions: Array
+    undetermined_directions: Array
 
 
 def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
@@ -111,20 +113,22 @@ def whitening(domain: Domain, equations: NormalEquations) -> Whitening:
     """
     count, errors = domain.tissue_count, len(domain.errors.names)
     precision, scale = domain.prior[1][:count], domain.scale[:count]
-    left = eliminate(equations, _of_errors(domain), np.zeros(count + errors), count)
-    eigenvalues, vectors = np.linalg.eigh(left.hessian * np.outer(scale, scale))
-    noise = left.eigenvalue_noise(scale[:, None] * vectors)
+    reduced = eliminate(equations, _of_errors(domain), np.zeros(count + errors), count)
+    eigenvalues, vectors = np.linalg.eigh(reduced.hessian * np.outer(scale, scale))
+    noise = reduced.eigenvalue_noise(scale[:, None] * vectors)
     tiny = 1e-12 * float(abs(eigenvalues).max()) + 1e-300
-    is_open = eigenvalues < np.maximum(NOISE_FACTOR * noise, tiny)
-    believed = np.where(is_open, np.maximum(noise, tiny), eigenvalues)
-    curvature, axes = np.linalg.eigh((vectors * believed) @ vectors.T + np.diag(precision * scale**2))
+    is_undetermined = eigenvalues < np.maximum(NOISE_FACTOR * noise, tiny)
+    usable = np.where(is_undetermined, np.maximum(noise, tiny), eigenvalues)
+    curvature, axes = np.linalg.eigh((vectors * usable) @ vectors.T + np.diag(precision * scale**2))
     tissue = scale[:, None] * ((axes / np.sqrt(np.maximum(curvature, tiny))) @ axes.T)
 
     # Instrument errors follow the tissue and have coordinates of their own. None of their directions is undetermined,
     # because their prior is proper.
-    own = np.concatenate([np.zeros((count, errors)), left.root])
-    open_directions = np.concatenate([vectors[:, is_open], np.zeros((errors, int(is_open.sum())))])
-    return Whitening(np.concatenate([left.lift @ tissue, own], axis=1), open_directions)
+    own = np.concatenate([np.zeros((count, errors)), reduced.root])
+    undetermined_directions = np.concatenate(
+        [vectors[:, is_undetermined], np.zeros((errors, int(is_undetermined.sum())))]
+    )
+    return Whitening(np.concatenate([reduced.lift @ tissue, own], axis=1), undetermined_directions)
 
 
 def _of_errors(domain: Domain) -> Array:
@@ -172,7 +176,7 @@ class ClosingModel:
 
     domain: Domain
     x: Array
-    known: Whitening
+    whitened: Whitening
     inverse: Array
     gradient: Array
     noise: Array
@@ -190,7 +194,7 @@ class ClosingModel:
         step = np.clip(self.x + domain.scale * scaled / max(1.0, length), low, high) - self.x
         return np.asarray(np.concatenate([step[:count], self._errors_after(step[:count])]))
 
-    def rest(self) -> Array:
+    def remaining_step(self) -> Array:
         """The whole remaining step to the minimum (F,) along the determined directions, with the errors at their
         optimum for the tissue.
 
@@ -202,8 +206,10 @@ class ClosingModel:
 
     def _whole_step(self) -> Array:
         # The Newton step (F,) in scales.
-        scaled = -self.known.transform @ self.inverse @ self.gradient / self.domain.scale
-        return np.asarray(scaled - self.known.open_directions @ (self.known.open_directions.T @ scaled))
+        scaled = -self.whitened.transform @ self.inverse @ self.gradient / self.domain.scale
+        return np.asarray(
+            scaled - self.whitened.undetermined_directions @ (self.whitened.undetermined_directions.T @ scaled)
+        )
 
     def _errors_after(self, tissue: Array) -> Array:
         # Change of the errors (K,) that minimises F = g'z + z'z / 2, z = M y, after a step of the tissue, which alone
@@ -212,10 +218,10 @@ class ClosingModel:
         if count == len(self.x):
             return np.zeros(0)
         whole = np.linalg.inv(self.inverse)
-        y = np.linalg.solve(self.known.transform[:count, :count], tissue)
+        y = np.linalg.solve(self.whitened.transform[:count, :count], tissue)
         own = np.linalg.lstsq(whole[:, count:], -(self.gradient + whole[:, :count] @ y))[0]
         low, high = (bound[count:] for bound in self.domain.bounds)
-        change = self.known.transform[count:] @ np.concatenate([y, own])
+        change = self.whitened.transform[count:] @ np.concatenate([y, own])
         return np.asarray(np.clip(self.x[count:] + change, low, high) - self.x[count:])
 
     def slope(self, step: Array) -> float:
@@ -224,7 +230,7 @@ class ClosingModel:
         """
         return float(self.gradient @ self._moved(step))
 
-    def promise(self, step: Array) -> tuple[float, float]:
+    def predicted_change(self, step: Array) -> tuple[float, float]:
         """Predicted change of F by a step (F,) and its standard error by noise; the part that noise alone predicts is
         subtracted.
 
@@ -235,17 +241,17 @@ class ClosingModel:
         return change, float(np.sqrt(max(float(moved @ self.noise @ moved), 0.0)))
 
     def _moved(self, step: Array) -> Array:
-        return np.asarray(np.linalg.solve(self.inverse, np.linalg.solve(self.known.transform, step)))
+        return np.asarray(np.linalg.solve(self.inverse, np.linalg.solve(self.whitened.transform, step)))
 
 
 def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> ClosingModel:
     """Quadratic model at x, where the closing measurement was made."""
-    known = whitening(domain, equations)
-    t = known.transform
+    whitened = whitening(domain, equations)
+    t = whitened.transform
     solved = response(sums, t.T @ domain.precision @ t, domain.relation, len(domain.errors.names))
     pooled = _pooled(t, equations, sums, solved)
     return ClosingModel(
-        domain, x, known, solved.inverse, pooled.gradient + t.T @ domain.prior_slope(x), positive_part(pooled.noise)
+        domain, x, whitened, solved.inverse, pooled.gradient + t.T @ domain.prior_slope(x), positive_part(pooled.noise)
     )
 
 
@@ -271,8 +277,8 @@ def uncertainty(
         part_count: number of objects that the fit treats as separate in the images, such as the teeth of a jaw.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
-    known = whitening(domain, equations)
-    t, count = known.transform, len(x)
+    whitened = whitening(domain, equations)
+    t, count = whitened.transform, len(x)
     prior = t.T @ domain.precision @ t
     parts = {"photographs": misfit * positive_part(t.T @ equations.data_noise @ t)} | _prior_parts(domain, t)
     meat = parts["photographs"] + prior
@@ -280,36 +286,40 @@ def uncertainty(
         inverse = np.eye(count)
         parts["rendering"] = positive_part(t.T @ equations.gradient_noise @ t)
         meat = meat + parts["rendering"]
-        left = t.T @ (equations.gradient + domain.prior_slope(x))
+        remaining_gradient = t.T @ (equations.gradient + domain.prior_slope(x))
     else:
-        solved, gone = (
+        solved, taken = (
             response(sums, prior, domain.relation, len(domain.errors.names)),
             np.linalg.solve(t, np.zeros(count) if step is None else step),
         )
         pooled, inverse = _pooled(t, equations, sums, solved), solved.inverse
-        rendered, unsure = positive_part(pooled.noise), np.diag(solved.variance @ (gone + pooled.carried) ** 2)
+        rendered, response_noise = positive_part(pooled.noise), np.diag(solved.variance @ (taken + pooled.carried) ** 2)
         kinds = ["mean_cosine"] * (len(sums.shifts) - len(moved)) + list(moved)
-        parts |= {"rendering": rendered + unsure}
+        parts |= {"rendering": rendered + response_noise}
         parts |= {
             kind: sums.shifts_of(k for k, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds)
         }
-        meat = meat + rendered + sums.shift_covariance + unsure
-        left = pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, gone) - prior @ gone
+        meat = meat + rendered + sums.shift_covariance + response_noise
+        remaining_gradient = (
+            pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, taken) - prior @ taken
+        )
 
     # Count the remaining step along the determined directions as error.
-    rest = ClosingModel(domain, x, known, inverse, left, parts["rendering"]).rest()
-    found = settle(domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(rest, rest), part_count)
-    covariance = 0.5 * (found.covariance + found.covariance.T)
+    remaining = ClosingModel(domain, x, whitened, inverse, remaining_gradient, parts["rendering"]).remaining_step()
+    combined = combine_with_prior(
+        domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(remaining, remaining), part_count
+    )
+    covariance = 0.5 * (combined.covariance + combined.covariance.T)
     return Uncertainty(
         domain,
-        found.x,
+        combined.x,
         covariance,
-        known.open_directions,
+        whitened.undetermined_directions,
         t @ t.T,
-        found.sandwich,
-        found.parts,
-        found.faults,
-        found.is_whole,
+        combined.sandwich,
+        combined.parts,
+        combined.faults,
+        combined.is_full_step,
     )
 
 

@@ -40,7 +40,7 @@ class LiftedNoise:
 
 
 @dataclass(frozen=True)
-class Eliminated:
+class ReducedEquations:
     """Reduced normal equations of the tissue's coordinates (F,), and the dependence of the K instrument errors
     on them.
     """
@@ -51,7 +51,7 @@ class Eliminated:
     gradient_noise: Array
     lift: Array
     """Matrix (F + K, F) that turns a step of the tissue into the step of all coordinates."""
-    settling: Array
+    error_step: Array
     """Step (F + K,) of all coordinates that brings the errors to their optimum and leaves the tissue as it is."""
     root: Array
     """S^-1/2 (K, K), the square root of the errors' covariance where the tissue is known exactly."""
@@ -66,7 +66,7 @@ class Eliminated:
         return float(np.sqrt(max(float(step @ self.gradient_noise @ step) + 0.25 * curvature, 0.0)))
 
 
-def eliminate(equations: NormalEquations, precision: Array, slope: Array, count: int) -> Eliminated:
+def eliminate(equations: NormalEquations, precision: Array, slope: Array, count: int) -> ReducedEquations:
     """Eliminate all but the first ``count`` coordinates.
 
     Without instrument errors the result is the equations themselves, with the tissue's prior added.
@@ -80,20 +80,20 @@ def eliminate(equations: NormalEquations, precision: Array, slope: Array, count:
     size = len(gradient)
     if count == size:
         noises = equations.hessian_noise, equations.gradient_noise
-        return Eliminated(hessian, gradient, *noises, np.eye(size), np.zeros(size), np.zeros((0, 0)))
+        return ReducedEquations(hessian, gradient, *noises, np.eye(size), np.zeros(size), np.zeros((0, 0)))
     own, errors = slice(0, count), slice(count, size)
     values, vectors = np.linalg.eigh(hessian[errors, errors])
     root, inverse = (vectors * values**-0.5) @ vectors.T, (vectors / values) @ vectors.T
-    follow = inverse @ hessian[errors, own]
-    lift = np.concatenate([np.eye(count), -follow])
-    left = hessian[own, own] - hessian[own, errors] @ follow + equations.hessian_noise.of_eliminated(inverse)
-    settling = np.concatenate([np.zeros(count), -inverse @ gradient[errors]])
-    return Eliminated(
-        0.5 * (left + left.T),
+    error_response = inverse @ hessian[errors, own]
+    lift = np.concatenate([np.eye(count), -error_response])
+    reduced = hessian[own, own] - hessian[own, errors] @ error_response + equations.hessian_noise.of_eliminated(inverse)
+    error_step = np.concatenate([np.zeros(count), -inverse @ gradient[errors]])
+    return ReducedEquations(
+        0.5 * (reduced + reduced.T),
         lift.T @ gradient,
         LiftedNoise(equations.hessian_noise, lift),
         lift.T @ equations.gradient_noise @ lift,
         lift,
-        settling,
+        error_step,
         root,
     )

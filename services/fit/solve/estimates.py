@@ -29,7 +29,7 @@ DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
 
 
 def estimates(
-    tissue: Optics, parts: Iterable[str], known: Uncertainty | None, shape_known: Uncertainty | None = None
+    tissue: Optics, parts: Iterable[str], uncertainty: Uncertainty | None, shape_uncertainty: Uncertainty | None = None
 ) -> dict[str, Estimate]:
     """Estimates of every parameter of the named parts, and of the derived quantities, by name: unit, standard error and
     whether the data determine it.
@@ -37,29 +37,29 @@ def estimates(
     Args:
         tissue: tissue parameters of the solution.
         parts: names ``enamel``, ``dentin``, ``shape``, for a mouth ``3.enamel``, ``3.shape``, ``gums`` or ``cavity``.
-        known: uncertainty of the fitted coordinates; None where nothing was fitted.
-        shape_known: uncertainty of the blend weights where the fit of another channel determined them.
+        uncertainty: uncertainty of the fitted coordinates; None where nothing was fitted.
+        shape_uncertainty: uncertainty of the blend weights where the fit of another channel determined them.
     """
-    fitted = set(known.domain.parameters) if known is not None else set()
+    fitted = set(uncertainty.domain.parameters) if uncertainty is not None else set()
     out: dict[str, Estimate] = {}
     for part in parts:
         if part == "cavity":
             out["cavity.reflectance"] = _raw(
-                tissue, "cavity.reflectance", known if "cavity.reflectance" in fitted else None
+                tissue, "cavity.reflectance", uncertainty if "cavity.reflectance" in fitted else None
             )
             continue
         if part.rpartition(".")[2] == "shape":
             names = [f"{part}.{k}" for k in range(len(_weights(tissue, part)))]
-            out |= {name: _raw(tissue, name, known if name in fitted else shape_known) for name in names}
+            out |= {name: _raw(tissue, name, uncertainty if name in fitted else shape_uncertainty) for name in names}
             continue
         for leaf in MEDIUM_FIELDS:
             name = f"{part}.{leaf}"
             if f"{part}.cosine" in fitted and leaf in {"sigma", "alpha", "g1"}:
-                out[name] = _derived(tissue, known, part, attrgetter(leaf), UNITS[leaf])
+                out[name] = _derived(tissue, uncertainty, part, attrgetter(leaf), UNITS[leaf])
             else:
-                out[name] = _raw(tissue, name, known if name in fitted else None)
+                out[name] = _raw(tissue, name, uncertainty if name in fitted else None)
         for leaf, (unit, quantity) in DERIVED.items():
-            out[f"{part}.{leaf}"] = _derived(tissue, known, part, quantity, unit)
+            out[f"{part}.{leaf}"] = _derived(tissue, uncertainty, part, quantity, unit)
     return out
 
 
@@ -68,57 +68,60 @@ def _weights(tissue: Optics, part: str) -> tuple[float, ...]:
     return tissue.shape if isinstance(tissue, Tissue) else tissue.teeth[int(part.partition(".")[0])].shape
 
 
-def _raw(tissue: Optics, name: str, known: Uncertainty | None) -> Estimate:
+def _raw(tissue: Optics, name: str, uncertainty: Uncertainty | None) -> Estimate:
     unit = UNITS[kind_of(name)]
-    if known is None:
+    if uncertainty is None:
         return Estimate(value=tissue.value(name), se=None, unit=unit, determined=False)
-    slope = np.zeros(len(known.x))
-    for k, coordinate in enumerate(known.domain.coordinates):
+    slope = np.zeros(len(uncertainty.x))
+    for k, coordinate in enumerate(uncertainty.domain.coordinates):
         if name in coordinate.targets:
-            slope[k] = natural_derivative(coordinate.kind, float(known.x[k]))
-    return _estimate(tissue.value(name), unit, known, slope)
+            slope[k] = natural_derivative(coordinate.kind, float(uncertainty.x[k]))
+    return _estimate(tissue.value(name), unit, uncertainty, slope)
 
 
-def _estimate(value: float, unit: str, known: Uncertainty, slope: Array) -> Estimate:
-    se, determined = known.standard_error(slope), known.is_determined(slope)
-    return Estimate(value=value, se=se, unit=unit, determined=determined, se_parts=known.se_parts(slope))
+def _estimate(value: float, unit: str, uncertainty: Uncertainty, slope: Array) -> Estimate:
+    se, determined = uncertainty.standard_error(slope), uncertainty.is_determined(slope)
+    return Estimate(value=value, se=se, unit=unit, determined=determined, se_parts=uncertainty.se_parts(slope))
 
 
 def _derived(
-    tissue: Optics, known: Uncertainty | None, part: str, quantity: Callable[[Medium], float], unit: str
+    tissue: Optics, uncertainty: Uncertainty | None, part: str, quantity: Callable[[Medium], float], unit: str
 ) -> Estimate:
     value = quantity(tissue.medium(part))
-    if known is None:
+    if uncertainty is None:
         return Estimate(value=value, se=None, unit=unit, determined=False)
     # Central differences in the unbounded domain; the step is far below every scale and far above rounding.
-    slope, step = np.zeros(len(known.x)), 1e-5
-    for k, coordinate in enumerate(known.domain.coordinates):
+    slope, step = np.zeros(len(uncertainty.x)), 1e-5
+    for k, coordinate in enumerate(uncertainty.domain.coordinates):
         if any(target.startswith(f"{part}.") for target in coordinate.targets):
-            shift = np.zeros(len(known.x))
+            shift = np.zeros(len(uncertainty.x))
             shift[k] = step
             high, low = (
-                quantity(known.domain.tissue_at(known.x + sign * shift, tissue).medium(part)) for sign in (1, -1)
+                quantity(uncertainty.domain.tissue_at(uncertainty.x + sign * shift, tissue).medium(part))
+                for sign in (1, -1)
             )
             slope[k] = (high - low) / (2 * step)
     if not slope.any():
         return Estimate(value=value, se=None, unit=unit, determined=False)
-    return _estimate(value, unit, known, slope)
+    return _estimate(value, unit, uncertainty, slope)
 
 
-def instrument_estimates(known: Uncertainty) -> dict[str, Estimate]:
+def instrument_estimates(uncertainty: Uncertainty) -> dict[str, Estimate]:
     """Estimates of the instrument's errors by name; an error is determined where the images add more information than
     the calibration gave.
     """
-    first, found = known.domain.tissue_count, {}
-    for k, (name, before) in enumerate(zip(known.domain.errors.names, known.domain.errors.se.tolist(), strict=True)):
-        slope = np.zeros(len(known.x))
+    first, found = uncertainty.domain.tissue_count, {}
+    for k, (name, prior_se) in enumerate(
+        zip(uncertainty.domain.errors.names, uncertainty.domain.errors.se.tolist(), strict=True)
+    ):
+        slope = np.zeros(len(uncertainty.x))
         slope[first + k] = 1.0
-        se = known.standard_error(slope)
+        se = uncertainty.standard_error(slope)
         found[name] = Estimate(
-            value=float(known.x[first + k]),
+            value=float(uncertainty.x[first + k]),
             se=se,
             unit="1",
-            determined=se < MIN_DATA_SHARE**0.5 * before,
-            se_parts=known.se_parts(slope),
+            determined=se < MIN_DATA_SHARE**0.5 * prior_se,
+            se_parts=uncertainty.se_parts(slope),
         )
     return found

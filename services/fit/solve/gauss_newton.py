@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
 from services.fit.optics.domain import Domain
-from services.fit.solve.elimination import Eliminated, eliminate
+from services.fit.solve.elimination import ReducedEquations, eliminate
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
 from services.fit.solve.trust_region import solve_box
 
@@ -92,7 +92,7 @@ class Options:
     max_samples: int = 1024
     max_trials: int = 3
     """Largest number of trust radii tried with one set of normal equations."""
-    sure_z: float = 3.0
+    significance_z: float = 3.0
     """A change is significant beyond this many standard errors: a worse step passes with probability at most 1.3e-3."""
     model_error: float = 0.5
     """Relative error of the predicted change per unit of step length; at length 1 the prediction counts little."""
@@ -103,7 +103,7 @@ class Options:
     """Converged where the gain predicted for a further step is at most the gain by noise alone, and that at most this
     change of F."""
     least_radius: float = 1e-3
-    parts: int = 1
+    part_count: int = 1
     """Number of objects that the images tell apart, such as teeth. A step's length is the root mean square over them,
     so that each may move as far as a single one would."""
 
@@ -148,7 +148,7 @@ class Solution:
     samples: int
     equations: NormalEquations | None
     """Pooled normal equations at x; None where the last step discarded them."""
-    known_samples: float = 0.0
+    equation_samples: float = 0.0
     """Paths per pixel that ``equations`` are worth."""
 
 
@@ -159,22 +159,22 @@ class GaussNewton:
     domain: Domain
     options: Options = Options()
 
-    def init(self, x: Array, samples: int, before: Solution | None = None) -> State:
+    def init(self, x: Array, samples: int, previous: Solution | None = None) -> State:
         """State at a start, moved inside the bounds.
 
         Args:
-            before: outcome of a fit of the same measurements that ended at this very x; its equations are reused.
+            previous: outcome of a fit of the same measurements that ended at this very x; its equations are reused.
         """
         low, high = self.domain.bounds
         state = State(np.clip(x, low, high), samples)
         return (
             state
-            if before is None
+            if previous is None
             else replace(
                 state,
-                samples=max(samples, before.samples),
-                memory=before.equations,
-                memory_samples=before.known_samples,
+                samples=max(samples, previous.samples),
+                memory=previous.equations,
+                memory_samples=previous.equation_samples,
             )
         )
 
@@ -195,27 +195,27 @@ class GaussNewton:
             NonFiniteError: the problem returned NaN or infinity.
         """
         options, x = self.options, state.x
-        fresh, known = problem.linearise(x, samples=state.samples, step=state.step), float(state.samples)
+        pooled, samples = problem.linearise(x, samples=state.samples, step=state.step), float(state.samples)
         if state.memory is not None:
-            fresh, known = pool(state.memory, state.memory_samples, fresh, known), state.memory_samples + known
-        state = replace(state, step=state.step + 1, memory=fresh, memory_samples=known)
+            pooled, samples = pool(state.memory, state.memory_samples, pooled, samples), state.memory_samples + samples
+        state = replace(state, step=state.step + 1, memory=pooled, memory_samples=samples)
 
         # Add the weak prior, which is exact, to curvature and gradient but not to their noise, and eliminate the
         # instrument's errors.
-        equations = eliminate(fresh, self.domain.precision, self.domain.prior_slope(x), self.domain.tissue_count)
-        best, settling = x + equations.settling, equations.settling
+        equations = eliminate(pooled, self.domain.precision, self.domain.prior_slope(x), self.domain.tissue_count)
+        best, error_step = x + equations.error_step, equations.error_step
         noise_gain = gain_by_noise(equations)
 
         # Converged: nothing to gain beyond noise, and the noise itself small. Tested at full radius, so that a small
         # radius never looks like convergence.
-        _, promised = self._propose(equations, x, max(state.radius, 1.0))
-        if promised <= noise_gain <= options.tolerance and not self._drowns(equations, state):
-            return self._settled(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
+        _, predicted_gain = self._propose(equations, x, max(state.radius, 1.0))
+        if predicted_gain <= noise_gain <= options.tolerance and not self._needs_more_samples(equations, state):
+            return self._last_step(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
 
-        radius, at_fault = state.radius, False
-        for trial in range(options.max_trials if promised > noise_gain else 0):
-            step, promised = self._propose(equations, x, radius)
-            if promised <= noise_gain:
+        radius, is_model_wrong = state.radius, False
+        for trial in range(options.max_trials if predicted_gain > noise_gain else 0):
+            step, predicted_gain = self._propose(equations, x, radius)
+            if predicted_gain <= noise_gain:
                 break
             new, length = best + equations.lift @ step, self._length(step)
             compared = problem.compare(best, new, samples=state.samples, step=state.step - 1, trial=trial)
@@ -228,55 +228,55 @@ class GaussNewton:
             # Prediction and comparison, each with its standard error; the part of the prediction that the gradient's
             # own noise causes is subtracted.
             model_se = math.hypot(
-                equations.step_noise(step), (options.slope_error + options.model_error * length) * promised
+                equations.step_noise(step), (options.slope_error + options.model_error * length) * predicted_gain
             )
-            judged = Judged(change, compared.se, noise_gain - promised, model_se, options.sure_z)
-            if judged.is_better(options.sure_z):
-                poor = change > 0.25 * judged.model
-                grown = 2 * radius if length > 0.8 * radius and change < 0.5 * judged.model else radius
+            step_test = StepTest(change, compared.se, noise_gain - predicted_gain, model_se, options.significance_z)
+            if step_test.is_better(options.significance_z):
+                poor = change > 0.25 * step_test.model
+                grown = 2 * radius if length > 0.8 * radius and change < 0.5 * step_test.model else radius
                 state = replace(
                     state,
                     x=new,
                     accepted=state.accepted + 1,
-                    radius=min(0.5 * length if poor and judged.contradicted else grown, 4.0),
+                    radius=min(0.5 * length if poor and step_test.is_contradicted else grown, 4.0),
                     verdict="accepted",
                 )
-                return self._limited(self._carry(state, settling + equations.lift @ step, length))
-            at_fault = judged.is_worse or judged.contradicted
-            if not at_fault:
+                return self._with_step_limit(self._carry(state, error_step + equations.lift @ step, length))
+            is_model_wrong = step_test.is_worse or step_test.is_contradicted
+            if not is_model_wrong:
                 break
             radius = 0.25 * min(length, radius)
             if radius < options.least_radius:
                 return replace(state, result=Result.STALLED, verdict="worse at every radius")
-        if at_fault:
-            return self._limited(
+        if is_model_wrong:
+            return self._with_step_limit(
                 replace(state, radius=radius, memory=None, memory_samples=0.0, verdict="worse: radius reduced")
             )
         if state.samples < options.max_samples:
-            return self._limited(
+            return self._with_step_limit(
                 replace(state, samples=min(2 * state.samples, options.max_samples), verdict="noise: samples doubled")
             )
-        return self._settled(
+        return self._last_step(
             problem, replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit"), equations
         )
 
-    def _settled(self, problem: Problem, state: State, equations: Eliminated) -> State:
+    def _last_step(self, problem: Problem, state: State, equations: ReducedEquations) -> State:
         # Newton step along the directions that the data determine: curvature beyond its noise, and noise of the step
         # below one scale.
         count = self.domain.tissue_count
-        scale, x, settling = self.domain.scale[:count], state.x[:count], equations.settling
-        if state.memory is not None and settling.any():
-            state = replace(state, x=state.x + settling, memory=state.memory.moved(settling))
+        scale, x, error_step = self.domain.scale[:count], state.x[:count], equations.error_step
+        if state.memory is not None and error_step.any():
+            state = replace(state, x=state.x + error_step, memory=state.memory.moved(error_step))
         eigenvalues, vectors, spread = _spread(equations, scale)
         noise = equations.eigenvalue_noise(scale[:, None] * vectors)
-        sure = vectors[
+        determined = vectors[
             :,
             (eigenvalues > DETERMINED * noise)
             & (eigenvalues > spread)
             & (eigenvalues > 1e-13 * abs(eigenvalues).max()),
         ]
-        curvature = np.einsum("ak,ab,bk->k", sure, equations.hessian * np.outer(scale, scale), sure)
-        step = scale * (sure @ (-(sure.T @ (scale * equations.gradient)) / curvature))
+        curvature = np.einsum("ak,ab,bk->k", determined, equations.hessian * np.outer(scale, scale), determined)
+        step = scale * (determined @ (-(determined.T @ (scale * equations.gradient)) / curvature))
         length = self._length(step)
         if state.memory is None or length == 0:
             return state
@@ -292,18 +292,18 @@ class GaussNewton:
         model_se = math.hypot(
             equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model
         )
-        judged = Judged(change, compared.se, model + gain_by_noise(equations), model_se, options.sure_z)
-        refused = not judged.is_better(LAST_STEP_Z) if options.slope_error else judged.is_worse
+        step_test = StepTest(change, compared.se, model + gain_by_noise(equations), model_se, options.significance_z)
+        refused = not step_test.is_better(LAST_STEP_Z) if options.slope_error else step_test.is_worse
         if refused:
             return state
         if length > 1:
             # The step is too long for one linear model: linearise again from its end.
-            return self._limited(
+            return self._with_step_limit(
                 self._carry(replace(state, x=new, result=Result.RUNNING, verdict="settling"), whole, 1.0)
             )
         return replace(state, x=new, memory=state.memory.moved(whole), verdict=f"{state.verdict}, settled")
 
-    def _drowns(self, equations: Eliminated, state: State) -> bool:
+    def _needs_more_samples(self, equations: ReducedEquations, state: State) -> bool:
         # Whether more samples are needed because the step's noise along a direction exceeds one scale. Instrument
         # errors leave little information along such directions, so their gain lies below the tolerance, which is one of
         # the image loss.
@@ -316,11 +316,11 @@ class GaussNewton:
     def _length(self, step: Array) -> float:
         # Length of a step of the tissue, in scales.
         scale = self.domain.scale[: self.domain.tissue_count]
-        return float(np.linalg.norm(step / scale)) / math.sqrt(self.options.parts)
+        return float(np.linalg.norm(step / scale)) / math.sqrt(self.options.part_count)
 
-    def _propose(self, equations: Eliminated, x: Array, radius: float) -> tuple[Array, float]:
+    def _propose(self, equations: ReducedEquations, x: Array, radius: float) -> tuple[Array, float]:
         # Step of the tissue within the radius, and the gain that the model predicts for it.
-        reach, count = radius * math.sqrt(self.options.parts), self.domain.tissue_count
+        reach, count = radius * math.sqrt(self.options.part_count), self.domain.tissue_count
         low, high = (bound[:count] for bound in self.domain.bounds)
         step = solve_box(
             equations.hessian,
@@ -341,18 +341,18 @@ class GaussNewton:
             state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (length / 0.3) ** 2)
         )
 
-    def _limited(self, state: State) -> State:
+    def _with_step_limit(self, state: State) -> State:
         return replace(state, result=Result.MAX_STEPS) if state.step >= self.options.max_steps else state
 
 
-def _spread(equations: Eliminated, scale: Array) -> tuple[Array, Array, Array]:
+def _spread(equations: ReducedEquations, scale: Array) -> tuple[Array, Array, Array]:
     # Eigenvalues and directions of the scaled curvature, and the standard deviation of the gradient along each.
     eigenvalues, vectors = np.linalg.eigh(equations.hessian * np.outer(scale, scale))
     variance = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise * np.outer(scale, scale), vectors)
     return eigenvalues, vectors, np.sqrt(np.maximum(variance, 0.0))
 
 
-def gain_by_noise(equations: NormalEquations | Eliminated) -> float:
+def gain_by_noise(equations: NormalEquations | ReducedEquations) -> float:
     """Mean gain tr(H^-1 C) / 2 that the gradient's noise alone predicts for a Newton step at the true optimum, over
     directions of positive curvature.
     """
@@ -363,31 +363,31 @@ def gain_by_noise(equations: NormalEquations | Eliminated) -> float:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """A step's change of F by comparison and by the model, with standard errors; ``sure_z`` of them are significant."""
+class StepTest:
+    """A step's change of F by comparison and by the model; ``significance_z`` standard errors are significant."""
 
     change: float
     change_se: float
     model: float
     model_se: float
-    sure_z: float = 3.0
+    significance_z: float = 3.0
 
     @property
     def is_worse(self) -> bool:
         """Whether the comparison is significantly worse."""
-        return self.change > self.sure_z * self.change_se
+        return self.change > self.significance_z * self.change_se
 
     @property
-    def contradicted(self) -> bool:
+    def is_contradicted(self) -> bool:
         """Whether the two estimates differ significantly."""
-        return abs(self.change - self.model) > self.sure_z * math.hypot(self.change_se, self.model_se)
+        return abs(self.change - self.model) > self.significance_z * math.hypot(self.change_se, self.model_se)
 
     def is_better(self, z: float) -> bool:
         """Whether both estimates combined are better by z standard errors. A comparison that is significantly worse, or
         contradicts the prediction and is worse, overrules them.
         """
         total, total_se = _combine(self.change, self.change_se, self.model, self.model_se)
-        return total + z * total_se < 0 and not self.is_worse and not (self.contradicted and self.change > 0)
+        return total + z * total_se < 0 and not self.is_worse and not (self.is_contradicted and self.change > 0)
 
 
 def _combine(first: float, first_se: float, second: float, second_se: float) -> tuple[float, float]:

@@ -40,18 +40,18 @@ class Recombination:
     """Covariance V (K, K) of the prior."""
 
     @property
-    def cross(self) -> Array:
+    def cross_covariance(self) -> Array:
         """Covariance of x and d, c (F, K)."""
         return np.asarray(self.covariance[:, self._first :] - self.response @ self.prior)
 
     @property
-    def spread(self) -> Array:
+    def difference_covariance(self) -> Array:
         """Covariance D (K, K) of d, if neither solution nor prior is faulty."""
-        common = self.follows @ self.prior
+        common = self.error_response @ self.prior
         return np.asarray(self.covariance[self._first :, self._first :] - common - common.T + self.prior)
 
     @property
-    def follows(self) -> Array:
+    def error_response(self) -> Array:
         """Response B[e] (K, K) of the solution's own errors to the prior's mean."""
         return self.response[self._first :]
 
@@ -59,35 +59,37 @@ class Recombination:
     def _first(self) -> int:
         return len(self.covariance) - len(self.prior)
 
-    def change(self, wrong: tuple[int, ...] = ()) -> Array:
+    def change(self, rejected: tuple[int, ...] = ()) -> Array:
         """Q (F, K) of the best combination x + Q d, which is -G where every prior is believed.
 
         Args:
-            wrong: indices of the errors whose prior is rejected. The solution is freed of these priors: their means are
-                set where the solution puts the errors.
+            rejected: indices of the errors whose prior is rejected. The solution is freed of these priors: their means
+                are set where the solution puts the errors.
         """
-        used = [k for k in range(len(self.prior)) if k not in wrong]
+        used = [k for k in range(len(self.prior)) if k not in rejected]
         freed = np.zeros_like(self.response)
-        if wrong:
-            own, pulls = list(wrong), np.eye(len(self.prior)) - self.follows
+        if rejected:
+            own, pulls = list(rejected), np.eye(len(self.prior)) - self.error_response
             freed[:, own] = self.response[:, own] @ np.linalg.inv(pulls[np.ix_(own, own)])
-        left = self.after(freed)
+        freed_solution = self.updated(freed)
         unit, change = np.sqrt(np.diag(self.prior))[used], np.zeros_like(freed)
-        change[:, used] = -left.cross[:, used] @ _inverse(left.spread[np.ix_(used, used)], unit)
+        change[:, used] = -freed_solution.cross_covariance[:, used] @ _inverse(
+            freed_solution.difference_covariance[np.ix_(used, used)], unit
+        )
         through = np.eye(len(self.prior)) + freed[self._first :]
         return np.asarray(freed + change @ through)
 
-    def after(self, change: Array) -> Recombination:
+    def updated(self, change: Array) -> Recombination:
         """The solution x + Q d, with its covariance and response."""
-        both = change @ self.cross.T
-        covariance = self.covariance + both + both.T + change @ self.spread @ change.T
-        response = self.response + change @ (self.follows - np.eye(len(self.prior)))
+        both = change @ self.cross_covariance.T
+        covariance = self.covariance + both + both.T + change @ self.difference_covariance @ change.T
+        response = self.response + change @ (self.error_response - np.eye(len(self.prior)))
         return Recombination(covariance, response, self.prior)
 
 
-def _inverse(spread: Array, unit: Array) -> Array:
+def _inverse(covariance: Array, unit: Array) -> Array:
     # Pseudo-inverse in units of the prior's standard errors: directions of d without variance have none in c either.
-    values, vectors = np.linalg.eigh(0.5 * (spread + spread.T) / np.outer(unit, unit))
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T) / np.outer(unit, unit))
     kept = values > SMALLEST_SHARE
     whitened = (vectors[:, kept] / np.sqrt(values[kept])) / unit[:, None]
     return np.asarray(whitened @ whitened.T)
@@ -102,7 +104,7 @@ FAULT_Z = 3.0
 class Fault:
     """A calibration error that lies farther from its prior than the standard errors of both allow."""
 
-    place: int
+    index: int
     """Index among the errors."""
     size: float
     """Estimate of the prior's fault from the images, in the error's unit."""
@@ -110,7 +112,7 @@ class Fault:
     """``size`` over its standard error, which covers the images' errors and the prior's."""
 
 
-def faults(off: Array, found: Recombination) -> tuple[Fault, ...]:
+def faults(deviations: Array, found: Recombination) -> tuple[Fault, ...]:
     """Errors that lie more than ``FAULT_Z`` standard errors from their prior, the most significant first.
 
     A prior that is off by f moves d by f h, with h the error's own column of 1 - B[e], so f = h'D^-1 d / h'D^-1 h is
@@ -118,20 +120,23 @@ def faults(off: Array, found: Recombination) -> tuple[Fault, ...]:
     a faulty error biases the others (data snooping, Baarda 1968).
 
     Args:
-        off: d (K,), errors of the first solution less their prior's mean.
+        deviations: d (K,), errors of the first solution less their prior's mean.
         found: the first solution and its prior.
     """
-    moves, weight = np.eye(len(off)) - found.follows, _inverse(found.spread, np.sqrt(np.diag(found.prior)))
-    left, told = set(range(len(off))), list[Fault]()
-    while left:
-        seen = {k: float(moves[:, k] @ weight @ moves[:, k]) for k in left}
-        sizes = {k: float(moves[:, k] @ weight @ off) / max(seen[k], 1e-300) for k in left}
-        worst = max(left, key=lambda k: abs(sizes[k]) * np.sqrt(seen[k]))
-        z = sizes[worst] * float(np.sqrt(seen[worst]))
+    moves, weight = (
+        np.eye(len(deviations)) - found.error_response,
+        _inverse(found.difference_covariance, np.sqrt(np.diag(found.prior))),
+    )
+    remaining, detected = set(range(len(deviations))), list[Fault]()
+    while remaining:
+        information = {k: float(moves[:, k] @ weight @ moves[:, k]) for k in remaining}
+        sizes = {k: float(moves[:, k] @ weight @ deviations) / max(information[k], 1e-300) for k in remaining}
+        worst = max(remaining, key=lambda k: abs(sizes[k]) * np.sqrt(information[k]))
+        z = sizes[worst] * float(np.sqrt(information[worst]))
         if abs(z) <= FAULT_Z:
             break
-        told.append(Fault(worst, sizes[worst], z))
+        detected.append(Fault(worst, sizes[worst], z))
         along = weight @ moves[:, worst]
-        weight = weight - np.outer(along, along) / seen[worst]
-        left.remove(worst)
-    return tuple(told)
+        weight = weight - np.outer(along, along) / information[worst]
+        remaining.remove(worst)
+    return tuple(detected)

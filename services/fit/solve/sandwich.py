@@ -28,7 +28,7 @@ class Sandwich:
     """Factor s by which residuals exceed the measurements' noise."""
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Covariance V (K, K) of the prior of the instrument's errors."""
-    wrong: tuple[int, ...] = ()
+    rejected: tuple[int, ...] = ()
     """Indices of the instrument's errors whose prior is rejected as a fault."""
 
     @property
@@ -38,13 +38,13 @@ class Sandwich:
 
     def covariance_of(self, inverse: Array, meat: Array) -> Array:
         """Covariance (F, F) of x for another M^-1 and meat, each (F, F)."""
-        plain = self.plain(inverse, meat)
+        before = self.product(inverse, meat)
         if not len(self.prior):
-            return plain
-        found = Recombination(plain, self.response(inverse), self.prior)
-        return found.after(found.change(self.wrong)).covariance
+            return before
+        found = Recombination(before, self.response(inverse), self.prior)
+        return found.updated(found.change(self.rejected)).covariance
 
-    def plain(self, inverse: Array, meat: Array) -> Array:
+    def product(self, inverse: Array, meat: Array) -> Array:
         """Covariance T M^-1 meat M^-T T' (F, F) before the prior is used in full."""
         half = self.transform @ inverse
         return np.asarray(half @ meat @ half.T)
@@ -56,7 +56,7 @@ class Sandwich:
 
 
 @dataclass(frozen=True)
-class Settled:
+class CombinedSolution:
     """Solution after the prior of the instrument's errors was used in full."""
 
     x: Array
@@ -64,19 +64,19 @@ class Settled:
     parts: dict[str, Array]
     sandwich: Sandwich
     faults: tuple[Fault, ...]
-    is_whole: bool = True
+    is_full_step: bool = True
     """Whether the solution took the whole step; False where the step was shortened to the range in which images are
     linear."""
 
 
-def settle(
+def combine_with_prior(
     domain: Domain,
     x: Array,
     sandwich: Sandwich,
     meats: Mapping[str, Array],
     unfinished: Array,
     part_count: int = 1,
-) -> Settled:
+) -> CombinedSolution:
     """Use the prior of the instrument's errors in full, except for errors that are found to be faults of the
     calibration.
 
@@ -88,32 +88,37 @@ def settle(
         unfinished: covariance (F, F) of the remaining step to the minimum.
         part_count: number of objects that the fit treats as separate in the images, such as the teeth of a jaw.
     """
-    count, plain = domain.tissue_count, {name: sandwich.plain(sandwich.inverse, meat) for name, meat in meats.items()}
-    whole = sandwich.plain(sandwich.inverse, sandwich.meat) + unfinished
-    plain["unfinished"] = unfinished
+    count, parts_before = (
+        domain.tissue_count,
+        {name: sandwich.product(sandwich.inverse, meat) for name, meat in meats.items()},
+    )
+    whole = sandwich.product(sandwich.inverse, sandwich.meat) + unfinished
+    parts_before["unfinished"] = unfinished
     if not domain.errors.names:
-        return Settled(x, whole, plain, sandwich, ())
+        return CombinedSolution(x, whole, parts_before, sandwich, ())
     sandwich = replace(sandwich, prior=domain.errors.matrix)
     found = Recombination(whole, sandwich.response(sandwich.inverse), sandwich.prior)
-    told = faults(x[count:], found)
-    wrong = tuple(fault.place for fault in told)
-    change = found.change(wrong)
-    after = found.after(change)
+    detected = faults(x[count:], found)
+    rejected = tuple(fault.index for fault in detected)
+    change = found.change(rejected)
+    updated = found.updated(change)
 
     # Transform every part but the prior's by 1 + Q; the prior's parts follow from the new solution's response.
     through = np.eye(len(x))
     through[:, count:] += change
-    parts = {name: through @ part @ through.T for name, part in plain.items()} | _of_prior(domain, after)
+    parts = {name: through @ part @ through.T for name, part in parts_before.items()} | _of_prior(domain, updated)
 
     # Take only as much of the step as moves the tissue by one scale for each object, because images are not linear
     # farther than that; the rest of the step counts as error.
     step, (low, high) = change @ x[count:], domain.bounds
     length = float(np.linalg.norm((step / domain.scale)[:count]) / np.sqrt(part_count))
-    gone = np.asarray(step / max(1.0, length), dtype=np.float64)
-    left = np.outer(step - gone, step - gone)
-    parts["unfinished"] = parts["unfinished"] + left
-    moved = np.clip(x + gone, low, high)
-    return Settled(moved, after.covariance + left, parts, replace(sandwich, wrong=wrong), told, length <= 1)
+    taken = np.asarray(step / max(1.0, length), dtype=np.float64)
+    remaining = np.outer(step - taken, step - taken)
+    parts["unfinished"] = parts["unfinished"] + remaining
+    moved = np.clip(x + taken, low, high)
+    return CombinedSolution(
+        moved, updated.covariance + remaining, parts, replace(sandwich, rejected=rejected), detected, length <= 1
+    )
 
 
 def _of_prior(domain: Domain, found: Recombination) -> dict[str, Array]:

@@ -62,8 +62,8 @@ class StainState:
     """Optical depths (T,), the last step (T,), and the visibility and misfit that the step found."""
 
     depth: Array
-    moved: Array
-    seen: Array
+    last_step: Array
+    determined: Array
     """Mask (T,) of the texels that measurements determine better than the prior."""
     squares: float = 0.0
 
@@ -71,8 +71,8 @@ class StainState:
         """The state as JSON values; floats survive exactly."""
         return {
             "depth": self.depth.tolist(),
-            "moved": self.moved.tolist(),
-            "seen": self.seen.astype(int).tolist(),
+            "moved": self.last_step.tolist(),
+            "seen": self.determined.astype(int).tolist(),
             "squares": self.squares,
         }
 
@@ -87,7 +87,7 @@ class StainState:
         )
 
 
-def clean(texels: int) -> StainState:
+def clean_state(texels: int) -> StainState:
     """State of a surface without stains."""
     return StainState(np.zeros(texels), np.zeros(texels), np.zeros(texels, dtype=bool))
 
@@ -105,7 +105,7 @@ class StainSolver:
         carried = np.maximum(sums.carried, 0.0)
         ratio = sums.explained / np.where(carried > 0, carried, 1.0)
         slope = np.where(carried > 0, carried * np.log(np.maximum(ratio, 1e-3)), 0.0)
-        return self._relative(state, self._moved(state, sums, slope, 2.0, 0.0, -DEEPEST))
+        return self._relative(state, self._stepped(state, sums, slope, 2.0, 0.0, -DEEPEST))
 
     def pattern_step(self, state: StainState, sums: StainSums) -> StainState:
         """A step with momentum along the gradient, at the common factor of all images that fits best."""
@@ -113,7 +113,7 @@ class StainSolver:
         factor = float(np.clip(sums.explained.sum() / total, 0.1, 10.0)) if total > 0 else 1.0
         scaled = StainSums(sums.explained * factor, sums.carried * factor**2, sums.squares)
         return self._relative(
-            state, self._moved(state, scaled, scaled.explained - scaled.carried, 1.0, MOMENTUM, -DEEPEST)
+            state, self._stepped(state, scaled, scaled.explained - scaled.carried, 1.0, MOMENTUM, -DEEPEST)
         )
 
     def exact_step(self, state: StainState, sums: StainSums, number: int) -> StainState:
@@ -123,15 +123,15 @@ class StainSolver:
         Args:
             number: number of exact steps before this one.
         """
-        return self._moved(state, sums, sums.explained - sums.carried, 1 + number / SLOWER_AFTER, MOMENTUM, 0.0)
+        return self._stepped(state, sums, sums.explained - sums.carried, 1 + number / SLOWER_AFTER, MOMENTUM, 0.0)
 
     def _relative(self, before: StainState, moved: StainState) -> StainState:
         # Depths relative to the cleanest part of the visible surface; the media take up the common factor.
-        if not moved.seen.any():
+        if not moved.determined.any():
             return before
-        floor = float(np.quantile(moved.depth[moved.seen], CLEAN_SHARE))
-        depth = np.where(moved.seen, np.clip(moved.depth - floor, 0.0, DEEPEST), 0.0)
-        return StainState(depth, np.where(moved.seen, depth - before.depth, 0.0), moved.seen, moved.squares)
+        floor = float(np.quantile(moved.depth[moved.determined], CLEAN_SHARE))
+        depth = np.where(moved.determined, np.clip(moved.depth - floor, 0.0, DEEPEST), 0.0)
+        return StainState(depth, np.where(moved.determined, depth - before.depth, 0.0), moved.determined, moved.squares)
 
     def _prior(self) -> Any:
         # Sparse precision matrix (T, T) of the prior: each texel towards clean, and neighbours towards each other.
@@ -145,7 +145,7 @@ class StainSolver:
         )
         return sparse.identity(self.texels, format="csr") / CLEAN_SD**2 + difference.T @ difference / NEIGHBOUR_SD**2
 
-    def _moved(
+    def _stepped(
         self, state: StainState, sums: StainSums, slope: Array, bound: float, momentum: float, low: float
     ) -> StainState:
         from scipy import sparse
@@ -155,6 +155,6 @@ class StainSolver:
         # ``carried`` negative, the prior's curvature is left alone.
         prior, carried = self._prior(), np.maximum(sums.carried, 0.0)
         gradient = slope + prior @ state.depth
-        step = -spsolve((sparse.diags(bound * carried) + prior).tocsc(), gradient) + momentum * state.moved
+        step = -spsolve((sparse.diags(bound * carried) + prior).tocsc(), gradient) + momentum * state.last_step
         depth = np.clip(state.depth + np.clip(step, -LONGEST_STEP, LONGEST_STEP), low, DEEPEST)
         return StainState(depth, depth - state.depth, carried > prior.diagonal(), float(sums.squares))

@@ -118,12 +118,12 @@ def search_node(
     # noise from biasing <C,C>.
     bins = len(edges) - 1
     cross, gram, total = np.zeros(bins), np.zeros((bins, bins)), 0.0
-    for (first, second), seen in zip(orders, observed, strict=True):
+    for (first, second), photographs in zip(orders, observed, strict=True):
         a, b = first.reshape(bins, -1), second.reshape(bins, -1)
-        product = (a * seen.weight) @ b.T
-        cross += 0.5 * (a + b) @ (seen.weight * seen.reference)
+        product = (a * photographs.weight) @ b.T
+        cross += 0.5 * (a + b) @ (photographs.weight * photographs.reference)
         gram += 0.5 * (product + product.T)
-        total += float(seen.weight @ (seen.reference**2 - seen.variance))
+        total += float(photographs.weight @ (photographs.reference**2 - photographs.variance))
     cr, cc = powers @ cross, np.einsum("ak,kl,al->a", powers, gram, powers)
 
     # A black render (<C,C> = 0) explains nothing: error 1, scale 0.

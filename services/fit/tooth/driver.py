@@ -15,17 +15,17 @@ from services.anatomy.frame import ToothFrame
 from services.core.geometry import Camera, Tooth
 from services.core.records import JobSpec
 from services.core.results import FitReport
-from services.fit.checks.alignment import offsets_told
-from services.fit.checks.frames import photographs_told
-from services.fit.checks.identifiability import NOTHING, correlation, told
+from services.fit.checks.alignment import offset_sentences
+from services.fit.checks.frames import photograph_sentences
+from services.fit.checks.identifiability import NOT_EXPLAINED, correlation, determined_sentences
 from services.fit.checks.next_calibration import calibration_advice
 from services.fit.checks.thickness import ThicknessMap, thickness_map
-from services.fit.execution.attempt import Attempt, judge, standard_errors, worst_error
+from services.fit.execution.attempt import Attempt, assess_convergence, standard_errors, worst_error
 from services.fit.execution.channel_fit import ChannelFit
 from services.fit.execution.executors import Executor
 from services.fit.execution.journal import Journal
 from services.fit.export.previews import shown_images
-from services.fit.export.stains import keep_stains
+from services.fit.export.stains import store_stains
 from services.fit.inputs.observations import (
     ChannelFiles,
     Observations,
@@ -37,7 +37,7 @@ from services.fit.inputs.observations import (
 )
 from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
 from services.fit.instrument.capture import instrument_of
-from services.fit.instrument.found import instrument_report
+from services.fit.instrument.report import instrument_report
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import estimates
@@ -56,8 +56,8 @@ class FitDriver:
         observations = read_observations(attempt.context.root, spec)
         (tooth,) = observations.teeth
         dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
-        if misnumbered := _number_told(tooth, spec):
-            attempt.log(misnumbered)
+        if numbering_fault := _numbering_fault(tooth, spec):
+            attempt.log(numbering_fault)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
         layout = (
@@ -77,7 +77,7 @@ class FitDriver:
             for channel in channels
         }
         journal = attempt.journal(files.values())
-        begun, _ = journal.once("begun", lambda: started_s)
+        begun, _ = journal.get_or_compute("begun", lambda: started_s)
 
         # Fit the channel with the most signal first; where blend weights are fitted, the others take them from it.
         modes = len(dentin.modes_mm) if dentin is not None else 0
@@ -96,17 +96,21 @@ class FitDriver:
                 shape = fits[channel].tissue.shape
                 if spec.advise and number == 0 and fits[channel].solution.result.converged:
                     next_capture = schedule.next_capture(fits[channel], attempt.inputs)
-                    measured = calibration_advice(fits[channel].tissue, schedule.media, fits[channel].known)
+                    measured = calibration_advice(fits[channel].tissue, schedule.media, fits[channel].uncertainty)
                     next_capture = f"{next_capture} {measured}".strip()
         textures = {c: stain for c in channels if (stain := fits[c].tissue.stain) is not None}
         if layout is not None and textures:
-            keep_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
+            store_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
         report = self._publish(
             observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun
         )
-        if misnumbered:
+        if numbering_fault:
             report = report.model_copy(
-                update={"converged": False, "advice": f"{misnumbered} {report.advice}".strip(), "told": NOTHING}
+                update={
+                    "converged": False,
+                    "advice": f"{numbering_fault} {report.advice}".strip(),
+                    "told": NOT_EXPLAINED,
+                }
             )
         where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
         return report.model_copy(update={"next_capture": where + next_capture})
@@ -118,7 +122,7 @@ class FitDriver:
         views: tuple[ViewStack, ...],
         journal: Journal,
         run_on: Executor,
-        place: tuple[int, int],
+        channel_position: tuple[int, int],
     ) -> ChannelSchedule:
         attempt, spec = self.attempt, self.attempt.spec
         media = 2 * spec.adam_steps if spec.solver == "adam" else spec.max_steps + 10
@@ -130,11 +134,14 @@ class FitDriver:
             journal=journal,
             has_dentin=True,
             modes=0,
-            report=attempt.teller(
-                observations, views, journal, lambda step: (place[0] + min(step / expected, 0.99)) / place[1]
+            report=attempt.step_reporter(
+                observations,
+                views,
+                journal,
+                lambda step: (channel_position[0] + min(step / expected, 0.99)) / channel_position[1],
             ),
-            say=attempt.log,
-            pause=attempt.context.raise_if_cancelled,
+            log=attempt.log,
+            raise_if_cancelled=attempt.context.raise_if_cancelled,
             shown=shown_images(views),
         )
 
@@ -149,20 +156,20 @@ class FitDriver:
     ) -> FitReport:
         evaluations = {c: fit.evaluation for c, fit in fits.items()}
         self.attempt.write_records(journal, observations, evaluations, views)
-        known = {c: fit.known for c, fit in fits.items()}
-        tables = {c: self._table(fit, known[c], known[first]) for c, fit in fits.items()}
-        converged, advice = judge(fits)
-        misplaced = offsets_told(
+        uncertainties = {c: fit.uncertainty for c, fit in fits.items()}
+        tables = {c: self._table(fit, uncertainties[c], uncertainties[first]) for c, fit in fits.items()}
+        converged, advice = assess_convergence(fits)
+        misplaced = offset_sentences(
             evaluations,
             {c: worst_error(fit) for c, fit in fits.items()},
             observations,
             views,
             f"the mesh of tooth {observations.teeth[0].fdi}",
         )
-        wrong = photographs_told(evaluations, observations, views, is_placed=not misplaced)
+        wrong = photograph_sentences(evaluations, observations, views, is_placed=not misplaced)
         converged, advice = converged and not misplaced and not wrong, misplaced + wrong + advice
-        correlations = {c: correlation(known[c]) for c in fits}
-        shape, covariance = fits[first].tissue.shape, shape_covariance(known[first])
+        correlations = {c: correlation(uncertainties[c]) for c in fits}
+        shape, covariance = fits[first].tissue.shape, shape_covariance(uncertainties[first])
         thickness = fitted_thickness(
             observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance
         )
@@ -179,15 +186,21 @@ class FitDriver:
             shape_covariance=covariance,
             enamel_thickness=None if thickness is None else thickness.mean,
             correlations=correlations,
-            told=told(tables, correlations) if converged else NOTHING,
+            told=determined_sentences(tables, correlations) if converged else NOT_EXPLAINED,
             seconds=seconds,
-            **instrument_report(self.attempt.spec, known, observations.manifest),
+            **instrument_report(self.attempt.spec, uncertainties, observations.manifest),
         )
 
-    def _table(self, fit: ChannelFit[Tissue], known: Uncertainty, shape_known: Uncertainty) -> dict[str, Any]:
+    def _table(
+        self, fit: ChannelFit[Tissue], uncertainty: Uncertainty, shape_uncertainty: Uncertainty
+    ) -> dict[str, Any]:
         parts = ("enamel",) if self.attempt.spec.dentin == "none" else ("enamel", "dentin", "shape")
-        fitted_shape = shape_known if any(name.startswith("shape.") for name in shape_known.domain.parameters) else None
-        return estimates(fit.tissue, parts, known, fitted_shape)
+        fitted_shape = (
+            shape_uncertainty
+            if any(name.startswith("shape.") for name in shape_uncertainty.domain.parameters)
+            else None
+        )
+        return estimates(fit.tissue, parts, uncertainty, fitted_shape)
 
 
 def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> DentinShape | None:
@@ -206,10 +219,10 @@ def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> De
     return None
 
 
-def _number_told(tooth: Tooth, spec: JobSpec) -> str:
-    from services.anatomy.jaw_frames import number_told
+def _numbering_fault(tooth: Tooth, spec: JobSpec) -> str:
+    from services.anatomy.jaw_frames import fdi_mismatch_note
 
-    return number_told(tooth) if spec.dentin == "fit" else ""
+    return fdi_mismatch_note(tooth) if spec.dentin == "fit" else ""
 
 
 def blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
@@ -229,14 +242,14 @@ def viewpoints_mm(cameras: tuple[Camera, ...]) -> NDArray[np.float64]:
     return np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
 
 
-def shape_covariance(known: Uncertainty, tooth: int | None = None) -> tuple[tuple[float, ...], ...]:
+def shape_covariance(uncertainty: Uncertainty, tooth: int | None = None) -> tuple[tuple[float, ...], ...]:
     """Covariance of the blend weights, in a jaw those of one tooth; empty where they were not fitted."""
     own = [
         k
-        for k, coordinate in enumerate(known.domain.coordinates)
+        for k, coordinate in enumerate(uncertainty.domain.coordinates)
         if coordinate.kind == "shape" and coordinate.tooth == tooth
     ]
-    return tuple(tuple(row) for row in known.covariance[np.ix_(own, own)].tolist())
+    return tuple(tuple(row) for row in uncertainty.covariance[np.ix_(own, own)].tolist())
 
 
 def fitted_thickness(

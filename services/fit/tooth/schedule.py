@@ -32,9 +32,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from services.core.errors import SettingsError
-from services.fit.checks.next_capture import Sensor, advice
+from services.fit.checks.next_capture import Sensor, capture_advice
 from services.fit.execution.channel_fit import ChannelFit, Stages
-from services.fit.execution.closing import Held
+from services.fit.execution.closing import HeldCosines
 from services.fit.execution.passes import StackProblem, orders_task
 from services.fit.execution.stain_passes import StainStage
 from services.fit.inputs.observations import COARSE_PIXELS
@@ -72,7 +72,7 @@ STAIN_SAMPLES = 2
 needed in the end."""
 START_STEPS = 2
 """Largest number of steps from each start."""
-ADAM_BURST = 10
+ADAM_STEPS_PER_ENTRY = 10
 """Number of Adam steps between two journal entries and reports, each of which costs an evaluation of all images."""
 
 Fitted = tuple[StackProblem[Tissue], Tissue, Solution]
@@ -94,9 +94,9 @@ class ChannelSchedule(Stages[Tissue]):
         """Fit the channel."""
         if not self._domain(("sigma", "alpha")).coordinates and not self.modes:
             raise SettingsError(f"held = {sorted(self.spec.held)} leaves nothing to fit; hold fewer parameters.")
-        problem, tissue, solution = self._paper_stages() if self.spec.solver == "adam" else self._stages()
+        problem, tissue, solution = self._adam_stages() if self.spec.solver == "adam" else self._stages()
         if self.stain_layout is not None:
-            problem, tissue, solution = self._stained(self.stain_layout, problem, tissue, solution)
+            problem, tissue, solution = self._fit_stains(self.stain_layout, problem, tissue, solution)
         return self._finish(replace(problem, base=tissue, stage="final"), solution)
 
     def start(self) -> Tissue:
@@ -104,7 +104,7 @@ class ChannelSchedule(Stages[Tissue]):
         tissue = self._homogeneous_start()
         if not self.has_dentin:
             return tissue
-        domain, options = shared_domain(self._priors), self.short(HOMOGENEOUS_STEPS)
+        domain, options = shared_domain(self._priors), self.preparatory_options(HOMOGENEOUS_STEPS)
         return self._solve("homogeneous", domain, tissue, options, self.spec.samples_per_pixel, SIMILAR_G)[0]
 
     @property
@@ -112,46 +112,52 @@ class ChannelSchedule(Stages[Tissue]):
         """See Stages."""
         return ("enamel", "dentin") if self.has_dentin else ("enamel",)
 
-    def _held(self, domain: Domain) -> Held:
-        told = {
+    def _held_cosines(self, domain: Domain) -> HeldCosines:
+        fixed = {
             name.rpartition(".")[0]
             for name in (*domain.parameters, *self.spec.held)
             if name.endswith((".g1", ".cosine"))
         }
-        return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in told}
+        return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in fixed}
 
-    def _others(self, tissue: Tissue) -> dict[str, float]:
+    def _other_values(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}
 
     def next_capture(self, fit: ChannelFit[Tissue], folder: Path) -> str:
         """One sentence on the light or view that would help this channel most."""
-        self.pause()
+        self.raise_if_cancelled()
         sensor = Sensor(self.spec.sensor_noise_relative, self.spec.sensor_noise_floor)
         given = folder, self.media, sensor, self.files.weight, fit.samples
-        found, _ = self.journal.once(f"{self.scope}/next-capture", lambda: advice(fit.problem, fit.known, *given)[0])
+        found, _ = self.journal.get_or_compute(
+            f"{self.scope}/next-capture", lambda: capture_advice(fit.problem, fit.uncertainty, *given)[0]
+        )
         return str(found)
 
     def _stages(self) -> Fitted:
         # Fit the media and the dentin's shape by Gauss-Newton.
         spec, samples, options = self.spec, self.spec.samples_per_pixel, self.options(self.files.coarse)
         domain = self._domain(("sigma", "alpha"))
-        tissue, reached = self._neighbourhood(domain, options) if domain.coordinates else (self._given(), 2 * samples)
+        tissue, samples_reached = (
+            self._fit_similar_media(domain, options) if domain.coordinates else (self._held_tissue(), 2 * samples)
+        )
         domain = self._with_shape(self._with_cosines(domain) if spec.lobes == 1 else domain)
         domain = replace(domain, errors=self.files.errors)
-        before: Solution | None = None
+        previous: Solution | None = None
         if self.modes:
             problem = StackProblem(self.passes, domain, tissue, "shape", jacobian_g=SIMILAR_G)
-            tissue, before = self._iterate(problem, options, reached)
+            tissue, previous = self._iterate(problem, options, samples_reached)
 
-        options = self.at_full_resolution()
+        options = self.switch_to_full_resolution()
         exact_samples = max(
-            self.fewer(round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))),
+            self.full_image_samples(
+                round(EXACT_SAMPLES * samples * max(1.0, 3 * COARSE_PIXELS / self.files.coarse.pixels))
+            ),
             MIN_EXACT_SAMPLES,
         )
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         is_same = self.files.full.blocks == self.files.coarse.blocks and not is_reweighted(spec.loss)
-        tissue, solution = self._iterate(problem, options, exact_samples, before if is_same else None)
+        tissue, solution = self._iterate(problem, options, exact_samples, previous if is_same else None)
         for again in range(1, REWEIGHTINGS + 1) if is_reweighted(spec.loss) else ():
             self._reweight(f"exact.{again}", tissue)
             problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
@@ -162,25 +168,25 @@ class ChannelSchedule(Stages[Tissue]):
             tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
         return problem, tissue, solution
 
-    def _neighbourhood(self, domain: Domain, options: Options) -> tuple[Tissue, int]:
+    def _fit_similar_media(self, domain: Domain, options: Options) -> tuple[Tissue, int]:
         # Run the stages in similar media; returns the tissue and the last number of paths per pixel.
         tissue = self.start()
         if self.has_dentin:
-            tissue = self._best_start(tissue, self.short(START_STEPS))
+            tissue = self._best_start(tissue, self.preparatory_options(START_STEPS))
         stage = "layered" if self.has_dentin else "homogeneous"
         tissue, solution = self._solve(
             stage, domain, tissue.with_values(self.spec.held), options, 2 * self.spec.samples_per_pixel, SIMILAR_G
         )
         return tissue, solution.samples
 
-    def _given(self) -> Tissue:
+    def _held_tissue(self) -> Tissue:
         # Media that are held in whole, so that only the dentin's shape is fitted.
         return self._uniform(Medium(1.0, 0.5, g1=HELD_G)).with_values(self.spec.held)
 
     def _uniform(self, medium: Medium) -> Tissue:
         return Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
 
-    def _paper_stages(self) -> Fitted:
+    def _adam_stages(self) -> Fitted:
         # Fit as in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
         tissue = self._homogeneous_start()
         if self.has_dentin:
@@ -189,9 +195,12 @@ class ChannelSchedule(Stages[Tissue]):
             )
         tissue = (self._with_lobes(tissue) if self.spec.lobes == 2 else tissue).with_values(self.spec.held)
         domain = self._with_shape(self._domain(ALL_LEAVES if self.spec.lobes == 2 else ("sigma", "alpha")))
-        self.at_full_resolution()
+        self.switch_to_full_resolution()
         return self._descend(
-            "layered" if self.has_dentin else "homogeneous", domain, tissue, self.fewer(self.spec.samples_per_pixel)
+            "layered" if self.has_dentin else "homogeneous",
+            domain,
+            tissue,
+            self.full_image_samples(self.spec.samples_per_pixel),
         )
 
     def _descend(self, stage: str, domain: Domain, tissue: Tissue, samples: int) -> Fitted:
@@ -199,43 +208,46 @@ class ChannelSchedule(Stages[Tissue]):
         self._reweight(stage, tissue)
         problem = StackProblem(self.passes, domain, tissue, stage)
         solver = adam.Adam(domain, adam.Options(self.spec.adam_rate, max_steps=self.spec.adam_steps))
-        return problem, *self._run(solver, adam, problem, solver.init(domain.x_of(tissue), samples), ADAM_BURST)
+        return problem, *self._run(
+            solver, adam, problem, solver.init(domain.x_of(tissue), samples), ADAM_STEPS_PER_ENTRY
+        )
 
     def _reweight(self, stage: str, tissue: Tissue) -> None:
         # Compute new weights, which all later stages use, where the loss depends on the residuals.
         if is_reweighted(self.spec.loss):
-            self.pause()
-            samples = self.fewer(self.spec.max_samples_per_pixel)
+            self.raise_if_cancelled()
+            samples = self.full_image_samples(self.spec.max_samples_per_pixel)
             self.passes = reweighted(self.passes, self.journal, self.spec.loss, tissue, samples=samples, stage=stage)
 
-    def _stained(
+    def _fit_stains(
         self, layout: StainLayout, problem: StackProblem[Tissue], tissue: Tissue, solution: Solution
     ) -> Fitted:
         # Fit the texture and the media alternately; return the plain fit where a texture gains nothing.
         options = self.options(self.files.full)
         samples = min(
-            max(self.fewer(STAIN_SAMPLES * self.spec.samples_per_pixel), solution.samples), options.max_samples
+            max(self.full_image_samples(STAIN_SAMPLES * self.spec.samples_per_pixel), solution.samples),
+            options.max_samples,
         )
         last = problem, tissue, solution
 
-        def refit(stained: Tissue, turn: int, is_last: bool) -> Tissue:
+        def refit(stained: Tissue, number: int, is_last: bool) -> Tissue:
             nonlocal last
             if self.spec.solver == "adam":
                 last = self._descend(
-                    f"stained.{turn}", problem.domain, stained, self.fewer(self.spec.samples_per_pixel)
+                    f"stained.{number}", problem.domain, stained, self.full_image_samples(self.spec.samples_per_pixel)
                 )
                 return last[1]
             limits = options if is_last else replace(options, max_steps=min(HOMOGENEOUS_STEPS, options.max_steps))
-            problem_now = replace(problem, base=stained, stage=f"stained.{turn}")
+            problem_now = replace(problem, base=stained, stage=f"stained.{number}")
             last = problem_now, *self._iterate(problem_now, limits, samples)
             return last[1]
 
-        def tell(stage: str, step: int, stained: Tissue, verdict: str) -> None:
+        def report(stage: str, step: int, stained: Tissue, verdict: str) -> None:
             self.steps += 1
-            if not self.is_told:
-                self._announce(stage, step, stained, samples, verdict)
+            if not self.is_reported:
+                self._evaluate_and_report(stage, step, stained, samples, verdict)
 
-        stage = StainStage(self.passes, self.journal, layout, samples, self.pause, tell)
+        stage = StainStage(self.passes, self.journal, layout, samples, self.raise_if_cancelled, report)
         return last if stage.run(tissue, refit) is not None else (problem, tissue, solution)
 
     def _domain(self, leaves: tuple[str, ...]) -> Domain:
@@ -289,8 +301,8 @@ class ChannelSchedule(Stages[Tissue]):
                 found.append(table_search.search_node(node, pairs, edges, observed, albedos))
             return [asdict(candidate) for candidate in table_search.best(found)]
 
-        self.pause()
-        best, _ = self.journal.once(f"{self.scope}/search", compute)
+        self.raise_if_cancelled()
+        best, _ = self.journal.get_or_compute(f"{self.scope}/search", compute)
         return table_search.Candidate(**best[0])
 
     def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
@@ -315,8 +327,8 @@ class ChannelSchedule(Stages[Tissue]):
                 best = k if change.change < 0 else best
             return best
 
-        self.pause()
-        best, _ = self.journal.once(f"{self.scope}/starts", compute)
+        self.raise_if_cancelled()
+        best, _ = self.journal.get_or_compute(f"{self.scope}/starts", compute)
         return ends[int(best)]
 
     def _with_lobes(self, tissue: Tissue) -> Tissue:

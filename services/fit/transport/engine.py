@@ -78,7 +78,7 @@ class Engine:
         kind = LightMaps if self._geometry.single else MouthMaps
         maps = kind(recipe.light_positions_mm, recipe.light_intensities, recipe.vertices_mm())
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
-        self._some_lights: dict[tuple[int, ...], PointLights] = {}
+        self._lights_by_selection: dict[tuple[int, ...], PointLights] = {}
         self._shape_gradients: dict[int, ShapeGradients] = {}
         self._radius_mm = reach_mm
         refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
@@ -120,7 +120,7 @@ class Engine:
         from services.fit.transport.paths.scores import Plan
 
         def summarise(tables: Sums) -> StackEstimate:
-            mean, variance = self._among_all(view, *_mean_and_variance(tables[0]))
+            mean, variance = self._expand_to_all_lights(view, *_mean_and_variance(tables[0]))
             return StackEstimate(mean, variance)
 
         effort = Effort(samples, rel_error, max_seconds, max_samples, batches)
@@ -168,8 +168,8 @@ class Engine:
         place = {name: k for k, name in enumerate(media + shapes, 1)}
 
         def summarise(tables: Sums) -> JacobianEstimate:
-            mean, variance = self._among_all(view, *_mean_and_variance(tables[0]))
-            pairs = [self._among_all(view, *_mean_and_variance(tables[place[name]])) for name in names]
+            mean, variance = self._expand_to_all_lights(view, *_mean_and_variance(tables[0]))
+            pairs = [self._expand_to_all_lights(view, *_mean_and_variance(tables[place[name]])) for name in names]
             slopes, slope_variances = (
                 np.stack([pair[k] for pair in pairs]) if pairs else np.zeros((0, *mean.shape)) for k in range(2)
             )
@@ -268,7 +268,7 @@ class Engine:
         plan, bins = Plan(order_edges=tuple(int(edge) for edge in bin_edges)), len(bin_edges) - 1
         batches, count = Effort(samples=samples, batches=batches).shares(samples)
         (sums,) = self._trace(white, view, plan, range(count), seed, batches)
-        (orders,) = self._among_all(view, (sums / count).mean(axis=0).reshape(len(view), -1, bins).T)
+        (orders,) = self._expand_to_all_lights(view, (sums / count).mean(axis=0).reshape(len(view), -1, bins).T)
         return orders
 
     def stain_gradient(
@@ -301,10 +301,10 @@ class Engine:
         textures = self._geometry.textures
         if textures is None:
             raise InputError("The scene has no stains to differentiate; give a tooth's tissue a stain.")
-        seen = cotangent if view.lights is None else cotangent[list(view.lights)]
-        largest = float(np.abs(seen).max())
+        listed_cotangent = cotangent if view.lights is None else cotangent[list(view.lights)]
+        largest = float(np.abs(listed_cotangent).max())
         batches, count = Effort(samples=samples, batches=batches).shares(samples)
-        tally = StainTally(textures, seen / (largest or 1.0), batches)
+        tally = StainTally(textures, listed_cotangent / (largest or 1.0), batches)
         start = CameraStart(view, batches, seed, self._radius_mm)
         sums, _ = self._walk(media, lights, start, Plan(stains=True)).run(count, tally).arrays()
         require_finite_gradient("the stains", view, sums)
@@ -313,7 +313,7 @@ class Engine:
             means.mean(axis=0),
             means.var(axis=0, ddof=1) / batches if batches > 1 else np.full(textures.count, np.nan),
         )
-        return StainGradient(textures.cut(gradient), textures.cut(variance), batches * count)
+        return StainGradient(textures.split_by_tooth(gradient), textures.split_by_tooth(variance), batches * count)
 
     def _prepare(self, tissue: Tissue | Mouth, view: View) -> tuple[Media, PointLights]:
         """Check a request, update shapes and stains of the scene, and return the media and lights of its kernel."""
@@ -325,7 +325,7 @@ class Engine:
         reshaped = self._geometry.reshape(tuple(tuple(tooth.shape) for tooth in mouth.teeth))
         if self._geometry.restain(tuple(tooth.stain for tooth in mouth.teeth)) or reshaped:
             self._lights.maps.trace(self._geometry, self._ior)
-            self._some_lights.clear()
+            self._lights_by_selection.clear()
         return Media(media), self._lights_of(view)
 
     def _trace(self, tissue: Tissue | Mouth, view: View, plan: Plan, numbers: range, seed: int, batches: int) -> Sums:
@@ -349,7 +349,7 @@ class Engine:
         require_finite(whole, view)
         return whole
 
-    def _among_all(self, view: View, *arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    def _expand_to_all_lights(self, view: View, *arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Arrays (..., lights of the view, N) extended to all lights, with zeros for lights that were not sampled."""
         if view.lights is None:
             return arrays
@@ -371,14 +371,14 @@ class Engine:
 
         if view.lights is None:
             return self._lights
-        if view.lights not in self._some_lights:
+        if view.lights not in self._lights_by_selection:
             chosen = list(view.lights)
-            self._some_lights[view.lights] = PointLights(
+            self._lights_by_selection[view.lights] = PointLights(
                 self.recipe.light_positions_mm[chosen],
                 self.recipe.light_intensities[chosen],
-                self._lights.maps.of(chosen),
+                self._lights.maps.subset(chosen),
             )
-        return self._some_lights[view.lights]
+        return self._lights_by_selection[view.lights]
 
 
 def _mean_and_variance(batches: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

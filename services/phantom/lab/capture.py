@@ -38,7 +38,7 @@ BLACKS, FLATS = 4, 2
 
 
 @dataclass(frozen=True)
-class Shown:
+class PinholeImages:
     """One camera's images as an ideal pinhole would see them, and their distortion by its lens."""
 
     camera: CalibratedCamera
@@ -51,8 +51,8 @@ class Shown:
 
         width, height = self.camera.size
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        places = Lens(self.camera).undistorted(np.stack([x.ravel(), y.ravel()], axis=1)) - moved_px - 0.5
-        maps = places.reshape(height, width, 2).astype(np.float32)
+        positions = Lens(self.camera).undistorted(np.stack([x.ravel(), y.ravel()], axis=1)) - moved_px - 0.5
+        maps = positions.reshape(height, width, 2).astype(np.float32)
         return np.asarray(
             cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         )
@@ -65,7 +65,13 @@ def sway_mm(time_s: float) -> Floats:
 
 
 def write_capture(
-    root: Path, rig: Calibration, sensor: Sensor, mouth: LabMouth, shown: list[Shown], calibration: str, seed: int
+    root: Path,
+    rig: Calibration,
+    sensor: Sensor,
+    mouth: LabMouth,
+    pinhole_images: list[PinholeImages],
+    calibration: str,
+    seed: int,
 ) -> None:
     """Write a raw folder of the mouth: its frames, its scan and the operator's clicks.
 
@@ -74,35 +80,42 @@ def write_capture(
         rig: the true rig.
         sensor: sensor of all cameras.
         mouth: the mouth that is photographed.
-        shown: images of each camera.
+        pinhole_images: images of each camera.
         calibration: path of the calibration that ``raw.toml`` names.
         seed: seed of noise and clicks.
     """
     random = np.random.default_rng([seed, 0xCA9])
     writer = RawWriter(root, rig, sensor, random)
     lights = [light.name for light in rig.lights]
-    for number, one in enumerate(shown):
+    for number, one in enumerate(pinhole_images):
         writer.black(number, (*EXPOSURES_S, TRACKING_S), BLACKS)
         for flat in range(FLATS):
-            even = np.full(one.images.shape[1:], 0.6 / (np.pi * 1e6))
-            writer.shoot(number, f"flat{flat}", even, EXPOSURES_S[0], kind="flat")
+            uniform = np.full(one.images.shape[1:], 0.6 / (np.pi * 1e6))
+            writer.shoot(number, f"flat{flat}", uniform, EXPOSURES_S[0], kind="flat")
         time_s = 0.0
 
         def take(
-            name: str, image: Floats, exposure_s: float, number: int = number, one: Shown = one, **told: object
+            name: str,
+            image: Floats,
+            exposure_s: float,
+            number: int = number,
+            one: PinholeImages = one,
+            **frame_keys: object,
         ) -> None:
             nonlocal time_s
-            moved_px = _seen_move(one.camera, sway_mm(time_s))
-            writer.shoot(number, name, one.through_lens(image, moved_px), exposure_s, time_s=round(time_s, 6), **told)
+            moved_px = _image_displacement(one.camera, sway_mm(time_s))
+            writer.shoot(
+                number, name, one.through_lens(image, moved_px), exposure_s, time_s=round(time_s, 6), **frame_keys
+            )
             time_s += FRAME_S
 
-        together = one.images.sum(axis=0)
+        all_lights = one.images.sum(axis=0)
         for j, light in enumerate(lights):
             if j % TRACKING_EVERY == 0:
-                take(f"all{j}", together, TRACKING_S, kind="tracking")
+                take(f"all{j}", all_lights, TRACKING_S, kind="tracking")
             for exposure_s in EXPOSURES_S:
                 take(f"{light}_{exposure_s:g}", one.images[j], exposure_s, kind="light", light=light)
-        take(f"all{len(lights)}", together, TRACKING_S, kind="tracking")
+        take(f"all{len(lights)}", all_lights, TRACKING_S, kind="tracking")
     write_scan(root / "scan.ply", mouth)
     writer.finish(
         {
@@ -113,7 +126,7 @@ def write_capture(
     )
 
 
-def _seen_move(camera: CalibratedCamera, moved_mm: Floats) -> Floats:
+def _image_displacement(camera: CalibratedCamera, moved_mm: Floats) -> Floats:
     """Displacement (2,) in pixels of the middle of the teeth in the pinhole image.
 
     At half a metre all teeth move by about the same.
@@ -123,12 +136,15 @@ def _seen_move(camera: CalibratedCamera, moved_mm: Floats) -> Floats:
 
 
 def _clicks(rig: Calibration, mouth: LabMouth, random: np.random.Generator) -> list[dict[str, object]]:
-    turn, shift = mouth.world_from_scan[:3, :3], mouth.world_from_scan[:3, 3]
+    rotation, shift = mouth.world_from_scan[:3, :3], mouth.world_from_scan[:3, 3]
     found: list[dict[str, object]] = []
     for (tooth, point), scan_mm in landmarks_mm(mouth).items():
-        world = (turn @ scan_mm + shift)[None]
+        world = (rotation @ scan_mm + shift)[None]
         pixels = [
-            {"camera": one.name, "xy_px": (Lens(one).seen(world)[0] + random.normal(0, CLICK_PX, 2)).round(2).tolist()}
+            {
+                "camera": one.name,
+                "xy_px": (Lens(one).project(world)[0] + random.normal(0, CLICK_PX, 2)).round(2).tolist(),
+            }
             for one in rig.cameras
         ]
         found.append({"tooth": tooth, "point": point, "xyz_mm": scan_mm.round(4).tolist(), "pixels": pixels})

@@ -27,7 +27,7 @@ class RawWriter:
         self.root, self.rig, self.sensor, self._random = root, rig, sensor, random
         self._frames: list[Entry] = []
 
-    def shoot(self, camera: int, name: str, radiance: Floats, exposure_s: float, **told: Any) -> None:
+    def shoot(self, camera: int, name: str, radiance: Floats, exposure_s: float, **frame_keys: Any) -> None:
         """Photograph an image (H, W, 3) and write it as NAME.npy.
 
         Args:
@@ -35,27 +35,27 @@ class RawWriter:
             name: name of the file, after that of the camera.
             radiance: image on the sensor, behind the lens.
             exposure_s: exposure time of the frame, seconds.
-            told: further keys of the frame in ``raw.toml``.
+            frame_keys: further keys of the frame in ``raw.toml``.
         """
-        taken = self.rig.cameras[camera]
-        file = f"{taken.name}_{name}.npy"
-        np.save(self.root / file, self.sensor.photograph(taken, radiance, exposure_s, self._random))
-        self._frames.append({"camera": taken.name, "file": file, "exposure_s": exposure_s, **told})
+        calibrated = self.rig.cameras[camera]
+        file = f"{calibrated.name}_{name}.npy"
+        np.save(self.root / file, self.sensor.photograph(calibrated, radiance, exposure_s, self._random))
+        self._frames.append({"camera": calibrated.name, "file": file, "exposure_s": exposure_s, **frame_keys})
 
     def black(self, camera: int, exposures_s: Sequence[float], count: int) -> None:
         """Take ``count`` black frames with each exposure time."""
         width, height = self.rig.cameras[camera].size
         for exposure_s in exposures_s:
             for number in range(count):
-                nothing = np.zeros((height, width, 3))
-                self.shoot(camera, f"black{number}_{exposure_s:g}", nothing, exposure_s, kind="black")
+                dark = np.zeros((height, width, 3))
+                self.shoot(camera, f"black{number}_{exposure_s:g}", dark, exposure_s, kind="black")
 
-    def finish(self, others: Mapping[str, Any]) -> None:
+    def finish(self, tables: Mapping[str, Any]) -> None:
         """Write ``raw.toml`` with cameras, lights, frames and other tables."""
         cameras = [
             {"name": one.name, "size": list(one.size), "bits": self.sensor.bits, "mosaic": self.sensor.mosaic}
             for one in self.rig.cameras
         ]
         lights = [{"name": one.name} for one in self.rig.lights]
-        tree = {"units": "mm", "camera": cameras, "light": lights, "frame": self._frames, **others}
+        tree = {"units": "mm", "camera": cameras, "light": lights, "frame": self._frames, **tables}
         write_atomic(self.root / DESCRIPTION, description_toml(tree))

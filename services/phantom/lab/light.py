@@ -45,8 +45,8 @@ class MouthLight:
         tooth = mouth.fitted
         assert tooth.dentin is not None
         # Use one scene of unit intensities for all channels, because images are linear in each light's intensity.
-        places, unit = np.array([light.position_mm for light in lights]), np.ones(len(lights))
-        self._engine = Engine(single_tooth(tooth.outer, DentinShape.known(tooth.dentin), places, unit))
+        positions_mm, unit = np.array([light.position_mm for light in lights]), np.ones(len(lights))
+        self._engine = Engine(single_tooth(tooth.outer, DentinShape.known(tooth.dentin), positions_mm, unit))
 
     def images(self, camera: CalibratedCamera, samples: int, seed: int) -> Floats:
         """Radiance (L, H, W, 3) under each light, averaged over the pixels.
@@ -56,8 +56,8 @@ class MouthLight:
             samples: paths per pixel of the fitted tooth in green; red and blue get a quarter of them.
             seed: seed of the paths.
         """
-        drawn, shaded, visible, met = self._around(camera)
-        share = np.where(met > 0, visible / np.maximum(met, 1), 0.0)
+        drawn, shaded, visible, unoccluded = self._shade_locally(camera)
+        share = np.where(unoccluded > 0, visible / np.maximum(unoccluded, 1), 0.0)
         for channel, name in enumerate(CHANNELS):
             paths = samples if name == "green" else max(samples // 4, 1)
             own = render_engine(self._engine, self._tissues[name], camera, visible > 0, paths, seed)[0]
@@ -65,12 +65,12 @@ class MouthLight:
             own = _smoothed(own * intensity[:, None, None], visible > 0, share)
             # Scale the shaded neighbours so that the tooth, shaded like them, has its rendered mean brightness.
             whole = visible == len(SUBPIXELS)
-            like = own[:, whole].sum() / max(float(shaded[:, whole, channel].sum()), 1e-30)
+            scale = own[:, whole].sum() / max(float(shaded[:, whole, channel].sum()), 1e-30)
             teeth, others = drawn[0][..., channel], drawn[1][..., channel]
-            drawn[1][..., channel] = own + like * teeth + others
+            drawn[1][..., channel] = own + scale * teeth + others
         return drawn[1]
 
-    def _around(
+    def _shade_locally(
         self, camera: CalibratedCamera
     ) -> tuple[tuple[Floats, Floats], Floats, NDArray[np.int64], NDArray[np.int64]]:
         """Shade everything by local illumination, without the engine.
@@ -82,12 +82,12 @@ class MouthLight:
         """
         width, height = camera.size
         neighbours, others, fitted = (np.zeros((len(self._lights), height * width, 3)) for _ in range(3))
-        visible, met = (np.zeros(height * width, dtype=np.int64) for _ in range(2))
+        visible, unoccluded = (np.zeros(height * width, dtype=np.int64) for _ in range(2))
         last_tooth = len(self._colours) - 4
         for offset in SUBPIXELS:
             origin, directions = pixel_rays(camera, offset)
             hits = self._all.first_hits(origin, directions)
-            met += self._alone.first_hits(origin, directions).hit
+            unoccluded += self._alone.first_hits(origin, directions).hit
             visible += hits.mesh == 0
             for n, light in enumerate(self._lights):
                 towards = np.array(light.position_mm) - hits.points_mm
@@ -96,18 +96,18 @@ class MouthLight:
                 cosine = ((hits.normals * towards).sum(axis=1) / distance + wrap) / (1 + wrap)
                 lit = np.where(hits.hit, np.maximum(cosine, 0), 0.2) / (np.pi * distance**2) / len(SUBPIXELS)
                 light_out = lit[:, None] * self._colours[hits.mesh] * np.array(light.intensity)
-                for target, where in (
+                for target, is_shown in (
                     (fitted, hits.mesh == 0),
                     (neighbours, (hits.mesh > 0) & (hits.mesh <= last_tooth)),
                     (others, (hits.mesh < 0) | (hits.mesh > last_tooth)),
                 ):
-                    target[n] += np.where(where[:, None], light_out, 0.0)
+                    target[n] += np.where(is_shown[:, None], light_out, 0.0)
         shape = (len(self._lights), height, width, 3)
-        seen = visible.reshape(height, width), met.reshape(height, width)
-        return (neighbours.reshape(shape), others.reshape(shape)), fitted.reshape(shape), *seen
+        counts = visible.reshape(height, width), unoccluded.reshape(height, width)
+        return (neighbours.reshape(shape), others.reshape(shape)), fitted.reshape(shape), *counts
 
 
-def _smoothed(images: Floats, seen: NDArray[np.bool_], share: Floats) -> Floats:
+def _smoothed(images: Floats, visible: NDArray[np.bool_], share: Floats) -> Floats:
     """Smooth the noise in images (L, H, W) of a tooth, and scale each pixel by the share (H, W) that shows the tooth.
 
     With a few hundred paths some pixels come out several times too bright. A sensor would clip them, which real light
@@ -115,6 +115,6 @@ def _smoothed(images: Floats, seen: NDArray[np.bool_], share: Floats) -> Floats:
     """
     import cv2
 
-    weight = cv2.GaussianBlur(seen.astype(np.float64), (0, 0), SMOOTHING_PX)
-    smooth = [cv2.GaussianBlur(image * seen, (0, 0), SMOOTHING_PX) for image in images]
-    return np.where(seen, np.stack(smooth) / np.maximum(weight, 1e-12), 0.0) * share
+    weight = cv2.GaussianBlur(visible.astype(np.float64), (0, 0), SMOOTHING_PX)
+    smooth = [cv2.GaussianBlur(image * visible, (0, 0), SMOOTHING_PX) for image in images]
+    return np.where(visible, np.stack(smooth) / np.maximum(weight, 1e-12), 0.0) * share

@@ -17,7 +17,7 @@ from services.core.files.meshes import write_mesh
 from services.core.geometry import Matrix4, Record, teeth_folder
 from services.core.store import read_record, write_record
 from services.phantom.files import medium_truth
-from services.phantom.lab.capture import Shown, write_capture
+from services.phantom.lab.capture import PinholeImages, write_capture
 from services.phantom.lab.light import MouthLight
 from services.phantom.lab.mouth import FITTED, true_mouth
 from services.phantom.lab.rig import CHANNELS, RigSize, true_rig
@@ -65,7 +65,7 @@ class LabRecord(Record):
     """True media by channel, then by enamel and dentin."""
 
 
-def make_lab(root: Path, size: LabSize, subject: int, seed: int, tell: Callable[[str], None]) -> bool:
+def make_lab(root: Path, size: LabSize, subject: int, seed: int, report: Callable[[str], None]) -> bool:
     """Make a laboratory, unless the folder contains it already, and return whether it was made.
 
     Args:
@@ -73,11 +73,11 @@ def make_lab(root: Path, size: LabSize, subject: int, seed: int, tell: Callable[
         size: size of the laboratory.
         subject: seed of the subject's teeth and optics.
         seed: seed of all other random numbers.
-        tell: called with the name of each step as it begins.
+        report: called with the name of each step as it begins.
     """
     recipe = repr((size, subject, seed))
-    kept = root / TRUTH / LAB_RECORD
-    if kept.is_file() and read_record(kept, LabRecord).recipe == recipe:
+    record_path = root / TRUTH / LAB_RECORD
+    if record_path.is_file() and read_record(record_path, LabRecord).recipe == recipe:
         return False
     for part in (SESSION, MOUTH, TRUTH):
         shutil.rmtree(root / part, ignore_errors=True)
@@ -87,16 +87,16 @@ def make_lab(root: Path, size: LabSize, subject: int, seed: int, tell: Callable[
         true_mouth(subject, seed),
         subject_tissues(subject, CHANNELS),
     )
-    tell("calibration session: boards, spheres, flat field and chart")
+    report("calibration session: boards, spheres, flat field and chart")
     numbers = {"n_boards": size.boards, "n_mirror": size.mirror, "n_white": size.white}
     first_board = write_session(root / SESSION, rig, sensor, seed, **numbers)
     light = MouthLight(mouth, rig.lights, tissues)
-    shown = []
+    pinhole_images = []
     for number, camera in enumerate(rig.cameras):
-        tell(f"mouth: camera {camera.name} is rendered under {len(rig.lights)} lights")
-        shown.append(Shown(camera, light.images(camera, size.samples, seed + 7919 * number)))
-    tell("mouth: the capture's frames")
-    write_capture(root / MOUTH, rig, sensor, mouth, shown, f"../{CALIBRATION}/{CALIBRATION_FILE}", seed)
+        report(f"mouth: camera {camera.name} is rendered under {len(rig.lights)} lights")
+        pinhole_images.append(PinholeImages(camera, light.images(camera, size.samples, seed + 7919 * number)))
+    report("mouth: the capture's frames")
+    write_capture(root / MOUTH, rig, sensor, mouth, pinhole_images, f"../{CALIBRATION}/{CALIBRATION_FILE}", seed)
     _write_truth(root / TRUTH, rig)
     tooth = mouth.fitted
     for name, mesh in (("outer.ply", tooth.outer), ("dentin.ply", tooth.dentin)):
@@ -114,7 +114,7 @@ def make_lab(root: Path, size: LabSize, subject: int, seed: int, tell: Callable[
             "media": media,
         }
     )
-    write_record(kept, record)
+    write_record(record_path, record)
     return True
 
 

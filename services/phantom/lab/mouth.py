@@ -18,13 +18,13 @@ from services.phantom.lab.scan import scan_of, write_labelled_ply
 from services.phantom.lips import lips_and_retractor
 
 Floats = NDArray[np.float64]
-PLACES = 3
+TEETH_A_SIDE = 3
 """Number of teeth on each side of the midline."""
 FITTED = 11
 """FDI number of the tooth whose optics are measured."""
 SCAN_NOISE_MM = 0.02
 """Standard deviation of each coordinate of the scan, mm."""
-SCAN_TURN_RAD, SCAN_SHIFT_MM = 1.0, 30.0
+SCAN_ROTATION_RAD, SCAN_SHIFT_MM = 1.0, 30.0
 """Half widths of the uniform draws of rotation vector and translation between the scan's frame and the mouth's."""
 
 
@@ -58,7 +58,7 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
     from scipy.spatial.transform import Rotation
 
     jaw = build_jaw(subject)
-    own = [tooth for tooth in jaw.teeth if tooth.fdi % 10 <= PLACES]
+    own = [tooth for tooth in jaw.teeth if tooth.fdi % 10 <= TEETH_A_SIDE]
     crowns = np.concatenate([tooth.outer.vertices_mm for tooth in own])
     shift = -(crowns.min(axis=0) + crowns.max(axis=0)) / 2
     shift[1] = -np.quantile(crowns[:, 1], 0.9)
@@ -68,12 +68,12 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
     fitted = Tooth(FITTED, _moved(rooted.outer, shift), _moved(rooted.dentin, shift))
 
     random = np.random.default_rng([seed, 0x5CA])
-    scan = scan_of(jaw, SCAN_NOISE_MM, seed, PLACES)
-    turn = Rotation.from_rotvec(random.uniform(-SCAN_TURN_RAD, SCAN_TURN_RAD, 3)).as_matrix()
-    away = random.uniform(-SCAN_SHIFT_MM, SCAN_SHIFT_MM, 3)
-    vertices = (scan.mesh.vertices_mm + shift) @ turn.T + away
+    scan = scan_of(jaw, SCAN_NOISE_MM, seed, TEETH_A_SIDE)
+    rotation = Rotation.from_rotvec(random.uniform(-SCAN_ROTATION_RAD, SCAN_ROTATION_RAD, 3)).as_matrix()
+    translation = random.uniform(-SCAN_SHIFT_MM, SCAN_SHIFT_MM, 3)
+    vertices = (scan.mesh.vertices_mm + shift) @ rotation.T + translation
     world_from_scan = np.eye(4)
-    world_from_scan[:3, :3], world_from_scan[:3, 3] = turn.T, -turn.T @ away
+    world_from_scan[:3, :3], world_from_scan[:3, 3] = rotation.T, -rotation.T @ translation
     return LabMouth(
         teeth,
         fitted,

@@ -19,10 +19,10 @@ CAMERA_MM = 500.0
 LENS = (-0.35, 0.3, 0.001, -0.0006)
 """Radial and tangential distortion in OpenCV's order: one or two pixels in the corners of an image of half a
 megapixel."""
-OFF_CAMERA_MM, OFF_CAMERA_DEG, OFF_FOCAL, OFF_CENTRE_PX = 4.0, 0.5, 0.02, 6.0
+CAMERA_SD_MM, CAMERA_SD_DEG, FOCAL_SD, CENTRE_SD_PX = 4.0, 0.5, 0.02, 6.0
 """Standard deviations of a mounted camera from the plan: position (each coordinate), direction (each axis), focal
 length (relative) and principal point (each coordinate)."""
-OFF_LIGHT_MM, LIGHT_SPREAD = 8.0, 0.2
+LIGHT_SD_MM, LIGHT_SPREAD = 8.0, 0.2
 """Standard deviation of each coordinate of a light's position, and relative half width of the uniform draw of its
 brightness."""
 WHITE_COUNTS_PER_S = 1.3e5
@@ -30,7 +30,7 @@ WHITE_COUNTS_PER_S = 1.3e5
 counts in a fiftieth of a second."""
 RESPONSE = (0.8, 1.0, 0.7)
 """Relative response of a sensor in red, green and blue."""
-OFF_RESPONSE = 0.05
+RESPONSE_SD = 0.05
 """Relative standard deviation of the response between cameras and channels."""
 
 
@@ -61,14 +61,14 @@ def true_rig(size: RigSize, sensor_black: float, seed: int) -> Calibration:
     random = np.random.default_rng([seed, 0x716])
     planned = dome_cameras(size.cameras, 1.0, (Mesh(np.zeros((1, 3)), np.zeros((0, 3), dtype=np.int32)),))
     cameras = [_camera(one.name, np.array(one.camera_from_world), size, sensor_black, random) for one in planned]
-    places = np.array([one.position_mm for one in dome_lights(size.lights, CHANNELS, seed)])
-    places += random.normal(0, OFF_LIGHT_MM, places.shape)
+    positions_mm = np.array([one.position_mm for one in dome_lights(size.lights, CHANNELS, seed)])
+    positions_mm += random.normal(0, LIGHT_SD_MM, positions_mm.shape)
     intensity = 1 + LIGHT_SPREAD * random.uniform(-1, 1, (size.lights, 1)) + 0.03 * random.normal(size=(size.lights, 3))
     # Apply the gauge of all calibrations: the mean of the lights' intensities is 1 in every channel.
     intensity /= intensity.mean(axis=0)
     lights = [
-        CalibratedLight(name=f"L{n}", position_mm=tuple(place), intensity=tuple(own))
-        for n, (place, own) in enumerate(zip(places.tolist(), intensity.tolist(), strict=True))
+        CalibratedLight(name=f"L{n}", position_mm=tuple(position), intensity=tuple(own))
+        for n, (position, own) in enumerate(zip(positions_mm.tolist(), intensity.tolist(), strict=True))
     ]
     return Calibration(units="mm", channels=CHANNELS, cameras=tuple(cameras), lights=tuple(lights))
 
@@ -94,17 +94,17 @@ def _rows(matrix: Floats) -> tuple[tuple[float, ...], ...]:
 def _camera(name: str, planned: Floats, size: RigSize, black: float, random: np.random.Generator) -> CalibratedCamera:
     from scipy.spatial.transform import Rotation
 
-    turn = Rotation.from_rotvec(np.radians(random.normal(0, OFF_CAMERA_DEG, 3))).as_matrix()
-    rotation = turn @ planned[:3, :3]
+    rotation_error = Rotation.from_rotvec(np.radians(random.normal(0, CAMERA_SD_DEG, 3))).as_matrix()
+    rotation = rotation_error @ planned[:3, :3]
     centre = -planned[:3, :3].T @ planned[:3, 3]
-    centre = CAMERA_MM * centre / np.linalg.norm(centre) + random.normal(0, OFF_CAMERA_MM, 3)
+    centre = CAMERA_MM * centre / np.linalg.norm(centre) + random.normal(0, CAMERA_SD_MM, 3)
     # Aim the camera at the teeth, as a person who mounts it would do.
     rotation = _aimed(rotation, -centre)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
-    focal = CAMERA_MM / size.pixel_mm * (1 + OFF_FOCAL * random.normal())
-    middle = np.array(size.pixels) / 2 + random.normal(0, OFF_CENTRE_PX, 2)
-    response = WHITE_COUNTS_PER_S * np.array(RESPONSE) * (1 + OFF_RESPONSE * random.normal(size=3))
+    focal = CAMERA_MM / size.pixel_mm * (1 + FOCAL_SD * random.normal())
+    middle = np.array(size.pixels) / 2 + random.normal(0, CENTRE_SD_PX, 2)
+    response = WHITE_COUNTS_PER_S * np.array(RESPONSE) * (1 + RESPONSE_SD * random.normal(size=3))
     return CalibratedCamera.model_validate(
         {
             "name": name,
@@ -139,19 +139,21 @@ class Lens:
 
         K = np.array(self.camera.K)
         K[:2, 2] -= 0.5  # because OpenCV's pixel centres are whole numbers
-        until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-9)
         points = (np.asarray(pixels, dtype=np.float64) - 0.5).reshape(-1, 1, 2)
-        found = cv2.undistortPoints(points, K, np.array(self.camera.distortion), R=np.eye(3), P=K, criteria=until)
+        found = cv2.undistortPoints(points, K, np.array(self.camera.distortion), R=np.eye(3), P=K, criteria=criteria)
         return np.asarray(found.reshape(-1, 2) + 0.5)
 
-    def seen(self, points_mm: Floats) -> Floats:
+    def project(self, points_mm: Floats) -> Floats:
         """Pixels (N, 2) of the photograph that show world points (N, 3)."""
         import cv2
 
         K, pose = np.array(self.camera.K), np.array(self.camera.camera_from_world)
         K[:2, 2] -= 0.5
-        turn = cv2.Rodrigues(pose[:3, :3])[0]
-        found = cv2.projectPoints(np.asarray(points_mm), turn, pose[:3, 3], K, np.array(self.camera.distortion))[0]
+        rotation_vector = cv2.Rodrigues(pose[:3, :3])[0]
+        found = cv2.projectPoints(
+            np.asarray(points_mm), rotation_vector, pose[:3, 3], K, np.array(self.camera.distortion)
+        )[0]
         return np.asarray(found.reshape(-1, 2) + 0.5)
 
     def rays(self) -> tuple[Floats, Floats]:

@@ -16,14 +16,14 @@ BELOW_CERVIX_MM = 4.0
 """Distance below the mean cervical line to which the scan shows the gums, mm."""
 
 
-def scan_of(jaw: Jaw, noise_mm: float = 0.02, seed: int = 0, places: int = 7) -> LabelledScan:
+def scan_of(jaw: Jaw, noise_mm: float = 0.02, seed: int = 0, teeth_a_side: int = 7) -> LabelledScan:
     """Scan a phantom jaw, in the jaw's frame.
 
     Args:
         jaw: the phantom.
         noise_mm: standard deviation of each coordinate.
         seed: seed of the noise.
-        places: number of teeth on each side of the midline that are scanned; the scan ends behind them.
+        teeth_a_side: number of teeth on each side of the midline that are scanned; the scan ends behind them.
     """
     surfaces = separate(tuple(Tooth(tooth.fdi, tooth.outer) for tooth in jaw.teeth), jaw.gums)
     cervix = float(
@@ -41,11 +41,11 @@ def scan_of(jaw: Jaw, noise_mm: float = 0.02, seed: int = 0, places: int = 7) ->
     faces = index.reshape(-1)[faces].astype(np.int32)
     kept = joined[faces][..., 2].min(axis=1) > cervix - BELOW_CERVIX_MM
     middles = {tooth.fdi: tooth.outer.vertices_mm.mean(axis=0) for tooth in jaw.teeth}
-    if places < 7:
+    if teeth_a_side < 7:
         # End the scan midway to the next tooth, and leave out all teeth behind.
-        behind = np.mean([middles[10 * quadrant + places + k][1] for quadrant in (1, 2) for k in (0, 1)])
+        behind = np.mean([middles[10 * quadrant + teeth_a_side + k][1] for quadrant in (1, 2) for k in (0, 1)])
         near = joined[faces].mean(axis=1)[:, 1] > behind
-        kept &= near & ((labels == 0) | (labels % 10 <= places))
+        kept &= near & ((labels == 0) | (labels % 10 <= teeth_a_side))
     joined = joined + np.random.default_rng(seed).normal(0, noise_mm, joined.shape)
     return LabelledScan(Mesh(joined, faces[kept]), labels[kept])
 

@@ -30,12 +30,14 @@ MIRROR_MM, WHITE_MM = 16.0, 14.0
 """Radii of the mirror sphere and of the white sphere, mm."""
 REFLECTANCE = (0.92, 0.91, 0.90)
 """Reflectance of the white sphere in red, green and blue."""
-PLACES = np.array(
+SPHERE_POSITIONS = np.array(
     [[-1.0, 0.4, -1.0], [1.0, -0.6, -0.9], [-0.9, -0.8, 1.0], [1.0, 0.6, 1.0], [0.0, 1.4, 0.1], [0.0, -1.4, -0.1]]
 )
-"""Places (N, 3) of the spheres' centres, in units of the distance from the middle at which all of a sphere is seen."""
+"""Positions (N, 3) of the spheres' centres, in units of the distance from the middle at which all of a sphere is
+seen."""
 MARGIN_MM, DEPTH_MM = 4.0, 10.0
-"""Margin around a sphere in the picture, and largest unit of ``PLACES`` along the cameras' line of sight, mm."""
+"""Margin around a sphere in the picture, and largest unit of ``SPHERE_POSITIONS`` along the cameras' line of sight,
+mm."""
 WALL, BODY, GLINT = 0.25, 0.02, 1.5
 """Radiance of the wall behind the mirror sphere, of the mirror's own surface and of its highlights, relative to a white
 diffuser."""
@@ -60,11 +62,11 @@ class Session:
         self._writer = writer
         self._lenses = [Lens(camera) for camera in writer.rig.cameras]
         self._rays = [lens.rays() for lens in self._lenses]
-        self.places = [self._place(random, is_first=number == 0) for number in range(n_places)]
-        self.centres_mm = PLACES * self._reach_mm()
+        self.poses = [self._board_pose(random, is_first=number == 0) for number in range(n_places)]
+        self.centres_mm = SPHERE_POSITIONS * self._largest_offset_mm()
         self._texture = _board_texture()
 
-    def _reach_mm(self) -> Floats:
+    def _largest_offset_mm(self) -> Floats:
         """Largest distances (3,) in mm of a sphere's centre from the middle, along x, y and z."""
         halves = [
             np.array(camera.size) / 2 * np.linalg.norm(np.array(camera.camera_from_world)[:3, 3]) / camera.K[0][0]
@@ -73,18 +75,18 @@ class Session:
         x, z = np.maximum(np.min(halves, axis=0) - MIRROR_MM - MARGIN_MM, 1.0)
         return np.array([x, min(x, DEPTH_MM), z])
 
-    def _place(self, random: np.random.Generator, *, is_first: bool) -> Floats:
+    def _board_pose(self, random: np.random.Generator, *, is_first: bool) -> Floats:
         """Random pose (4, 4) world_from_board; the plate faces the cameras, which look along the world's −y."""
         from scipy.spatial.transform import Rotation
 
         facing = Rotation.from_euler("x", 90, degrees=True)
         tilt = 0.1 if is_first else TILT_RAD
-        turn = (Rotation.from_rotvec(random.uniform(-tilt, tilt, 3)) * facing).as_matrix()
+        rotation = (Rotation.from_rotvec(random.uniform(-tilt, tilt, 3)) * facing).as_matrix()
         columns, rows = BOARD.squares
         middle = np.array([columns, rows, 0]) * BOARD.square_mm / 2
         pose = np.eye(4)
-        pose[:3, :3] = turn
-        pose[:3, 3] = random.uniform(-1, 1, 3) * np.array(SHIFT_MM) * (not is_first) - turn @ middle
+        pose[:3, :3] = rotation
+        pose[:3, 3] = random.uniform(-1, 1, 3) * np.array(SHIFT_MM) * (not is_first) - rotation @ middle
         return pose
 
     def board(self, camera: int, place: int) -> None:
@@ -92,13 +94,13 @@ class Session:
         import cv2
 
         centre, rays = self._rays[camera]
-        board_from_world = np.linalg.inv(self.places[place])
+        board_from_world = np.linalg.inv(self.poses[place])
         origin, towards = board_from_world[:3, :3] @ centre + board_from_world[:3, 3], rays @ board_from_world[:3, :3].T
         on_plate = origin[:2] - towards[:, :2] * (origin[2] / towards[:, 2:3])
         width, height = self._writer.rig.cameras[camera].size
         maps = (on_plate.reshape(height, width, 2) * TEXELS_PER_MM - 0.5).astype(np.float32)
-        seen = cv2.remap(self._texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=0.8)
-        light = WHITE_RADIANCE * (0.05 + 0.75 * seen.astype(np.float64))
+        texture = cv2.remap(self._texture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=0.8)
+        light = WHITE_RADIANCE * (0.05 + 0.75 * texture.astype(np.float64))
         image = np.repeat(light[..., None], 3, axis=2)
         self._writer.shoot(camera, f"board{place}", image, EXPOSURE_S, kind="board", board="plate", place=f"p{place}")
 
@@ -124,33 +126,33 @@ class Session:
             body = np.array(REFLECTANCE) / np.pi * np.array(lamp.intensity) * cosine / distance**2
         wall = WALL * WHITE_RADIANCE if kind == "mirror" else 0.02 * WHITE_RADIANCE
         image = (covered * body + (1 - covered) * wall).reshape(*taken.size[::-1], 3)
-        told = {"light": lamp.name, "sphere": kind, "place": f"s{place}"}
-        self._writer.shoot(camera, f"{kind}{place}_{lamp.name}", image, EXPOSURE_S, kind=f"{kind}-sphere", **told)
+        frame_keys = {"light": lamp.name, "sphere": kind, "place": f"s{place}"}
+        self._writer.shoot(camera, f"{kind}{place}_{lamp.name}", image, EXPOSURE_S, kind=f"{kind}-sphere", **frame_keys)
 
     def _glint(self, camera: int, middle_mm: Floats, radius_mm: float, light_mm: Floats) -> Floats:
         """Relative radiance (N, 1) of a highlight at all pixels; zero if the highlight would lie at the outline."""
-        lens, eye = self._lenses[camera], self._rays[camera][0]
-        normal = eye - middle_mm
+        lens, camera_centre = self._lenses[camera], self._rays[camera][0]
+        normal = camera_centre - middle_mm
         for _ in range(50):
             point = middle_mm + radius_mm * normal / np.linalg.norm(normal)
-            to_eye, to_light = eye - point, light_mm - point
+            to_camera, to_light = camera_centre - point, light_mm - point
             # Apply the law of reflection: the normal bisects the angle between eye and light.
-            normal = to_eye / np.linalg.norm(to_eye) + to_light / np.linalg.norm(to_light)
+            normal = to_camera / np.linalg.norm(to_camera) + to_light / np.linalg.norm(to_light)
         normal /= np.linalg.norm(normal)
         width, height = lens.camera.size
-        if normal @ to_eye / np.linalg.norm(to_eye) < 0.3:
+        if normal @ to_camera / np.linalg.norm(to_camera) < 0.3:
             return np.zeros((width * height, 1))
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        spot = lens.seen(point[None])[0]
-        off = (x - spot[0]) ** 2 + (y - spot[1]) ** 2
-        return np.asarray(GLINT * np.exp(-off / (2 * GLINT_PX**2))).reshape(-1, 1)
+        spot = lens.project(point[None])[0]
+        squared_px = (x - spot[0]) ** 2 + (y - spot[1]) ** 2
+        return np.asarray(GLINT * np.exp(-squared_px / (2 * GLINT_PX**2))).reshape(-1, 1)
 
     def flat(self, camera: int) -> None:
         """Photograph a uniform source that fills the view."""
         width, height = self._writer.rig.cameras[camera].size
         for number in range(2):
-            even = np.full((height, width, 3), 0.6 * WHITE_RADIANCE)
-            self._writer.shoot(camera, f"flat{number}", even, EXPOSURE_S, kind="flat")
+            uniform = np.full((height, width, 3), 0.6 * WHITE_RADIANCE)
+            self._writer.shoot(camera, f"flat{number}", uniform, EXPOSURE_S, kind="flat")
 
     def chart(self, camera: int, xyz: Floats) -> None:
         """Photograph a chart of 24 patches with the colours ``xyz`` (24, 3) that fills the middle of the view."""
@@ -166,8 +168,8 @@ class Session:
                 slice(int(x - 0.4 * step[0]), int(x + 0.4 * step[0])),
             )
             image[rows, columns] = rgb[patch]
-        told = {"chart": "colours", "corners_px": corners.tolist()}
-        self._writer.shoot(camera, "chart", image * WHITE_RADIANCE, EXPOSURE_S, kind="chart", **told)
+        frame_keys = {"chart": "colours", "corners_px": corners.tolist()}
+        self._writer.shoot(camera, "chart", image * WHITE_RADIANCE, EXPOSURE_S, kind="chart", **frame_keys)
 
 
 def write_session(
@@ -216,7 +218,7 @@ def write_session(
             "chart": [{"name": "colours", "type": "colorchecker-24", "reference": "chart.csv"}],
         }
     )
-    return session.places[0]
+    return session.poses[0]
 
 
 def _board_texture() -> NDArray[np.float32]:

@@ -48,14 +48,14 @@ def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
     normal with a few fixed vectors and polynomials of the pixel's position.
     """
     pose, inverse_K = np.asarray(camera.camera_from_world), np.linalg.inv(np.asarray(camera.K))
-    eye = -pose[:3, :3].T @ pose[:3, 3]
+    camera_centre = -pose[:3, :3].T @ pose[:3, 3]
     # Find the world directions of pixel (0, 0), of a step in x and of a step in y, each for unit depth along the
     # camera's axis
     start, step_x, step_y = (
         pose[:3, :3].T @ inverse_K @ vector
         for vector in (np.array([0.5, 0.5, 1]), np.array([1, 0, 0]), np.array([0, 1, 0]))
     )
-    to_light = np.asarray(light.position_mm) - eye
+    to_light = np.asarray(light.position_mm) - camera_centre
     vectors = np.stack([start, step_x, step_y, to_light], axis=1).astype(np.float32)
     height, width = footprint.mesh.shape
     x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
@@ -74,13 +74,13 @@ def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
     )
     cosines = np.full(footprint.mesh.shape, -1, dtype=np.float32)
     for rows in bands(footprint.mesh.shape):
-        seen = footprint.mesh[rows] >= 0
-        if not seen.any():
+        visible = footprint.mesh[rows] >= 0
+        if not visible.any():
             continue
-        first, last = (int(one) for one in np.flatnonzero(seen.any(axis=0))[[0, -1]])
+        first, last = (int(one) for one in np.flatnonzero(visible.any(axis=0))[[0, -1]])
         columns = slice(first, last + 1)
-        seen = seen[:, columns]
-        depth = np.where(seen, footprint.depth_mm[rows, columns], np.float32(1))
+        visible = visible[:, columns]
+        depth = np.where(visible, footprint.depth_mm[rows, columns], np.float32(1))
         by_normal = footprint.normal[rows, columns].reshape(-1, 3) @ vectors
         at_start, by_x, by_y, light_cosine = (by_normal[:, k].reshape(depth.shape) for k in range(4))
         ray_cosine = at_start + by_x * x[columns]
@@ -97,7 +97,7 @@ def half_cosines(camera: Camera, light: Light, footprint: Footprint) -> Image:
         # Take the cosine with the half vector (l + v) / |l + v|, where |l + v|² = 2 + 2 l·v
         between = dot / (distance * depth * ray_length)
         half = np.sqrt(np.maximum(2 + 2 * between, np.float32(1e-12)))
-        np.copyto(cosines[rows, columns], (light_cosine - ray_cosine) / half, where=seen)
+        np.copyto(cosines[rows, columns], (light_cosine - ray_cosine) / half, where=visible)
     return cosines
 
 
@@ -127,9 +127,9 @@ def highlight_mask(
     o = options or HighlightOptions()
     cone = np.float32(np.cos(np.radians(o.cone_deg)))
     is_near = cosines > cone
-    near, burnt = usable & is_near, saturated & is_near
+    near, saturated_near = usable & is_near, saturated & is_near
     mask = np.zeros(usable.shape, dtype=bool)
-    if not (near | burnt).any():
+    if not (near | saturated_near).any():
         return mask
     around = usable & (cosines > np.float32(np.cos(np.radians(PROFILE_DEG))))
     axis = np.asarray(light_colour, dtype=np.float64)
@@ -140,7 +140,7 @@ def highlight_mask(
     colour = _fit_colour(radiance, brightness, usable, far, axis) if radiance.shape[-1] >= 3 else None
 
     # Estimate the reflected part of each pixel and test it against the thresholds, a few rows at a time
-    weak, strong = burnt.astype(np.uint8), burnt
+    weak, strong = saturated_near.astype(np.uint8), saturated_near
     profile = LobeProfile()
     for rows in bands(usable.shape):
         own = around[rows]

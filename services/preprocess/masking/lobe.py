@@ -72,9 +72,11 @@ class LobeProfile:
             brightness: light of the pixels along the light's colour.
             reflected, weight: estimate of the reflected part of the brightness, and its inverse variance.
         """
-        told = weight > 0
-        if not told.all():
-            cosines, brightness, reflected, weight = (one[told] for one in (cosines, brightness, reflected, weight))
+        has_weight = weight > 0
+        if not has_weight.all():
+            cosines, brightness, reflected, weight = (
+                one[has_weight] for one in (cosines, brightness, reflected, weight)
+            )
         degrees = np.degrees(np.arccos(np.clip(cosines, -1, 1))).astype(np.int64)
         variance = np.asarray(1 / weight, dtype=np.float32)
         self._total += self._by_degree(degrees, brightness)
@@ -104,8 +106,8 @@ class LobeProfile:
         )
         # Reject a lobe whose amplitude is noise, that is as broad as shading, or whose core reflects too little
         core = lobe.by_angle > lobe.by_angle.max() / 2
-        seen = reflected[core].sum() / total[core].sum() + lobe.bias if core.any() else 0.0
-        if not 0 < lobe.error < 1 / SIGMA or lobe.roughness == ROUGHNESS[-1] or seen < CORE_SHARE:
+        core_share = reflected[core].sum() / total[core].sum() + lobe.bias if core.any() else 0.0
+        if not 0 < lobe.error < 1 / SIGMA or lobe.roughness == ROUGHNESS[-1] or core_share < CORE_SHARE:
             return 0.0
         own = lobe.by_angle * count / (1 + max(lobe.bias, 0.0))
         share = own / np.maximum(total - own, 1e-9 * total.max())

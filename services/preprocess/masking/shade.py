@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Light
 from services.core.records import MaskBit
 from services.core.stage import StageContext
-from services.preprocess.masking.shadows import expected_irradiance, reached_by, shadow_confidence
+from services.preprocess.masking.shadows import expected_irradiance, is_unoccluded, shadow_confidence
 from services.preprocess.projection import Footprint
 from services.preprocess.quality import assess, write_picture
 from services.preprocess.source import Image, Source, View
@@ -39,18 +39,18 @@ class _Coarse:
         step: side of a square, pixels.
         points_mm: (h, w, 3) mean world position of the surface.
         normal: (h, w, 3) mean unit normal.
-        seen: (h, w) squares that hold a covered pixel.
+        visible: (h, w) squares that hold a covered pixel.
     """
 
     step: int
     points_mm: Image
     normal: Image
-    seen: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
 
     def mean(self, values: NDArray[Any], weight: NDArray[np.float32]) -> tuple[Image, Image]:
         """Weighted mean (h, w, …) of an image (H, W, …) over the squares, and the sums (h, w) of the weights."""
-        sums = _squares(weight, self.step)
-        weighted = _squares(values * (weight if values.ndim == weight.ndim else weight[..., None]), self.step)
+        sums = _block_sums(weight, self.step)
+        weighted = _block_sums(values * (weight if values.ndim == weight.ndim else weight[..., None]), self.step)
         divisor = np.maximum(sums, 1e-6)
         return (weighted / (divisor if weighted.ndim == 2 else divisor[..., None])).astype(np.float32), sums
 
@@ -66,27 +66,27 @@ def shade(files: AttemptFiles, source: Source, subject: Subject, view: View, con
     """
     camera, lights = view.number, source.lights_of(view.number)
     coarse = _averaged(view)
-    stacks = [np.zeros((len(lights), *coarse.seen.shape), dtype=np.float32) for _ in range(4)]
+    stacks = [np.zeros((len(lights), *coarse.visible.shape), dtype=np.float32) for _ in range(4)]
     radiance, variance, irradiance, facing = stacks
     by_geometry = np.zeros(radiance.shape, dtype=bool)
     rendered = subject.fitted_meshes()
-    for place, j in enumerate(lights):
+    for index, j in enumerate(lights):
         context.raise_if_cancelled()
         lamp = source.description.lights[j]
-        radiance[place], variance[place] = _brightness(files, view, j, coarse)
-        irradiance[place], facing[place] = _light_on(coarse, lamp, rendered)
-        if subject.in_the_way:
-            free = reached_by(coarse.points_mm, coarse.normal, lamp.position_mm, list(subject.in_the_way))
-            by_geometry[place] = coarse.seen & (irradiance[place] > 0) & ~free
-            irradiance[place][by_geometry[place]] = 0
+        radiance[index], variance[index] = _brightness(files, view, j, coarse)
+        irradiance[index], facing[index] = _light_on(coarse, lamp, rendered)
+        if subject.occluders:
+            unoccluded = is_unoccluded(coarse.points_mm, coarse.normal, lamp.position_mm, list(subject.occluders))
+            by_geometry[index] = coarse.visible & (irradiance[index] > 0) & ~unoccluded
+            irradiance[index][by_geometry[index]] = 0
     confidence = by_geometry.astype(np.float32)
     if len(lights) >= MIN_LIGHTS:
         pixel_mm = coarse.step * _pixel_mm(view.camera, view.footprint)
-        found = shadow_confidence(radiance, variance, irradiance, facing, coarse.seen, pixel_mm)
+        found = shadow_confidence(radiance, variance, irradiance, facing, coarse.visible, pixel_mm)
         confidence = np.maximum(confidence, found)
-    for place, j in enumerate(lights):
+    for index, j in enumerate(lights):
         context.raise_if_cancelled()
-        _flag(files, subject, view, camera, j, _finer(confidence[place], coarse.step, view.footprint.covered))
+        _flag(files, subject, view, camera, j, _upsampled(confidence[index], coarse.step, view.footprint.covered))
 
 
 def _averaged(view: View) -> _Coarse:
@@ -118,10 +118,10 @@ def _brightness(files: AttemptFiles, view: View, light: int, coarse: _Coarse) ->
 
 def _light_on(coarse: _Coarse, lamp: Light, rendered: Sequence[Any]) -> tuple[Image, Image]:
     """Irradiance (h, w) of a light where rendered surfaces do not shade it, and cosine of incidence (h, w)."""
-    way = np.asarray(lamp.position_mm, dtype=np.float32) - coarse.points_mm
-    facing = (way * coarse.normal).sum(axis=-1) / np.maximum(np.linalg.norm(way, axis=-1), 1e-6)
-    reached = reached_by(coarse.points_mm, coarse.normal, lamp.position_mm, rendered)
-    irradiance = expected_irradiance(coarse.points_mm, coarse.normal, lamp.position_mm, reached & coarse.seen)
+    to_light = np.asarray(lamp.position_mm, dtype=np.float32) - coarse.points_mm
+    facing = (to_light * coarse.normal).sum(axis=-1) / np.maximum(np.linalg.norm(to_light, axis=-1), 1e-6)
+    unoccluded = is_unoccluded(coarse.points_mm, coarse.normal, lamp.position_mm, rendered)
+    irradiance = expected_irradiance(coarse.points_mm, coarse.normal, lamp.position_mm, unoccluded & coarse.visible)
     return irradiance * np.float32(np.mean(lamp.intensity)), facing.astype(np.float32)
 
 
@@ -157,13 +157,13 @@ def _flag(files: AttemptFiles, subject: Subject, view: View, camera: int, light:
     files.put_image(camera, light, done.model_copy(update=changed))
 
 
-def _squares(values: NDArray[Any], step: int) -> NDArray[np.float32]:
+def _block_sums(values: NDArray[Any], step: int) -> NDArray[np.float32]:
     """Sums (h, w, …) over squares of ``step`` pixels; squares at the right and lower edges may be smaller."""
     rows = np.add.reduceat(values, np.arange(0, values.shape[0], step), axis=0)
     return np.asarray(np.add.reduceat(rows, np.arange(0, values.shape[1], step), axis=1), dtype=np.float32)
 
 
-def _finer(confidence: Image, step: int, covered: NDArray[np.bool_]) -> Image:
+def _upsampled(confidence: Image, step: int, covered: NDArray[np.bool_]) -> Image:
     """Repeat a coarse image (h, w) at full resolution (H, W); 0 at pixels that are not covered."""
     fine = confidence.repeat(step, axis=0).repeat(step, axis=1)[: covered.shape[0], : covered.shape[1]]
     return np.where(covered, fine, np.float32(0))

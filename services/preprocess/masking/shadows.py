@@ -45,10 +45,10 @@ class ShadowRule:
     smooth_mm: float = 0.5
     """Standard deviation of the Gaussian that smooths brightness before the comparison, so that one pixel's noise
     decides nothing. It is finer than the spread of light."""
-    telling: float = 0.4
+    min_relative_irradiance: float = 0.4
     """Smallest irradiance, as a fraction of that of the pixel's best light, of a light that counts for the pixel's
     unshadowed brightness. Grazing lights are left out because their irradiance is the least certain."""
-    facing: float = 0.03
+    min_cosine: float = 0.03
     """Cosine of incidence below which a pixel is lit mainly by light from its neighbourhood and is not judged."""
     bright_quantile: float = 0.65
     """Quantile of a pixel's ratios under all lights that is taken as the unshadowed one. Most lights are not shadowed,
@@ -76,30 +76,30 @@ def expected_irradiance(
         position_mm: position of the light.
         unoccluded: (H, W) points that the light reaches; None if it reaches all.
     """
-    way = np.asarray(position_mm, dtype=np.float32) - points_mm
-    squared = (way * way).sum(axis=-1)
-    facing = (way * normal).sum(axis=-1)
+    to_light = np.asarray(position_mm, dtype=np.float32) - points_mm
+    squared = (to_light * to_light).sum(axis=-1)
+    facing = (to_light * normal).sum(axis=-1)
     irradiance = np.where(np.isfinite(squared) & (facing > 0), facing / np.maximum(squared, 1e-12) ** 1.5, 0)
     if unoccluded is not None:
         irradiance = np.where(unoccluded, irradiance, 0)
     return np.asarray(irradiance, dtype=np.float32)
 
 
-def reached_by(
+def is_unoccluded(
     points_mm: Image, normal: Image, position_mm: tuple[float, float, float], meshes: Sequence[Mesh]
 ) -> NDArray[np.bool_]:
     """Whether a point light reaches each point (H, W) past known surfaces, by a shadow map rendered from the light."""
-    eye = _camera_at(position_mm, meshes)
-    nearest = project(eye, meshes)
+    light_camera = _camera_at(position_mm, meshes)
+    nearest = project(light_camera, meshes)
     height, width = points_mm.shape[:2]
-    pixels, depth = eye.project(points_mm.reshape(-1, 3).astype(np.float64))
+    pixels, depth = light_camera.project(points_mm.reshape(-1, 3).astype(np.float64))
     column, row = (np.floor(np.nan_to_num(pixels[:, k], nan=-1.0)).astype(np.int64) for k in range(2))
-    inside = (column >= 0) & (row >= 0) & (column < eye.size[0]) & (row < eye.size[1])
+    inside = (column >= 0) & (row >= 0) & (column < light_camera.size[0]) & (row < light_camera.size[1])
     first = nearest.depth_mm[np.where(inside, row, 0), np.where(inside, column, 0)]
     # Allow for the slant: across one pixel of the map a surface's depth varies by the pixel size times the tangent of
     # the angle of incidence.
-    way = np.asarray(position_mm) - points_mm
-    cosine = np.clip((way * normal).sum(axis=-1) / np.linalg.norm(way, axis=-1), MIN_COSINE, 1).ravel()
+    to_light = np.asarray(position_mm) - points_mm
+    cosine = np.clip((to_light * normal).sum(axis=-1) / np.linalg.norm(to_light, axis=-1), MIN_COSINE, 1).ravel()
     slant_mm = SHADOW_PIXEL_MM * np.sqrt(1 / cosine**2 - 1)
     blocked = inside & (first < depth - DEPTH_BIAS_MM - slant_mm)
     return np.asarray(~blocked.reshape(height, width))
@@ -132,7 +132,7 @@ def shadow_confidence(
     variance: Image,
     irradiance: Image,
     facing: Image,
-    seen: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
     pixel_mm: float,
     rule: ShadowRule | None = None,
 ) -> Image:
@@ -142,7 +142,7 @@ def shadow_confidence(
         radiance, variance: (L, H, W), of one channel or their sum; pixels without a value have infinite variance.
         irradiance: (L, H, W), expected without unknown occluders.
         facing: (L, H, W), cosine of the angle between normal and light.
-        seen: (H, W), pixels that show a tooth.
+        visible: (H, W), pixels that show a tooth.
         pixel_mm: size of a pixel on the tooth.
         rule: parameters; None for the defaults.
     """
@@ -151,54 +151,54 @@ def shadow_confidence(
     rule = rule or ShadowRule()
     # Expect brightness in proportion to the irradiance, a part of it blurred by the spread of light inside the tooth;
     # smooth it and the image alike
-    inside = np.stack([_spread(layer, seen, rule.spread_mm / pixel_mm) for layer in irradiance])
-    known = seen & np.isfinite(variance)
+    inside = np.stack([_spread(layer, visible, rule.spread_mm / pixel_mm) for layer in irradiance])
+    known = visible & np.isfinite(variance)
     smooth_px = rule.smooth_mm / pixel_mm
     expected = (1 - rule.spread_share) * irradiance + rule.spread_share * inside
     expected, radiance = (
-        np.stack([_spread(layer, told, smooth_px) for layer, told in zip(stack, known, strict=True)])
+        np.stack([_spread(layer, mask, smooth_px) for layer, mask in zip(stack, known, strict=True)])
         for stack in (expected, radiance)
     )
     # Take a high quantile of a pixel's brightness per irradiance over its well-lit images as the unshadowed one
-    tells = known & (facing > rule.facing) & (expected > 0)
+    is_judged = known & (facing > rule.min_cosine) & (expected > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        response = np.where(tells, radiance / expected, np.nan)
-    bright = expected >= rule.telling * np.where(tells, expected, 0).max(axis=0)
-    brightness = _upper(np.where(bright, response, np.nan), rule.bright_quantile)
+        response = np.where(is_judged, radiance / expected, np.nan)
+    bright = expected >= rule.min_relative_irradiance * np.where(is_judged, expected, 0).max(axis=0)
+    brightness = _high_quantile(np.where(bright, response, np.nan), rule.bright_quantile)
     # Compare each image with it; a value of infinite error gets the probability one half
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         ratio = response / brightness
         error = np.sqrt(variance) / (expected * brightness)
-        ratio, error = np.where(tells, ratio, np.nan), np.where(tells, error, np.nan)
+        ratio, error = np.where(is_judged, ratio, np.nan), np.where(is_judged, error, np.nan)
         total = np.sqrt(rule.model_error**2 + error**2)
     # Raise the threshold of likely pixels that are connected to a certain one
     certain = ratio < rule.certain
     likely = ratio < rule.possible
-    touched = np.stack([_touching(seeds, grown) for seeds, grown in zip(certain, likely, strict=True)])
-    limit = np.where(touched, rule.possible, rule.certain)
+    is_connected = np.stack([_connected(seeds, grown) for seeds, grown in zip(certain, likely, strict=True)])
+    limit = np.where(is_connected, rule.possible, rule.certain)
     with np.errstate(invalid="ignore"):
         probability = norm.cdf((limit - ratio) / total)
-    return np.where(tells, probability, 0).astype(np.float32)
+    return np.where(is_judged, probability, 0).astype(np.float32)
 
 
-def _spread(layer: Image, seen: NDArray[np.bool_], sigma_px: float) -> Image:
-    """Gaussian-weighted mean around each pixel over the pixels ``seen``; 0 elsewhere."""
+def _spread(layer: Image, visible: NDArray[np.bool_], sigma_px: float) -> Image:
+    """Gaussian-weighted mean around each pixel over the pixels ``visible``; 0 elsewhere."""
     import cv2
 
-    weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), max(sigma_px, 0.1))
-    blurred = cv2.GaussianBlur(np.where(seen, layer, 0).astype(np.float32), (0, 0), max(sigma_px, 0.1))
-    return np.asarray(np.where(seen, blurred / np.maximum(weight, 1e-6), 0), dtype=np.float32)
+    weight = cv2.GaussianBlur(visible.astype(np.float32), (0, 0), max(sigma_px, 0.1))
+    blurred = cv2.GaussianBlur(np.where(visible, layer, 0).astype(np.float32), (0, 0), max(sigma_px, 0.1))
+    return np.asarray(np.where(visible, blurred / np.maximum(weight, 1e-6), 0), dtype=np.float32)
 
 
-def _upper(response: Image, quantile: float) -> Image:
+def _high_quantile(response: Image, quantile: float) -> Image:
     """Quantile (H, W) over the lights of a stack (L, H, W), NaN values left out; NaN where all are NaN."""
     ordered = np.sort(response, axis=0)  # NaN comes last
     count = np.isfinite(response).sum(axis=0)
-    place = np.clip(np.rint(quantile * (count - 1)), 0, None).astype(np.int64)
-    return np.asarray(np.take_along_axis(ordered, place[None], axis=0)[0], dtype=np.float32)
+    rank = np.clip(np.rint(quantile * (count - 1)), 0, None).astype(np.int64)
+    return np.asarray(np.take_along_axis(ordered, rank[None], axis=0)[0], dtype=np.float32)
 
 
-def _touching(seeds: NDArray[np.bool_], grown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _connected(seeds: NDArray[np.bool_], grown: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Connected components of ``grown`` that contain a seed."""
     import cv2
 

@@ -99,7 +99,7 @@ def require_plausible_scale(cameras: tuple[Camera, ...], lights: tuple[Light, ..
             )
 
 
-def require_seen(footprint: Footprint, teeth: int, camera: Camera) -> None:
+def require_visible_teeth(footprint: Footprint, teeth: int, camera: Camera) -> None:
     """Refuse a camera that sees no tooth.
 
     Raises:

@@ -23,7 +23,7 @@ from services.preprocess.raw.checks import require_like_exposures
 from services.preprocess.raw.demosaic import demosaic
 from services.preprocess.raw.lens import Lens, fitted_vignetting
 from services.preprocess.raw.response import NEAR_FULL, Linearity, Series, measure_linearity
-from services.preprocess.scratch import kept_array
+from services.preprocess.scratch import cached_array
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
@@ -96,13 +96,13 @@ class CameraFrames:
         self._full = np.float32(np.inf if self.raw.full_counts is None else self.raw.full_counts)
         self._black_frames = folder.frames_of(camera.name, "black")
         self.linearity = Linearity(np.empty(0), (0.0, 0.0), float(self._full))
-        kept = None if scratch is None else scratch / MEASURES
-        if kept is not None and kept.is_file():
-            self._take(Measures.model_validate_json(kept.read_bytes()))
+        stored = None if scratch is None else scratch / MEASURES
+        if stored is not None and stored.is_file():
+            self._restore(Measures.model_validate_json(stored.read_bytes()))
         else:
             self._measure(assumed_noise)
-            if kept is not None:
-                write_atomic(kept, self._measures().model_dump_json().encode())
+            if stored is not None:
+                write_atomic(stored, self._measures().model_dump_json().encode())
         self._ambient = self._measured_ambient()
 
     def _measure(self, assumed_noise: tuple[float, float]) -> None:
@@ -123,12 +123,12 @@ class CameraFrames:
             notes=tuple(self.notes),
         )
 
-    def _take(self, told: Measures) -> None:
-        self.noise = NoiseModel(told.read_counts, told.counts_per_electron, told.relative)
+    def _restore(self, measures: Measures) -> None:
+        self.noise = NoiseModel(measures.read_counts, measures.counts_per_electron, measures.relative)
         # Leave the deviations of single blocks empty, because only the notes report them.
-        self.linearity = Linearity(np.empty(0), told.curve, float(self._full))
-        self.lens = Lens(self.calibrated, told.vignetting)
-        self.notes += told.notes
+        self.linearity = Linearity(np.empty(0), measures.curve, float(self._full))
+        self.lens = Lens(self.calibrated, measures.vignetting)
+        self.notes += measures.notes
 
     def exposure(self, frame: RawFrame) -> Exposure:
         """Linear counts of a whole frame above black and ambient light; (H, W) of a mosaic, else (H, W, C).
@@ -193,7 +193,7 @@ class CameraFrames:
                 counts += self._black_counts(frame) / np.float32(len(frames))
             return counts
 
-        return kept_array(None if self._scratch is None else self._scratch / name, mean)
+        return cached_array(None if self._scratch is None else self._scratch / name, mean)
 
     def _black_counts(self, frame: RawFrame) -> Image:
         counts = read_counts(self._root, self._folder, frame).astype(np.float32)
@@ -212,9 +212,9 @@ class CameraFrames:
                 f"Camera {name} has no black frame, so the zero of {lit.file} and its other frames is unknown; add one"
                 ' with the lens covered (kind = "black"), or give black_counts in the calibration.'
             )
-        told = f"{self.calibrated.black_counts:g}"
+        black = f"{self.calibrated.black_counts:g}"
         self.notes.append(
-            f"Camera {name} has no black frame; black is taken as the calibration's {told} counts everywhere."
+            f"Camera {name} has no black frame; black is taken as the calibration's {black} counts everywhere."
         )
 
     def _measured_noise(self, relative: float, floor: float) -> NoiseModel:
@@ -246,7 +246,7 @@ class CameraFrames:
 
     def _read_noise(self) -> float | None:
         found = []
-        for own in _alike(self._black_frames):
+        for own in _repeated_exposures(self._black_frames):
             if len(own) > 1:
                 counts = [self._black_counts(one) for one in own[:FRAMES_MEASURED]]
                 found.append((len(counts) - 1, read_noise(counts, own[0].gain)))
@@ -259,10 +259,10 @@ class CameraFrames:
         The pixels are thinned out to about ``PIXELS_MEASURED``.
         """
         flats = self._folder.frames_of(self.raw.name, "flat")
-        groups = [own for own in _alike(flats) if len(own) > 1]
+        groups = [own for own in _repeated_exposures(flats) if len(own) > 1]
         if not groups:
             lit = self._folder.frames_of(self.raw.name, "light")
-            groups = [own for own in _alike(lit) if len(own) > 1]
+            groups = [own for own in _repeated_exposures(lit) if len(own) > 1]
         for first, second in [pair for own in groups for pair in pairwise(own)][:FRAMES_MEASURED]:
             step = -(-int(np.prod(self.raw.size)) // PIXELS_MEASURED)
             a, b = (_unsaturated(self.exposure(one)).reshape(-1)[::step] for one in (first, second))
@@ -275,21 +275,23 @@ class CameraFrames:
         found = measure_linearity(list(self._series()), float(self._full)) if is_known else self.linearity
         if found.ratios.size:
             low, middle, high = np.percentile(found.ratios, (5, 50, 95))
-            told = (
+            sentence = (
                 f"Camera {name}: longer exposures are {middle:.3f} times as bright as their times say (5 to 95 %:"
                 f" {low:.3f} to {high:.3f})"
             )
             self.notes.append(
-                f"{told}{'' if found.is_linear else '; its counts are linearised by a curve fitted to that'}."
+                f"{sentence}{'' if found.is_linear else '; its counts are linearised by a curve fitted to that'}."
             )
         return found
 
     def _series(self) -> Iterator[Series]:
         flats = self._folder.frames_of(self.raw.name, "flat")
-        ladders = [own for own in _ladders(flats) if len(own) > 1]
-        if not ladders:
-            ladders = [own for own in _ladders(self._folder.frames_of(self.raw.name, "light")) if len(own) > 1]
-        pairs = [pair for own in ladders for pair in pairwise(own)]
+        brackets = [own for own in _exposure_brackets(flats) if len(own) > 1]
+        if not brackets:
+            brackets = [
+                own for own in _exposure_brackets(self._folder.frames_of(self.raw.name, "light")) if len(own) > 1
+            ]
+        pairs = [pair for own in brackets for pair in pairwise(own)]
         # Choose pairs evenly from all series, because some lights are brighter than others
         for pair in pairs[:: max(1, len(pairs) // FRAMES_MEASURED)]:
             shorter, longer = (self.exposure(frame) for frame in pair)
@@ -315,10 +317,12 @@ class CameraFrames:
                     f"Frame {self._root / flats[0].file} ({flats[0].label}) and all other flat ones are full at"
                     f" {int(lost.sum())} pixels; take one with a shorter exposure."
                 )
-            seen = np.atleast_3d(rate) if self.raw.mosaic == "none" else demosaic(rate, self.raw.mosaic)
-            vignetting = fitted_vignetting(self.calibrated, seen)
-            told = ", ".join(f"{value:.3g}" for value in vignetting)
-            self.notes.append(f"Camera {self.raw.name}: the fall of light is fitted to its flat frames ({told}).")
+            colours = np.atleast_3d(rate) if self.raw.mosaic == "none" else demosaic(rate, self.raw.mosaic)
+            vignetting = fitted_vignetting(self.calibrated, colours)
+            coefficients = ", ".join(f"{value:.3g}" for value in vignetting)
+            self.notes.append(
+                f"Camera {self.raw.name}: the fall of light is fitted to its flat frames ({coefficients})."
+            )
         return Lens(self.calibrated, vignetting or (0.0, 0.0, 0.0))
 
     def _measured_ambient(self) -> Image | None:
@@ -337,7 +341,7 @@ def _unsaturated(exposure: Exposure) -> Image:
     return np.where(exposure.headroom > 0, exposure.signal, np.nan).astype(np.float32)
 
 
-def _alike(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
+def _repeated_exposures(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
     """Group frames of one scene under one light with the same exposure, gain and level."""
     groups: dict[object, list[RawFrame]] = defaultdict(list)
     for frame in frames:
@@ -345,7 +349,7 @@ def _alike(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
     return list(groups.values())
 
 
-def _ladders(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
+def _exposure_brackets(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
     """Group frames of one scene under one light, one frame for each exposure, from the shortest to the longest."""
     groups: dict[object, dict[float, RawFrame]] = defaultdict(dict)
     for frame in frames:

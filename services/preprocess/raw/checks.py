@@ -16,13 +16,13 @@ from services.preprocess.colours import FrameColour
 
 Image = NDArray[np.float32]
 
-EXPOSURE_OFF = 1.5
+MAX_EXPOSURE_FACTOR = 1.5
 """Largest factor by which a frame may be brighter or darker than expected from another exposure of its light."""
-CUT_SHARE = 0.8
+CLIP_SHARE = 0.8
 """Fraction of full scale at which counts are clipped for this comparison, because sensors are not linear above it."""
-TELLING_SHARE = 0.01
+MIN_MEAN_SHARE = 0.01
 """Smallest mean, as a fraction of full scale, of a frame that is compared; a darker one does not show its exposure."""
-TELLING_CONTRAST = 0.2
+MIN_CONTRAST = 0.2
 """Smallest ratio of a picture's standard deviation to its mean at which it is compared with another exposure."""
 MIN_CORRELATION = 0.5
 """Smallest correlation of two exposures of the same scene. Noise of 12 bits leaves 0.9, and a tooth that moved by a
@@ -37,13 +37,13 @@ def missing_exposures(folder: RawFolder) -> Iterator[str]:
             exposures.setdefault(str(frame.light), set()).add(frame.exposure_s * frame.gain)
         usual = set.union(*exposures.values()) if exposures else set()
         for light, own in exposures.items():
-            lacking = sorted(
+            missing = sorted(
                 value for value in usual - own if sum(value in one for one in exposures.values()) > len(exposures) / 2
             )
-            if lacking:
+            if missing:
                 files = ", ".join(one.file for one in folder.frames_of(camera.name, "light") if one.light == light)
                 yield (
-                    f"Camera {camera.name}, light {light} lacks the exposure of {lacking[0]:g} s that most lights have;"
+                    f"Camera {camera.name}, light {light} lacks the exposure of {missing[0]:g} s that most lights have;"
                     f" its frames are {files}."
                 )
 
@@ -75,11 +75,11 @@ def require_like_exposures(
     order = sorted(zip(frames, exposures, strict=True), key=lambda one: one[1].factor)
     for (shorter, first), (longer, second) in pairwise(order):
         what = f"Frame {root / longer.file} ({longer.label})"
-        off = _brighter(first, second.signal, second.headroom, second.factor)
-        if off is None:
+        log_ratio = _log_brightness_ratio(first, second.signal, second.headroom, second.factor)
+        if log_ratio is None:
             continue
-        if np.abs(off).max() < np.log(EXPOSURE_OFF):
-            if not _shows_the_same(first, second):
+        if np.abs(log_ratio).max() < np.log(MAX_EXPOSURE_FACTOR):
+            if not _is_correlated(first, second):
                 raise CaptureInputError(
                     f"{what} shows another picture than {shorter.file}; exchange its bytes, or correct its light or"
                     " place."
@@ -89,20 +89,22 @@ def require_like_exposures(
             swap = np.arange(len(channels))
             red, blue = channels.index("red"), channels.index("blue")
             swap[[red, blue]] = blue, red
-            against = _brighter(first, second.signal[..., swap], second.headroom[..., swap], second.factor)
-            if against is not None and np.abs(against).max() < np.log(EXPOSURE_OFF) / 2:
+            swapped_log_ratio = _log_brightness_ratio(
+                first, second.signal[..., swap], second.headroom[..., swap], second.factor
+            )
+            if swapped_log_ratio is not None and np.abs(swapped_log_ratio).max() < np.log(MAX_EXPOSURE_FACTOR) / 2:
                 raise CaptureInputError(
                     f"{what} has red and blue exchanged against {shorter.file}; export both with the same order of"
                     " channels."
                 )
-        found = "brighter" if off[np.argmax(np.abs(off))] > 0 else "darker"
+        found = "brighter" if log_ratio[np.argmax(np.abs(log_ratio))] > 0 else "darker"
         raise CaptureInputError(
             f"{what} is clearly {found} than {shorter.file} lets expect from exposure_s, gain and level; correct these,"
             " or the order of its bytes, bits or channels."
         )
 
 
-def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
+def _log_brightness_ratio(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
     """Logarithm (C,) of the ratio of a longer exposure's mean to the mean expected from a shorter one, by channel.
 
     It is None if the frames are too dark or full scale is unknown. Both exposures are clipped below full scale, so that
@@ -115,21 +117,24 @@ def _brighter(first: Exposure, signal: Image, headroom: Image, factor: float) ->
     full = float(np.max(headroom + signal))
     if not np.isfinite(full):
         return None
-    most = np.float32(CUT_SHARE * full)
-    expected = np.minimum(first.signal * np.float32(factor / first.factor), most)
-    means = [np.atleast_1d(np.mean(one, axis=(0, 1), dtype=np.float64)) for one in (expected, np.minimum(signal, most))]
-    if min(mean.min() for mean in means) < TELLING_SHARE * full:
+    clip_counts = np.float32(CLIP_SHARE * full)
+    expected = np.minimum(first.signal * np.float32(factor / first.factor), clip_counts)
+    means = [
+        np.atleast_1d(np.mean(one, axis=(0, 1), dtype=np.float64))
+        for one in (expected, np.minimum(signal, clip_counts))
+    ]
+    if min(mean.min() for mean in means) < MIN_MEAN_SHARE * full:
         return None
     return np.asarray(np.log(means[1] / means[0]))
 
 
-def _shows_the_same(first: Exposure, second: Exposure) -> bool:
+def _is_correlated(first: Exposure, second: Exposure) -> bool:
     """Whether two exposures correlate in every channel; channels without contrast are not compared."""
-    seen = (first.headroom > 0) & (second.headroom > 0)
-    planes = [np.moveaxis(np.atleast_3d(image), -1, 0) for image in (first.signal, second.signal, seen)]
+    unsaturated = (first.headroom > 0) & (second.headroom > 0)
+    planes = [np.moveaxis(np.atleast_3d(image), -1, 0) for image in (first.signal, second.signal, unsaturated)]
     for a, b, usable in zip(*planes, strict=True):
         shorter, longer = a[usable.astype(bool)].astype(np.float64), b[usable.astype(bool)].astype(np.float64)
-        if shorter.size < 2 or shorter.std() < TELLING_CONTRAST * abs(shorter.mean()) or longer.std() == 0:
+        if shorter.size < 2 or shorter.std() < MIN_CONTRAST * abs(shorter.mean()) or longer.std() == 0:
             continue
         if np.corrcoef(shorter, longer)[0, 1] < MIN_CORRELATION:
             return False

@@ -48,13 +48,13 @@ def demosaic(values: Image, mosaic: Mosaic, means: NDArray[np.float32] | None = 
     filtered = {name: _filter(balanced, kernel) for name, kernel in _kernels().items()}
     for y in range(2):
         for x in range(2):
-            own, place = channels[y, x], (slice(y, None, 2), slice(x, None, 2))
-            for wanted in {0, 1, 2} - {own}:
-                # A green pixel has the wanted colour beside it in its row or in its column; others have it at the
+            own, site = channels[y, x], (slice(y, None, 2), slice(x, None, 2))
+            for missing in {0, 1, 2} - {own}:
+                # A green pixel has the missing colour beside it in its row or in its column; others have it at the
                 # corners.
-                beside = "row" if channels[y, 1 - x] == wanted else "column"
-                name = "green" if wanted == 1 else beside if own == 1 else "across"
-                image[*place, wanted] = filtered[name][place]
+                beside = "row" if channels[y, 1 - x] == missing else "column"
+                name = "green" if missing == 1 else beside if own == 1 else "across"
+                image[*site, missing] = filtered[name][site]
     image *= scale
     return image
 
@@ -74,8 +74,8 @@ def demosaic_variance(variance: Image, mosaic: Mosaic) -> Image:
     channels, tent = site_channels(mosaic), np.outer([1, 2, 1], [1, 2, 1]).astype(np.float32)
     result = np.empty((*variance.shape, 3), dtype=np.float32)
     for k in range(3):
-        seen = np.tile(channels == k, (-(-variance.shape[0] // 2), -(-variance.shape[1] // 2)))
-        mask = seen[: variance.shape[0], : variance.shape[1]].astype(np.float32)
+        has_channel = np.tile(channels == k, (-(-variance.shape[0] // 2), -(-variance.shape[1] // 2)))
+        mask = has_channel[: variance.shape[0], : variance.shape[1]].astype(np.float32)
         blurred, weight = (
             cv2.filter2D(one, -1, tent, borderType=cv2.BORDER_REFLECT_101) for one in (variance * mask, mask)
         )

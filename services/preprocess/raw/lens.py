@@ -9,19 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera
-from services.preprocess.window import Window
+from services.preprocess.window import BORDER_TOLERANCE_PX, Window
 
 Image = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-EVEN = 2
+MOSAIC_PERIOD = 2
 """Period of a mosaic's pattern, pixels. A part cut out of a photograph begins at a multiple of it."""
 REACH_PX = 4
 """Margin in pixels around samples that demosaicing and interpolation read."""
-BEYOND_PX = 1e-3
-"""Distance beyond the outermost pixel centres, pixels, up to which a sample is accepted. Interpolation mixes in the
-black around the image by this fraction."""
 FLAT_BLOCK = 16
 """Side in pixels of a block of a flat field, whose mean is fitted: vignetting is smooth."""
 MIN_BLOCKS = 16
@@ -41,7 +38,7 @@ class Lens:
     camera: CalibratedCamera
     vignetting: tuple[float, float, float]
 
-    def source(self, window: Window) -> Image | None:
+    def distorted_positions(self, window: Window) -> Image | None:
         """Positions in the photograph of the pixels of a window of the undistorted image.
 
         Returns:
@@ -59,7 +56,7 @@ class Lens:
         )
         return np.ascontiguousarray(np.stack(maps, axis=-1), dtype=np.float32)
 
-    def fall(self, x: Image, y: Image) -> Image | None:
+    def relative_brightness(self, x: Image, y: Image) -> Image | None:
         """Relative brightness of a uniform source at pixel indices of the photograph; None without vignetting."""
         if not any(self.vignetting):
             return None
@@ -77,10 +74,12 @@ class Sampler:
 
     def __init__(self, lens: Lens, window: Window) -> None:
         self._lens, self._window, self._size = lens, window, lens.camera.size
-        self._source = lens.source(window)
+        self._distorted_positions = lens.distorted_positions(window)
         needed = window
-        if self._source is not None:
-            (left, top), (right, bottom) = (bound(self._source.reshape(-1, 2), axis=0) for bound in (np.min, np.max))
+        if self._distorted_positions is not None:
+            (left, top), (right, bottom) = (
+                bound(self._distorted_positions.reshape(-1, 2), axis=0) for bound in (np.min, np.max)
+            )
             needed = Window(
                 int(np.clip(top, 0, self._size[1] - 1)),
                 int(np.clip(np.ceil(bottom), 0, self._size[1] - 1)) + 1,
@@ -88,50 +87,57 @@ class Sampler:
                 int(np.clip(np.ceil(right), 0, self._size[0] - 1)) + 1,
             )
         grown = needed.grown(REACH_PX, self._size)
-        self.region = Window(grown.top // EVEN * EVEN, grown.bottom, grown.left // EVEN * EVEN, grown.right)
+        self.region = Window(
+            grown.top // MOSAIC_PERIOD * MOSAIC_PERIOD,
+            grown.bottom,
+            grown.left // MOSAIC_PERIOD * MOSAIC_PERIOD,
+            grown.right,
+        )
 
     @property
-    def is_still_exact(self) -> bool:
+    def is_exact_at_rest(self) -> bool:
         """Whether the pixels of an unmoved subject need no interpolation."""
-        return self._source is None
+        return self._distorted_positions is None
 
-    def places(self, in_window: Image) -> Image:
+    def positions(self, in_window: Image) -> Image:
         """Indices x, y (2, H, W) in the photograph of positions x, y (2, H, W) given as indices in the window."""
         import cv2
 
-        if self._source is None:
+        if self._distorted_positions is None:
             return in_window + np.array([self._window.left, self._window.top], dtype=np.float32)[:, None, None]
         # Interpolate the lens's map, which is smooth; beyond the window its edge values are used.
         x, y = np.ascontiguousarray(in_window, dtype=np.float32)
-        found = cv2.remap(self._source, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        found = cv2.remap(self._distorted_positions, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.ascontiguousarray(np.moveaxis(found, -1, 0))
 
-    def source(self, places: Sequence[Image]) -> Window:
-        """Part of ``region`` whose rows contain the given places (2, h, W) and the margin for demosaicing and
+    def source_window(self, positions: Sequence[Image]) -> Window:
+        """Part of ``region`` whose rows contain the given positions (2, h, W) and the margin for demosaicing and
         interpolation.
         """
-        low, high = min(float(one[1].min()) for one in places), max(float(one[1].max()) for one in places)
+        low, high = min(float(one[1].min()) for one in positions), max(float(one[1].max()) for one in positions)
         region = self.region
-        top = int(np.clip(np.floor(low) - REACH_PX, region.top, max(region.bottom - EVEN, region.top)))
-        top = top // EVEN * EVEN
-        bottom = int(np.clip(np.ceil(high) + 1 + REACH_PX, min(top + EVEN, region.bottom), region.bottom))
+        top = int(np.clip(np.floor(low) - REACH_PX, region.top, max(region.bottom - MOSAIC_PERIOD, region.top)))
+        top = top // MOSAIC_PERIOD * MOSAIC_PERIOD
+        bottom = int(np.clip(np.ceil(high) + 1 + REACH_PX, min(top + MOSAIC_PERIOD, region.bottom), region.bottom))
         return Window(top, bottom, region.left, region.right)
 
-    def sampled(self, image: Image, places: Image, held: Window | None = None) -> Image:
+    def sampled(self, image: Image, positions: Image, loaded: Window | None = None) -> Image:
         """Interpolate an image linearly at indices of the photograph; 0 outside the image.
 
         Args:
             image: (h, w) or (h, w, C).
-            places: x, y (2, H, W) as indices of the photograph.
-            held: the part of the photograph that the image covers; None for ``region``.
+            positions: x, y (2, H, W) as indices of the photograph.
+            loaded: the part of the photograph that the image covers; None for ``region``.
 
         Returns:
             Values (H, W, C).
         """
         import cv2
 
-        held = self.region if held is None else held
-        x, y = (np.ascontiguousarray(places[k] - np.float32(start)) for k, start in ((0, held.left), (1, held.top)))
+        loaded = self.region if loaded is None else loaded
+        x, y = (
+            np.ascontiguousarray(positions[k] - np.float32(start)) for k, start in ((0, loaded.left), (1, loaded.top))
+        )
         planes = np.atleast_3d(image)
         # Split the channels, because OpenCV's remap takes at most four at once.
         parts = [
@@ -140,11 +146,14 @@ class Sampler:
         ]
         return np.concatenate(parts, axis=2).astype(np.float32)
 
-    def beyond(self, places: Image) -> BoolArray:
+    def beyond(self, positions: Image) -> BoolArray:
         """Places (H, W) that lie beyond the photograph, so that interpolation mixes in black."""
-        (x, y), (width, height) = places, self._size
+        (x, y), (width, height) = positions, self._size
         return np.asarray(
-            (x < -BEYOND_PX) | (x > width - 1 + BEYOND_PX) | (y < -BEYOND_PX) | (y > height - 1 + BEYOND_PX)
+            (x < -BORDER_TOLERANCE_PX)
+            | (x > width - 1 + BORDER_TOLERANCE_PX)
+            | (y < -BORDER_TOLERANCE_PX)
+            | (y > height - 1 + BORDER_TOLERANCE_PX)
         )
 
 

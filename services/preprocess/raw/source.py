@@ -18,8 +18,8 @@ from services.preprocess.raw.checks import missing_exposures
 from services.preprocess.raw.view import RawView
 from services.preprocess.rig import MIN_TRACKING
 from services.preprocess.source import LightImage, Motions, View
-from services.preprocess.stabilisation.motion import ViewMotion, exposures_together, frames_to_match, jaws
-from services.preprocess.stabilisation.seen import SeenFlow
+from services.preprocess.stabilisation.flow_comparison import FlowComparison
+from services.preprocess.stabilisation.motion import ViewMotion, frames_to_match, group_exposures, jaws
 
 
 class RawSource:
@@ -58,19 +58,21 @@ class RawSource:
         self.calibration = read_calibration(frames_root, self._folder, calibration)
         self._cameras = {camera.name: camera for camera in self.calibration.cameras}
         self.description = described(frames_root, self._folder, self.calibration, self.root)
-        self._frames = _in_time(frame for frame in self._folder.frame if frame.kind in {"light", "tracking"})
+        self._frames = _sorted_by_time(frame for frame in self._folder.frame if frame.kind in {"light", "tracking"})
         self.notes: tuple[str, ...] = tuple(missing_exposures(self._folder))
-        fewest = min(sum(frame.kind == "tracking" for frame in self._of(camera.name)) for camera in self._folder.camera)
+        fewest = min(
+            sum(frame.kind == "tracking" for frame in self._frames_of(camera.name)) for camera in self._folder.camera
+        )
         if fewest < MIN_TRACKING:
-            told = (
+            shortage = (
                 f"A camera has {fewest} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to"
                 " 0.2 px"
             )
-            self.notes += (f"{told}; take one with all lights on after every few lights.",)
+            self.notes += (f"{shortage}; take one with all lights on after every few lights.",)
 
     def lights_of(self, camera: int) -> tuple[int, ...]:
         """See ``Source``."""
-        lit = {frame.light for frame in self._of(self.description.cameras[camera].name) if frame.kind == "light"}
+        lit = {frame.light for frame in self._frames_of(self.description.cameras[camera].name) if frame.kind == "light"}
         return tuple(k for k, light in enumerate(self.description.lights) if light.name in lit)
 
     def identity(self) -> str:
@@ -81,28 +83,28 @@ class RawSource:
         lines += [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in paths]
         return "\n".join(lines)
 
-    def matched(self, camera: int) -> tuple[int, ...]:
+    def matched_frames(self, camera: int) -> tuple[int, ...]:
         """See ``Source``."""
         return tuple(row.index for row in frames_to_match(self._table(self.description.cameras[camera].name)))
 
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """See ``Source``."""
-        raw, taken = self._raw_view(view), self._of(view.whole.name)
-        together = {own[0].index: own for own in exposures_together(self._table(view.whole.name)) if own[0].light}
+        raw, taken = self._raw_view(view), self._frames_of(view.whole.name)
+        together = {own[0].index: own for own in group_exposures(self._table(view.whole.name)) if own[0].light}
 
         def picture(row: FrameRecord) -> NDArray[np.float32]:
             return raw.brightness([taken[one.index] for one in together.get(row.index, (row,))])
 
         return raw.motion.measure(frames, picture)
 
-    def seen_flow(self, view: View, motions: Motions) -> SeenFlow | None:
+    def flow_comparison(self, view: View, motions: Motions) -> FlowComparison | None:
         """See ``Source``."""
-        raw, taken = self._raw_view(view), self._of(view.whole.name)
-        return raw.motion.seen_flow(lambda row: raw.brightness([taken[row.index]]), motions)
+        raw, taken = self._raw_view(view), self._frames_of(view.whole.name)
+        return raw.motion.flow_comparison(lambda row: raw.brightness([taken[row.index]]), motions)
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:
         """See ``Source``. The exposures of each light are merged."""
-        raw, taken = self._raw_view(view), self._of(view.whole.name)
+        raw, taken = self._raw_view(view), self._frames_of(view.whole.name)
         table = self._table(view.whole.name)
         for light in lights:
             name = self.description.lights[light].name
@@ -123,9 +125,9 @@ class RawSource:
         )
 
     def _table(self, camera: str) -> list[FrameRecord]:
-        return [_row(index, frame) for index, frame in enumerate(self._of(camera))]
+        return [_row(index, frame) for index, frame in enumerate(self._frames_of(camera))]
 
-    def _of(self, camera: str) -> list[RawFrame]:
+    def _frames_of(self, camera: str) -> list[RawFrame]:
         return [frame for frame in self._frames if frame.camera == camera]
 
 
@@ -142,7 +144,7 @@ def _row(index: int, frame: RawFrame) -> FrameRecord:
     )
 
 
-def _in_time(frames: Iterator[RawFrame]) -> list[RawFrame]:
+def _sorted_by_time(frames: Iterator[RawFrame]) -> list[RawFrame]:
     """Sort frames by the time at which they were taken; if one has no time, keep the order of the list."""
     listed = list(frames)
     if any(frame.time_s is None for frame in listed):

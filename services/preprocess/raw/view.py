@@ -16,8 +16,8 @@ from services.core.records import MaskBit
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import colour_of, require_like_exposures
 from services.preprocess.raw.demosaic import channel_means, demosaic, demosaic_variance, spoiled
-from services.preprocess.raw.lens import EVEN, Sampler
-from services.preprocess.raw.room import Room, strips
+from services.preprocess.raw.lens import MOSAIC_PERIOD, Sampler
+from services.preprocess.raw.memory_budget import MemoryBudget, strips
 from services.preprocess.rig import STILL_PX, UNCERTAIN_PX
 from services.preprocess.source import Image, LightImage, View
 from services.preprocess.stabilisation.motion import Displacement, ViewMotion
@@ -76,7 +76,7 @@ class RawView:
         self._root, self._frames, self._view, self.motion, self._channels = root, frames, view, motion, channels
         self._mosaic, camera = frames.raw.mosaic, frames.calibrated
         self._sampler = Sampler(frames.lens, motion.window)
-        self._room = Room(memory_bytes, frames.raw, len(channels), view.window, self._sampler.region)
+        self._budget = MemoryBudget(memory_bytes, frames.raw, len(channels), view.window, self._sampler.region)
         assert camera.radiance_per_count is not None
         self._scale = np.array(camera.radiance_per_count, dtype=np.float32)
         self._unmixed = (
@@ -92,18 +92,18 @@ class RawView:
         means = self._means([self._sparse(frame, counts) for frame, counts in zip(frames, taken, strict=True)])
         height, width = self.motion.window.shape
         image = np.empty((height, width), dtype=np.float32)
-        for strip in strips(height, self._room.rows(len(frames))):
+        for strip in strips(height, self._budget.rows(len(frames))):
             parts = list(bands_of(strip, width))
-            places = [self._sampler.places(_indices(rows, slice(0, width))) for rows in parts]
-            held = self._sampler.source(places)
-            signal = self._light([self._exposure(*one, held) for one in zip(frames, taken, strict=True)])
+            positions = [self._sampler.positions(_indices(rows, slice(0, width))) for rows in parts]
+            loaded = self._sampler.source_window(positions)
+            signal = self._merged_signal([self._exposure(*one, loaded) for one in zip(frames, taken, strict=True)])
             colour = signal if self._mosaic == "none" else demosaic(signal, self._mosaic, means)
             grey = colour.mean(axis=-1, keepdims=True)
-            for rows, at in zip(parts, places, strict=True):
-                image[rows] = self._sampler.sampled(grey, at, held)[..., 0]
+            for rows, at in zip(parts, positions, strict=True):
+                image[rows] = self._sampler.sampled(grey, at, loaded)[..., 0]
         return image
 
-    def _light(self, exposures: Sequence[Exposure]) -> Image:
+    def _merged_signal(self, exposures: Sequence[Exposure]) -> Image:
         """Merge exposures above black; a pixel that is saturated in all of them keeps the shortest one's value.
 
         A single exposure is returned in counts, merged ones in counts per unit of the exposure factor.
@@ -123,7 +123,7 @@ class RawView:
             CaptureInputError: the exposures contradict each other; the message names the frame. SettingsError: there is
                 too little memory.
         """
-        strip_rows = self._room.rows(len(frames))
+        strip_rows = self._budget.rows(len(frames))
         shots = [
             Shot(frame, self._frames.counts(frame, self._sampler.region), move)
             for frame, move in zip(frames, moves, strict=True)
@@ -135,7 +135,7 @@ class RawView:
         radiance, variance = (np.empty((height, width, len(self._channels)), dtype=np.float32) for _ in range(2))
         bits = np.zeros((height, width), dtype=np.uint16)
         groups = self._groups(shots)
-        is_warped = [own[0].move.median_px > STILL_PX or not self._sampler.is_still_exact for own in groups]
+        is_warped = [own[0].move.median_px > STILL_PX or not self._sampler.is_exact_at_rest for own in groups]
         for rows in strips(height, strip_rows):
             parts = [
                 self._strip(own, rows, means, warped=warped) for own, warped in zip(groups, is_warped, strict=True)
@@ -148,46 +148,49 @@ class RawView:
         usable = (bits == 0) & self._view.footprint.covered
         colour = colour_of(frames[0], self._channels, radiance[usable])
         farthest = max(moves, key=lambda move: move.median_px)
-        moved = self.motion.stored(farthest), farthest.median_px, any(is_warped)
-        told = [error for move in moves if (error := move.told_error_px) is not None]
-        return LightImage(radiance, variance, bits, *moved, colour, max(told, default=None))
+        moved = self.motion.stored_field(farthest), farthest.median_px, any(is_warped)
+        errors_px = [error for move in moves if (error := move.known_error_px) is not None]
+        return LightImage(radiance, variance, bits, *moved, colour, max(errors_px, default=None))
 
     def _groups(self, shots: Sequence[Shot]) -> list[list[Shot]]:
         """Group exposures that show the subject at the same place: all of them, or each on its own."""
         height, width = self._view.window.shape
         middle = slice(height // 2, height // 2 + 1)
         covered = self._view.footprint.covered[middle]
-        seen = covered if covered.any() else np.ones((1, width), dtype=bool)
-        first = self.motion.places(shots[0].move, middle)
-        apart = max(
-            float(np.linalg.norm(self.motion.places(shot.move, middle) - first, axis=0)[seen].mean()) for shot in shots
+        visible = covered if covered.any() else np.ones((1, width), dtype=bool)
+        first = self.motion.positions(shots[0].move, middle)
+        distance_px = max(
+            float(np.linalg.norm(self.motion.positions(shot.move, middle) - first, axis=0)[visible].mean())
+            for shot in shots
         )
-        return [list(shots)] if apart < STILL_PX else [[shot] for shot in shots]
+        return [list(shots)] if distance_px < STILL_PX else [[shot] for shot in shots]
 
     def _sparse(self, frame: RawFrame, counts: Counts) -> Exposure:
         """Exposure of evenly spaced cells of the region, for statistics of the whole region."""
-        region, cell = self._sampler.region, 1 if self._mosaic == "none" else EVEN
+        region, cell = self._sampler.region, 1 if self._mosaic == "none" else MOSAIC_PERIOD
         step = cell * max(1, int(np.sqrt(counts.shape[0] * counts.shape[1] / COMPARED_PIXELS)))
         rows, columns = (
             (np.arange(0, length - cell + 1, step)[:, None] + np.arange(cell)).ravel() for length in counts.shape[:2]
         )
-        there = np.ix_(rows, columns)
-        return self._frames.exposure_of(frame, counts[there], np.ix_(rows + region.top, columns + region.left))
+        cells = np.ix_(rows, columns)
+        return self._frames.exposure_of(frame, counts[cells], np.ix_(rows + region.top, columns + region.left))
 
     def _means(self, sparse: Sequence[Exposure]) -> NDArray[np.float32] | None:
         """Mean brightness (3,) of a mosaic's channels; None for a camera without a mosaic."""
         rate, _, _ = merge(sparse, self._frames.noise)
         return None if self._mosaic == "none" else channel_means(rate, self._mosaic)
 
-    def _exposure(self, frame: RawFrame, counts: Counts, held: Window) -> Exposure:
-        """Exposure of the part ``held`` of the region."""
-        return self._frames.exposure_of(frame, counts[held.within(self._sampler.region)], (held.rows, held.columns))
+    def _exposure(self, frame: RawFrame, counts: Counts, loaded: Window) -> Exposure:
+        """Exposure of the part ``loaded`` of the region."""
+        return self._frames.exposure_of(
+            frame, counts[loaded.within(self._sampler.region)], (loaded.rows, loaded.columns)
+        )
 
-    def _colours(self, shots: Sequence[Shot], held: Window, means: NDArray[np.float32] | None) -> Image:
+    def _colours(self, shots: Sequence[Shot], loaded: Window, means: NDArray[np.float32] | None) -> Image:
         """Merge exposures in a part of the region; (H, W, 2 C + 1): C rates in counts per second, C variances, and 1
         where the pixel is lost.
         """
-        exposures = [self._exposure(shot.frame, shot.counts, held) for shot in shots]
+        exposures = [self._exposure(shot.frame, shot.counts, loaded) for shot in shots]
         rate, variance, lost = merge(exposures, self._frames.noise)
         del exposures
         if self._mosaic != "none":
@@ -207,35 +210,37 @@ class RawView:
         """
         height, width, count = strip.stop - strip.start, self._view.window.shape[1], len(self._channels)
         parts = list(bands_of(strip, width))
-        places = [self._places(shots[0].move, rows, warped=warped) for rows in parts]
-        held = self._sampler.source(places)
-        colours = self._colours(shots, held, means)
+        positions = [self._positions(shots[0].move, rows, warped=warped) for rows in parts]
+        loaded = self._sampler.source_window(positions)
+        colours = self._colours(shots, loaded, means)
         radiance, variance = (np.empty((height, width, count), dtype=np.float32) for _ in range(2))
         lost, beyond = (np.zeros((height, width), dtype=bool) for _ in range(2))
-        for rows, at in zip(parts, places, strict=True):
+        for rows, at in zip(parts, positions, strict=True):
             own = slice(rows.start - strip.start, rows.stop - strip.start)
             if warped:
-                found = self._sampler.sampled(colours, at, held)
+                found = self._sampler.sampled(colours, at, loaded)
                 beyond[own] = self._sampler.beyond(at)
             else:
-                top, left = self._view.window.top - held.top, self._view.window.left - held.left
+                top, left = self._view.window.top - loaded.top, self._view.window.left - loaded.left
                 found = colours[top + rows.start : top + rows.stop, left : left + width]
-            fall = self._frames.lens.fall(at[0], at[1])
-            scale = self._scale if fall is None else self._scale / fall[..., None]
+            relative_brightness = self._frames.lens.relative_brightness(at[0], at[1])
+            scale = self._scale if relative_brightness is None else self._scale / relative_brightness[..., None]
             np.multiply(found[..., :count], scale, out=radiance[own])
             np.multiply(found[..., count:-1], scale**2, out=variance[own])
             lost[own] = found[..., -1] > 0
         return radiance, variance, lost, beyond
 
-    def _places(self, move: Displacement, rows: slice, *, warped: bool) -> Image:
+    def _positions(self, move: Displacement, rows: slice, *, warped: bool) -> Image:
         """Positions in the photograph of some rows of the view: x, y (2, rows, W) as indices."""
         window = self._view.window
         if not warped:
             return _indices(slice(window.top + rows.start, window.top + rows.stop), window.columns)
         if move.median_px > STILL_PX:
-            return self._sampler.places(self.motion.places(move, rows))
+            return self._sampler.positions(self.motion.positions(move, rows))
         inner = window.within(self.motion.window)
-        return self._sampler.places(_indices(slice(inner[0].start + rows.start, inner[0].start + rows.stop), inner[1]))
+        return self._sampler.positions(
+            _indices(slice(inner[0].start + rows.start, inner[0].start + rows.stop), inner[1])
+        )
 
 
 def _indices(rows: slice, columns: slice) -> Image:

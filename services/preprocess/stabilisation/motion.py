@@ -13,7 +13,7 @@ from services.core.errors import CaptureInputError
 from services.core.records import FrameRecord
 from services.preprocess.projection import Footprint
 from services.preprocess.source import Motions, View
-from services.preprocess.stabilisation.seen import SeenFlow, seen_flow
+from services.preprocess.stabilisation.flow_comparison import FlowComparison, compare_flow
 from services.preprocess.stabilisation.stabilise import TERMS, Aligner, Feature, FloatArray, SurfaceFlow, interpolate
 from services.preprocess.window import Window
 
@@ -51,10 +51,10 @@ def frames_to_match(frames: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
     tracking = tuple(frame for frame in frames if frame.kind == "tracking")
     if len(tracking) >= 2:
         return tracking
-    return tuple(own[0] for own in exposures_together(frames) if own[0].kind == "light")
+    return tuple(own[0] for own in group_exposures(frames) if own[0].kind == "light")
 
 
-def exposures_together(frames: Sequence[FrameRecord]) -> list[tuple[FrameRecord, ...]]:
+def group_exposures(frames: Sequence[FrameRecord]) -> list[tuple[FrameRecord, ...]]:
     """Group consecutive frames of the same kind and light, in order."""
     return [tuple(own) for _, own in groupby(frames, key=lambda frame: (frame.kind, frame.light))]
 
@@ -74,7 +74,7 @@ class Displacement:
     error_px: float
 
     @property
-    def told_error_px(self) -> float | None:
+    def known_error_px(self) -> float | None:
         """Estimated error in pixels; None where it cannot be estimated."""
         return self.error_px or None
 
@@ -95,18 +95,18 @@ class ViewMotion:
             frames: all frames of the capture.
         """
         self._view = view
-        self._used = frames_to_match(frames)
-        self._interpolated = self._used[0].kind == "tracking"
-        self._stands_for = {frame.index: own[0].index for own in exposures_together(frames) for frame in own}
-        seen = [np.isin(view.footprint.mesh, list(meshes)) for meshes in bodies]
-        sides = [_shorter_side(one) for one in seen if one.any()]
-        reach = int(np.ceil(REACH_OF_LIMIT * LIMIT_OF_EXTENT * max(sides))) + REACH_PX
-        self.window: Window = view.window.grown(reach, view.whole.size)
+        self._matched = frames_to_match(frames)
+        self._interpolated = self._matched[0].kind == "tracking"
+        self._representative = {frame.index: own[0].index for own in group_exposures(frames) for frame in own}
+        visible = [np.isin(view.footprint.mesh, list(meshes)) for meshes in bodies]
+        sides_px = [_shorter_side(one) for one in visible if one.any()]
+        reach_px = int(np.ceil(REACH_OF_LIMIT * LIMIT_OF_EXTENT * max(sides_px))) + REACH_PX
+        self.window: Window = view.window.grown(reach_px, view.whole.size)
         """The view's window enlarged by the largest accepted motion."""
         self._inner = view.window.within(self.window)
-        around = _placed(view.footprint, self.window.shape, self._inner)
-        laid = [SurfaceFlow(around, meshes, view.kept(f"relief-{k}")) for k, meshes in enumerate(bodies)]
-        self._bodies = [body for body in laid if body.seen.any()]
+        embedded = _embedded(view.footprint, self.window.shape, self._inner)
+        flows = [SurfaceFlow(embedded, meshes, view.scratch_file(f"relief-{k}")) for k, meshes in enumerate(bodies)]
+        self._bodies = [body for body in flows if body.visible.any()]
         # Compute medians from evenly strided pixels only
         self._step = max(1, int(np.sqrt(np.prod(view.window.shape) / MEDIAN_PIXELS)))
 
@@ -129,11 +129,11 @@ class ViewMotion:
         """
         if not frames:
             return
-        first = self._used[0]
+        first = self._matched[0]
         feature: Feature = "texture" if self._interpolated else "edges"
         reference = picture(first)
         aligners = [Aligner(body, reference, feature, level) for body in self._bodies]
-        for frame in self._used:
+        for frame in self._matched:
             if frame.index not in frames:
                 continue
             if frame.index == first.index:
@@ -158,12 +158,12 @@ class ViewMotion:
             frame: any frame of the capture.
             motions: coefficients of all ``frames_to_match``.
         """
-        index = np.array([used.index for used in self._used], dtype=np.float64)
+        index = np.array([matched.index for matched in self._matched], dtype=np.float64)
         if self._interpolated:
-            knots = np.stack([motions[used.index] for used in self._used])
+            knots = np.stack([motions[matched.index] for matched in self._matched])
             coefficients, error = interpolate(index, knots, float(frame.index))
         else:
-            coefficients = motions[self._stands_for[frame.index]]
+            coefficients = motions[self._representative[frame.index]]
             error = np.zeros_like(coefficients)
         medians = [self._median(body, c) for body, c in zip(self._bodies, coefficients, strict=True)]
         # Take the error of the shift as that of the field, because the other terms are small beside it
@@ -171,35 +171,37 @@ class ViewMotion:
             coefficients, max(medians, default=0.0), float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
         )
 
-    def places(self, displacement: Displacement, rows: slice) -> Image:
+    def positions(self, displacement: Displacement, rows: slice) -> Image:
         """Positions in a frame of some rows of the view: x and y (2, rows, width) as indices into ``window``."""
         own_rows, columns = self._rows(rows), self._inner[1]
-        places = self._bodies[0].places(displacement.coefficients[0], own_rows, columns)
+        positions = self._bodies[0].positions(displacement.coefficients[0], own_rows, columns)
         for body, coefficients in zip(self._bodies[1:], displacement.coefficients[1:], strict=True):
-            seen = body.seen[own_rows, columns]
-            if seen.any():
-                np.copyto(places, body.places(coefficients, own_rows, columns), where=seen)
-        return places
+            visible = body.visible[own_rows, columns]
+            if visible.any():
+                np.copyto(positions, body.positions(coefficients, own_rows, columns), where=visible)
+        return positions
 
-    def seen_flow(self, picture: Callable[[FrameRecord], NDArray[np.generic]], motions: Motions) -> SeenFlow | None:
+    def flow_comparison(
+        self, picture: Callable[[FrameRecord], NDArray[np.generic]], motions: Motions
+    ) -> FlowComparison | None:
         """Optical flow to the tracking frame that moved most, before and after stabilisation; None without two of them.
 
         Args:
             picture: gives the values of a frame in ``window``.
             motions: coefficients of all ``frames_to_match``.
         """
-        if not self._interpolated or len(self._used) < 2 or not self._bodies:
+        if not self._interpolated or len(self._matched) < 2 or not self._bodies:
             return None
-        moves = [self.at(frame, motions) for frame in self._used]
+        moves = [self.at(frame, motions) for frame in self._matched]
         farthest = max(range(len(moves)), key=lambda k: moves[k].median_px)
         # If no frame moved, compare the last one with the first
         farthest = farthest or len(moves) - 1
-        places = self.places(moves[farthest], slice(0, self._view.window.shape[0]))
-        first, moved = (picture(self._used[k]) for k in (0, farthest))
-        teeth = self._view.footprint.covered & np.any([body.seen[self._inner] for body in self._bodies], axis=0)
-        return seen_flow(self._used[farthest].index, first, moved, self._inner, places, teeth)
+        positions = self.positions(moves[farthest], slice(0, self._view.window.shape[0]))
+        first, moved = (picture(self._matched[k]) for k in (0, farthest))
+        teeth = self._view.footprint.covered & np.any([body.visible[self._inner] for body in self._bodies], axis=0)
+        return compare_flow(self._matched[farthest].index, first, moved, self._inner, positions, teeth)
 
-    def stored(self, displacement: Displacement) -> Image:
+    def stored_field(self, displacement: Displacement) -> Image:
         """Displacement (h, w, 2) at every ``stored_step``-th pixel of the whole image that lies in the view.
 
         Pixels that show no tooth get the displacement of the first jaw.
@@ -215,7 +217,7 @@ class ViewMotion:
         )
         field = self._bodies[0].field(displacement.coefficients[0], rows, columns)
         for body, coefficients in zip(self._bodies[1:], displacement.coefficients[1:], strict=True):
-            field = np.where(body.seen[rows, columns, None], body.field(coefficients, rows, columns), field)
+            field = np.where(body.visible[rows, columns, None], body.field(coefficients, rows, columns), field)
         return field
 
     def _rows(self, rows: slice) -> slice:
@@ -224,17 +226,17 @@ class ViewMotion:
 
     def _median(self, body: SurfaceFlow, coefficients: FloatArray) -> float:
         rows, columns = (slice(own.start, own.stop, self._step) for own in self._inner)
-        seen = body.seen[rows, columns]
-        if not seen.any():
+        visible = body.visible[rows, columns]
+        if not visible.any():
             return 0.0
-        return float(np.median(np.linalg.norm(body.field(coefficients, rows, columns)[seen], axis=-1)))
+        return float(np.median(np.linalg.norm(body.field(coefficients, rows, columns)[visible], axis=-1)))
 
 
-def _shorter_side(seen: NDArray[np.bool_]) -> int:
-    return min(int(np.ptp(np.flatnonzero(seen.any(axis=axis)))) + 1 for axis in (0, 1))
+def _shorter_side(visible: NDArray[np.bool_]) -> int:
+    return min(int(np.ptp(np.flatnonzero(visible.any(axis=axis)))) + 1 for axis in (0, 1))
 
 
-def _placed(footprint: Footprint, shape: tuple[int, int], inner: tuple[slice, slice]) -> Footprint:
+def _embedded(footprint: Footprint, shape: tuple[int, int], inner: tuple[slice, slice]) -> Footprint:
     """Embed a footprint in a larger window without surfaces around it; the normals are not enlarged."""
     mesh, covered = np.full(shape, -1, dtype=np.int16), np.zeros(shape, dtype=bool)
     depth_mm = np.full(shape, np.inf, dtype=np.float32)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.preprocess.projection import Footprint
-from services.preprocess.scratch import kept_array
+from services.preprocess.scratch import cached_array
 from services.preprocess.window import bands
 
 Image = NDArray[np.float32]
@@ -30,7 +30,7 @@ TERMS = 7
 Feature = Literal["texture", "edges"]
 # Prior standard deviations of the terms after the shift, between frames under the same light, as fractions of the
 # body's shorter side; the shift has no prior. A nod or turn by a few degrees moves a tooth's outline by this much.
-LIKELY_SHARE = (0.02, 0.02, 0.02, 0.007, 0.007, 0.007)
+PRIOR_SHARE = (0.02, 0.02, 0.02, 0.007, 0.007, 0.007)
 # Number of pixels that count as one observation. Features are made with Gaussians of 2 px, so that residuals of about
 # 4π 2² pixels are correlated
 CORRELATED_PX = 50.0
@@ -51,18 +51,18 @@ class SurfaceFlow:
     Args:
         footprint: surfaces that the camera sees at the reference time.
         meshes: numbers of the body's meshes in the footprint.
-        kept: file of the relief, read if it exists and else written; None to compute the relief and write nothing.
+        cache: file of the relief, read if it exists and else written; None to compute the relief and write nothing.
     """
 
-    def __init__(self, footprint: Footprint, meshes: Sequence[int], kept: Path | None = None) -> None:
-        seen = np.isin(footprint.mesh, list(meshes))
-        self.seen = seen
-        if not seen.any():
+    def __init__(self, footprint: Footprint, meshes: Sequence[int], cache: Path | None = None) -> None:
+        visible = np.isin(footprint.mesh, list(meshes))
+        self.visible = visible
+        if not visible.any():
             return
-        rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
         self._centre_px = np.array([columns.mean(), rows.mean()])
         self._scale_px = max(1.0, 0.5 * max(np.ptp(columns), np.ptp(rows)))
-        self._relief = kept_array(kept, lambda: _relief(footprint.depth_mm, seen))
+        self._relief = cached_array(cache, lambda: _relief(footprint.depth_mm, visible))
         self.extent_px = float(min(np.ptp(columns), np.ptp(rows)) + 1)
 
     def terms(self, relief: Image, x_px: Image, y_px: Image) -> Image:
@@ -70,15 +70,11 @@ class SurfaceFlow:
         x, y = ((v - c) / self._scale_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
         return np.stack([np.ones_like(relief), x, y, relief, x * x, x * y, y * y], axis=-1).astype(np.float32)
 
-    def field(
-        self, coefficients: FloatArray, rows: slice = slice(None), columns: slice = slice(None), step: int = 1
-    ) -> Image:
-        """Displacement (rows, columns, 2) in pixels from the reference to the frame, every ``step`` pixels."""
-        if step > 1:
-            rows, columns = (slice(one.start, one.stop, step) for one in (rows, columns))
+    def field(self, coefficients: FloatArray, rows: slice = slice(None), columns: slice = slice(None)) -> Image:
+        """Displacement (rows, columns, 2) in pixels from the reference to the frame."""
         return np.moveaxis(self._planes(coefficients, rows, columns, moved=0), 0, -1)
 
-    def places(self, coefficients: FloatArray, rows: slice, columns: slice) -> Image:
+    def positions(self, coefficients: FloatArray, rows: slice, columns: slice) -> Image:
         """Positions of the reference's pixels in the frame: x and y (2, rows, columns) in pixels."""
         return self._planes(coefficients, rows, columns, moved=1)
 
@@ -104,29 +100,29 @@ class SurfaceFlow:
 
         size = (max(1, self._relief.shape[1] // factor), max(1, self._relief.shape[0] // factor))
         whole = np.s_[: size[1] * factor, : size[0] * factor]
-        relief, seen = self._relief[whole], self.seen[whole].astype(np.uint8)
+        relief, visible = self._relief[whole], self.visible[whole].astype(np.uint8)
         if factor > 1:
             relief = cv2.resize(relief, size, interpolation=cv2.INTER_AREA)
-            seen = cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST)
+            visible = cv2.resize(visible, size, interpolation=cv2.INTER_NEAREST)
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BAND_PX + 1, 2 * BAND_PX + 1))
-        region = cv2.dilate(seen, disc) > 0
+        region = cv2.dilate(visible, disc) > 0
         y, x = np.mgrid[0 : size[1], 0 : size[0]].astype(np.float32)
         return region, self.terms(relief, (x + 0.5) * factor - 0.5, (y + 0.5) * factor - 0.5)
 
 
-def _relief(depth_mm: Image, seen: BoolArray) -> Image:
+def _relief(depth_mm: Image, visible: BoolArray) -> Image:
     """Relief (H, W): depth minus its mean, in standard deviations.
 
     It is continued beyond the outline, so that the outline itself can be matched.
     """
     import cv2
 
-    depth = np.where(seen, depth_mm, 0).astype(np.float32)
-    mean, spread = float(depth_mm[seen].mean()), max(float(depth_mm[seen].std()), 1e-6)
-    weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), BAND_PX)
+    depth = np.where(visible, depth_mm, 0).astype(np.float32)
+    mean, spread = float(depth_mm[visible].mean()), max(float(depth_mm[visible].std()), 1e-6)
+    weight = cv2.GaussianBlur(visible.astype(np.float32), (0, 0), BAND_PX)
     beyond = cv2.GaussianBlur(depth, (0, 0), BAND_PX) / np.maximum(weight, 1e-6)
     beyond = np.where(weight > 1e-3, beyond, mean)
-    return np.asarray((np.where(seen, depth, beyond) - mean) / spread, dtype=np.float32)
+    return np.asarray((np.where(visible, depth, beyond) - mean) / spread, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -220,7 +216,7 @@ class Aligner:
         """
         if self._feature == "edges":
             return np.asarray(np.tile(EDGE_RIDGE, 2) * np.trace(hessian) / (2 * TERMS) + 1e-12)
-        precision = np.concatenate([[0], (self._extent_px * np.asarray(LIKELY_SHARE)) ** -2.0])
+        precision = np.concatenate([[0], (self._extent_px * np.asarray(PRIOR_SHARE)) ** -2.0])
         return np.asarray(CORRELATED_PX * scale**2 * np.tile(precision, 2) + 1e-12)
 
 

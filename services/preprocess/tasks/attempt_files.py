@@ -35,7 +35,7 @@ from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone, 
 R = TypeVar("R", bound=Record)
 STAGE = "prepared"
 ARRAYS = "prepared.zarr"
-OF_AN_IMAGE = ("radiance", "variance", "valid", "motion", "shadow")
+IMAGE_ARRAYS = ("radiance", "variance", "valid", "motion", "shadow")
 """Names of the arrays in which each image has a shard of its own."""
 WORK = ".prepared.work"
 PLAN = "plan.json"
@@ -86,28 +86,28 @@ class AttemptFiles:
             PlatformError: the package that accesses this kind of URL is not installed.
         """
         earlier = sorted(self._attempts(), key=lambda path: int(path.name.rpartition(".")[2]))
-        left = [path for path in earlier if (path / ARRAYS).exists()]
+        resumable = [path for path in earlier if (path / ARRAYS).exists()]
         plan = _read(self.work / PLAN, _Plan)
-        kept = left[-1] if plan is not None and plan.digest == digest and left else None
-        if kept is None:
+        resumed = resumable[-1] if plan is not None and plan.digest == digest and resumable else None
+        if resumed is None:
             # Remove the plan first, because it declares the other files as resumable
             (self.work / PLAN).unlink(missing_ok=True)
             shutil.rmtree(self.work, ignore_errors=True)
         for path in earlier:
-            if path != kept:
+            if path != resumed:
                 discard(path)
-        if kept is None:
+        if resumed is None:
             self.folder.mkdir(exist_ok=True)
             self.work.mkdir()
             if url is not None:
                 write_record(self.arrays, new_remote_folder(self.arrays, url))
-        elif kept != self.folder:
-            kept.rename(self.folder)
-        if kept is not None:
-            self._forget_what_is_gone()
-        return kept is not None
+        elif resumed != self.folder:
+            resumed.rename(self.folder)
+        if resumed is not None:
+            self._forget_images_with_missing_objects()
+        return resumed is not None
 
-    def announce(self, digest: str) -> None:
+    def mark_resumable(self, digest: str) -> None:
         """Record that the empty store exists, from which moment a later attempt can resume it."""
         write_record(self.work / PLAN, _Plan(digest=digest))
 
@@ -202,7 +202,7 @@ class AttemptFiles:
         remote = remote_folder(self.arrays)
         if remote is None:
             return {}
-        listings = [remote.listed(f"{name}/c/{camera}/{light}") for name in OF_AN_IMAGE]
+        listings = [remote.listed(f"{name}/c/{camera}/{light}") for name in IMAGE_ARRAYS]
         return {name: one for listing in listings for name, one in listing.items()}
 
     def seal(self, images: Iterable[ImageDone]) -> None:
@@ -215,17 +215,17 @@ class AttemptFiles:
         if remote is None:
             return
         written = {name: one for done in images for name, one in done.objects.items()}
-        there = RemoteFolder(url=remote.url, objects=written).require_intact("retry the job, which makes it anew")
+        listed = RemoteFolder(url=remote.url, objects=written).require_intact("retry the job, which makes it anew")
         self.writer.require_lease()
-        write_record(self.arrays, RemoteFolder(url=remote.url, objects=there))
+        write_record(self.arrays, RemoteFolder(url=remote.url, objects=listed))
 
-    def _forget_what_is_gone(self) -> None:
+    def _forget_images_with_missing_objects(self) -> None:
         """Remove the records of images with a missing or changed object on the server, so that they are made again."""
         remote = remote_folder(self.arrays)
-        there = {} if remote is None else remote.listed()
+        listed = {} if remote is None else remote.listed()
         for path in self.work.glob("*/image-*.json"):
             done = _read(path, ImageDone)
-            if done is not None and any(there.get(name) != one for name, one in done.objects.items()):
+            if done is not None and any(listed.get(name) != one for name, one in done.objects.items()):
                 path.unlink()
 
     def _put(self, path: Path, record: Record) -> None:

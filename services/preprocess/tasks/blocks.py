@@ -3,9 +3,9 @@
 Each block is one Dask task and may safely run again: ``develop`` skips images that are stored already, the other steps
 make the same results anew. ::
 
-    look (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows
+    locate (camera) ──> match (camera, some frames) ──> develop (camera, some lights) ──> shade (camera), where shadows
     are asked for
-                                                 └──> compare (camera), where motion is measured
+                                                   └──> compare (camera), where motion is measured
 
 Each image's shards are written by one block at a time.
 """
@@ -21,22 +21,22 @@ import numpy as np
 
 from services.core.records import JobSpec, MaskBit
 from services.core.stage import LocalContext
-from services.preprocess.brightness import light_of
+from services.preprocess.brightness import measure_light
 from services.preprocess.masking.masks import HandMasks
 from services.preprocess.masking.shade import shade
-from services.preprocess.masking.valid import require_seen, valid_bits
+from services.preprocess.masking.valid import require_visible_teeth, valid_bits
 from services.preprocess.opening import open_source
 from services.preprocess.quality import assess, by_stop, write_picture
 from services.preprocess.quality_flow import camera_flow, write_flow
 from services.preprocess.source import Bits, LightImage, Motions, Source, View
 from services.preprocess.stabilisation.motion import stored_step
-from services.preprocess.subject import NOTHING, Subject, read_subject
+from services.preprocess.subject import NO_SURFACE, Subject, read_subject
 from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone
 
 NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)
 """Mask bits of pixels that are left out of an image's brightness levels and noise."""
-Step = Literal["look", "match", "compare", "develop", "shade"]
+Step = Literal["locate", "match", "compare", "develop", "shade"]
 BLOCKS_PER_THREAD = 4
 """Number of blocks for each thread, high enough that no thread is idle for long at the end."""
 LARGEST_BLOCK = 8
@@ -65,16 +65,16 @@ class Block:
         """Run the step; ``develop`` skips images that are stored already.
 
         Raises:
-            CaptureInputError, StoreError: as ``Source`` and ``require_seen`` document. JobCancelledError: the job was
-                cancelled. FencedError: another attempt has begun.
+            CaptureInputError, StoreError: as ``Source`` and ``require_visible_teeth`` document. JobCancelledError: the
+                job was cancelled. FencedError: another attempt has begun.
         """
         context = LocalContext(self.files.writer.root, self.files.writer.attempt)
         context.raise_if_cancelled()
         self.files.writer.require_lease()
         source = open_source(self.spec, context.root, verify=False)
         subject = read_subject(source.root, whole=self.spec.kind == "jaw", fdi=self.spec.fdi)
-        if self.step == "look":
-            _look(self.files, source, subject, self.camera)
+        if self.step == "locate":
+            _locate(self.files, source, subject, self.camera)
             return
         view = self.files.view(self.camera, source.description.cameras[self.camera])
         assert view is not None, "blocks that need a view wait for it"
@@ -87,7 +87,7 @@ class Block:
         if self.step == "shade":
             shade(self.files, source, subject, view, context)
             return
-        motions = self.files.motions(self.camera, source.matched(self.camera))
+        motions = self.files.motions(self.camera, source.matched_frames(self.camera))
         if self.step == "compare":
             _compare(self.files, source, view, motions)
             return
@@ -127,13 +127,13 @@ def images_of(block: Block, files: AttemptFiles) -> Iterator[ImageDone]:
         yield done
 
 
-def _look(files: AttemptFiles, source: Source, subject: Subject, camera: int) -> None:
+def _locate(files: AttemptFiles, source: Source, subject: Subject, camera: int) -> None:
     """Find a camera's window and footprint, and mark the lights without an image as unlit."""
     whole = source.description.cameras[camera]
     view = subject.view_of(camera, whole)
-    require_seen(view.footprint, len(subject.teeth), whole)
+    require_visible_teeth(view.footprint, len(subject.teeth), whole)
     surface, valid = (files.array(name) for name in ("surface", "valid"))
-    labels = np.full(surface.shape[1:], NOTHING, dtype=np.int16)
+    labels = np.full(surface.shape[1:], NO_SURFACE, dtype=np.int16)
     labels[view.window.rows, view.window.columns] = view.footprint.mesh
     surface[camera] = labels
     for light in sorted(set(range(valid.shape[1])) - set(source.lights_of(camera))):
@@ -143,10 +143,10 @@ def _look(files: AttemptFiles, source: Source, subject: Subject, camera: int) ->
 
 def _compare(files: AttemptFiles, source: Source, view: View, motions: Motions) -> None:
     """Write the pictures of optical flow before and after stabilisation."""
-    seen = source.seen_flow(view, motions)
-    flow = None if seen is None else camera_flow(view.whole.name, seen)
-    if seen is not None and flow is not None:
-        write_flow(files.folder / "quality" / "flow", seen, flow)
+    comparison = source.flow_comparison(view, motions)
+    flow = None if comparison is None else camera_flow(view.whole.name, comparison)
+    if comparison is not None and flow is not None:
+        write_flow(files.folder / "quality" / "flow", comparison, flow)
     files.put_flow(view.number, FlowDone(flow=flow))
 
 
@@ -172,19 +172,19 @@ class ImageWriter:
         footprint, window = self.view.footprint, self.view.window
         bits = valid_bits(image, footprint, self.view.camera, lamp, self.subject.glossy(footprint))
         bits |= self.masks.bits(camera.name, lamp.name, camera.size)[window.rows, window.columns]
-        shown = light_of(image, self.view, lamp, (bits == 0) & (footprint.mesh < len(self.subject.teeth)))
-        if shown is not None and shown.dark:
+        image_light = measure_light(image, self.view, lamp, (bits == 0) & (footprint.mesh < len(self.subject.teeth)))
+        if image_light is not None and image_light.dark:
             bits |= np.uint16(MaskBit.UNLIT)
         self.store_masked(light, image, bits)
         picture = self.files.folder / "quality" / f"{camera.name}_{lamp.name}.png"
         write_picture(picture, image.radiance, bits)
-        valued = footprint.covered & (bits & NO_VALUE == 0)
-        stops = by_stop(image.radiance, image.variance, valued)
+        has_value = footprint.covered & (bits & NO_VALUE == 0)
+        stops = by_stop(image.radiance, image.variance, has_value)
         moved = image.motion_px, image.motion_error_px
         return ImageDone(
             quality=assess(camera.name, lamp.name, bits, footprint.covered, *moved, stops),
             tooth_pixels=tuple(self.subject.pixels_of_teeth(footprint, bits).tolist()),
-            light=shown,
+            light=image_light,
             colour=image.colour,
             notes=self.source.notes,
             files=self.files.files_of(self.view.number, light, picture),
@@ -194,17 +194,17 @@ class ImageWriter:
 
     def store_masked(self, light: int, image: LightImage, bits: Bits) -> None:
         """Write an image's arrays and its mask bits (H, W)."""
-        place, window = (self.view.number, light), self.view.window
+        image_index, window = (self.view.number, light), self.view.window
         for name, values in (("radiance", image.radiance), ("variance", image.variance)):
-            self.files.array(name)[*place, window.rows, window.columns] = values
+            self.files.array(name)[*image_index, window.rows, window.columns] = values
         valid = self.files.array("valid")
         whole = np.full(valid.shape[2:], MaskBit.OUTSIDE, dtype=np.uint16)
         whole[window.rows, window.columns] = bits
-        valid[place] = whole
+        valid[image_index] = whole
         if image.displacement is None:
             return
         motion = self.files.array("motion")
         step = stored_step((valid.shape[2], valid.shape[3]))
         top, left = -(-window.top // step), -(-window.left // step)
         rows, columns = image.displacement.shape[:2]
-        motion[*place, top : top + rows, left : left + columns] = image.displacement
+        motion[*image_index, top : top + rows, left : left + columns] = image.displacement

@@ -15,7 +15,7 @@ from services.preprocess.stabilisation.motion import stored_step
 FORMAT = 9
 """Version of the prepared store and of the work files that one attempt leaves for the next. Raise it whenever either
 format changes, or when the same input gives other pixels."""
-INDIFFERENT = frozenset({"workers", "priority", "memory_gib"})
+OPTIONS_WITHOUT_EFFECT = frozenset({"workers", "priority", "memory_gib"})
 """Names of the options that change no pixel."""
 
 
@@ -61,7 +61,7 @@ def create_arrays(store: Path, source: Source, *, with_shadows: bool) -> None:
 def digest_of_inputs(spec: JobSpec, source: Source, masks: HandMasks) -> str:
     """SHA-256 of all inputs of the store; results made with another digest cannot be resumed."""
     digest = hashlib.sha256()
-    parts = [str(FORMAT), spec.model_dump_json(exclude=set(INDIFFERENT)), source.identity(), masks.digest]
+    parts = [str(FORMAT), spec.model_dump_json(exclude=set(OPTIONS_WITHOUT_EFFECT)), source.identity(), masks.digest]
     for path in sorted(source.root.rglob("*.ply")):
         parts += [path.relative_to(source.root).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()]
     for part in parts:
@@ -86,8 +86,8 @@ def held_out_images(spec: JobSpec, source: Source) -> tuple[tuple[str, str], ...
         raise SettingsError("Option 'held_out_cameras' keeps every camera from the fit; leave at least one to it.")
     if spec.held_out_lights is None and source.held_out and not spec.held_out_cameras:
         return source.held_out
-    usual = () if spec.held_out_cameras else tuple(names[3::4])
-    chosen = spec.held_out_lights if spec.held_out_lights is not None else usual
+    by_default = () if spec.held_out_cameras else tuple(names[3::4])
+    chosen = spec.held_out_lights if spec.held_out_lights is not None else by_default
     if unknown := [name for name in chosen if name not in names]:
         raise SettingsError(
             f"Option 'held_out_lights' names {unknown[0]}, but the capture has {', '.join(names)}; correct it."

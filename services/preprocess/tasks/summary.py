@@ -55,7 +55,7 @@ def summarise(
     for camera in source.description.cameras:
         colours = [done.colour for done in images if done.quality.camera == camera.name and done.colour is not None]
         require_like_colours(colours, camera.name)
-    seen = np.sum([done.tooth_pixels for done in images], axis=0)
+    tooth_pixels = np.sum([done.tooth_pixels for done in images], axis=0)
     valid_pixels = sum(report.valid_pixels for report in reports)
     if valid_pixels == 0:
         if brightness.dark:
@@ -75,9 +75,9 @@ def summarise(
     brightness.require_plausible()
     fdi = tuple(tooth.fdi for tooth in subject.teeth)
     # Collect the notes that sources made while they read, each once
-    told = dict.fromkeys([*source.notes, *(note for done in images for note in done.notes)])
-    notes = [*told, *brightness.notes(), *unusable_note(reports)]
-    if hidden := [str(number) for number, count in zip(fdi, seen, strict=True) if count == 0]:
+    source_notes = dict.fromkeys([*source.notes, *(note for done in images for note in done.notes)])
+    notes = [*source_notes, *brightness.notes(), *unusable_note(reports)]
+    if hidden := [str(number) for number, count in zip(fdi, tooth_pixels, strict=True) if count == 0]:
         notes.append(f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
     for note in notes:
         context.report(StageEvent(stage="prepare", kind="log", message=note))
@@ -85,8 +85,8 @@ def summarise(
         done.quality.model_copy(update={"valid_by_tooth": dict(zip(fdi, done.tooth_pixels, strict=True))})
         for done in images
     )
-    looked_at = [files.flow(k) for k in range(len(source.description.cameras))]
-    flows = tuple(done.flow for done in looked_at if done is not None and done.flow is not None)
+    flow_records = [files.flow(k) for k in range(len(source.description.cameras))]
+    flows = tuple(done.flow for done in flow_records if done is not None and done.flow is not None)
     write_record(files.folder / "quality.json", QualityReport(images=covered, flows=flows))
     write_page(files.folder, covered, flows, notes)
     _copy_meshes(source.root, files.folder, fdi)
@@ -104,7 +104,7 @@ def summarise(
         dentin_known=tuple(tooth.fdi for tooth in subject.teeth if tooth.dentin is not None),
         gums=subject.whole and subject.gums is not None,
         cavity=subject.whole and subject.cavity is not None,
-        tooth_pixels=tuple(seen.tolist()),
+        tooth_pixels=tuple(tooth_pixels.tolist()),
         median_motion_px=float(np.median(motions)) if motions else None,
         uncertainty=source.description.uncertainty,
         masks=masks,
@@ -123,8 +123,8 @@ def _images(files: AttemptFiles, source: Source) -> list[ImageDone]:
 
 
 def _copy_meshes(source: Path, target: Path, fdi: tuple[int, ...]) -> None:
-    wanted = [teeth_folder(Path(), number) / name for number in fdi for name in ("outer.ply", "dentin.ply")]
-    for relative in [*wanted, Path("gums.ply"), Path("cavity.ply")]:
+    mesh_files = [teeth_folder(Path(), number) / name for number in fdi for name in ("outer.ply", "dentin.ply")]
+    for relative in [*mesh_files, Path("gums.ply"), Path("cavity.ply")]:
         if (source / relative).is_file():
             (target / relative).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source / relative, target / relative)

@@ -1,1 +1,1 @@
-"""Webhooks over faults of the receiver, the network and the server."""
+"""Webhooks under faults of the receiver, the network and the server."""

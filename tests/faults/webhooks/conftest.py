@@ -1,4 +1,4 @@
-"""The service whose webhooks are tried."""
+"""The service whose webhooks are tested."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where webhooks lead: redirects, names that lead inside, certificates of other names."""
+"""Targets of webhooks: redirects, names that resolve to private addresses, certificates of other names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.receiver import receiving
 from tests.support.webhook_service import Service
 
 CERTIFICATE = Path(__file__).parents[2] / "support" / "localhost.pem"
-"""For the name localhost, signed by itself, with its key."""
+"""File with a self-signed certificate for the name localhost and its key."""
 
 
 @pytest.mark.attack("webhooks", "a redirect")
@@ -30,7 +30,7 @@ def test_a_redirect_is_not_followed(service: Service) -> None:
 
 @pytest.mark.attack("webhooks", "a name that leads inside once it is checked")
 def test_a_name_that_leads_inside_is_not_connected_to(service: Service) -> None:
-    """The subscription is old, the name was public then; what counts is where it leads now."""
+    """The name's address counts at the delivery, whatever it was at the subscription."""
     with receiving() as receiver, service.sending(AddressPolicy()):
         webhook = service.subscribe(receiver.url.replace("127.0.0.1", "localhost"))
         service.run_job()
@@ -42,7 +42,9 @@ def test_a_name_that_leads_inside_is_not_connected_to(service: Service) -> None:
 
 @pytest.mark.attack("webhooks", "a certificate of another name")
 def test_a_certificate_must_prove_the_name_though_the_address_is_connected_to(service: Service) -> None:
-    """Trusted and named rightly; then signed by nobody known; then for another name."""
+    """Three deliveries: a trusted certificate of the right name, an untrusted signer, and a certificate of another
+    name.
+    """
     certified = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     certified.load_cert_chain(CERTIFICATE)
     trusting = ssl.create_default_context(cafile=CERTIFICATE)

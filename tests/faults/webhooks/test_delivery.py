@@ -1,4 +1,4 @@
-"""What happened is told at least once, signed, and the log says how it went."""
+"""Events are delivered at least once and signed, and the log records each attempt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How often a receiver is tried, when it is given up, and what the log forgets."""
+"""Number of tries for a receiver, the time after which it is given up, and the deliveries that the log forgets."""
 
 from __future__ import annotations
 

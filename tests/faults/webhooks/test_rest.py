@@ -1,4 +1,4 @@
-"""Webhooks over REST, their bounds and their secrets."""
+"""Webhooks over REST, their limits and their secrets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a server that is killed, started again, or deletes a job still tells."""
+"""Events that are still delivered after the server was killed or restarted, or has deleted the job."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.webhook_service import Service, states_in
 
 
 def test_a_server_killed_between_event_and_delivery_tells_it_after_its_restart(service: Service) -> None:
-    """Killed before it read the event; then after it had claimed the delivery; then after the receiver had it."""
+    """The server stops after it claimed a delivery, then before it read an event, then after the receiver had it."""
     with receiving() as receiver:
         webhook = service.subscribe(receiver.url)
         service.run_job()

@@ -1,1 +1,1 @@
-"""Who may ask what of the API."""
+"""Access control of the API."""

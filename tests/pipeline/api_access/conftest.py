@@ -1,4 +1,4 @@
-"""A server that asks for tokens."""
+"""A server that requires tokens."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ from tests.support.guarded_server import Guarded, guarded
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
-    # More refusals than a test of every route makes; their limit has tests of its own.
+    # Allow more refusals than a test of every route makes; the limit itself is tested elsewhere.
     with guarded(tmp_path_factory.mktemp("data"), write_report, rates=RateSettings(refusals_per_minute=1000)) as server:
         yield server

@@ -1,4 +1,4 @@
-"""Who did what is written before the answer leaves."""
+"""The audit log records the caller and the action before the answer is sent."""
 
 from __future__ import annotations
 

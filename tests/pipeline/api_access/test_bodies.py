@@ -1,4 +1,4 @@
-"""Bodies have limits, announced or not."""
+"""Request bodies have size limits, whether or not their length is announced."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_body_has_a_limit(small: Guarded, length: int, status: int, announced:
 
 
 def raw_exchange(server: Guarded, head: str, chunks: list[bytes]) -> bytes:
-    """Send bytes as they are and read until the server closes the connection."""
+    """Send bytes unchanged and read until the server closes the connection; returns the answer."""
     import socket
 
     url = server.client.base_url

@@ -1,4 +1,4 @@
-"""Tokens, sessions, and how often one may ask."""
+"""Tokens, sessions, and limits on the rate of requests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from services.api.app import create_app
 from services.api.auth import authentication as gate
-from services.api.auth.scopes import LIVENESS, guarded_routes
+from services.api.auth.scopes import LIVENESS, scoped_routes
 from services.api.auth.sessions import COOKIE
 from services.api.auth.tokens import Scope
 from services.core.settings import RateSettings, ServerSettings
@@ -48,7 +48,7 @@ def test_tokens_are_made_used_listed_and_revoked_over_the_api(server: Guarded) -
 
 
 def sign_in(server: Guarded, scope: Scope = Scope.SUBMIT) -> dict[str, str]:
-    """The cookie header of a new session."""
+    """Open a session; returns the header with its cookie."""
     answer = server.ask("POST", "/v1/session", scope)
     assert answer.status_code == 200
     set_cookie = answer.headers["set-cookie"]
@@ -88,7 +88,7 @@ def test_a_sessions_dark_key_opens_all_off_and_nothing_else(server: Guarded) -> 
     allowed = {("POST", "/v1/dome/off"), ("DELETE", "/v1/dome/light")}
     for method, path in allowed:
         assert server.client.request(method, path, headers=shown).json()["code"] == "dome-unknown", "it was let in"
-    for route in guarded_routes(server.app.routes):
+    for route in scoped_routes(server.app.routes):
         path = route.template.replace("{", "").replace("}", "")
         for method in (route.methods or {"GET"}) - {"HEAD", "OPTIONS"}:
             if route.needs is not None and (method, path) not in allowed:

@@ -1,4 +1,4 @@
-"""Every route needs one scope, and every answer keeps out of caches and frames."""
+"""Every route needs one scope, and every answer forbids caching and display inside frames."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from fastapi import APIRouter, FastAPI
 
 from services.api.app import create_app
-from services.api.auth.scopes import LIVENESS, SETUP, guarded_routes, needs
+from services.api.auth.scopes import LIVENESS, SETUP, needs, scoped_routes
 from services.api.auth.tokens import Caller, Scope
 from services.core.settings import ServerSettings
 from tests.support.access_requests import add_first
@@ -48,7 +48,7 @@ KNOWN_SCOPES = {
 def operations(app: FastAPI) -> list[tuple[str, str, Scope]]:
     """Method, template and declared scope of every route."""
     found = []
-    for route in guarded_routes(app.routes):
+    for route in scoped_routes(app.routes):
         if route.template not in {LIVENESS, SETUP}:
             assert route.needs is not None, f"{route.template} declares {len(route.declared)} scopes"
             found += [(method, route.template, route.needs.scope) for method in route.methods]
@@ -58,7 +58,7 @@ def operations(app: FastAPI) -> list[tuple[str, str, Scope]]:
 @pytest.mark.attack("routes × scopes", "a route that declares no scope")
 def test_every_route_declares_exactly_one_scope(tmp_path: Path) -> None:
     app = create_app(ServerSettings(data=tmp_path))
-    # Served and ended, as an application closes what it opened when it ends.
+    # Serve the application to its end, because it closes its database only then.
     with serving(app):
         declared = {f"{method} {template}": scope for method, template, scope in operations(app)}
     assert len(declared) > len(KNOWN_SCOPES)

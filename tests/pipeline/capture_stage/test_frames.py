@@ -1,4 +1,4 @@
-"""What frames hold: radiance, noise, motion, and the light that the registers say."""
+"""Contents of frames: radiance, noise, motion, and the light that the dome's registers state."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def test_counts_turn_back_into_the_radiance_of_the_one_light(
                 assert (seen == manifest.black_level).all()
                 continue
             still = stills.sum(axis=0) if frame.light is None else stills[int(frame.light[1:])]
-            # Rounding to counts moves radiance by half a count; float32 sums of the stills by some of their epsilons.
+            # Rounding to counts changes radiance by up to half a count, and float32 sums of the stills by some
+            # epsilons.
             tolerance = (
                 0.5 * manifest.radiance_per_count / (frame.level * frame.exposure_s)
                 + 8 * np.finfo(np.float32).eps * still.max()
@@ -73,7 +74,7 @@ def test_brightest_single_light_sits_at_seven_tenths(tmp_path: Path, job: Callab
     manifest = stage.run(job(), LocalContext(tmp_path / "job"))
     lit = [frame.index for frame in manifest.frames if frame.kind == "light"]
     brightest = (frames_of(tmp_path / "job")[:, lit].max() - manifest.black_level) / (2**16 - 1 - manifest.black_level)
-    # The gain follows the 99.9th percentile of the brightest image; of 432 pixels that lies within 1 % of its maximum.
+    # The gain follows the 99.9th percentile of the brightest image; with 432 pixels this is within 1 % of its maximum.
     assert brightest == pytest.approx(0.7, rel=0.01)
 
 
@@ -85,8 +86,8 @@ def test_noise_is_as_specified(tmp_path: Path, job: Callable[..., JobSpec]) -> N
     truth = frames_of(tmp_path / "clean")[0, lit].astype(np.float64)
     deviation = np.hypot(0.02 * (truth - clean.black_level), 0.004 * (2**16 - 1))
     z = (frames_of(tmp_path / "noisy")[0, lit] - truth) / deviation
-    # n samples of N(0, 1): mean within 4/√n, variance within 4·√(2/n); together a false alarm in 8,000 seeds, and the
-    # seed is fixed.
+    # For n samples of N(0, 1) the bounds are 4/√n for the mean and 4·√(2/n) for the variance: together one false alarm
+    # in 8,000 seeds, and the seed is fixed.
     assert abs(z.mean()) < 4 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 4 * np.sqrt(2 / z.size)
 
@@ -131,7 +132,8 @@ def test_motion_displaces_frames_by_the_stated_field(tmp_path: Path, job: Callab
     truth = 0.1 + 0.225 * (1 + light % 2 + waves)
     seen = radiance_of(manifest, frames_of(tmp_path / "job")[0, last.index], last)
     inside = np.s_[4:-4, 4:-4]
-    # Interpolation error of waves of amplitude 0.225 and wave numbers 1/4 and 1/5, as derived in test_capture_motion.
+    # The bound is the interpolation error of waves of amplitude 0.225 and wave numbers 1/4 and 1/5, as derived in
+    # test_capture_motion.
     bound = 0.225 * 0.5625 / 6 * ((1 / 4) ** 3 + 1.25 * (1 / 5) ** 3) + manifest.radiance_per_count / (
         last.level * last.exposure_s
     )
@@ -161,7 +163,8 @@ def test_the_measured_incisor_is_captured_through_a_dome_of_its_own(tmp_path: Pa
             variance = (0.01 * still) ** 2 + (0.002 * 4095 * count) ** 2 + count**2 / 12
             z_sum += float(((seen - still) ** 2 / variance).sum())
             pixels += still.size
-    # Chi-square over n pixels: mean 1, deviation √(2/n); 4 deviations, and the seed is fixed.
+    # Chi-square over n pixels, divided by n, has the mean 1 and the standard deviation √(2/n). The tolerance is 4
+    # standard deviations, and the seed is fixed.
     assert z_sum / pixels == pytest.approx(1, abs=4 * np.sqrt(2 / pixels))
     assert manifest.fdi == (11,)
     assert (tmp_path / "capture" / "teeth" / "11" / "dentin.ply").is_file()

@@ -1,4 +1,4 @@
-"""What a preflight finds before any frame."""
+"""Findings of a preflight before any frame is taken."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def test_preflight_names_a_dead_light_before_any_frame(
 
 
 class LeakyRoom(SimulatedCameras):
-    """Cameras in a room that is not dark: 500 counts more everywhere."""
+    """Cameras in a room that is not dark, with 500 counts more in every pixel."""
 
     def read(self) -> tuple[NDArray[np.uint16], ...]:
         return tuple(image + np.uint16(500) for image in super().read())
 
 
 def look(mouth: Path, address: Address, kind: type[SimulatedCameras], gain_level: float) -> tuple[str, ...]:
-    """Preflight at level 0.5 with cameras whose gain suits another level."""
+    """Run a preflight at level 0.5 with cameras whose gain is set for ``gain_level``; returns its findings."""
     rig = RigSpec(mouth=mouth, exposure_s=0.01, simulation=NOISELESS)
     plan = plan_capture(rig, LIGHTS)
     stills = Stills(mouth, read_record(mouth / "capture.json", FolderCapture))

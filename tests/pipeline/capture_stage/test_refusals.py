@@ -1,4 +1,4 @@
-"""What cannot be captured is one sentence before any light."""
+"""An impossible capture is refused with one sentence before any light is on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures that are cancelled, overtaken or broken off end in the dark and go on after their last frame."""
+"""Captures that are cancelled, overtaken or broken off leave the dome dark and continue after their last frame."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.support.mouth import write_mouth
 
 
 class CancelAfter(LocalContext):
-    """Asks for a cancel once so many frames are stored, and looks at the lights when it does."""
+    """A context that requests a cancel after a number of stored frames, and asserts that the dome is dark then."""
 
     def __init__(self, root: Path, frames: int, address: Address) -> None:
         super().__init__(root, listener=self._count)
@@ -42,7 +42,7 @@ class CancelAfter(LocalContext):
         self._left -= event.kind == "progress"
 
     def raise_if_cancelled(self) -> None:
-        # The lookout asks too, from a thread of its own and under light.
+        # The capture's watcher also asks for a cancel, from its own thread and while a light is on.
         if threading.current_thread() is threading.main_thread():
             assert not outputs(self._address).any()
         if self._left == 0:
@@ -72,14 +72,14 @@ def test_a_cancelled_capture_is_dark_and_resumes(
 
 
 LONG_S = 58.0
-"""An exposure that outlasts every wait of a test: whoever waits for its end has failed. At a level of 0.1 it is within
-the dose of a light."""
+"""Exposure time longer than every wait of a test, so that code that waits for its end fails the test. At a level of 0.1
+it is within the dose limit of a light."""
 WAIT_S = 30.0
 
 
 @pytest.fixture
 def long_job(job: Callable[..., JobSpec], monkeypatch: pytest.MonkeyPatch) -> Callable[..., JobSpec]:
-    """A job that exposes for so long as soon as a light is on; without the preflight's glimpses, and with short black
+    """A job that exposes for ``LONG_S`` when a light is on, without the preflight's flashes and with short black
     frames.
     """
 
@@ -95,7 +95,7 @@ def long_job(job: Callable[..., JobSpec], monkeypatch: pytest.MonkeyPatch) -> Ca
 
 
 def begin(spec: JobSpec, root: Path) -> tuple[threading.Thread, list[Exception]]:
-    """Capture in a thread; what it raises is put into the list."""
+    """Capture in a thread; returns it and the list that receives its exceptions."""
     raised: list[Exception] = []
 
     def capture() -> None:
@@ -178,7 +178,7 @@ def test_a_torn_journal_line_is_no_frame(
     journal = root / ".capture.1" / "journal.jsonl"
     journal.write_text(spoil(journal.read_text()))
     events: list[StageEvent] = []
-    # The same attempt number again, as a plain rerun of the command has it.
+    # Use the same attempt number again, as a rerun of the command does.
     stage.run(job(), LocalContext(root, listener=events.append))
     assert next(event.data["frame"] for event in events if event.kind == "progress") == recaptured
 
@@ -212,7 +212,7 @@ def test_a_full_disk_keeps_what_was_acknowledged(tmp_path: Path, job: Callable[.
 
     def fill_disk(event: StageEvent) -> None:
         if event.kind == "progress" and event.data["frame"] == 4:
-            # A shard of 160 x 160 x 3 noisy 12-bit pixels is over 100 kB; nothing else that is written comes near.
+            # A shard of 160 x 160 x 3 noisy 12-bit pixels is over 100 kB, and all other written files are much smaller.
             resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
 
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -1,1 +1,1 @@
-"""The dome by hand, over the API."""
+"""The dome worked by hand over the API."""

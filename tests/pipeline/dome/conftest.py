@@ -1,4 +1,4 @@
-"""A simulated dome, who looks at it, and a server that has it."""
+"""A simulated dome, an observer of it, and a server that drives it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ALL OFF darkens the dome whatever else goes on, and holds."""
+"""ALL OFF darkens the dome whatever else is running, and the dome stays dark."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_light_that_was_asked_for_before_all_off_does_not_come_after_it(
 
 
 class Seen:
-    """Looks at the dome all the time from a thread of its own."""
+    """Reads the dome's outputs all the time in a thread of its own."""
 
     def __init__(self, address: Address) -> None:
         self._observer, self._ending = DomeObserver(*address), threading.Event()
@@ -78,7 +78,7 @@ def test_all_off_stops_a_capture_and_no_light_is_seen_after_it(
         off_s = time.monotonic()
         assert answer["stopped"] == [job]
         ended = client.get(f"/v1/jobs/{job}/events").text
-        # Whether it stood between two frames or in one: it says which.
+        # The stop came either between two frames or during one, and the job's end states which.
         assert client.get(f"/v1/jobs/{job}").json()["state"] == "CANCELLED" or '"code":"rig-stopped"' in ended, ended[
             -600:
         ]
@@ -105,7 +105,7 @@ def test_all_off_tells_whoever_drives_the_dome(
 
 
 def console_of(server: int) -> psutil.Process:
-    """The dome's process of a server."""
+    """The process of a server that drives its dome."""
     return next(child for child in psutil.Process(server).children() if "services.capture.console" in child.cmdline())
 
 
@@ -131,7 +131,7 @@ def test_of_two_all_offs_at_once_the_later_one_holds(
             if not later:
                 later.append(threading.Thread(target=lambda: answer(number=7, do="off")))
                 later[0].start()
-                # Whoever waits for the order to be written takes all of this time.
+                # Code that waits until the order is written waits for all of this time.
                 later[0].join(1)
             return max(numbers)
 
@@ -149,7 +149,7 @@ def test_all_off_darkens_a_dome_that_is_late_to_say_what_it_is(
     late_s = 3.0
     for module in ("all_off", "controller", "driver"):
         monkeypatch.setattr(f"services.capture.dome.{module}.REPLY_TIMEOUT_S", 4 * late_s)
-    # As the process does it, each command in a thread of its own.
+    # Run each command in a thread of its own, as the dome's process does.
     with console(shared_dome) as answer, ThreadPoolExecutor(2) as threads:
         assert threads.submit(answer, do="light", light=0, level=0.1, on_s=20).result().code is None
         order_fault(*shared_dome, FaultKind.DELAY, round(1000 * late_s), on=reg.IDENTITY)

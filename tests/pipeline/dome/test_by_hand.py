@@ -1,4 +1,4 @@
-"""One light by hand: what it may do, how long, and who may ask for it."""
+"""One light switched on by hand: its limits of level and time, and the callers who may do it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_light_that_nobody_asks_for_again_goes_dark(client: httpx.Client, obse
     client.put("/v1/dome/light", json={"light": 1, "on_s": 0.8}).raise_for_status()
     wait_until(lambda: lit(observer) == ())
     assert time.monotonic() - began_s >= 0.8, "the renewed light went dark before its time"
-    # By its own process, not by the controller's watchdog.
+    # The dome's own process darkened it, not the controller's watchdog.
     assert observer.faults() == FaultBit(0)
 
 
@@ -76,7 +76,7 @@ def test_light_by_hand_adds_up_to_the_limit(shared_dome: Address, observer: Dome
         lit_s = time.monotonic()
         wait_until(lambda: time.monotonic() > lit_s + 0.2)
         answer(do="dark")
-        # What was on adds 0.02 level-seconds at least; another light has had none.
+        # The first exposure adds at least 0.02 level-seconds to this light's dose, but none to another light's.
         assert answer(do="light", light=0, level=0.1, on_s=14.9).code == "rig-exposure-limit"
         assert lit(observer) == ()
         assert answer(do="light", light=1, level=0.1, on_s=14.9).code is None

@@ -1,4 +1,4 @@
-"""Preflights, and captures that have the dome for themselves."""
+"""Preflights, and captures that have exclusive use of the dome."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_preflight_tells_what_it_finds(
 
 def test_all_off_ends_a_preflight(client: httpx.Client, observer: DomeObserver, tmp_path: Path) -> None:
     answers: list[httpx.Response] = []
-    # A black and a lit frame of seconds each, so that it is certainly under way.
+    # The black and the lit frame take seconds each, so that the preflight is certainly still running.
     wanted = rig(tmp_path, exposure_s=2.0, level=0.1)
     asking = threading.Thread(target=lambda: answers.append(client.post("/v1/dome/preflight", json=wanted)))
     asking.start()

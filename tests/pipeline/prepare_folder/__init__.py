@@ -1,1 +1,1 @@
-"""Folder captures as the prepare stage imports them."""
+"""Import of folder captures by the prepare stage."""

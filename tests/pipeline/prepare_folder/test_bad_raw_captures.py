@@ -20,13 +20,13 @@ from tests.support.raw_folders import Tree, write_toml
 from tests.support.raw_sensor import Sensor
 
 FRAME = "c0_l2_0.1.npy"
-"""The last light's longer exposure, which every kind of bad input below damages or contradicts."""
+"""File of the last light's longer exposure, which every kind of bad input below damages or contradicts."""
 Damage = Callable[[Path, Tree], object]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tree]:
-    """A raw folder that is prepared as it is: one camera, four lights, two exposures, reddish."""
+    """A raw folder that preparation accepts: one camera, four lights, two exposures, with stronger red."""
     root = tmp_path_factory.mktemp("whole")
     write_mouth(root / "mouth", lights=4, sizes=((40, 32),))
     tree = json.loads((root / "mouth" / "capture.json").read_text())
@@ -45,17 +45,17 @@ def entry(tree: Tree, file: str = FRAME) -> dict[str, Any]:
 
 
 def told(**changed: Any) -> Damage:
-    """The description changed at the frame."""
+    """Damage that changes the frame's entry in the description."""
     return lambda _, tree: entry(tree).update(changed)
 
 
 def values(make: Callable[[np.ndarray], np.ndarray], file: str = FRAME) -> Damage:
-    """The numbers changed of a frame."""
+    """Damage that changes the counts of a frame."""
     return lambda root, _: np.save(root / file, make(np.load(root / file)))
 
 
 def replaced(name: str, content: bytes) -> Damage:
-    """The frame as another file."""
+    """Damage that replaces the frame by another file."""
 
     def damage(root: Path, tree: Tree) -> None:
         (root / name).write_bytes(content)
@@ -65,7 +65,7 @@ def replaced(name: str, content: bytes) -> Damage:
 
 
 def image(name: str, make: Callable[[np.ndarray], np.ndarray] = lambda v: v, share: float = 1.0) -> Damage:
-    """The frame as a file that OpenCV writes, cut off after a share of its bytes."""
+    """Damage that stores the frame as a file written by OpenCV, cut off after a share of its bytes."""
 
     def damage(root: Path, tree: Tree) -> None:
         cv2.imwrite(str(root / name), make(np.load(root / FRAME))[..., ::-1])
@@ -92,7 +92,7 @@ def without(kind: str) -> Damage:
 
 
 def shifted_mosaic(root: Path, tree: Tree) -> None:
-    """All frames as a mosaic, this one starting at the next column."""
+    """Damage that stores all frames as a mosaic, with this frame's pattern shifted by one column."""
     tree["camera"][0]["mosaic"] = "RGGB"
     del tree["camera"][0]["channels"]
     for one in tree["frame"]:

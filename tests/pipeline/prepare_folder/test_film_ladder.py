@@ -1,8 +1,8 @@
-"""A real ladder of twelve exposures on film: each photograph is told by the merge of the eleven others.
+"""A real series of twelve exposures on film: each photograph is predicted from the merge of the eleven others.
 
-The ladder comes with a merged image, which is no truth: its darkest tenth is twice as bright as its own mid-tones say
-of the same counts, as it averages logarithms with the film's fog in them, and it tells the four shortest photographs up
-to 2.3 stops too dark. A photograph that was left out is a truth for all.
+The series comes with a merged image, which is not the truth. Its darkest tenth is twice as bright as its own mid-tones
+imply for the same counts, because it averages logarithms that contain the film's fog, and it predicts the four shortest
+photographs up to 2.3 stops too dark. A photograph that was left out is a truth for every method.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from services.core.raw.noise import NoiseModel
 from tests.support.shared_data import shared_path
 
 STEP = 3
-"""Every so many pixels are looked at: 39,000 of them, 400,000 pairs of a photograph and a pixel."""
+"""Step of the pixels compared in x and y: 39,000 pixels, 400,000 pairs of a photograph and a pixel."""
 FULL = 250
 LOW, HIGH = 40, 215
-"""Counts that tell a film's exposure: the fog lies at 18."""
+"""Range of counts that depend on the film's exposure; the fog is at 18."""
 NOISE = NoiseModel(0.01, 0.001)
-"""Of straightened counts. A scan's noise is no sensor's; ten times as much of either moves the figures by 0.01."""
+"""Assumed noise of linearised counts. A scan's noise is not that of a sensor; ten times as much of either part changes
+the figures by 0.01."""
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """Photographs (H, W, 3) from the longest exposure to the shortest, and the response (256, 3) that OpenCV finds."""
+    """Photographs (H, W, 3) from the longest to the shortest exposure, and the response by OpenCV (256, 3)."""
 
     photographs: list[np.ndarray]
     exposures_s: np.ndarray
@@ -70,7 +71,9 @@ def ladder() -> Ladder:
 
 
 def stops_off(ladder: Ladder, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """By how many stops the others tell a photograph wrong, about what a count usually says; and which one it is."""
+    """Errors in stops of the prediction of photographs from the others, relative to the usual error of a count; and the
+    photograph's index for each.
+    """
     values, stops, channels, numbers = [], [], [], []
     for left_out in range(1, len(ladder.photographs) - 1):
         merged = getattr(ladder, name)([k for k in range(len(ladder.photographs)) if k != left_out])
@@ -81,7 +84,7 @@ def stops_off(ladder: Ladder, name: str) -> tuple[np.ndarray, np.ndarray]:
         channels.append(np.broadcast_to(np.arange(3), photograph.shape)[told])
         numbers.append(np.full(told.sum(), left_out))
     value, stop, channel, number = (np.concatenate(one) for one in (values, stops, channels, numbers))
-    # What a count means is free, so no merge has an advantage by the response that it knows
+    # Subtract the usual error of each count, so that no merge has an advantage by the response that it knows.
     usual = np.zeros((3, 256))
     for c in range(3):
         for count in range(LOW, HIGH + 1):
@@ -90,7 +93,9 @@ def stops_off(ladder: Ladder, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_photograph_is_told_by_the_others_better_than_by_the_merges_of_others(ladder: Ladder) -> None:
-    """5 to 95 % in stops: here -0.34 to 0.27, OpenCV -0.31 to 0.39, the image that comes with them -0.56 to 0.40."""
+    """Range from 5 to 95 % in stops: -0.34 to 0.27 here, -0.31 to 0.39 by OpenCV, -0.56 to 0.40 by the image that comes
+    with the series.
+    """
     width = {}
     for name in ("ours", "opencv", "reference"):
         low, high = np.percentile(stops_off(ladder, name)[0], (5, 95))
@@ -99,7 +104,9 @@ def test_a_photograph_is_told_by_the_others_better_than_by_the_merges_of_others(
 
 
 def test_no_photograph_is_told_brighter_or_darker_than_another(ladder: Ladder) -> None:
-    """Medians of up to 0.09 stops, of the image that comes with them 2.3; shutters keep their times to a tenth."""
+    """Medians are up to 0.09 stops, and 2.3 for the image that comes with the series; shutters keep their times to a
+    tenth.
+    """
     medians = {}
     for name in ("ours", "reference"):
         off, number = stops_off(ladder, name)

@@ -1,4 +1,4 @@
-"""What a folder capture becomes: radiance, noise, masks, and what is said of it."""
+"""Result of importing a folder capture: radiance, noise, masks, and messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.shared_data import shared_path
 
 
 def test_incisor_imports_whole(tmp_path: Path) -> None:
-    """Valid pixels are those that ray tracing of centres and corners gives; images and variances arrive bit by bit."""
+    """Valid pixels are those found by ray tracing of centres and corners; images and variances keep every bit."""
     folder = shared_path("data/tooth-ur1-truth")
     manifest = prepare(folder, tmp_path, boundary="matched", dentin="known")
     published, _ = open_stage(tmp_path, "prepared", PreparedManifest)

@@ -1,4 +1,4 @@
-"""Raw folders, prepared: counts of a known sensor become the radiance that it saw."""
+"""Preparation of raw folders: counts of a known sensor become the radiance that it received."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def mouth(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def textured(mouth: Path) -> Path:
-    """The same with waves of 8 pixels, by which its motion is known to a hundredth of a pixel."""
+    """The mouth with waves of 8 pixels in its images, from which motion can be measured to a hundredth of a pixel."""
     for file in mouth.glob("c*_l*.npy"):
         image = np.load(file)
         y, x = np.mgrid[: image.shape[0], : image.shape[1]]
@@ -62,18 +62,18 @@ def smooth_truth(manifest: PreparedManifest, shape: tuple[int, ...]) -> np.ndarr
 
 
 def test_colour_counts_of_three_exposures_become_radiance_with_its_variance(textured: Path, tmp_path: Path) -> None:
-    """z of all pixels that are not full: mean square within 5 standard errors, 4 %, and 3 % for the noise model's own
-    error.
+    """z-scores of all pixels below full scale: the mean square is 1 within 5 standard errors (4 %) plus 3 % for the
+    error of the noise model.
 
-    The mean may be off by 0.05, as the black frames' and the flat frames' noise is shared by all pixels of a place or a
-    camera.
+    The tolerance of the mean is 0.05, because the noise of black and flat frames is common to all frames of a pixel or
+    all pixels of a camera.
     """
     write_raw_capture(tmp_path / "raw", textured, Sensor(), (0.0125, 0.05, 0.2), flats=6)
     source = RawSource(tmp_path / "raw", None, 0.01, 0.002)
     subject = read_subject(source.root, whole=False)
     for k, camera in enumerate(source.description.cameras):
         view = subject.view_of(k, camera)
-        motions = dict(source.match(view, source.matched(k)))
+        motions = dict(source.match(view, source.matched_frames(k)))
         for j, image in source.images(view, source.lights_of(k), motions):
             truth = np.load(textured / f"c{k}_l{j}.npy")[view.window.rows, view.window.columns]
             assert image.motion_px is not None
@@ -90,17 +90,17 @@ def test_colour_counts_of_three_exposures_become_radiance_with_its_variance(text
 def test_exposures_that_show_nothing_move_no_subject(
     textured: Path, tmp_path: Path, others_s: tuple[float, ...]
 ) -> None:
-    """Without tracking frames edges are matched, and an exposure that is all noise or full has none: lights are found
-    where one good exposure shows them.
+    """Without tracking frames, motion comes from matched edges. Exposures of pure noise or at full scale have no edges,
+    so the motion is that of one good exposure.
 
-    Edges are good to about a pixel; the same edges with a little more or less noise to a tenth of that.
+    Edges are accurate to about a pixel; the same edges with a little more or less noise agree to a tenth of that.
     """
     found = []
     for name, exposures_s in (("one", (0.05,)), ("several", tuple(sorted((0.05, *others_s))))):
         write_raw_capture(tmp_path / name, textured, Sensor(), exposures_s, tracking=0)
         source = RawSource(tmp_path / name, None, 0.01, 0.002)
         view = read_subject(source.root, whole=False).view_of(0, source.description.cameras[0])
-        motions = dict(source.match(view, source.matched(0)))
+        motions = dict(source.match(view, source.matched_frames(0)))
         assert len(motions) == 3
         assert all(image.motion_px is not None for _, image in source.images(view, (0, 1, 2), motions))
         found.append([coefficients[:, 0] for coefficients in motions.values()])
@@ -108,7 +108,9 @@ def test_exposures_that_show_nothing_move_no_subject(
 
 
 def test_a_mosaic_becomes_radiance_of_all_channels(mouth: Path, tmp_path: Path) -> None:
-    """Waves of 28 pixels through a mosaic: interpolation and 12 bits of noise leave 3 % rms, and no bias of 0.5 %."""
+    """For waves of 28 pixels through a mosaic, interpolation and noise at 12 bits leave 3 % rms and less than 0.5 %
+    bias.
+    """
     write_raw_capture(tmp_path / "raw", mouth, Sensor(mosaic="GRBG"), (0.05, 0.2), flats=0)
     manifest = prepare(tmp_path / "raw", tmp_path / "job")
     radiance, _, valid = prepared(tmp_path / "job")
@@ -119,9 +121,9 @@ def test_a_mosaic_becomes_radiance_of_all_channels(mouth: Path, tmp_path: Path) 
 
 
 def test_the_report_shows_the_motion_of_photographs_and_that_it_is_gone(tmp_path: Path) -> None:
-    """A mosaic of 12 bits that moves by 2 px at a time, which keeps its pattern: 6 px from the first tracking frame.
+    """The subject moves by 2 px at a time, which keeps the mosaic's pattern: 6 px from the first tracking frame.
 
-    The flow's own errors are a tenth of a pixel.
+    The optical flow's own errors are a tenth of a pixel.
     """
     write_mouth(tmp_path / "mouth", lights=6, sizes=((160, 120), (140, 100)))
     tree = json.loads((tmp_path / "mouth" / "capture.json").read_text())

@@ -1,4 +1,4 @@
-"""Real exposures by others: linearity and black of raw mosaics, and the merge of a ladder of exposures."""
+"""Real raw data of other groups: linearity and black level of raw mosaics, and the merge of a series of exposures."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from tests.support.shared_data import shared_path
 
 SIZE = (408, 342)
 MIN_MEAN, MAX_COUNT = 10.0, 250.0
-"""As for the figures that the data's source states: shorter patch means above the one, no pixel above the other."""
+"""Limits used for the figures that the data's source states: least mean of a patch in the shorter exposure, and largest
+count of a pixel."""
 
 
 @pytest.fixture(scope="module")
 def chart(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CameraFrames]:
-    """A ColorChecker under seven bands in four exposures with dark frames, as a raw folder."""
+    """A raw folder of a ColorChecker under seven spectral bands in four exposures, with dark frames."""
     data, root = shared_path("data/colorchecker-raw"), tmp_path_factory.mktemp("chart")
     frames = []
     for path in sorted(data.rglob("captured_images/**/*.tif")):
@@ -56,14 +57,14 @@ def patches(band: str = "550nm") -> np.ndarray:
 
 
 def site_means(image: np.ndarray, labels: np.ndarray, reduce: str = "mean") -> np.ndarray:
-    """Mean, or greatest value, of each patch in each pixel of the pattern, (4, 24)."""
+    """Mean or largest value (4, 24) of each patch, by position in the mosaic's pattern."""
     views = zip(sites(image, "GBRG"), sites(labels, "GBRG"), strict=True)
     return np.array([[getattr(view[where == k], reduce)() for k in range(1, 25)] for (_, view), (_, where) in views])
 
 
 def test_exposures_of_a_real_sensor_are_linear_above_their_black(chart: tuple[Path, CameraFrames]) -> None:
-    """The source's own figures over its 430 pairs: median 1.001, 5 % 0.973, 95 % 1.040; within 0.002, 0.005 and 0.005
-    of them.
+    """The source's figures over its 430 pairs are median 1.001, 5 % quantile 0.973 and 95 % quantile 1.040; the
+    tolerances are 0.002, 0.005 and 0.005.
     """
     root, camera = chart
     assert camera.linearity.is_linear
@@ -86,7 +87,7 @@ def test_exposures_of_a_real_sensor_are_linear_above_their_black(chart: tuple[Pa
 
 
 def test_merged_exposures_of_the_grey_row_follow_its_measured_reflectance(chart: tuple[Path, CameraFrames]) -> None:
-    """The source's correlations for single exposures: 0.996 to 0.9996 from 450 to 700 nm."""
+    """The source's correlations for single exposures are 0.996 to 0.9996 from 450 to 700 nm."""
     root, camera = chart
     folder, labels = read_raw_folder(root), patches()
     with shared_path("data/colorchecker-raw/spectral_data/spectra_averaged.csv").open() as stream:

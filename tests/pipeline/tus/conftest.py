@@ -1,4 +1,4 @@
-"""A server that takes uploads, and one upload that has begun."""
+"""A server that accepts uploads, and one upload that has begun."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def client(tmp_path: Path, world: World) -> Iterator[httpx.Client]:
     engine = upgraded(tmp_path / "db.sqlite")
     limits = UploadLimits(open_for_s=100, silence_s=2, keep_free_bytes=10)
     app = FastAPI()
-    app.state.parsers = ThreadPool(1)
+    app.state.parser_pool = ThreadPool(1)
     problems.install(app)
     captures = Captures(engine, tmp_path, limits, lambda: world.now_s, lambda: world.free_bytes, world.write)
     app.include_router(build_captures_router(captures))

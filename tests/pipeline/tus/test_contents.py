@@ -1,4 +1,4 @@
-"""Which bytes an upload takes, and when it is gone."""
+"""The bytes that an upload accepts, and the time after which it expires."""
 
 from __future__ import annotations
 

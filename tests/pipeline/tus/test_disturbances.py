@@ -20,7 +20,7 @@ from tests.support.uploading import TUS, announce, checksum, offset_of, patch, u
 
 
 def wait_for_partial(data: Path) -> None:
-    """Until the server has begun to receive."""
+    """Wait until the server has begun to receive."""
     while not any(path.is_file() for path in (data / "partial").rglob("*")):
         time.sleep(0.02)
 

@@ -1,4 +1,4 @@
-"""The tus protocol as it is spoken: options, parts, offsets, versions, checksums, metadata."""
+"""Requests and answers of the tus protocol: options, parts, offsets, versions, checksums, metadata."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 /** The part of the public REST API that this page uses. */
 
-import { clearTheWay } from "./follow";
+import { freeConnections } from "./follow";
 import { inLane } from "./lanes";
 import type { OptionSchema } from "./optionField";
 
@@ -289,7 +289,7 @@ export const listCalibrations = (): Promise<NamedCalibration[]> => ask("/calibra
 /** Store the calibration that a job has made under a name. */
 export const keepCalibration = (job: string, name: string): Promise<NamedCalibration> =>
   ask(`/jobs/${job}/calibration/${encodeURIComponent(name)}`, "PUT");
-export const submitJob = (wanted: object): Promise<Job> => ask("/jobs", "POST", {}, wanted);
+export const submitJob = (options: object): Promise<Job> => ask("/jobs", "POST", {}, options);
 export const renameJob = (id: string, name: string | null): Promise<Job> => ask(`/jobs/${id}`, "PATCH", {}, { name });
 export const deleteJob = (id: string): Promise<Deletion> => ask(`/jobs/${id}`, "DELETE");
 export const cancelJob = (id: string): Promise<Job> => ask(`/jobs/${id}/cancel`, "POST");
@@ -304,7 +304,7 @@ export const getDome = (patienceMs = DOME_PATIENCE_MS): Promise<DomeState> =>
  * the key fails, the cookie is tried: darkening twice is harmless.
  */
 export async function allOff(session: Session | null): Promise<AllOff> {
-  clearTheWay();
+  freeConnections();
   const off = (how: RequestInit): Promise<AllOff> => request("/dome/off", { method: "POST", priority: "high", ...how });
   if (session?.is_open) return off({ credentials: "omit" });
   if (!session?.dark_key) return off({});

@@ -35,7 +35,7 @@ export class DomeView {
   private readonly offTrouble = element("p", { class: "failure off-trouble", role: "alert" });
   private readonly done = element("p", { class: "done", role: "status" });
   private readonly refusal = element("p", { class: "failure", role: "alert" });
-  private readonly silence = element("p", { class: "failure", role: "alert" });
+  private readonly noAnswer = element("p", { class: "failure", role: "alert" });
   private readonly facts = element("dl", { class: "facts" });
   private readonly capturing = element("p", { class: "soft" });
   private readonly level = numberInput("level", 5, 1, 100);
@@ -52,7 +52,7 @@ export class DomeView {
   private readonly look = element("button", {}, "Run the preflight");
   private readonly findings = element("ul", { class: "findings", role: "status" });
   private capturers = "";
-  private deeds = 0;
+  private actionCount = 0;
   private timer = 0;
   private clock = 0;
   /** When the dome last reported its state (`performance.now()`, ms), and that state in words. */
@@ -66,7 +66,7 @@ export class DomeView {
   ) {
     this.offTrouble.hidden = true;
     this.refusal.hidden = true;
-    this.silence.hidden = true;
+    this.noAnswer.hidden = true;
     this.capturing.hidden = true;
     this.off.addEventListener("click", () => void this.allOff());
     this.dark.addEventListener("click", () => void this.act(async () => this.hear(await darken())));
@@ -95,7 +95,7 @@ export class DomeView {
       ),
       this.done,
       this.refusal,
-      this.silence,
+      this.noAnswer,
       section("One light, for alignment", this.capturing, this.fields(), this.grid.root),
       section(
         "Preflight",
@@ -175,9 +175,9 @@ export class DomeView {
       await action();
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
-      tell(this.refusal, problem);
+      showProblem(this.refusal, problem);
     } finally {
-      this.deeds += 1;
+      this.actionCount += 1;
     }
   }
 
@@ -187,11 +187,12 @@ export class DomeView {
   }
 
   private async askAgain(): Promise<void> {
-    const deeds = this.deeds;
+    const actionCount = this.actionCount;
     try {
       const dome = document.hidden ? null : await getDome();
       if (this.isStopped) return;
-      if (dome && deeds === this.deeds) this.take(dome); // an answer from before the last action is out of date
+      // An answer from before the last action is out of date.
+      if (dome && actionCount === this.actionCount) this.take(dome);
       this.onConnection(true);
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
@@ -200,8 +201,8 @@ export class DomeView {
       this.onConnection(!isLost);
       // After a timeout the state stays until it is too old (showAge).
       if (!(problem instanceof DOMException)) this.forget();
-      tell(this.silence, problem);
-      this.silence.hidden = isLost || problem instanceof DOMException;
+      showProblem(this.noAnswer, problem);
+      this.noAnswer.hidden = isLost || problem instanceof DOMException;
     }
     this.askLater();
   }
@@ -237,7 +238,7 @@ export class DomeView {
   }
 
   private take(dome: DomeState): void {
-    this.silence.hidden = true;
+    this.noAnswer.hidden = true;
     this.hear(dome.status);
     this.address.textContent = dome.address;
     const capturers = [...dome.capturing, dome.others_capturing].join();
@@ -287,7 +288,7 @@ export class DomeView {
 }
 
 /** Show a problem. A sentence that is shown already is not set again, so that screen readers do not repeat it. */
-function tell(where: HTMLElement, problem: unknown): void {
+function showProblem(where: HTMLElement, problem: unknown): void {
   where.hidden = false;
   if (where.textContent !== sentenceOf(problem)) where.textContent = sentenceOf(problem);
 }

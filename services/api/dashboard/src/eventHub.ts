@@ -14,8 +14,8 @@ const GATHER_MS = 30;
  * Time in ms between two reports of a page on the jobs that it follows. A page that was silent for four times as long
  * was closed without notice.
  */
-export const TELL_MS = 10_000;
-const SILENCE_MS = 4 * TELL_MS;
+export const REPORT_MS = 10_000;
+const EXPIRY_MS = 4 * REPORT_MS;
 /** Time in ms for which the stream stays closed for ALL OFF, so that a connection is free. */
 const CLEAR_MS = 2000;
 
@@ -23,15 +23,15 @@ const CLEAR_MS = 2000;
  * Message of a page: the jobs that it follows, each with the id of the last event that it knows, or that all
  * connections are needed.
  */
-export type Wish = { follow: [job: string, after: number][] } | { clear: true };
+export type PageMessage = { follow: [job: string, after: number][] } | { clear: true };
 /** Message to a page. `text` is an event as JSON; `state` is null for a job that does not exist. */
-export type News =
+export type HubMessage =
   { job: string; id: number; text: string } | { job: string; state: string | null } | { open: boolean };
 
 interface Page {
-  places: Map<string, number>;
+  positions: Map<string, number>;
   heardMs: number;
-  tell: (news: News) => void;
+  notify: (message: HubMessage) => void;
 }
 
 export class EventHub {
@@ -40,37 +40,37 @@ export class EventHub {
   /** The jobs of the stream that is open, or was open last. */
   private streamed = "";
   /** By job, the id of the last event that the stream has delivered, or after which it began. */
-  private told = new Map<string, number>();
+  private delivered = new Map<string, number>();
   private timer = 0;
 
   constructor() {
-    setInterval(() => this.forgetTheSilent(), TELL_MS);
+    setInterval(() => this.dropSilentPages(), REPORT_MS);
   }
 
   /** Handle the message of a page. */
-  take(page: unknown, wish: Wish, tell: (news: News) => void): void {
-    if ("clear" in wish) {
+  handle(page: unknown, request: PageMessage, notify: (message: HubMessage) => void): void {
+    if ("clear" in request) {
       this.clear();
       return;
     }
-    if (!wish.follow.length) {
+    if (!request.follow.length) {
       this.pages.delete(page);
     } else {
-      const known = this.pages.get(page)?.places;
-      const places = new Map(wish.follow.map(([job, after]) => [job, Math.max(after, known?.get(job) ?? 0)]));
-      this.pages.set(page, { places, heardMs: Date.now(), tell });
-      if (this.source?.readyState === EventSource.OPEN) tell({ open: true });
+      const known = this.pages.get(page)?.positions;
+      const positions = new Map(request.follow.map(([job, after]) => [job, Math.max(after, known?.get(job) ?? 0)]));
+      this.pages.set(page, { positions, heardMs: Date.now(), notify });
+      if (this.source?.readyState === EventSource.OPEN) notify({ open: true });
     }
     this.openSoon(GATHER_MS);
   }
 
   /** By job, the smallest id after which some page lacks events. */
-  private places(): Map<string, number> {
-    const places = new Map<string, number>();
+  private positions(): Map<string, number> {
+    const positions = new Map<string, number>();
     for (const page of this.pages.values()) {
-      for (const [job, after] of page.places) places.set(job, Math.min(after, places.get(job) ?? after));
+      for (const [job, after] of page.positions) positions.set(job, Math.min(after, positions.get(job) ?? after));
     }
-    return places;
+    return positions;
   }
 
   private openSoon(afterMs: number): void {
@@ -89,30 +89,31 @@ export class EventHub {
    * delivered.
    */
   private open(): void {
-    const places = this.places();
-    const wanted = [...places.keys()].sort().join();
-    if (this.source && wanted === this.streamed && !this.isBehind()) return;
+    const positions = this.positions();
+    const jobs = [...positions.keys()].sort().join();
+    if (this.source && jobs === this.streamed && !this.isBehind()) return;
     this.close();
-    if (!places.size) return;
-    this.streamed = wanted;
-    this.told = new Map(places);
-    const source = new EventSource(`/v1/events?${[...places].map(([job, after]) => `job=${job}:${after}`).join("&")}`);
+    if (!positions.size) return;
+    this.streamed = jobs;
+    this.delivered = new Map(positions);
+    const query = [...positions].map(([job, after]) => `job=${job}:${after}`).join("&");
+    const source = new EventSource(`/v1/events?${query}`);
     this.source = source;
-    source.onopen = () => this.tellAll({ open: true });
+    source.onopen = () => this.notifyAll({ open: true });
     source.onerror = () => {
       if (this.source !== source) return;
       this.close();
-      this.tellAll({ open: false });
+      this.notifyAll({ open: false });
       this.openSoon(REOPEN_MS);
     };
     source.onmessage = (message) => {
       const { id, job } = JSON.parse(message.data) as { id: number; job: string };
-      this.told.set(job, id);
+      this.delivered.set(job, id);
       for (const page of this.pages.values()) {
-        const after = page.places.get(job);
+        const after = page.positions.get(job);
         if (after === undefined || id <= after) continue;
-        page.places.set(job, id);
-        page.tell({ job, id, text: message.data });
+        page.positions.set(job, id);
+        page.notify({ job, id, text: message.data });
       }
     };
     source.addEventListener("end", (message) => {
@@ -125,17 +126,17 @@ export class EventHub {
         .filter((one) => one !== job)
         .join();
       if (!this.streamed) this.close();
-      for (const page of this.pages.values()) if (page.places.delete(job)) page.tell({ job, state });
+      for (const page of this.pages.values()) if (page.positions.delete(job)) page.notify({ job, state });
     });
   }
 
   private isBehind(): boolean {
     // A page that opened later, or was shown again, needs events that were delivered already.
-    return [...this.places()].some(([job, after]) => after < (this.told.get(job) ?? 0));
+    return [...this.positions()].some(([job, after]) => after < (this.delivered.get(job) ?? 0));
   }
 
-  private tellAll(news: News): void {
-    for (const page of this.pages.values()) page.tell(news);
+  private notifyAll(message: HubMessage): void {
+    for (const page of this.pages.values()) page.notify(message);
   }
 
   private clear(): void {
@@ -143,8 +144,8 @@ export class EventHub {
     this.openSoon(CLEAR_MS);
   }
 
-  private forgetTheSilent(): void {
-    for (const [key, page] of this.pages) if (page.heardMs < Date.now() - SILENCE_MS) this.pages.delete(key);
+  private dropSilentPages(): void {
+    for (const [key, page] of this.pages) if (page.heardMs < Date.now() - EXPIRY_MS) this.pages.delete(key);
     if (this.source) this.openSoon(0);
   }
 }

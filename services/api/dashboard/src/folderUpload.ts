@@ -47,7 +47,7 @@ export class FolderUpload {
 
   constructor(
     private readonly files: FolderFile[],
-    private readonly tell: (progress: UploadProgress) => void,
+    private readonly onProgress: (progress: UploadProgress) => void,
   ) {
     this.totalBytes = files.reduce((sum, { file }) => sum + file.size, 0);
   }
@@ -102,7 +102,7 @@ export class FolderUpload {
   }
 
   private report(phase: UploadProgress["phase"], path: string): void {
-    this.tell({ phase, path, doneBytes: this.doneBytes, totalBytes: this.totalBytes });
+    this.onProgress({ phase, path, doneBytes: this.doneBytes, totalBytes: this.totalBytes });
   }
 }
 

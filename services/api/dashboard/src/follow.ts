@@ -1,7 +1,7 @@
 /** The part of a page in the one stream of events that all pages of a browser share; a hidden page follows no job. */
 
 import type { JobEvent } from "./api";
-import { EventHub, type News, TELL_MS, type Wish } from "./eventHub";
+import { EventHub, type HubMessage, REPORT_MS, type PageMessage } from "./eventHub";
 
 interface Follower {
   newest: number;
@@ -11,7 +11,7 @@ interface Follower {
 }
 
 const followers = new Map<string, Follower>();
-let send: ((wish: Wish) => void) | null = null;
+let send: ((request: PageMessage) => void) | null = null;
 
 /**
  * Follow the events of a job from the first one to its end. Each is delivered once and in order, whatever happens to
@@ -24,56 +24,56 @@ export function followEvents(
   onConnection: Follower["onConnection"],
 ): () => void {
   const follower = { newest: 0, onEvent, onEnd, onConnection };
-  if (followers.delete(job)) tell(); // so that the events are delivered again from the first one
+  if (followers.delete(job)) report(); // so that the events are delivered again from the first one
   followers.set(job, follower);
-  tell();
+  report();
   return () => {
     if (followers.get(job) !== follower) return;
     followers.delete(job);
-    tell();
+    report();
   };
 }
 
 /** Close the stream of events for a while, so that all connections are free for the next request. */
-export function clearTheWay(): void {
+export function freeConnections(): void {
   connect()({ clear: true });
 }
 
-function tell(isHere = !document.hidden): void {
-  connect()({ follow: isHere ? [...followers].map(([job, follower]) => [job, follower.newest]) : [] });
+function report(isVisible = !document.hidden): void {
+  connect()({ follow: isVisible ? [...followers].map(([job, follower]) => [job, follower.newest]) : [] });
 }
 
-function connect(): (wish: Wish) => void {
+function connect(): (request: PageMessage) => void {
   if (send) return send;
   if (typeof SharedWorker === "undefined") {
     const hub = new EventHub();
-    send = (wish) => hub.take(followers, wish, take);
+    send = (request) => hub.handle(followers, request, deliver);
   } else {
     const { port } = new SharedWorker("/eventWorker.js", "dentine events");
-    port.onmessage = (message: MessageEvent<News>) => take(message.data);
-    send = (wish) => port.postMessage(wish);
+    port.onmessage = (message: MessageEvent<HubMessage>) => deliver(message.data);
+    send = (request) => port.postMessage(request);
   }
-  document.addEventListener("visibilitychange", () => tell());
-  addEventListener("pagehide", () => tell(false));
-  addEventListener("pageshow", () => tell());
+  document.addEventListener("visibilitychange", () => report());
+  addEventListener("pagehide", () => report(false));
+  addEventListener("pageshow", () => report());
   setInterval(() => {
-    if (followers.size && !document.hidden) tell();
-  }, TELL_MS);
+    if (followers.size && !document.hidden) report();
+  }, REPORT_MS);
   return send;
 }
 
-function take(news: News): void {
-  if ("open" in news) {
-    for (const follower of followers.values()) follower.onConnection(news.open);
+function deliver(message: HubMessage): void {
+  if ("open" in message) {
+    for (const follower of followers.values()) follower.onConnection(message.open);
     return;
   }
-  const follower = followers.get(news.job);
+  const follower = followers.get(message.job);
   if (!follower) return;
-  if ("state" in news) {
-    followers.delete(news.job);
+  if ("state" in message) {
+    followers.delete(message.job);
     follower.onEnd();
-  } else if (news.id > follower.newest) {
-    follower.newest = news.id;
-    follower.onEvent(JSON.parse(news.text) as JobEvent);
+  } else if (message.id > follower.newest) {
+    follower.newest = message.id;
+    follower.onEvent(JSON.parse(message.text) as JobEvent);
   }
 }

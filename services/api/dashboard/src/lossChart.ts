@@ -136,8 +136,8 @@ export class LossChart {
     const latest = [...this.channels].map(([name, points]) => {
       const last = [...points.values()];
       const loss = last.at(-1)?.loss;
-      const told = last.findLast((point) => point.heldOut !== null);
-      const error = told?.heldOut ? `, held-out error ${percent(told.heldOut, told.heldOutSe)}` : "";
+      const tested = last.findLast((point) => point.heldOut !== null);
+      const error = tested?.heldOut ? `, held-out error ${percent(tested.heldOut, tested.heldOutSe)}` : "";
       return `${name}: loss ${loss ? significant(loss) : "not yet"}${error}`;
     });
     const result =

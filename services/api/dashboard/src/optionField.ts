@@ -135,8 +135,8 @@ export class OptionField {
             ? `above ${exclusiveMinimum}`
             : "";
     const form = type === "array" ? "names, separated by commas" : type === "object" ? "one a line" : "";
-    const told = this.schema.description ?? "";
-    const parts = [told && told[0]?.toUpperCase() + told.slice(1), limits, form].filter((part) => part);
+    const meaning = this.schema.description ?? "";
+    const parts = [meaning && meaning[0]?.toUpperCase() + meaning.slice(1), limits, form].filter((part) => part);
     return parts.length ? `${parts.join("; ")}.` : "";
   }
 }

@@ -18,7 +18,7 @@ export class SlabView {
     element("p", { class: "soft" }, "No phase function yet; it comes when all wavelengths are done."),
   );
   /** Message of each wavelength that is finished, by the wavelength in nm. */
-  private readonly told = new Map<number, string>();
+  private readonly messages = new Map<number, string>();
   private shown = "";
 
   constructor(private readonly job: string) {}
@@ -26,10 +26,12 @@ export class SlabView {
   take(event: JobEvent): void {
     const { wavelength_nm: wavelength, wavelengths: all } = event.data;
     if (typeof wavelength !== "number" || typeof all !== "number") return;
-    this.told.set(wavelength, event.message);
-    const rows = [...this.told].sort(([one], [other]) => one - other).map(([, message]) => element("li", {}, message));
+    this.messages.set(wavelength, event.message);
+    const rows = [...this.messages]
+      .sort(([one], [other]) => one - other)
+      .map(([, message]) => element("li", {}, message));
     this.progress.replaceChildren(
-      element("p", { class: "soft" }, `${this.told.size} of ${all} wavelengths done.`),
+      element("p", { class: "soft" }, `${this.messages.size} of ${all} wavelengths done.`),
       element("ul", { class: "wavelengths" }, ...rows),
     );
   }

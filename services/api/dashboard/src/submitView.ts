@@ -232,8 +232,8 @@ export class SubmitView {
   private async submit(): Promise<void> {
     this.refusal.hidden = true;
     const isRig = this.source.value === "rig";
-    const asked = [...(isRig ? this.rigFields : []), ...this.fields];
-    const wrong = asked.filter((field) => !field.check());
+    const shownFields = [...(isRig ? this.rigFields : []), ...this.fields];
+    const wrong = shownFields.filter((field) => !field.check());
     wrong[0]?.focus();
     if (wrong.length) return;
     this.go.disabled = true;
@@ -246,7 +246,7 @@ export class SubmitView {
       location.hash = `#/${job.id}`;
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
-      this.refuse(sentenceOf(problem), asked);
+      this.refuse(sentenceOf(problem), shownFields);
     } finally {
       this.go.disabled = false;
     }

@@ -61,7 +61,7 @@ export class UploadCard {
     try {
       const folder = await given;
       this.show(folder);
-      const capture = await new FolderUpload(folder.files, (progress) => this.tell(progress)).run();
+      const capture = await new FolderUpload(folder.files, (progress) => this.showProgress(progress)).run();
       this.note.textContent = "Uploaded and checked.";
       this.onDone(capture);
     } catch (problem) {
@@ -85,7 +85,7 @@ export class UploadCard {
     this.leftOut.textContent = `Left out, as no part of a capture: ${shown}${more}.`;
   }
 
-  private tell({ phase, path, doneBytes, totalBytes }: UploadProgress): void {
+  private showProgress({ phase, path, doneBytes, totalBytes }: UploadProgress): void {
     this.bar.value = totalBytes ? doneBytes / totalBytes : 0;
     const doing = phase === "hashing" ? "Reading" : "Sending";
     this.note.textContent = `${doing} ${path}: ${bytes(doneBytes)} of ${bytes(totalBytes)}.`;

@@ -14,9 +14,9 @@ export class VerdictCard {
 
   show(verdict: Verdict | null): void {
     this.root.hidden = verdict === null;
-    const told = JSON.stringify(verdict);
-    if (!verdict || told === this.shown) return; // an alert that is shown already is not set again
-    this.shown = told;
+    const json = JSON.stringify(verdict);
+    if (!verdict || json === this.shown) return; // an alert that is shown already is not set again
+    this.shown = json;
     const thickness = verdict.enamel_thickness;
     const errors = Object.entries(verdict.channels).map(([channel, error]) => `${channel} ${figureOf(error)}`);
     const note =

@@ -50,7 +50,7 @@ class ChosenDictionary:
     spheres: Spheres | None = None
 
 
-Door = Callable[[Sample], ChosenDictionary]
+DictionaryFactory = Callable[[Sample], ChosenDictionary]
 
 
 def dictionary_of(root: Path, folder: SlabFolder, wavelength_nm: float, options: SlabOptions) -> ChosenDictionary:
@@ -61,5 +61,5 @@ def dictionary_of(root: Path, folder: SlabFolder, wavelength_nm: float, options:
         CaptureInputError: the dictionary's file is wrong.
     """
     module, _, function = chosen("dictionary", options.dictionary, DICTIONARIES).door.partition(":")
-    door: Door = getattr(import_module(module), function)
-    return door(Sample(root, wavelength_nm, index_of(folder, wavelength_nm).value, options))
+    factory: DictionaryFactory = getattr(import_module(module), function)
+    return factory(Sample(root, wavelength_nm, index_of(folder, wavelength_nm).value, options))

@@ -45,10 +45,12 @@ def spheres(sample: Sample) -> ChosenDictionary:
     radii, values, volumes = np.zeros(ATOMS), np.zeros((KNOTS, ATOMS)), np.zeros(ATOMS)
     for atom, (low, high) in enumerate(itertools.pairwise(edges)):
         sizes = np.exp(np.linspace(math.log(low), math.log(high), 2 * RADII_PER_ATOM + 1)[1::2])
-        told = [scattered(relative, float(size)) for size in sizes]
+        scattered_light = [scattered(relative, float(size)) for size in sizes]
         # An atom has as many spheres of each radius, so cross-sections and volumes add up.
-        values[:, atom] = sum(intensity for intensity, _ in told)
-        areas_um2 = sum(efficiency * size**2 for (_, efficiency), size in zip(told, sizes, strict=True)) * math.pi
+        values[:, atom] = sum(intensity for intensity, _ in scattered_light)
+        areas_um2 = (
+            sum(efficiency * size**2 for (_, efficiency), size in zip(scattered_light, sizes, strict=True)) * math.pi
+        )
         contents_um3 = 4 / 3 * math.pi * float((sizes**3).sum())
         volumes[atom] = contents_um3 / areas_um2 * um_per_size / 1000
         radii[atom] = math.sqrt(low * high) * um_per_size

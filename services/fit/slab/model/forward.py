@@ -115,10 +115,10 @@ def render(
     images = np.repeat(first_images[None], batches, axis=0)
     rows = np.repeat(first_rows[None], batches, axis=0)
     for block, sums in zip(tasks, blocks(run_block, tasks), strict=True):
-        number, seen = block.place[-1], rig.lights[block.light].images
-        images[number, seen] += sums.images
+        number, own = block.place[-1], rig.lights[block.light].images
+        images[number, own] += sums.images
         if scores:
-            rows[number, seen] += sums.rows
+            rows[number, own] += sums.rows
     return Batches(images, rows, first_images, first_rows)
 
 

@@ -100,9 +100,11 @@ def rig_of(folder: SlabFolder, wavelength_nm: float, index: float | None = None)
     entries = folder.images_at(wavelength_nm)
     views = []
     for light in folder.lights:
-        seen = [(number, cameras[image.camera]) for number, image in enumerate(entries) if image.light == light.name]
-        if seen:
-            views.append(_views(folder, interface, grid, light, seen))
+        cameras_of_light = [
+            (number, cameras[image.camera]) for number, image in enumerate(entries) if image.light == light.name
+        ]
+        if cameras_of_light:
+            views.append(_views(folder, interface, grid, light, cameras_of_light))
     return Rig(folder.cell.width_mm, interface, grid, tuple(views), len(entries))
 
 
@@ -127,22 +129,22 @@ def grid_of(pixels: PixelGrid) -> Grid:
 
 
 def _views(
-    folder: SlabFolder, interface: Interface, grid: Grid, light: Light, seen: list[tuple[int, SlabCamera]]
+    folder: SlabFolder, interface: Interface, grid: Grid, light: Light, cameras_of_light: list[tuple[int, SlabCamera]]
 ) -> Views:
     sine = interface.inside_sine(light.angle_deg)
-    sines = np.array([interface.inside_sine(camera.angle_deg) for _, camera in seen])
+    sines = np.array([interface.inside_sine(camera.angle_deg) for _, camera in cameras_of_light])
     # A solid angle shrinks on its way in by (n0/n)^2 cos b / cos b_in; radiance is power per sr outside and projected
     # area.
     solid = (interface.index_outside / interface.index) ** 2 / np.sqrt(1 - sines**2)
     passed = np.array([interface.transmittance(s) for s in sines])
     size = folder.beam.size_mm
     return Views(
-        images=np.array([number for number, _ in seen]),
+        images=np.array([number for number, _ in cameras_of_light]),
         beam=Beam(folder.beam.profile == "disc", size / math.cos(math.radians(light.angle_deg)), size),
         sine=sine,
         transmittance=interface.transmittance(sine),
         shift_mm=interface.glass_shift_mm(sine),
-        far=np.array([camera.side != light.side for _, camera in seen]),
+        far=np.array([camera.side != light.side for _, camera in cameras_of_light]),
         sines=sines,
         scales=passed * solid / grid.area_mm2,
         shifts_mm=np.array([interface.glass_shift_mm(s) for s in sines]),

@@ -36,7 +36,7 @@ def single_scattering(rig: Rig, material: Material, *, scores: bool) -> tuple[Ar
     rows = np.zeros((*rig.shape, KNOTS + 1) if scores else (0,))
     for views in rig.lights:
         for camera, image in enumerate(views.images):
-            for cosine, ways, shares in _routes(rig, material, views, camera):
+            for cosine, lengths, shares in _routes(rig, material, views, camera):
                 # Interpolate f at the route's one angle from its two knots.
                 place = math.acos(min(max(cosine, -1.0), 1.0)) / SPACING_RAD
                 knot = min(int(place), KNOTS - 2)
@@ -47,7 +47,7 @@ def single_scattering(rig: Rig, material: Material, *, scores: bool) -> tuple[Ar
                 if scores:
                     rows[image, :, knot] += shares.sum(axis=0) * lower
                     rows[image, :, knot + 1] += shares.sum(axis=0) * upper
-                    rows[image, :, KNOTS] += ways @ values
+                    rows[image, :, KNOTS] += lengths @ values
     return images, rows
 
 
@@ -60,39 +60,39 @@ def _routes(rig: Rig, material: Material, views: Views, camera: int) -> Iterator
     for before, after in itertools.product(range(MAX_REFLECTIONS + 1), repeat=2):
         if before + after > MAX_REFLECTIONS:
             continue
-        ahead = before % 2 == 0
+        is_forward = before % 2 == 0
         towards_far = bool(views.far[camera]) != (after % 2 == 1)
-        cosine = sine * lateral + (inward if ahead else -inward) * (outward if towards_far else -outward)
+        cosine = sine * lateral + (inward if is_forward else -inward) * (outward if towards_far else -outward)
 
         # Compute the depths of the cells' edges along the pass, and the path lengths to and from them.
-        passed = np.linspace(0, width, DEPTH_CELLS + 1)
-        depth = passed if ahead else width - passed
-        way_in = (before * width + passed) / inward
-        way_out = (after * width + (width - depth if towards_far else depth)) / outward
-        ways = way_in + way_out
-        exits = way_in * sine + way_out * lateral + views.shift_mm + float(views.shifts_mm[camera])
+        travelled = np.linspace(0, width, DEPTH_CELLS + 1)
+        depth = travelled if is_forward else width - travelled
+        length_in = (before * width + travelled) / inward
+        length_out = (after * width + (width - depth if towards_far else depth)) / outward
+        lengths = length_in + length_out
+        exits = length_in * sine + length_out * lateral + views.shift_mm + float(views.shifts_mm[camera])
 
         # Integrate exp(-sigma_t path length) over each cell, which is exact, and take its mean path length.
-        step_in, step_out = width / DEPTH_CELLS / inward, ways[1:] - ways[:-1]
-        middle = (ways[1:] + ways[:-1]) / 2
+        step_in, step_out = width / DEPTH_CELLS / inward, lengths[1:] - lengths[:-1]
+        middle = (lengths[1:] + lengths[:-1]) / 2
         half = material.extinction_per_mm * step_out / 2
         density = np.exp(-material.extinction_per_mm * middle) * _sinhc(half)
         strength = views.transmittance * float(views.scales[camera]) * step_in
-        for share, shift in _returns(rig.interface, sine, before, lateral, after):
+        for share, shift in _reflections(rig.interface, sine, before, lateral, after):
             spread = _spread(rig.grid, views.beam, exits[:-1] + shift, exits[1:] + shift)
             if share > 0:
                 yield cosine, middle - _langevin(half) * step_out / 2, (strength * share * density)[:, None] * spread
 
 
-def _returns(
+def _reflections(
     interface: Interface, sine: float, before: int, lateral: float, after: int
 ) -> Iterator[tuple[float, float]]:
     """Share and displacement for every way to be reflected ``before`` times before and ``after`` times after the
     scattering.
     """
-    ways = [interface.reflections(sine)] * before + [interface.reflections(lateral)] * after
-    for chosen in itertools.product(*ways):
-        yield math.prod(way.share for way in chosen), sum(way.shift_mm for way in chosen)
+    reflections = [interface.reflections(sine)] * before + [interface.reflections(lateral)] * after
+    for chosen in itertools.product(*reflections):
+        yield math.prod(one.share for one in chosen), sum(one.shift_mm for one in chosen)
 
 
 def _sinhc(x: Array) -> Array:

@@ -17,7 +17,7 @@ def block_key(*numbers: int) -> np.uint64:
 
 
 @njit(cache=True, inline="always")
-def mixed(state):  # type: ignore[no-untyped-def]  # compiled
+def splitmix64(state):  # type: ignore[no-untyped-def]  # compiled
     """SplitMix64's output function, a bijection of 64-bit words."""
     z = (state ^ (state >> np.uint64(30))) * FIRST_MIX
     z = (z ^ (z >> np.uint64(27))) * SECOND_MIX
@@ -27,11 +27,11 @@ def mixed(state):  # type: ignore[no-untyped-def]  # compiled
 @njit(cache=True, inline="always")
 def path_state(key, path):  # type: ignore[no-untyped-def]  # compiled
     """State at which a path's stream starts."""
-    return mixed(key + mixed(np.uint64(path) + GOLDEN))
+    return splitmix64(key + splitmix64(np.uint64(path) + GOLDEN))
 
 
 @njit(cache=True, inline="always")
 def uniform(state):  # type: ignore[no-untyped-def]  # compiled
     """The next number in (0, 1) and the state after it."""
     state = state + GOLDEN
-    return (np.float64(mixed(state) >> np.uint64(11)) + 0.5) * TO_UNIT, state
+    return (np.float64(splitmix64(state) >> np.uint64(11)) + 0.5) * TO_UNIT, state

@@ -43,7 +43,7 @@ def reflectance(cosine, eta):  # type: ignore[no-untyped-def]  # compiled
 
 
 @njit(cache=True)
-def meet_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
+def sample_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
     """Whether light comes back from a face, its displacement in the glass in units of its lateral direction, and the
     next random state.
 
@@ -60,26 +60,26 @@ def meet_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
     inner = math.sqrt(max(1 - sine * sine, 1e-12))
     far = reflectance(inner, outside / wall)
     # Displacement per unit of lateral direction in the medium: t tan(a_glass) / sin(a).
-    way = thickness / (wall * inner)
+    pass_shift = thickness / (wall * inner)
     shift = 0.0
     while True:
-        shift += way
+        shift += pass_shift
         u, state = uniform(state)
         if u >= far:
             return False, shift, state
-        shift += way
+        shift += pass_shift
         u, state = uniform(state)
         if u >= near:
             return True, shift, state
 
 
 @njit(cache=True)
-def shift_of_a_return(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
+def sample_reflected_shift(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
     """Displacement in the glass of light that comes back, in units of its lateral direction, and the next random
     state.
     """
     while True:
-        back, shift, state = meet_face(cosine, glass, state)
+        back, shift, state = sample_face(cosine, glass, state)
         if back:
             return shift, state
 
@@ -94,7 +94,7 @@ def draw_cosine(u, v, cumulative, cosines, guide):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, inline="always")
-def at_angle(cosine, scattering):  # type: ignore[no-untyped-def]  # compiled
+def interpolate_f(cosine, scattering):  # type: ignore[no-untyped-def]  # compiled
     """f(theta), the knot below theta, and the shares of both knots in f."""
     place = math.acos(min(max(cosine, -1.0), 1.0)) / SPACING_RAD
     knot = min(int(place), KNOTS - 2)
@@ -105,7 +105,7 @@ def at_angle(cosine, scattering):  # type: ignore[no-untyped-def]  # compiled
 
 
 @njit(cache=True, inline="always")
-def turned(x, y, z, cosine, azimuth):  # type: ignore[no-untyped-def]  # compiled
+def rotated(x, y, z, cosine, azimuth):  # type: ignore[no-untyped-def]  # compiled
     """A direction turned by a scattering angle, renormalised (Duff et al. 2017 for the frame)."""
     sine = math.sqrt(max(1 - cosine * cosine, 0.0))
     a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
@@ -171,20 +171,20 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
         # The first scattering is forced: the beam's passes between the faces form a geometric series that is sampled
         # exactly.
         weight = light[1] * albedo * collided / (1 - repeat)
-        x, y, way = light[2], 0.0, 0.0
+        x, y, path_length = light[2], 0.0, 0.0
         dx, dy, dz = light[0], 0.0, beam_cosine
         u, state = uniform(state)
         while u < repeat:
             u /= repeat
-            way += crossing
+            path_length += crossing
             x += dx * crossing
             if glass[1] > 0:
-                shift, state = shift_of_a_return(beam_cosine, glass, state)
+                shift, state = sample_reflected_shift(beam_cosine, glass, state)
                 x += dx * shift
             dz = -dz
         u, state = uniform(state)
         step = -math.log1p(-u * collided) / sigma_t
-        way += step
+        path_length += step
         x += dx * step
         z = dz * step if dz > 0 else width + dz * step
 
@@ -195,14 +195,14 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
             u, state = uniform(state)
             v, state = uniform(state)
             cosine, cell = draw_cosine(u, v, cumulative, cosines, guide)
-            value, knot, lower, upper = at_angle(cosine, scattering)
+            value, knot, lower, upper = interpolate_f(cosine, scattering)
             weight *= value / densities[cell]
             knots[scatters], lowers[scatters], uppers[scatters] = knot, lower, upper
             dense[knot] += lower
             dense[knot + 1] += upper
             scatters += 1
             u, state = uniform(state)
-            dx, dy, dz = turned(dx, dy, dz, cosine, 2 * math.pi * u)
+            dx, dy, dz = rotated(dx, dy, dz, cosine, 2 * math.pi * u)
 
             # Fly to the next scattering, or out.
             u, state = uniform(state)
@@ -213,8 +213,8 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
                 if step < reach:
                     break
                 step -= reach
-                way += reach
-                back, shift, state = meet_face(abs(dz), glass, state)
+                path_length += reach
+                back, shift, state = sample_face(abs(dz), glass, state)
                 x += dx * (reach + shift)
                 y += dy * (reach + shift)
                 z = edge
@@ -225,7 +225,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
                 dz = -dz
             if not alive:
                 break
-            way += step
+            path_length += step
             x += dx * step
             y += dy * step
             z += dz * step
@@ -246,7 +246,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
                         towards_far = far[camera] != (reflections % 2 == 1)
                         deep = (width - z if towards_far else z) + reflections * width
                         flight = deep / out
-                        value, knot, lower, upper = at_angle(
+                        value, knot, lower, upper = interpolate_f(
                             dx * lateral + (dz if towards_far else -dz) * out, scattering
                         )
                         amount = (
@@ -257,7 +257,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
                         shift = shifts[camera]
                         for _ in range(reflections):
                             if glass[1] > 0:
-                                more, state = shift_of_a_return(out, glass, state)
+                                more, state = sample_reflected_shift(out, glass, state)
                                 shift += lateral * more
                         px = (x + lateral * flight + shift + offset_x - x_from) / pitch_x
                         py = y + offset_y
@@ -271,7 +271,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
                         row = rows[camera, pixel]
                         row[knot] += amount * lower
                         row[knot + 1] += amount * upper
-                        row[KNOTS] += amount * (way + flight)
+                        row[KNOTS] += amount * (path_length + flight)
                         if scatters <= SPARSE_SCATTERS:
                             for j in range(scatters):
                                 row[knots[j]] += amount * lowers[j]

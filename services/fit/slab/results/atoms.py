@@ -29,14 +29,16 @@ def atoms_of(dictionary: ChosenDictionary, material: Material, uncertainty: Unce
     if not isinstance(material, Mixture):
         return {}
     weights, sigma_s = material.atom_weights, material.scattering_per_mm
-    every = np.eye(len(weights))
-    told = {
+    unit_slopes = np.eye(len(weights))
+    quantities = {
         f"atoms.{name}": _quantity(float(weight), slope, uncertainty, "1/mm", LARGEST_COEFFICIENT_SHARE * sigma_s)
-        for name, weight, slope in zip(dictionary.names, weights, every, strict=True)
+        for name, weight, slope in zip(dictionary.names, weights, unit_slopes, strict=True)
     }
     if dictionary.spheres is None:
-        return told
-    return _of_spheres(dictionary.spheres, weights, uncertainty) | told | _volumes(dictionary, weights, uncertainty)
+        return quantities
+    return (
+        _of_spheres(dictionary.spheres, weights, uncertainty) | quantities | _volumes(dictionary, weights, uncertainty)
+    )
 
 
 def _of_spheres(spheres: Spheres, weights: Array, uncertainty: Uncertainty) -> dict[str, Quantity]:
@@ -53,17 +55,17 @@ def _of_spheres(spheres: Spheres, weights: Array, uncertainty: Uncertainty) -> d
 def _volumes(dictionary: ChosenDictionary, weights: Array, uncertainty: Uncertainty) -> dict[str, Quantity]:
     assert dictionary.spheres is not None
     factors = dictionary.spheres.volume_mm
-    most = LARGEST_SIZE_SHARE * float(factors @ weights)
+    max_error = LARGEST_SIZE_SHARE * float(factors @ weights)
     return {
-        f"volumes.{name}": _quantity(float(factor * weight), factor * slope, uncertainty, "1", most)
+        f"volumes.{name}": _quantity(float(factor * weight), factor * slope, uncertainty, "1", max_error)
         for name, factor, weight, slope in zip(dictionary.names, factors, weights, np.eye(len(weights)), strict=True)
     }
 
 
-def _quantity(value: float, slope: Array, uncertainty: Uncertainty, unit: SlabUnit, most: float) -> Quantity:
+def _quantity(value: float, slope: Array, uncertainty: Uncertainty, unit: SlabUnit, max_error: float) -> Quantity:
     """A quantity from its derivatives with respect to the weights; determined where its error by the images alone is at
-    most ``most``.
+    most ``max_error``.
     """
     by_unknowns = np.append(slope, 0.0)
     chosen, alone = (float(np.sqrt(by_unknowns @ one @ by_unknowns)) for one in uncertainty.of_unknowns)
-    return Quantity(value=value, se=chosen, unit=unit, determined=alone <= most)
+    return Quantity(value=value, se=chosen, unit=unit, determined=alone <= max_error)

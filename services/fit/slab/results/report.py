@@ -18,8 +18,8 @@ from services.core.verdict import percent
 from services.fit.export.pictures import DIVERGING, data_uri, enlarge, signed_map, tone_map, white_level
 from services.fit.export.report import cell, gradient
 from services.fit.slab.results.chart import phase_chart
-from services.fit.slab.results.kept import Images
 from services.fit.slab.results.result import Quantity, SlabFit, SlabReport
+from services.fit.slab.results.stored import Images
 
 LABELS = {
     "sigma_t": "extinction σt",
@@ -88,32 +88,33 @@ def _errors(report: SlabReport, name: str) -> dict[str, Any] | None:
 
 
 def _row(report: SlabReport, name: str) -> dict[str, Any]:
-    told: list[Quantity] = [getattr(fit.parameters, name) for fit in report.fits]
+    quantities: list[Quantity] = [getattr(fit.parameters, name) for fit in report.fits]
     # An index that was given has no standard error.
     cells = [
-        cell(Estimate(value=one.value, se=one.se or None, unit=one.unit, determined=one.determined)) for one in told
+        cell(Estimate(value=one.value, se=one.se or None, unit=one.unit, determined=one.determined))
+        for one in quantities
     ]
-    return {"label": LABELS[name], "name": name, "cells": cells, "unit": "" if told[0].unit == "1" else "per mm"}
+    return {"label": LABELS[name], "name": name, "cells": cells, "unit": "" if quantities[0].unit == "1" else "per mm"}
 
 
 def _atoms(fit: SlabFit) -> list[dict[str, Any]]:
     """Rows of the sums over the dictionary's atoms, and of those atoms that are present."""
-    there = {name: one for name, one in fit.atoms.items() if one.value > 0}
+    present = {name: one for name, one in fit.atoms.items() if one.value > 0}
     return [
         {
             "name": ATOM_LABELS.get(name, _atom_label(name)),
             "cell": cell(Estimate(value=one.value, se=one.se, unit=one.unit, determined=one.determined)),
             "unit": {"1/mm": "per mm", "um": "µm"}.get(one.unit, ""),
         }
-        for name, one in there.items()
+        for name, one in present.items()
     ]
 
 
 def _atom_label(name: str) -> str:
     """Readable label of an atom such as ``atoms.radius=0.250um``."""
     what, _, atom = name.partition(".")
-    told = atom.replace("=", " ").removesuffix("um") + (" µm" if atom.endswith("um") else "")
-    return f"{'volume' if what == 'volumes' else 'σs'} of {told}"
+    label = atom.replace("=", " ").removesuffix("um") + (" µm" if atom.endswith("um") else "")
+    return f"{'volume' if what == 'volumes' else 'σs'} of {label}"
 
 
 def _phase(fit: SlabFit) -> tuple[str, str, str]:

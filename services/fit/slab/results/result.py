@@ -95,16 +95,16 @@ def parameters_of(material: Material, uncertainty: Uncertainty, index: Index) ->
         "sigma_s_reduced": material.scattering_per_mm * (1 - material.mean_cosine),
         "g": material.mean_cosine,
     }
-    told = {}
+    quantities = {}
     for name, slope in slopes(material).items():
         reference = {"g": 1.0, "sigma_a": material.extinction_per_mm}.get(name, abs(values[name]))
-        told[name] = Quantity(
+        quantities[name] = Quantity(
             value=values[name],
             se=uncertainty.standard_error(slope),
             unit="1" if name == "g" else "1/mm",
-            determined=uncertainty.whole_error(slope) <= LARGEST_COEFFICIENT_SHARE * reference,
+            determined=uncertainty.larger_error(slope) <= LARGEST_COEFFICIENT_SHARE * reference,
         )
-    return Parameters(**told, index=Quantity(value=index.value, se=index.se, unit="1", determined=True))
+    return Parameters(**quantities, index=Quantity(value=index.value, se=index.se, unit="1", determined=True))
 
 
 def phase_of(material: Material, uncertainty: Uncertainty) -> PhaseFunction:
@@ -137,7 +137,7 @@ class SlabReport(Record):
         """The verdict on all wavelengths together, where each wavelength takes the place of a channel."""
         held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
-        judged = FitReport(
+        summary = FitReport(
             converged=not stopped,
             advice=(
                 f"The search at {', '.join(stopped)} spent its steps before they stopped to help; raise option effort."
@@ -150,4 +150,4 @@ class SlabReport(Record):
             steps=sum(fit.steps for fit in self.fits),
             seconds=sum(fit.core_seconds for fit in self.fits),
         )
-        return verdict_of(judged)
+        return verdict_of(summary)

@@ -56,11 +56,11 @@ def values_text(fit: SlabFit) -> str:
 
 def scene_xml(fit: SlabFit, cell: Cell) -> str:
     """Scene of a slab of the cell's width before a camera, in even light."""
-    told = fit.parameters
+    parameters = fit.parameters
     bsdf = '<bsdf type="null"/>'
     if cell.boundary == "smooth":
         bsdf = (
-            f'<bsdf type="dielectric"><float name="int_ior" value="{told.index.value:g}"/><float name="ext_ior"'
+            f'<bsdf type="dielectric"><float name="int_ior" value="{parameters.index.value:g}"/><float name="ext_ior"'
             f' value="{cell.index_outside:g}"/></bsdf>'
         )
     edge_mm = EDGE_TO_WIDTH * cell.width_mm / 2
@@ -71,7 +71,7 @@ def scene_xml(fit: SlabFit, cell: Cell) -> str:
         edge_mm=edge_mm,
         half_mm=cell.width_mm / 2,
         bsdf=bsdf,
-        sigma_t=told.sigma_t.value,
-        albedo=told.sigma_s.value / told.sigma_t.value,
+        sigma_t=parameters.sigma_t.value,
+        albedo=parameters.sigma_s.value / parameters.sigma_t.value,
         values=values_text(fit),
     )

@@ -24,9 +24,9 @@ LARGEST_CHANGE = 1.0
 """Largest change of ln f at a knot in one step; each knot is limited by itself, so that the worst one does not slow the
 others."""
 
-LONGEST = 0.3
+MAX_LN_SCATTERING_CHANGE = 0.3
 """Largest change of ln sigma_s in one step of a thick cell."""
-BROAD = 9
+BROAD_COSINES = 9
 """Number of multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells resolve none that
 is smaller."""
 
@@ -34,11 +34,11 @@ is smaller."""
 class Coordinates(Protocol):
     """One kind of unknowns x (U,)."""
 
-    def begun(self, guess: Material) -> Material:
+    def initial_medium(self, guess: Material) -> Material:
         """A medium of this kind near the guess, from which the search begins."""
 
     def unknowns(self, material: Material) -> Array:
-        """Unknowns (U,) of a medium that ``begun`` or ``material_at`` gave."""
+        """Unknowns (U,) of a medium that ``initial_medium`` or ``material_at`` gave."""
 
     def material_at(self, x: Array) -> Material:
         """The medium with these unknowns."""
@@ -59,26 +59,26 @@ class Coordinates(Protocol):
     def weak_precision(self, material: Material) -> Array:
         """The same for a prior so weak that its information is not taken for a measurement."""
 
-    def broad(self) -> Array:
+    def broad_directions(self) -> Array:
         """Few directions (U, K) that matter in any sample, in which a noisy matrix is judged by itself; none where
         unknowns are few.
         """
 
-    def reach(self, material: Material) -> Array:
+    def broad_standard_deviations(self, material: Material) -> Array:
         """Standard deviations (K,) of a medium's error along these directions."""
 
     def minimum(self, matrix: Array, right: Array) -> Array:
         """The x (U,) within bounds at which x^T matrix x / 2 - right^T x is least."""
 
-    def held_back(self, change: Array, material: Material) -> Array:
+    def clipped_step(self, change: Array, material: Material) -> Array:
         """A step in which no unknown moves further than a linearisation holds."""
 
-    def similar(self, change: Array, material: Material) -> Array:
+    def similarity_step(self, change: Array, material: Material) -> Array:
         """A step adapted to a thick cell, whose images hardly change with sigma_s at a constant sigma_s' but much with
         sigma_s'.
         """
 
-    def is_bound(self, x: Array) -> NDArray[np.bool_]:
+    def is_at_bound(self, x: Array) -> NDArray[np.bool_]:
         """Mask (U,) of the unknowns that lie at a bound which they may not pass."""
 
 
@@ -86,7 +86,7 @@ class Coordinates(Protocol):
 class Knots:
     """Coordinates ln f at the knots, and sigma_a not below zero."""
 
-    def begun(self, guess: Material) -> Material:
+    def initial_medium(self, guess: Material) -> Material:
         """The guess itself, which is such a medium."""
         return guess
 
@@ -114,20 +114,20 @@ class Knots:
         """Inverse covariance of a ln f that may bend as sharply as any."""
         return precision(flag_scales())
 
-    def broad(self) -> Array:
-        """Cosines of multiples of the angle, and the absorption (UNKNOWNS, BROAD + 1); the first cosine is a change of
-        sigma_s, the second about one of g.
+    def broad_directions(self) -> Array:
+        """Cosines of multiples of the angle, and the absorption (UNKNOWNS, BROAD_COSINES + 1); the first cosine is a
+        change of sigma_s, the second about one of g.
         """
-        directions = np.zeros((UNKNOWNS, BROAD + 1))
-        directions[:KNOTS, :BROAD] = np.cos(np.outer(ANGLES_RAD, np.arange(BROAD)))
-        directions[KNOTS, BROAD] = 1
+        directions = np.zeros((UNKNOWNS, BROAD_COSINES + 1))
+        directions[:KNOTS, :BROAD_COSINES] = np.cos(np.outer(ANGLES_RAD, np.arange(BROAD_COSINES)))
+        directions[KNOTS, BROAD_COSINES] = 1
         return directions
 
-    def reach(self, material: Material) -> Array:
+    def broad_standard_deviations(self, material: Material) -> Array:
         """Standard deviations of a Henyey-Greenstein start: a factor of e in sigma_s, and less in directions that vary
         faster with the angle.
         """
-        return np.append(1 / np.maximum(np.arange(BROAD), 1.0) ** 2, 0.1 * material.extinction_per_mm)
+        return np.append(1 / np.maximum(np.arange(BROAD_COSINES), 1.0) ** 2, 0.1 * material.extinction_per_mm)
 
     def minimum(self, matrix: Array, right: Array) -> Array:
         """The minimum over all unknowns; where its absorption is negative, over the others with an absorption of
@@ -138,23 +138,23 @@ class Knots:
             x = np.append(np.asarray(np.linalg.solve(matrix[:-1, :-1], right[:-1]), dtype=np.float64), 0.0)
         return x
 
-    def held_back(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
+    def clipped_step(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
         """The step with each unknown limited by itself."""
         return np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
 
-    def similar(self, change: Array, material: Material) -> Array:
-        """The step, limited to ``LONGEST``, with f scaled so that sigma_s' becomes what the step says to first
-        order.
+    def similarity_step(self, change: Array, material: Material) -> Array:
+        """The step, limited to ``MAX_LN_SCATTERING_CHANGE``, with f scaled so that sigma_s' becomes what the step says
+        to first order.
         """
         slope = reduced_scattering_slope(material)
         length = abs(float(material.slope_of_scattering() @ change)) / material.scattering_per_mm
-        step = change * min(1.0, LONGEST / max(length, 1e-300))
-        moved = self.material_at(self.unknowns(material) + step)
-        aimed = math.log(material.reduced_scattering_per_mm) + float(slope @ step)
-        step[:KNOTS] += aimed - math.log(moved.reduced_scattering_per_mm)
+        step = change * min(1.0, MAX_LN_SCATTERING_CHANGE / max(length, 1e-300))
+        scaled = self.material_at(self.unknowns(material) + step)
+        ln_reduced = math.log(material.reduced_scattering_per_mm) + float(slope @ step)
+        step[:KNOTS] += ln_reduced - math.log(scaled.reduced_scattering_per_mm)
         return np.asarray(step)
 
-    def is_bound(self, x: Array) -> NDArray[np.bool_]:
+    def is_at_bound(self, x: Array) -> NDArray[np.bool_]:
         """All false: ln f has no bound, and an absorption at zero has the standard error of a free one."""
         return np.zeros(len(x), dtype=bool)
 

@@ -19,12 +19,12 @@ from services.fit.slab.images import Measurements
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
+from services.fit.slab.solve.checkpoint import Checkpoint, CheckpointFile, CombinedRenders
 from services.fit.slab.solve.coordinates import Coordinates
+from services.fit.slab.solve.measured_directions import broad_step, noise_ratio, step_matrix
 from services.fit.slab.solve.normal import NormalEquations, ResidualSums, normal_equations
 from services.fit.slab.solve.prior import Quadratic, is_thick
-from services.fit.slab.solve.seen import broad_step, noise_ratio, step_matrix
 from services.fit.slab.solve.smooth import Smoother, smoother_of
-from services.fit.slab.solve.standing import Joined, Standing, StandingFile
 from services.fit.slab.solve.weights import smoothed_covariance, weights_of
 
 Array = NDArray[np.float64]
@@ -32,23 +32,23 @@ Array = NDArray[np.float64]
 TOLERATED_RISE = 2.0
 """Number of standard errors by which the objective may rise: fewer would refuse good steps whose comparison is
 noisy."""
-WEIGHTS_DIFFER = 0.5
+TOLERATED_MISFIT_SHARE = 0.5
 """Share of the misfit by which it may rise in a thick cell: weights there come mostly from the paths' noise and are
 estimated anew for each render, and misfits of one medium were seen to differ by a third. Otherwise a low misfit would
 refuse all steps after it."""
 MAX_HALVINGS = 4
 """Largest number of times that a refused step is halved."""
-WORTHWHILE, WORTHWHILE_THICK = 2.0, 1.0
+PROMISE_RATIO, PROMISE_RATIO_THICK = 2.0, 1.0
 """Ratio of the fall of the objective that a step promises to the fall that noise alone promises. In the search a step
 below the first value waits for more paths; in the last stages a step above it is followed by another. There the second
 value holds in a thick cell, because the error left in sigma_s at a constant sigma_s' promises little beside the noise
 of all directions, and is still a tenth of sigma_s."""
-UNFINISHED = 5.0
+UNCONVERGED_RATIO = 5.0
 """The same ratio, above which the last step shows that the fit has not converged."""
-NEAR = 0.05
+MAX_COMBINED_CHANGE = 0.05
 """Largest distance in ln sigma_s at which residuals of several media are combined: the nonlinear part is then below a
 thousandth."""
-ENOUGH_PATHS = 0.5
+MAX_PATH_VARIANCE = 0.5
 """Largest variance by the paths, in units of that by the measurements, at which the fit of a thick cell may end."""
 DAMPING = 1.0
 """Levenberg term in units of the noise of J: with 0.3 and with 3 the end was the same within its noise, with 0.05 it
@@ -112,9 +112,9 @@ class Solution:
     misfit_se: float
     data_noise: Array
     """Covariance of the last gradient's noise by the measurements (U, U)."""
-    thick: bool
+    is_thick: bool
     """See ``GaussNewton.is_thick``."""
-    unsure: Array
+    matrix_error_gradient: Array
     """Error of the last step by the noise of the matrix, as a gradient: ``matrix_error`` times the step (U,)."""
 
 
@@ -134,30 +134,30 @@ class GaussNewton:
     """Monte Carlo covariance of one path for each light (pixels, C, C), a running mean over earlier renders."""
     multiple: Array | None = None
     """Light that has scattered twice and more (images, pixels), the same running mean."""
-    joined: Joined | None = None
+    combined: CombinedRenders | None = None
     """Renders of this stage that later ones are combined with, in a thick cell."""
     is_searching: bool = False
     """Whether the fit may still be far off: then steps use smooth derivatives and broad directions in any cell."""
-    kept: StandingFile | None = None
+    checkpoint_file: CheckpointFile | None = None
     """File that stores the state of the fit and from which the fit continues; None for neither."""
 
     def solve(self, guess: Callable[[], Material]) -> Solution:
         """The solution, from a guess, or from the state that an earlier attempt saved before a step of the last
         stages.
         """
-        standing = None if self.kept is None else self.kept.read()
-        if standing is None:
+        checkpoint = None if self.checkpoint_file is None else self.checkpoint_file.read()
+        if checkpoint is None:
             return self.finish(self.search(guess()))
-        self.renders, self.paths, self.path_noise = standing.renders, standing.paths, standing.path_noise
-        self.multiple, self.joined = standing.multiple, standing.joined
-        return self.finish(standing)
+        self.renders, self.paths, self.path_noise = checkpoint.renders, checkpoint.paths, checkpoint.path_noise
+        self.multiple, self.combined = checkpoint.multiple, checkpoint.combined
+        return self.finish(checkpoint)
 
-    def search(self, material: Material) -> Standing:
+    def search(self, material: Material) -> Checkpoint:
         """Iterate with few paths, until a step promises no more than their noise does or the budget of steps is
         spent.
         """
         self.is_searching = True
-        state = self.init(self.coordinates.begun(material))
+        state = self.init(self.coordinates.initial_medium(material))
         steps = 0
         converged = False
         while steps < self.budget.most_steps and not converged:
@@ -166,7 +166,7 @@ class GaussNewton:
         self.is_searching = False
         assert self.path_noise is not None
         assert self.multiple is not None
-        return Standing(
+        return Checkpoint(
             state.material, 0, 0, steps, converged, self.renders, self.paths, self.path_noise, self.multiple, None
         )
 
@@ -180,19 +180,19 @@ class GaussNewton:
         x = self.coordinates.unknowns(state.material)
         quadratic = quadratic_at(x, state.equations)
         prior = self.coordinates.precision(self.coordinates.scale(state.material, quadratic, sharp=False))
-        change = self.change(quadratic, prior, state.equations, state.material, state.damping)
-        promise = promised(quadratic, prior, x, change)
-        noise = noise_of_promise(quadratic, prior, state.equations.gradient_noise)
-        if promise < WORTHWHILE * noise and state.paths >= self.budget.search_paths:
+        change = self.damped_step(quadratic, prior, state.equations, state.material, state.damping)
+        promise = predicted_fall(quadratic, prior, x, change)
+        noise = noise_fall(quadratic, prior, state.equations.gradient_noise)
+        if promise < PROMISE_RATIO * noise and state.paths >= self.budget.search_paths:
             return state, True
-        paths = min(2 * state.paths, self.budget.search_paths) if promise < WORTHWHILE * noise else state.paths
+        paths = min(2 * state.paths, self.budget.search_paths) if promise < PROMISE_RATIO * noise else state.paths
         if paths > state.paths and self.is_thick(state.material):
             # Weights there come mostly from the paths' noise, so misfits of different numbers of paths cannot be
             # compared.
             again = self.linearised(state.material, paths, self.budget.batches)
             return State(state.material, again, paths, state.damping), False
         before = state.equations.misfit + 0.5 * float(x @ prior @ x)
-        differs = WEIGHTS_DIFFER * abs(state.equations.misfit) if self.is_thick(state.material) else 0.0
+        differs = TOLERATED_MISFIT_SHARE * abs(state.equations.misfit) if self.is_thick(state.material) else 0.0
         for halving in range(MAX_HALVINGS + 1):
             y = x + change / 2**halving
             moved = self.coordinates.material_at(y)
@@ -206,61 +206,65 @@ class GaussNewton:
             state.material, self.linearised(state.material, more, self.budget.batches), more, 4 * state.damping
         ), False
 
-    def finish(self, standing: Standing) -> Solution:
+    def finish(self, checkpoint: Checkpoint) -> Solution:
         """Take the steps of the last stages, each stage until its steps promise no more than noise does."""
-        while standing.stage < len(self.budget.last):
-            if self.kept is not None:
-                self.kept.write(standing)
-            material, (paths, batches) = standing.material, self.budget.last[standing.stage]
-            equations = self.linearised(material, paths, batches, join=self.is_thick(material))
+        while checkpoint.stage < len(self.budget.last):
+            if self.checkpoint_file is not None:
+                self.checkpoint_file.write(checkpoint)
+            material, (paths, batches) = checkpoint.material, self.budget.last[checkpoint.stage]
+            equations = self.linearised(material, paths, batches, combine=self.is_thick(material))
             x = self.coordinates.unknowns(material)
             # Where residuals of nearby media are combined, the gradient is that at the mean of these media.
-            centre = equations.residuals.place if self.joins(material) else x
+            centre = equations.residuals.place if self.combines(material) else x
             quadratic = quadratic_at(centre, equations)
             scale = self.coordinates.scale(material, quadratic, sharp=not self.is_thick(material))
             prior = self.coordinates.precision(scale)
-            change = self.change(quadratic, prior, equations, material, DAMPING)
+            change = self.damped_step(quadratic, prior, equations, material, DAMPING)
             moved = self.coordinates.material_at(x + change)
-            worth = promised(quadratic, prior, x, change) / noise_of_promise(quadratic, prior, equations.gradient_noise)
-            rest = 0.0
-            if self.is_thick(material) and self.joins(material) and standing.stage + 1 == len(self.budget.last):
-                data = noise_of_promise(quadratic, prior, equations.data_noise)
-                rest = noise_of_promise(quadratic, prior, equations.gradient_noise) / data
-            standing = self.after(standing, moved, worth, rest)
+            gain = predicted_fall(quadratic, prior, x, change) / noise_fall(quadratic, prior, equations.gradient_noise)
+            path_variance = 0.0
+            if self.is_thick(material) and self.combines(material) and checkpoint.stage + 1 == len(self.budget.last):
+                data = noise_fall(quadratic, prior, equations.data_noise)
+                path_variance = noise_fall(quadratic, prior, equations.gradient_noise) / data
+            checkpoint = self.next_checkpoint(checkpoint, moved, gain, path_variance)
         return Solution(
-            moved, quadratic, equations.gradient_noise, scale, equations.used, standing.search_steps,
-            standing.is_converged and worth < UNFINISHED, self.paths,
+            moved, quadratic, equations.gradient_noise, scale, equations.used, checkpoint.search_steps,
+            checkpoint.is_converged and gain < UNCONVERGED_RATIO, self.paths,
             self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
             self.is_thick(moved),
             equations.matrix_error @ (self.coordinates.unknowns(moved) - x),
         )  # fmt: skip
 
-    def after(self, standing: Standing, moved: Material, worth: float, rest: float) -> Standing:
+    def next_checkpoint(self, checkpoint: Checkpoint, moved: Material, gain: float, path_variance: float) -> Checkpoint:
         """The state before the next step of the stage, or before the first of the next stage where this one has ended.
 
         Args:
-            worth: fall that the last step promised, in units of the fall that noise alone promises.
-            rest: variance by the paths in units of that by the measurements, where renders of a stage are combined;
-                else 0.
+            gain: fall that the last step promised, in units of the fall that noise alone promises.
+            path_variance: variance by the paths in units of that by the measurements, where renders of a stage are
+                combined; else 0.
         """
         thick = self.is_thick(moved)
-        enough, most = (WORTHWHILE_THICK, self.budget.most_last_thick) if thick else (WORTHWHILE, self.budget.most_last)
-        went = abs(math.log(moved.scattering_per_mm / standing.material.scattering_per_mm))
-        is_over = (worth < enough and rest < ENOUGH_PATHS and (went < NEAR or not thick)) or standing.step + 1 >= most
+        min_gain, max_steps = (
+            (PROMISE_RATIO_THICK, self.budget.most_last_thick) if thick else (PROMISE_RATIO, self.budget.most_last)
+        )
+        is_near = abs(math.log(moved.scattering_per_mm / checkpoint.material.scattering_per_mm)) < MAX_COMBINED_CHANGE
+        is_over = (
+            gain < min_gain and path_variance < MAX_PATH_VARIANCE and (is_near or not thick)
+        ) or checkpoint.step + 1 >= max_steps
         assert self.path_noise is not None
         assert self.multiple is not None
         if is_over:
-            self.joined = None  # the next stage has batches of another size
+            self.combined = None  # the next stage has batches of another size
         return replace(
-            standing,
+            checkpoint,
             material=moved,
-            stage=standing.stage + is_over,
-            step=0 if is_over else standing.step + 1,
+            stage=checkpoint.stage + is_over,
+            step=0 if is_over else checkpoint.step + 1,
             renders=self.renders,
             paths=self.paths,
             path_noise=self.path_noise,
             multiple=self.multiple,
-            joined=self.joined,
+            combined=self.combined,
         )
 
     def is_thick(self, material: Material) -> bool:
@@ -269,7 +273,7 @@ class GaussNewton:
         """
         return is_thick(material, self.rig.width_mm)
 
-    def change(
+    def damped_step(
         self, quadratic: Quadratic, prior: Array, equations: NormalEquations, around: Material, damping: float
     ) -> Array:
         """The step to the damped minimum, in which no unknown moves further than the linearisation holds.
@@ -277,7 +281,7 @@ class GaussNewton:
         The Levenberg term is centred on the present point and holds directions whose curvature may be noise. It moves
         no fixed point, so that repeated steps from fresh paths end where an undamped one would.
         """
-        x, broad = self.coordinates.unknowns(around), self.coordinates.broad()
+        x, broad = self.coordinates.unknowns(around), self.coordinates.broad_directions()
         noise = equations.gradient_noise + equations.data_noise
         if not self.is_broad(around):
             broad = broad[
@@ -287,23 +291,23 @@ class GaussNewton:
             damping *= max(1.0, noise_ratio(quadratic, prior, noise))
         matrix = step_matrix(quadratic, prior, damping)
         slope = quadratic.linear + (quadratic.matrix + prior) @ x
-        first = x + self.coordinates.held_back(self.coordinates.minimum(matrix, matrix @ x - slope) - x, around)
+        first = x + self.coordinates.clipped_step(self.coordinates.minimum(matrix, matrix @ x - slope) - x, around)
         if not broad.size:
-            return self.coordinates.held_back(first - x, around)
-        reach = self.coordinates.reach(around)
+            return self.coordinates.clipped_step(first - x, around)
+        reach = self.coordinates.broad_standard_deviations(around)
         second = first + broad_step(quadratic, prior, broad, reach, noise, first)
         if second[-1] < 0:
             # Absorption cannot be negative: set it to zero, and minimise over the others.
             first[-1] = 0
             second = first + broad_step(quadratic, prior, broad[:, :-1], reach[:-1], noise, first)
-        return self.coordinates.similar(self.coordinates.held_back(second - x, around), around)
+        return self.coordinates.similarity_step(self.coordinates.clipped_step(second - x, around), around)
 
-    def linearised(self, material: Material, paths: int, batches: int, *, join: bool = False) -> NormalEquations:
+    def linearised(self, material: Material, paths: int, batches: int, *, combine: bool = False) -> NormalEquations:
         """Normal equations of fresh batches.
 
         Args:
-            join: whether derivatives of the stage's earlier renders are added. Weights then stay those of the first of
-                them.
+            combine: whether derivatives of the stage's earlier renders are added. Weights then stay those of the first
+                of them.
         """
         self.renders += 1
         self.paths += paths * batches * len(self.rig.lights)
@@ -317,12 +321,12 @@ class GaussNewton:
             scores=True,
             blocks=self.blocks,
         )
-        shape, seen = (self.rig.grid.rows, self.rig.grid.columns), [views.images for views in self.rig.lights]
-        own = tuple(smoothed_covariance(estimates.images[:, some], shape) * batches * paths for some in seen)
+        shape, images = (self.rig.grid.rows, self.rig.grid.columns), [views.images for views in self.rig.lights]
+        own = tuple(smoothed_covariance(estimates.images[:, index], shape) * batches * paths for index in images)
         # Weights come from earlier renders alone: rare bright paths raise a pixel and its variance together, and
         # weights that share them with the residuals raised sigma_s' by several per cent.
         recent = own if self.path_noise is None else self.path_noise
-        earlier = self.joined if join else None
+        earlier = self.combined if combine else None
         known = recent if earlier is None else earlier.path_noise
         variances = np.where(self.measured.held_out[:, None], np.inf, self.measured.variances)
         multiple = estimates.mean - estimates.single_images
@@ -335,7 +339,7 @@ class GaussNewton:
             # In a thin cell each camera sees other scatterings: their noise is hardly correlated, and an estimate of
             # the correlation would only add noise.
             noise = [one * np.eye(one.shape[1]) for one in noise]
-        weights = weights_of(seen, variances, noise)
+        weights = weights_of(images, variances, noise)
         self.path_noise = tuple((first + second) / 2 for first, second in zip(own, recent, strict=True))
         equations = normal_equations(
             estimates,
@@ -343,28 +347,28 @@ class GaussNewton:
             self.measured.values,
             weights,
             None if earlier is None else earlier.derivatives,
-            self.near(earlier, material),
+            self.nearby_residuals(earlier, material),
         )
-        self.joined = Joined(equations.derivatives, equations.residuals, known) if join else None
+        self.combined = CombinedRenders(equations.derivatives, equations.residuals, known) if combine else None
         return equations.chained(self.coordinates.chain(material))
 
     def is_broad(self, material: Material) -> bool:
         """Whether derivatives are smoothed, and a second step goes along broad directions."""
-        return self.is_thick(material) or (self.is_searching and self.joins(material))
+        return self.is_thick(material) or (self.is_searching and self.combines(material))
 
-    def joins(self, material: Material) -> bool:
+    def combines(self, material: Material) -> bool:
         """Whether the unknowns are ln f and sigma_a themselves, in which residuals of several media can be combined."""
         return self.coordinates.chain(material) is None
 
-    def near(self, earlier: Joined | None, material: Material) -> ResidualSums | None:
+    def nearby_residuals(self, earlier: CombinedRenders | None, material: Material) -> ResidualSums | None:
         """Residuals of earlier renders, where their media are so near that derivatives can carry them over to this one;
         else None.
         """
-        if earlier is None or not self.joins(material):
+        if earlier is None or not self.combines(material):
             return None
         place = self.coordinates.material_at(earlier.residuals.place)
         moved = abs(math.log(material.scattering_per_mm / place.scattering_per_mm))
-        return earlier.residuals if moved < NEAR else None
+        return earlier.residuals if moved < MAX_COMBINED_CHANGE else None
 
     def smoother(self, multiple: Array, variances: Array, noise: list[Array]) -> Smoother:
         """Smoother of derivatives, made from earlier renders; ``noise`` as the covariances of ``weights_of``."""
@@ -385,12 +389,12 @@ def quadratic_at(x: Array, equations: NormalEquations) -> Quadratic:
     )
 
 
-def promised(quadratic: Quadratic, prior: Array, x: Array, change: Array) -> float:
+def predicted_fall(quadratic: Quadratic, prior: Array, x: Array, change: Array) -> float:
     """Fall of the objective that the quadratic model promises."""
     total = quadratic.matrix + prior
     return -float((quadratic.linear + total @ x) @ change + 0.5 * change @ total @ change)
 
 
-def noise_of_promise(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:
+def noise_fall(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:
     """Mean fall of the objective that the gradient's noise alone promises."""
     return 0.5 * float(np.trace(np.linalg.lstsq(quadratic.matrix + quadratic.noise + prior, gradient_noise)[0]))

@@ -51,7 +51,7 @@ class Mixtures:
     atoms: Array
     """Phase functions at the knots, 1/sr (KNOTS, M); see ``unit_atoms``."""
 
-    def begun(self, guess: Material) -> Mixture:
+    def initial_medium(self, guess: Material) -> Mixture:
         """The mix that is nearest to the guess, by power per angle, with a little of every atom."""
         root = np.sqrt(tent_solid_angles())
         nearest, _ = optimize.nnls(self.atoms * root[:, None], guess.scattering * root)
@@ -90,15 +90,15 @@ class Mixtures:
         """The same for weights that may all be many times those of the medium."""
         return self.precision(WEAK_SHARE * material.scattering_per_mm)
 
-    def broad(self) -> Array:
+    def broad_directions(self) -> Array:
         """No directions, because atoms are few and each is judged by its bound."""
         return np.zeros((self.atoms.shape[1] + 1, 0))
 
-    def reach(self, material: Material) -> Array:  # noqa: ARG002 - there are no such directions
+    def broad_standard_deviations(self, material: Material) -> Array:  # noqa: ARG002 - there are no such directions
         """No directions."""
         return np.zeros(0)
 
-    def similar(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - weights are few and seen
+    def similarity_step(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - weights are few and seen
         """The step itself, as weights are few."""
         return change
 
@@ -110,12 +110,12 @@ class Mixtures:
         x, _ = optimize.nnls(upper, np.linalg.solve(upper.T, unit * right))
         return np.asarray(unit * x)
 
-    def held_back(self, change: Array, material: Material) -> Array:
+    def clipped_step(self, change: Array, material: Material) -> Array:
         """The step with each unknown limited by itself; between two points without a negative weight there is none."""
         most = LARGEST_SHARE * material.scattering_per_mm
         return np.clip(change, -most, most)
 
-    def is_bound(self, x: Array) -> NDArray[np.bool_]:
+    def is_at_bound(self, x: Array) -> NDArray[np.bool_]:
         """Mask (M + 1,) of the weights and the absorption that are zero."""
         return x <= 0
 

@@ -138,8 +138,10 @@ class NormalEquations:
 
 def derivative_rows(rows: Array, material: Material) -> Array:
     """Derivatives with respect to ln f and sigma_a from sums of shares and path lengths (..., KNOTS + 1)."""
-    ways = rows[..., KNOTS:]
-    return np.concatenate([rows[..., :KNOTS] - ways * (material.scattering * tent_solid_angles()), -ways], axis=-1)
+    lengths = rows[..., KNOTS:]
+    return np.concatenate(
+        [rows[..., :KNOTS] - lengths * (material.scattering * tent_solid_angles()), -lengths], axis=-1
+    )
 
 
 def normal_equations(
@@ -148,14 +150,14 @@ def normal_equations(
     values: Array,
     weights: Weights,
     earlier: DerivativeSums | None = None,
-    near: ResidualSums | None = None,
+    nearby: ResidualSums | None = None,
 ) -> NormalEquations:
     """Normal equations from all pixels that have weight.
 
     Args:
         values: measurements (images, pixels).
         earlier: derivatives of earlier batches, whitened by the same weights.
-        near: residuals of some of these batches, of nearby media.
+        nearby: residuals of some of these batches, of nearby media.
     """
     residuals = weights.whitened(batches.images - values).reshape(len(batches.images), -1)
     count = len(residuals)
@@ -185,12 +187,12 @@ def normal_equations(
     matrix = every.matrix()
     place = np.append(np.log(material.scattering), material.absorption_per_mm)
     own_products = np.sum([j.reshape(-1, UNKNOWNS).T @ r for j, r in zip(jacobians, residuals, strict=True)], axis=0)
-    seen = ResidualSums(total, own_products, count, place)
-    seen = seen if near is None else seen + near
-    gradient = (whole.T @ seen.total - seen.products) / (seen.count * others)
+    sums = ResidualSums(total, own_products, count, place)
+    sums = sums if nearby is None else sums + nearby
+    gradient = (whole.T @ sums.total - sums.products) / (sums.count * others)
     # The gradient is a U-statistic of batches: its variance is that of a batch's part, twice the mean over its pairs.
     parts = terms - terms.mean(axis=0)
-    gradient_noise = parts.T @ parts / pairs * (count / seen.count)
+    gradient_noise = parts.T @ parts / pairs * (count / sums.count)
     # The noise of earlier derivatives meets that of the measurements alike in all batches, so their spread does not
     # show it: it is added here.
     scattered = weights.of_measurements(whole.reshape(jacobians[0].shape)[None])[0].reshape(-1, UNKNOWNS)
@@ -201,7 +203,7 @@ def normal_equations(
     misfit_se = float(np.sqrt((variance * (np.maximum(products, 0) + variance / 2)).sum()))
     return NormalEquations(
         misfit, misfit_se, gradient, matrix, gradient_noise, noise=mean.T @ mean - matrix,
-        noise_gradient=mean.T @ seen.total / seen.count - gradient, used=int(weights.used.sum()),
+        noise_gradient=mean.T @ sums.total / sums.count - gradient, used=int(weights.used.sum()),
         matrix_error=every.matrix_error(), data_noise=(scattered.T @ scattered - own_data) / (every.count**2 - count),
-        derivatives=every, residuals=seen,
+        derivatives=every, residuals=sums,
     )  # fmt: skip

@@ -50,13 +50,13 @@ def projected(point: Array) -> Array:
     return np.asarray(np.maximum(point - np.max(point) - sums[count - 1] / count, 0))
 
 
-def weight_gradient(rows: Array, material: Material, pulls: Array) -> Array:
-    """Derivative with respect to the weights (KNOTS + 2,) of sum of pulls times images; ``pulls`` (images, pixels).
+def weight_gradient(rows: Array, material: Material, cotangent: Array) -> Array:
+    """Derivative with respect to the weights (KNOTS + 2,) of the sum of ``cotangent`` (images, pixels) times images.
 
     ``rows`` are sums of shares and path lengths (images, pixels, KNOTS + 1). Weight n adds sigma_max / Omega_n to f at
     knot n and sigma_max to the extinction; vacuum adds nothing.
     """
-    shares = np.einsum("ip,ipn->n", pulls, rows)
+    shares = np.einsum("ip,ipn->n", cotangent, rows)
     solid = tent_solid_angles()
     by_scattering = shares[:KNOTS] / (material.scattering * solid) - shares[KNOTS]
     return np.append(LARGEST_EXTINCTION_PER_MM * np.append(by_scattering, -shares[KNOTS]), 0.0)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from services.fit.slab.model.dictionary import KNOTS, Material, cosine_moments, tent_solid_angles
 from services.fit.slab.solve.gauss_newton import Solution
+from services.fit.slab.solve.measured_directions import measured_directions
 from services.fit.slab.solve.prior import Quadratic
-from services.fit.slab.solve.seen import seen_of
 
 Array = NDArray[np.float64]
 
@@ -37,15 +37,15 @@ class Uncertainty:
         """Standard error of a quantity, from its derivatives with respect to ln f and sigma_a (KNOTS + 1,)."""
         return float(np.sqrt(slope @ self.covariance @ slope))
 
-    def undetermined_error(self, slope: Array) -> float:
+    def error_by_images(self, slope: Array) -> float:
         """The same standard error as far as the images alone determine the quantity."""
         return float(np.sqrt(slope @ self.images_alone @ slope))
 
-    def whole_error(self, slope: Array) -> float:
+    def larger_error(self, slope: Array) -> float:
         """The larger of both, by which a quantity is judged: a fit that ended short of its minimum may have the smaller
         error under the weak prior.
         """
-        return max(self.standard_error(slope), self.undetermined_error(slope))
+        return max(self.standard_error(slope), self.error_by_images(slope))
 
 
 def uncertainty_of(solution: Solution) -> Uncertainty:
@@ -59,42 +59,46 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
     priors = coordinates.precision(solution.scale), coordinates.weak_precision(material)
-    (believed, held), (weakly, weakly_held) = (
-        (seen_of(quadratic, prior), np.diag(_half_lines(quadratic, prior, x, coordinates.is_bound(x))))
+    (directions, bounds), (weak_directions, weak_bounds) = (
+        (measured_directions(quadratic, prior), np.diag(_half_lines(quadratic, prior, x, coordinates.is_at_bound(x))))
         for prior in priors
     )
-    chosen: Array = np.asarray(np.linalg.inv(believed.total + held), dtype=np.float64)
-    alone: Array = np.asarray(np.linalg.inv(weakly.total + weakly_held), dtype=np.float64)
-    if solution.thick:
-        noise = solution.data_noise + solution.gradient_noise + np.outer(solution.unsure, solution.unsure)
-        chosen = chosen @ (believed.noise(noise) + priors[0] + held) @ chosen
-        left = _left(solution, x, priors[0], chosen)
+    chosen: Array = np.asarray(np.linalg.inv(directions.total + bounds), dtype=np.float64)
+    alone: Array = np.asarray(np.linalg.inv(weak_directions.total + weak_bounds), dtype=np.float64)
+    if solution.is_thick:
+        noise = (
+            solution.data_noise
+            + solution.gradient_noise
+            + np.outer(solution.matrix_error_gradient, solution.matrix_error_gradient)
+        )
+        chosen = chosen @ (directions.noise(noise) + priors[0] + bounds) @ chosen
+        remaining = _remaining_square(solution, x, priors[0], chosen)
         # Flags ask what the prior adds, so the covariance under the weak prior has only the noise that the weights
         # contain.
-        chosen, alone = chosen + left, alone + left
+        chosen, alone = chosen + remaining, alone + remaining
     if (chain := coordinates.chain(material)) is None:
         return Uncertainty(chosen, alone, (chosen, alone))
     return Uncertainty(chain @ chosen @ chain.T, chain @ alone @ chain.T, (chosen, alone))
 
 
-def _left(solution: Solution, x: Array, prior: Array, known: Array) -> Array:
+def _remaining_square(solution: Solution, x: Array, prior: Array, covariance: Array) -> Array:
     """Outer square (U, U) of the displacement left to the minimum within bounds, reduced by the share that noise alone
     leaves on average.
     """
     coordinates, quadratic = solution.coordinates, solution.quadratic
-    seen = seen_of(quadratic, prior)
-    slope = seen.projected(quadratic.linear + quadratic.matrix @ x)
-    left = coordinates.minimum(seen.total, seen.curvature @ x - slope) - x
+    directions = measured_directions(quadratic, prior)
+    slope = directions.projected(quadratic.linear + quadratic.matrix @ x)
+    remaining = coordinates.minimum(directions.total, directions.curvature @ x - slope) - x
     # In units of the covariance (U, U) without this term, noise leaves a squared length of one for each measured
     # direction.
-    length = float(left @ np.linalg.lstsq(known, left)[0])
-    share = max(0.0, 1 - len(seen.signals) / max(length, 1e-300))
-    return np.asarray(share * np.outer(left, left))
+    length = float(remaining @ np.linalg.lstsq(covariance, remaining)[0])
+    share = max(0.0, 1 - len(directions.signals) / max(length, 1e-300))
+    return np.asarray(share * np.outer(remaining, remaining))
 
 
 def covariance_of(quadratic: Quadratic, prior: Array) -> Array:
     """Posterior covariance of the unknowns under a prior's precision (U, U), where the weights contain all noise."""
-    return np.asarray(np.linalg.inv(seen_of(quadratic, prior).total))
+    return np.asarray(np.linalg.inv(measured_directions(quadratic, prior).total))
 
 
 def _half_lines(quadratic: Quadratic, prior: Array, x: Array, bound: NDArray[np.bool_]) -> Array:

@@ -46,8 +46,8 @@ def _reflection(file: SphereFile, reading: TotalsReading, scattered: float, mirr
         return scattered + mirror
     # Behind a baffle light meets the wall first. The wall receives all of the mirror's light, but scattered light less
     # the entrance's share.
-    spared = 1 - _area(sphere, sphere.third_port_mm) if sphere.baffle else 1.0
-    return (scattered + mirror / spared) * _gain(sphere, sample) / _gain(sphere, file.standard_reflectance)
+    wall_share = 1 - _area(sphere, sphere.third_port_mm) if sphere.baffle else 1.0
+    return (scattered + mirror / wall_share) * _gain(sphere, sample) / _gain(sphere, file.standard_reflectance)
 
 
 def _transmission(file: SphereFile, reading: TotalsReading, scattered: float, through: float, sample: float) -> float:

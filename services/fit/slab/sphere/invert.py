@@ -37,7 +37,7 @@ SEARCH = tuple(product(np.geomspace(0.02, 60, 8), np.geomspace(0.003, 8, 6)))
 MIN_THICKNESS, MAX_THICKNESS = 1e-6, 1e4
 """Bounds of both, times the width; at the lower one a slab absorbs, or scatters, too little for any reading to show."""
 MAX_G, MIN_G = 0.998, -0.95
-MAX_MISS = 2e-5
+MAX_READING_ERROR = 2e-5
 """Largest difference between fitted and measured readings of a slab of this index and width; a solution meets them to
 1e-10."""
 DIFFERENCE = 1e-4
@@ -102,17 +102,19 @@ class _Problem:
         measured = np.array([reading.R, reading.T])
         errors = np.array([reading.R_se or ASSUMED_SE, reading.T_se or ASSUMED_SE])
 
-        def misses(x: Array, nodes: int = self.nodes) -> Array:
+        def residuals(x: Array, nodes: int = self.nodes) -> Array:
             absorption, reduced = np.exp(x)
             return np.asarray((self.readings(absorption, reduced, extinction, nodes) - measured) / errors)
 
         starts = [np.log(np.array([a, s]) / width) for s, a in SEARCH if extinction is None or a / width < extinction]
-        start = min(starts, key=lambda x: float(np.square(misses(x, SEARCH_NODES)).sum()))
+        start = min(starts, key=lambda x: float(np.square(residuals(x, SEARCH_NODES)).sum()))
         bounds = np.log(MIN_THICKNESS / width), np.log(MAX_THICKNESS / width)
-        solution = least_squares(misses, start, bounds=bounds, diff_step=DIFFERENCE, xtol=1e-10, ftol=1e-14, gtol=1e-12)
+        solution = least_squares(
+            residuals, start, bounds=bounds, diff_step=DIFFERENCE, xtol=1e-10, ftol=1e-14, gtol=1e-12
+        )
         absorption, reduced = (float(value) for value in np.exp(solution.x))
         fitted = self.readings(absorption, reduced, extinction, self.nodes)
-        return self._told(name, absorption, reduced, extinction, fitted, errors)
+        return self._result(name, absorption, reduced, extinction, fitted, errors)
 
     def extinction_per_mm(self) -> float | None:
         """Extinction from the collimated transmittance t^2 x / (1 - r^2 x^2), x = exp(-sigma_t w), all reflections
@@ -134,15 +136,15 @@ class _Problem:
 
     def readings(self, absorption: float, reduced: float, extinction: float | None, nodes: int) -> Array:
         """R and T as the instrument would read them."""
-        told = self.expected(self.optics(absorption, reduced, extinction), nodes)
-        return np.array([told.R, told.T])
+        readings = self.expected(self.optics(absorption, reduced, extinction), nodes)
+        return np.array([readings.R, readings.T])
 
     def expected(self, optics: Optics, nodes: int) -> Readings:
         """All readings of the instrument for a medium."""
         totals = slab_totals(optics, self.file.cell.width_mm, interface_of(self.file.cell), nodes)
         return expected(totals, self.file, self.reading)
 
-    def _told(
+    def _result(
         self,
         name: str,
         absorption: float,
@@ -156,7 +158,7 @@ class _Problem:
         se = np.sqrt(np.diag(covariance))
         whole = absorption + reduced
         notes = self._notes(fitted, absorption, reduced, extinction)
-        missed = float(np.abs(fitted - np.array([self.reading.R, self.reading.T])).max()) > MAX_MISS
+        is_off = float(np.abs(fitted - np.array([self.reading.R, self.reading.T])).max()) > MAX_READING_ERROR
         scattering = None if extinction is None else _quantity(optics.scattering_per_mm, float(se[2]), "1/mm")
         fit = SphereFit(
             name=name,
@@ -167,7 +169,7 @@ class _Problem:
             sigma_t=None if extinction is None else _quantity(extinction, extinction_se, "1/mm"),
             R=self.reading.R, T=self.reading.T, T_unscattered=self.reading.T_unscattered,
             R_fitted=float(fitted[0]), T_fitted=float(fitted[1]),
-            converged=not missed, notes=notes,
+            converged=not is_off, notes=notes,
         )  # fmt: skip
         return Fitted(fit, optics, covariance[:2, :2])
 
@@ -192,8 +194,8 @@ class _Problem:
 
     def _responses(self, point: Array, knows_extinction: bool) -> Array:
         optics = self.optics(point[0], point[1], point[2] if knows_extinction else None)
-        told = self.expected(optics, self.nodes)
-        return np.array([told.R, told.T, optics.scattering_per_mm, optics.g])
+        readings = self.expected(optics, self.nodes)
+        return np.array([readings.R, readings.T, optics.scattering_per_mm, optics.g])
 
     def _extinction_se(self, extinction: float | None) -> float:
         measured = self.reading.T_unscattered
@@ -205,11 +207,11 @@ class _Problem:
 
     def _notes(self, fitted: Array, absorption: float, reduced: float, extinction: float | None) -> tuple[str, ...]:
         notes, reading, least = [], self.reading, 2 * MIN_THICKNESS / self.file.cell.width_mm
-        if float(np.abs(fitted - np.array([reading.R, reading.T])).max()) > MAX_MISS:
-            told = f"R = {reading.R:g}, T = {reading.T:g}"
+        if float(np.abs(fitted - np.array([reading.R, reading.T])).max()) > MAX_READING_ERROR:
+            measured = f"R = {reading.R:g}, T = {reading.T:g}"
             nearest = f"the nearest one reads {fitted[0]:.4f}, {fitted[1]:.4f}"
             notes.append(
-                f"No slab of this width and index reads {told}; {nearest}: check index, glass, standard and what R"
+                f"No slab of this width and index reads {measured}; {nearest}: check index, glass, standard and what R"
                 " includes."
             )
         if absorption < least:

@@ -15,10 +15,11 @@ PARAMETERS = ("sigma_a", "sigma_s_reduced", "g", "sigma_s", "sigma_t")
 def write_sphere(out: Path, fits: list[Fitted], translucency: Translucency | None) -> None:
     """Write the results by wavelength, in the form that a fit of images has."""
     out.mkdir(parents=True, exist_ok=True)
-    told = [fitted.fit.model_dump() for fitted in fits]
-    parameters = {fit["name"]: {name: fit[name] for name in PARAMETERS if fit[name] is not None} for fit in told}
+    results = [fitted.fit.model_dump() for fitted in fits]
+    parameters = {fit["name"]: {name: fit[name] for name in PARAMETERS if fit[name] is not None} for fit in results}
     readings = {
-        fit["name"]: {name: value for name, value in fit.items() if name not in {*PARAMETERS, "name"}} for fit in told
+        fit["name"]: {name: value for name, value in fit.items() if name not in {*PARAMETERS, "name"}}
+        for fit in results
     }
     files = {"parameters": parameters, "readings": readings}
     if translucency is not None:

@@ -68,7 +68,7 @@ def no_crossing(modes: int) -> Crossing:
 
 
 def offer(
-    kept: Crossing,
+    reservoir: Crossing,
     point: mi.Point3f,
     omega: mi.Vector3f,
     hit: Hit,
@@ -84,18 +84,18 @@ def offer(
     for shift in shifts:
         importance += dr.abs(shift)
     importance = dr.select(active, importance * throughput, 0)
-    total = kept.total + importance
+    total = reservoir.total + importance
     take = active & (u * total < importance)
     select = dr.select
     return Crossing(
-        select(take, point, kept.point),
-        select(take, omega, kept.omega),
-        select(take, mi.Vector3f(hit.normal), kept.normal),
-        select(take, before, kept.before),
-        select(take, after, kept.after),
-        select(take, throughput, kept.throughput),
-        [select(take, new, old) for new, old in zip(shifts, kept.shifts, strict=True)],
-        select(take, importance, kept.importance),
+        select(take, point, reservoir.point),
+        select(take, omega, reservoir.omega),
+        select(take, mi.Vector3f(hit.normal), reservoir.normal),
+        select(take, before, reservoir.before),
+        select(take, after, reservoir.after),
+        select(take, throughput, reservoir.throughput),
+        [select(take, new, old) for new, old in zip(shifts, reservoir.shifts, strict=True)],
+        select(take, importance, reservoir.importance),
         total,
     )
 

@@ -40,7 +40,7 @@ def harmonics(directions: Array, order: int) -> NDArray[np.float32]:
     return np.stack([np.broadcast_to(np.array(value), len(directions)) for value in values], axis=1)
 
 
-def per_cosine(cosine: mi.Float) -> mi.Float:
+def mean_inverse_cosine(cosine: mi.Float) -> mi.Float:
     """1 / |cosine|, or the mean of that over grazing cosines where the cosine is grazing."""
     size = dr.abs(cosine)
     return dr.select(size < GRAZING_COSINE, 2 / GRAZING_COSINE, dr.rcp(dr.maximum(size, GRAZING_COSINE)))
@@ -75,33 +75,33 @@ class BorderWalk(Walk, ABC):
         self.columns = (order + 1) ** 2 + 1
         """Columns of a light table: one per harmonic of the light that has collided, and one for light that has not."""
 
-    def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
+    def _move(self, walker: Walker, flight: Flight, throughput: mi.Float) -> None:
         crosses = flight.meets & ~flight.reflects & ~flight.hit.outer
         if not self.mesh.single:
             crosses &= flight.hit.surface == self.mesh.teeth + self.texels.tooth
-        strength = carried * per_cosine(dr.dot(walker.omega, flight.hit.normal))
-        fresh = self.book.order(walker.so_far) == 0
+        strength = throughput * mean_inverse_cosine(dr.dot(walker.omega, flight.hit.normal))
+        uncollided = self.scores.order(walker.scatterings) == 0
 
         def count(
-            lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+            lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
         ) -> mi.UInt32:
-            self._count(lane, hit, omega, strength, fresh, crosses)
+            self._count(lane, hit, omega, strength, uncollided, crosses)
             return lane
 
         dr.if_stmt(
-            (walker.lane, flight.hit, walker.omega, strength, fresh, crosses),
+            (walker.lane, flight.hit, walker.omega, strength, uncollided, crosses),
             crosses,
             count,
             lambda lane, *_: lane,
             label="border",
         )
-        super()._move(walker, flight, carried)
+        super()._move(walker, flight, throughput)
 
     @abstractmethod
     def _count(
-        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
     ) -> None:
-        """Score crossings of a lane's path with ``strength``, its weight over the cosine; ``fresh`` paths have not
+        """Score crossings of a lane's path with ``strength``, its weight over the cosine; ``uncollided`` paths have not
         collided.
         """
 
@@ -135,18 +135,18 @@ class LightWalk(BorderWalk):
         scale = lights.power[:, None] / (FIXED_POINT * lights.lanes_per_group * samples * self.texels.areas_mm2)
         return np.asarray(sums * scale[:, None, :, None], dtype=np.float32)
 
-    def _unmirrored(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - cameras need the medium
+    def _omits_reflection(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - cameras need the medium
         # Transmit light that has not scattered, and reflect none of it, as the straight connections of images do.
-        return self.book.order(walker.so_far) == 0
+        return self.scores.order(walker.scatterings) == 0
 
     def _count(
-        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
     ) -> None:
         first = (self.photons.group(lane) * self.texels.count + self._texel(hit, crosses)) * self.columns
         units = strength * FIXED_POINT
         for k, harmonic in enumerate(dr.sh_eval(omega, self.order)):
-            dr.scatter_add(self.table, mi.Int64(units * harmonic), first + k, crosses & ~fresh)
-        dr.scatter_add(self.table, mi.Int64(units), first + self.columns - 1, crosses & fresh)
+            dr.scatter_add(self.table, mi.Int64(units * harmonic), first + k, crosses & ~uncollided)
+        dr.scatter_add(self.table, mi.Int64(units), first + self.columns - 1, crosses & uncollided)
 
 
 class CameraWalk(BorderWalk):
@@ -176,7 +176,7 @@ class CameraWalk(BorderWalk):
         self.sums = dr.zeros(mi.Float64, start.lanes * self.light_batches * self.shape_modes)
         dr.make_opaque(self.light, self.sums)
 
-    def meet(self, samples: int) -> Array:
+    def shape_sums(self, samples: int) -> Array:
         """Sums over every lane's samples for each of M shape modes, (lanes, batches of light, M)."""
         self.trace(samples, Tally(1, 1, 0))
         dr.eval(self.sums)
@@ -184,16 +184,16 @@ class CameraWalk(BorderWalk):
         return np.array(self.sums).reshape(-1, self.light_batches, self.shape_modes)
 
     def _count(
-        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, fresh: mi.Bool, crosses: mi.Bool
+        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
     ) -> None:
         texel, speeds = self._texel(hit, crosses), self.mesh.velocity(hit, self.texels.tooth, crosses)
         harmonics = dr.sh_eval(omega, self.order)
         weighted = [harmonics[k] * c for j, c in enumerate(self.coefficients) for k in range(j * j, (j + 1) ** 2)]
         for batch in range(self.light_batches):
             first = ((lane % self.pixels * self.light_batches + batch) * self.texels.count + texel) * self.columns
-            change = dr.gather(mi.Float, self.light, first + self.columns - 1, crosses & fresh)
+            change = dr.gather(mi.Float, self.light, first + self.columns - 1, crosses & uncollided)
             for k, harmonic in enumerate(weighted):
-                change = dr.fma(harmonic, dr.gather(mi.Float, self.light, first + k, crosses & ~fresh), change)
+                change = dr.fma(harmonic, dr.gather(mi.Float, self.light, first + k, crosses & ~uncollided), change)
             for mode, speed in enumerate(speeds):
                 slot = (lane * self.light_batches + batch) * self.shape_modes + mode
                 dr.scatter_add(

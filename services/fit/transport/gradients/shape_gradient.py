@@ -64,7 +64,7 @@ class ShapeGradients:
         chosen = list(range(len(self.recipe.light_positions_mm)) if view.lights is None else view.lights)
         table = self._light(media, texels, chosen, photons, order, light_seed)
         lights = self.recipe.light_positions_mm[chosen]
-        arriving = -lights / np.linalg.norm(lights, axis=1, keepdims=True)
+        light_directions = -lights / np.linalg.norm(lights, axis=1, keepdims=True)
 
         per_batch = -(-samples // CAMERA_BATCHES)
         slice_size = max(1, TABLE_BUDGET // (LIGHT_BATCHES * texels.count * table.shape[-1]))
@@ -72,12 +72,12 @@ class ShapeGradients:
         for first in range(0, len(view), slice_size):
             piece = View(view.camera, view.pixels[first : first + slice_size])
             light = self._light_of_pixels(
-                table, series, order, piece, arriving, cotangent[chosen, first : first + slice_size]
+                table, series, order, piece, light_directions, cotangent[chosen, first : first + slice_size]
             )
             start = CameraStart(piece, CAMERA_BATCHES, camera_seed, self.radius_mm)
-            sums = CameraWalk(self.geometry, media, start, texels, self.ior, series.coefficients(order), light).meet(
-                per_batch
-            )
+            sums = CameraWalk(
+                self.geometry, media, start, texels, self.ior, series.coefficients(order), light
+            ).shape_sums(per_batch)
             crossed += sums.reshape(CAMERA_BATCHES, len(piece), LIGHT_BATCHES, -1).sum(axis=1) / per_batch
         return ShapeGradient(*crossed_mean(crossed), samples=per_batch * CAMERA_BATCHES)
 
@@ -91,30 +91,36 @@ class ShapeGradients:
         return LightWalk(self.geometry, media, start, texels, order, self.ior).gather(-(-per_group // lanes))
 
     def _light_of_pixels(
-        self, table: NDArray[np.float32], series: BorderSeries, order: int, view: View, arriving: Array, weights: Array
+        self,
+        table: NDArray[np.float32],
+        series: BorderSeries,
+        order: int,
+        view: View,
+        light_directions: Array,
+        weights: Array,
     ) -> NDArray[np.float32]:
         """Light weighted by the cotangent ``weights`` (L, N), in the form that ``CameraWalk`` takes: (N, batches,
         texels, columns).
 
-        ``arriving`` are directions of uncollided light, (L, 3), all taken as at the tooth's middle; a pixel's own
-        direction is that through its middle.
+        ``light_directions`` are directions of uncollided light, (L, 3), all taken as at the tooth's middle; a pixel's
+        own direction is that through its middle.
         """
-        seen, weighting, uncollided = -_along(view), weights.T.astype(np.float32), table[..., -1]
+        view_directions, weighting, uncollided = -_pixel_directions(view), weights.T.astype(np.float32), table[..., -1]
         light = np.tensordot(weighting, table, axes=1)
 
         # Light for a pixel's uncollided walk: collided light by the series, uncollided light by the phase function.
         factors = np.repeat(series.coefficients(order), 2 * np.arange(order + 1) + 1)
-        exact = weights * series.uncollided(arriving @ seen.T)
-        light[..., -1] = np.einsum("nbtk,nk->nbt", light[..., :-1], harmonics(seen, order) * factors)
+        exact = weights * series.uncollided(light_directions @ view_directions.T)
+        light[..., -1] = np.einsum("nbtk,nk->nbt", light[..., :-1], harmonics(view_directions, order) * factors)
         light[..., -1] += np.tensordot(exact.T.astype(np.float32), uncollided, axes=1)
 
         # Light for collided walks: here uncollided light is expanded in the series too.
-        for k, column in enumerate(harmonics(arriving, order).T):
+        for k, column in enumerate(harmonics(light_directions, order).T):
             light[..., k] += np.tensordot(weighting * column, uncollided, axes=1)
         return light
 
 
-def _along(view: View) -> Array:
+def _pixel_directions(view: View) -> Array:
     """Unit directions from the camera through the pixels' middles, (N, 3)."""
     rotation = np.asarray(view.camera.camera_from_world)[:3, :3]
     middles = np.concatenate([view.pixels + 0.5, np.ones((len(view), 1))], axis=1)

@@ -73,7 +73,7 @@ class StainTextures:
         )
         dr.eval(self._values, self._corners, self._layout)
 
-    def cut(self, texels: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, ...]:
+    def split_by_tooth(self, texels: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, ...]:
         """Split values of all texels into every tooth's (H, W); None for a tooth without stains."""
         return tuple(
             None if place is None else texels[place[0] : place[0] + place[1][0] * place[1][1]].reshape(place[1])

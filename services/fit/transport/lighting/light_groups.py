@@ -29,10 +29,10 @@ class LightGroups:
 
         # Write neighbouring lights into rows, so that a column, which is a group, has one light of every part of the
         # dome; dark copies fill the last row.
-        places = np.arange(self.size * self.count).reshape(self.size, self.count).T.reshape(-1)
-        members = neighbours_in_a_row(positions_mm)[places % lights]
+        slots = np.arange(self.size * self.count).reshape(self.size, self.count).T.reshape(-1)
+        members = spatial_order(positions_mm)[slots % lights]
         columns = np.concatenate([positions_mm, intensities[:, None]], axis=1)[members]
-        columns[places >= lights, 3] = 0
+        columns[slots >= lights, 3] = 0
         self._lights = aligned(mi.Float(columns.astype(np.float32).reshape(-1)))
         self._members = mi.UInt32(members.astype(np.uint32))
         dr.eval(self._members)
@@ -54,12 +54,12 @@ class LightGroups:
             total = dr.fma(importance(towards * inverse), light.w * dr.square(inverse), total)
             sums.append(total)
         threshold, chosen = u * total, first
-        for so_far in sums[:-1]:
-            chosen = chosen + dr.select(so_far <= threshold, mi.UInt32(1), mi.UInt32(0))
+        for partial_sum in sums[:-1]:
+            chosen = chosen + dr.select(partial_sum <= threshold, mi.UInt32(1), mi.UInt32(0))
         return dr.gather(mi.UInt32, self._members, chosen), total
 
 
-def neighbours_in_a_row(points: NDArray[np.float64]) -> NDArray[np.int64]:
+def spatial_order(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Indices (N,) of points (N, 3), ordered by repeated halving along the widest axis, so that points close in space
     are close in the list.
     """

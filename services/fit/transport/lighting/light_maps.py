@@ -93,7 +93,7 @@ class MapRay:
     """Distance travelled to the exit from dentin, mm."""
     surface: mi.Float
     """Transmittance of the outer face."""
-    meetings: mi.UInt32
+    events: mi.UInt32
     """Surfaces met so far, coded in bits."""
     limit: mi.Float
     """Distance travelled up to the surface behind which the map is not certain."""
@@ -117,7 +117,7 @@ class MapCell:
     inside: mi.Bool
     """Whether the vertex lies on the map."""
 
-    def between(self, word: int, shift: int) -> mi.Float:
+    def interpolated(self, word: int, shift: int) -> mi.Float:
         """Bilinear interpolation of the 16-bit number that starts at bit ``shift`` (0 or 16) of a table word."""
         values = [
             mi.Float((corner[word] >> shift) & 0xFFFF if shift == 0 else corner[word] >> shift)
@@ -152,21 +152,21 @@ class LightMaps:
         helper = np.where(np.abs(relative[:, :1]) < 0.9 * distance[:, None], [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
         right = np.cross(relative, helper)
         right *= (distance / np.linalg.norm(right, axis=1) / self.texel_mm)[:, None]
-        self._near = float(radius + MARGIN_MM)
+        self._half_depth_mm = float(radius + MARGIN_MM)
         self._centre = dr.opaque(mi.Vector3f, centre.tolist())
         columns = [-relative / distance[:, None], intensities[:, None], right, distance[:, None]]
         self._frames = aligned(mi.Float(np.concatenate(columns, axis=1).astype(np.float32).reshape(-1)))
         self._table = mi.UInt32(0)
-        self._depth_step = 2 * self._near / 65535
+        self._depth_step = 2 * self._half_depth_mm / 65535
         dr.eval(self._frames)
 
-    def of(self, chosen: list[int]) -> LightMaps:
+    def subset(self, chosen: list[int]) -> LightMaps:
         """The maps of the ``chosen`` lights."""
         maps = copy(self)
-        maps.keep(chosen)
+        maps.restrict_to(chosen)
         return maps
 
-    def keep(self, chosen: list[int]) -> None:
+    def restrict_to(self, chosen: list[int]) -> None:
         """Discard the maps of all other lights."""
         self._frames = aligned(mi.Float(np.array(self._frames).reshape(self.count, -1)[chosen].reshape(-1)))
         self._table = mi.UInt32(np.array(self._table).reshape(self.count, -1)[chosen].reshape(-1))
@@ -186,7 +186,7 @@ class LightMaps:
         ray_length = dr.norm(frame.forward + across) * frame.distance
         direction = (frame.forward + across) * (frame.distance / ray_length)
         offset = across * frame.distance
-        before = self._near + dr.squared_norm(offset) / (ray_length + frame.distance)
+        before = self._half_depth_mm + dr.squared_norm(offset) / (ray_length + frame.distance)
         start = mi.Point3f(self._centre + offset - direction * before)
 
         def step(ray: MapRay) -> tuple[MapRay]:
@@ -200,15 +200,15 @@ class LightMaps:
                 )
             if geometry.stained:
                 through *= geometry.stain(hit, ray.alive & geometry.on_stain(hit, ray.place, behind))
-            self._meet(ray, geometry, hit, through)
+            self._record_hit(ray, geometry, hit, through)
             ray.point = dr.select(hit.valid, geometry.advance(ray.point, ray.direction, hit, hit.valid), ray.point)
             ray.place = dr.select(hit.valid, behind, ray.place)
             return (ray,)
 
         ray = MapRay(
-            start, direction, dr.full(mi.Float, -self._near, lanes), dr.zeros(mi.UInt32, lanes),
+            start, direction, dr.full(mi.Float, -self._half_depth_mm, lanes), dr.zeros(mi.UInt32, lanes),
             dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes),
-            dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, -self._near, lanes),
+            dr.full(mi.Float, 1, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, -self._half_depth_mm, lanes),
             dr.full(mi.Bool, True, lanes),
         )  # fmt: skip
         (ray,) = dr.while_loop((ray,), lambda ray: ray.alive, step, label="light map")
@@ -216,28 +216,28 @@ class LightMaps:
         dr.sync_thread()
         self._store(ray)
 
-    def _meet(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:  # noqa: ARG002 - scenes of several surfaces need it
+    def _record_hit(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:  # noqa: ARG002 - scenes of several surfaces need it
         """Record a surface that a ray meets.
 
-        Bits of ``meetings``: outer surface entered, dentin entered, dentin left, outer surface left; the last bit marks
+        Bits of ``events``: outer surface entered, dentin entered, dentin left, outer surface left; the last bit marks
         any other order.
         """
-        entering, met = dr.dot(ray.direction, hit.normal) < 0, hit.valid
+        entering, is_hit = dr.dot(ray.direction, hit.normal) < 0, hit.valid
         event = dr.select(
             hit.outer, dr.select(entering, mi.UInt32(1), mi.UInt32(8)), dr.select(entering, mi.UInt32(2), mi.UInt32(4))
         )
         # Every event must happen once, and those of the dentin inside the tooth.
-        repeated = (ray.meetings & event) != 0
-        unordered = ((event > 1) & ((ray.meetings & 1) == 0)) | ((ray.meetings & 8) != 0)
-        ray.meetings |= dr.select(met, event | dr.select(repeated | unordered, mi.UInt32(16), mi.UInt32(0)), 0)
-        ray.entry = dr.select(met & (event == 1), ray.travelled, ray.entry)
-        ray.dentin_entry = dr.select(met & (event == 2), ray.travelled, ray.dentin_entry)
-        ray.dentin_exit = dr.select(met & (event == 4), ray.travelled, ray.dentin_exit)
-        ray.surface = dr.select(met & (event == 1), through, ray.surface)
-        ray.alive &= met & ((ray.meetings & 16) == 0)
+        repeated = (ray.events & event) != 0
+        unordered = ((event > 1) & ((ray.events & 1) == 0)) | ((ray.events & 8) != 0)
+        ray.events |= dr.select(is_hit, event | dr.select(repeated | unordered, mi.UInt32(16), mi.UInt32(0)), 0)
+        ray.entry = dr.select(is_hit & (event == 1), ray.travelled, ray.entry)
+        ray.dentin_entry = dr.select(is_hit & (event == 2), ray.travelled, ray.dentin_entry)
+        ray.dentin_exit = dr.select(is_hit & (event == 4), ray.travelled, ray.dentin_exit)
+        ray.surface = dr.select(is_hit & (event == 1), through, ray.surface)
+        ray.alive &= is_hit & ((ray.events & 16) == 0)
 
     def _store(self, ray: MapRay) -> None:
-        self._pack([ray.entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.meetings, (1 | 8, 1 | 2 | 4 | 8))
+        self._pack([ray.entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.events, (1 | 8, 1 | 2 | 4 | 8))
 
     def _pack(
         self,
@@ -275,9 +275,9 @@ class LightMaps:
         dr.eval(self._table)
 
     def _depth_code(self, depth: mi.Float) -> NDArray[np.uint32]:
-        return np.clip(np.rint((np.array(depth, dtype=np.float64) + self._near) / self._depth_step), 0, 65535).astype(
-            np.uint32
-        )
+        return np.clip(
+            np.rint((np.array(depth, dtype=np.float64) + self._half_depth_mm) / self._depth_step), 0, 65535
+        ).astype(np.uint32)
 
     @dataclass
     class _Frame:
@@ -294,7 +294,7 @@ class LightMaps:
         forward, right = mi.Vector3f(first.x, first.y, first.z), mi.Vector3f(second.x, second.y, second.z)
         return LightMaps._Frame(first.w, right, dr.cross(forward, right), forward, second.w)
 
-    def look(self, light: mi.UInt32, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> LightView:
+    def look_up(self, light: mi.UInt32, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> LightView:
         """Media between ``point`` and a light, with the direction to that light."""
         frame, from_centre = self._frame(light), mi.Vector3f(point - self._centre)
         from_light = frame.forward * frame.distance + from_centre
@@ -332,7 +332,8 @@ class LightMaps:
     def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:  # noqa: ARG002 - scenes of several surfaces need the place
         """Media and light according to a cell of the map."""
         entry, dentin_entry, dentin_exit = (
-            dr.fma(cell.between(*half), self._depth_step, -self._near) for half in ((0, 0), (0, 16), (1, 0))
+            dr.fma(cell.interpolated(*half), self._depth_step, -self._half_depth_mm)
+            for half in ((0, 0), (0, 16), (1, 0))
         )
         dentin_mm = dr.maximum(dr.minimum(cell.depth, dentin_exit) - dentin_entry, 0)
         enamel_mm = dr.maximum(cell.depth - entry - dentin_mm, 0)
@@ -342,7 +343,7 @@ class LightMaps:
             cell.falloff,
             (ENAMEL, DENTIN),
             (enamel_mm, dentin_mm),
-            cell.between(1, 16) * (1 / 65535),
+            cell.interpolated(1, 16) * (1 / 65535),
             certain,
         )
 

@@ -37,7 +37,7 @@ class PointLights:
 
     def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], maps: LightMaps) -> None:
         self.count = len(positions_mm)
-        self.turns = math.ceil(STEPS_PER_ROOT * math.sqrt(self.count))
+        self.connection_period = math.ceil(STEPS_PER_ROOT * math.sqrt(self.count))
         self.maps = maps
         self.groups = LightGroups(positions_mm, intensities)
         self.positions = mi.Float(np.ascontiguousarray(positions_mm.reshape(-1), dtype=np.float32))
@@ -150,7 +150,7 @@ def shadow(
         if geometry.stained:
             crosses = ray.alive & geometry.on_stain(hit, ray.place, behind)
             ray.surface *= geometry.stain(hit, crosses)
-            ray.stains = [kept.offer(hit, crosses) for kept in ray.stains]
+            ray.stains = [reservoir.offer(hit, crosses) for reservoir in ray.stains]
         if geometry.opaque:
             ray.surface = dr.select(hit.opaque, 0, ray.surface)
         ray.point = dr.select(hit.valid, geometry.advance(ray.point, direction, hit, hit.valid), ray.point)

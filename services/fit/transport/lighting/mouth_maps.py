@@ -14,10 +14,10 @@ from services.fit.transport.lighting.light_maps import LightMaps, LightView, Map
 from services.fit.transport.scene.geometry import Hit
 from services.fit.transport.scene.mesh_geometry import MeshGeometry
 
-FIRST = 31
-"""Bits of ``meetings`` that hold one more than the first object's number, or 0 while there is none."""
+FIRST_SOLID = 31
+"""Bits of ``events`` that hold one more than the first object's number, or 0 while there is none."""
 DENTIN_ENTERED, DENTIN_LEFT = 32, 64
-"""Bits of ``meetings`` that say whether the ray has entered and left that object's dentin."""
+"""Bits of ``events`` that say whether the ray has entered and left that object's dentin."""
 
 WALL_TEXELS = 2.0
 """Largest depth in texels of a vertex on the wall beyond the nearest corner of its cell."""
@@ -34,17 +34,17 @@ class MouthMaps(LightMaps):
         self._geometry = geometry
         super().trace(geometry, ior)
 
-    def _meet(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:
-        met, entering = hit.valid, dr.dot(ray.direction, hit.normal) < 0
-        thing = dr.select(hit.surface < geometry.teeth, hit.surface, hit.surface - geometry.teeth) + 1
-        begins = met & ((ray.meetings & FIRST) == 0)
-        dentin = met & ~begins & ~hit.outer & (thing == (ray.meetings & FIRST))
-        enters = dentin & entering & ((ray.meetings & DENTIN_ENTERED) == 0)
-        leaves = dentin & ~entering & ((ray.meetings & (DENTIN_ENTERED | DENTIN_LEFT)) == DENTIN_ENTERED)
-        ends = met & dr.select(begins, hit.opaque | ~entering, ~enters & ~leaves)
+    def _record_hit(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:
+        is_hit, entering = hit.valid, dr.dot(ray.direction, hit.normal) < 0
+        solid = dr.select(hit.surface < geometry.teeth, hit.surface, hit.surface - geometry.teeth) + 1
+        begins = is_hit & ((ray.events & FIRST_SOLID) == 0)
+        dentin = is_hit & ~begins & ~hit.outer & (solid == (ray.events & FIRST_SOLID))
+        enters = dentin & entering & ((ray.events & DENTIN_ENTERED) == 0)
+        leaves = dentin & ~entering & ((ray.events & (DENTIN_ENTERED | DENTIN_LEFT)) == DENTIN_ENTERED)
+        ends = is_hit & dr.select(begins, hit.opaque | ~entering, ~enters & ~leaves)
 
-        ray.meetings |= (
-            dr.select(begins, thing, 0)
+        ray.events |= (
+            dr.select(begins, solid, 0)
             | dr.select(enters, mi.UInt32(DENTIN_ENTERED), 0)
             | dr.select(leaves, mi.UInt32(DENTIN_LEFT), 0)
         )
@@ -52,51 +52,51 @@ class MouthMaps(LightMaps):
         ray.surface = dr.select(begins, through, ray.surface)
         ray.dentin_entry = dr.select(enters, ray.travelled, ray.dentin_entry)
         # Until the ray leaves it, all the rest of the way counts as dentin.
-        ray.dentin_exit = dr.select(enters, self._near, dr.select(leaves, ray.travelled, ray.dentin_exit))
+        ray.dentin_exit = dr.select(enters, self._half_depth_mm, dr.select(leaves, ray.travelled, ray.dentin_exit))
         ray.limit = dr.select(ends, ray.travelled, ray.limit)
-        ray.alive &= met & ~ends
+        ray.alive &= is_hit & ~ends
 
     def _store(self, ray: MapRay) -> None:
-        first = ray.meetings & FIRST
+        first = ray.events & FIRST_SOLID
         solids = range(1, self._geometry.teeth + 2)
         kinds = tuple(
             number | dentin for number in solids for dentin in (0, DENTIN_ENTERED, DENTIN_ENTERED | DENTIN_LEFT)
         )
-        entry = dr.select(first == 0, self._near, ray.entry)
+        entry = dr.select(first == 0, self._half_depth_mm, ray.entry)
         limit = mi.UInt32(self._depth_code(ray.limit)) | (first << 16)
-        self._pack([entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.meetings, kinds, (limit,))
+        self._pack([entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.events, kinds, (limit,))
 
     def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:
         halves = ((0, 0), (0, 16), (1, 0), (2, 0))
         entry, dentin_entry, dentin_exit, limit = (
-            dr.fma(cell.between(*half), self._depth_step, -self._near) for half in halves
+            dr.fma(cell.interpolated(*half), self._depth_step, -self._half_depth_mm) for half in halves
         )
-        thing = self._geometry.inside(place)
-        outside = thing > self._geometry.teeth
+        solid = self._geometry.inside(place)
+        outside = solid > self._geometry.teeth
         followed = (
-            ((cell.corners[0][1] & 0x10000) != 0) & ((cell.corners[0][2] >> 16) == thing + 1) & (cell.depth < limit)
+            ((cell.corners[0][1] & 0x10000) != 0) & ((cell.corners[0][2] >> 16) == solid + 1) & (cell.depth < limit)
         )
         nearest = cell.corners[0][0] & 0xFFFF
         for corner in cell.corners[1:]:
             nearest = dr.minimum(nearest, corner[0] & 0xFFFF)
         # For a vertex on the wall the first object is the wall itself, as far as the grid can resolve.
         free = outside & (
-            cell.depth < dr.fma(mi.Float(nearest), self._depth_step, -self._near) + WALL_TEXELS * self.texel_mm
+            cell.depth < dr.fma(mi.Float(nearest), self._depth_step, -self._half_depth_mm) + WALL_TEXELS * self.texel_mm
         )
 
         dentin_mm = dr.maximum(dr.minimum(cell.depth, dentin_exit) - dentin_entry, 0)
         enamel_mm = dr.maximum(cell.depth - entry - dentin_mm, 0)
         lengths_mm = [dr.select(outside, 0, enamel_mm), dr.select(outside, 0, dentin_mm)]
         numbers = self._geometry.numbers
-        medium = dr.select(outside, mi.UInt32(1), thing * (1 + numbers.dentin) + 1)
-        media = [medium, dr.select(thing < self._geometry.teeth, medium + 1, mi.UInt32(1))]
-        surface = dr.select(outside, 1, cell.between(1, 16) * (1 / 65535))
-        known = cell.inside & (followed | free)
+        medium = dr.select(outside, mi.UInt32(1), solid * (1 + numbers.dentin) + 1)
+        media = [medium, dr.select(solid < self._geometry.teeth, medium + 1, mi.UInt32(1))]
+        surface = dr.select(outside, 1, cell.interpolated(1, 16) * (1 / 65535))
+        certain = cell.inside & (followed | free)
         return LightView(
             cell.direction,
             cell.falloff,
             tuple(media[: 1 + numbers.dentin]),
             tuple(lengths_mm[: 1 + numbers.dentin]),
             surface,
-            known,
+            certain,
         )

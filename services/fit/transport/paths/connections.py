@@ -20,10 +20,10 @@ from services.fit.transport.paths.tally import Tally
 from services.fit.transport.scene.geometry import Geometry
 from services.fit.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
 
-MAP_DOUBT = 0.1
+MAP_RELATIVE_ERROR = 0.1
 """Bound assumed for the relative error of a light map where it is certain. It sets the share of a connection that
 shadow rays check."""
-MAP_FAILURE = 0.003
+MAP_ERROR_FLOOR = 0.003
 """Bound added to that one, relative to the largest possible contribution of the vertex, so that no connection goes
 unchecked."""
 
@@ -36,11 +36,11 @@ class Vertex:
     omega: mi.Vector3f
     """Propagation direction of the path before the vertex scatters it."""
     place: mi.UInt32
-    carried: mi.Float
+    throughput: mi.Float
     """Throughput of the path, albedos included."""
-    clear: mi.Float
+    max_transmittance: mi.Float
     """Transmittance over the distance in which no surface lies: an upper bound of the transmittance to any light."""
-    so_far: Scatterings
+    scatterings: Scatterings
     sums: list[mi.Float]
     border_sums: list[mi.Float]
     secondary: mi.Bool
@@ -51,11 +51,11 @@ class Vertex:
     stains: list[FaceCrossing]
     """One of the stained faces that the path crossed; empty unless stain derivatives are computed."""
     total: mi.Float
-    """Sum of ``carried * clear`` over the vertices offered; 0 when there was none."""
+    """Sum of ``throughput * max_transmittance`` over the vertices offered; 0 when there was none."""
 
 
 @dataclass
-class Doubt:
+class LookupCheck:
     """The light of a vertex whose look-up a shadow ray may check."""
 
     light: mi.UInt32
@@ -79,18 +79,18 @@ class Connections:
     """Connections from the vertices of walks through one geometry under one plan."""
 
     def __init__(
-        self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, book: Scores, ior: mi.Float | None
+        self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, scores: Scores, ior: mi.Float | None
     ) -> None:
-        self.geometry, self.media, self.lights, self.plan, self.book, self.ior = (
+        self.geometry, self.media, self.lights, self.plan, self.scores, self.ior = (
             geometry,
             media,
             lights,
             plan,
-            book,
+            scores,
             ior,
         )
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
-        self.turns = lights.turns
+        self.period = lights.connection_period
         """Number of steps of the walk per connection."""
 
     def no_vertex(self) -> Vertex:
@@ -100,16 +100,16 @@ class Connections:
             return [mi.Float(0) for _ in range(count)]
 
         return Vertex(
-            mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.book.unscattered(),
+            mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.scores.unscattered(),
             zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes),
             [mi.Bool(False)] * self.geometry.opaque, [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
         )  # fmt: skip
 
-    def offer(self, kept: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:
-        """Offer ``found`` to the reservoir ``kept``, with a uniform random number ``u``; ``found.total`` is ignored."""
-        importance = dr.select(active, found.carried * found.clear, 0)
-        total = kept.total + importance
-        chosen: Vertex = dr.select(active & (u * total < importance), found, kept)
+    def offer(self, reservoir: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:
+        """Offer ``found`` to ``reservoir``, with a uniform random number ``u``; ``found.total`` is ignored."""
+        importance = dr.select(active, found.throughput * found.max_transmittance, 0)
+        total = reservoir.total + importance
+        chosen: Vertex = dr.select(active & (u * total < importance), found, reservoir)
         chosen.total = total
         return chosen
 
@@ -117,18 +117,18 @@ class Connections:
         """Add the contributions of all lights at the kept vertex to the tally; returns the advanced generator."""
 
         def to_lights(vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool) -> mi.PCG32:
-            kept, rng = self._look_around(vertex, lane, rng, active, tally)
+            check, rng = self._connect_by_maps(vertex, lane, rng, active, tally)
 
             # Correct the maps' transmittance to one light by a shadow ray, cast with a probability proportional to the
             # assumed error.
-            chance = dr.clip(ROULETTE_GAIN * kept.total * self.lights.inverse_irradiance, DARKEST_CHANCE, 1)
-            casts = active & (kept.total > 0) & (rng.next_float32() < chance)
-            weight = kept.weight * kept.total / (kept.importance * chance)
+            chance = dr.clip(ROULETTE_GAIN * check.total * self.lights.inverse_irradiance, DARKEST_CHANCE, 1)
+            casts = active & (check.total > 0) & (rng.next_float32() < chance)
+            weight = check.weight * check.total / (check.importance * chance)
             if isinstance(tally, StainTally):
-                tally.credit(lane, vertex.stains[0], kept.expected_sum[0], active)
+                tally.credit(lane, vertex.stains[0], check.expected_sum[0], active)
                 ray_stains = [FaceCrossing.none(rng.next_float32())]
                 dr.if_stmt(
-                    (vertex, lane, kept, weight, ray_stains, casts),
+                    (vertex, lane, check, weight, ray_stains, casts),
                     casts,
                     correct_stains,
                     lambda *_: mi.Float(0),
@@ -136,39 +136,44 @@ class Connections:
                 )
             else:
                 dr.if_stmt(
-                    (vertex, lane, kept, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction"
+                    (vertex, lane, check, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction"
                 )
             return rng
 
         def correct_stains(
-            vertex: Vertex, lane: mi.UInt32, kept: Doubt, weight: mi.Float, stains: list[FaceCrossing], casts: mi.Bool
+            vertex: Vertex,
+            lane: mi.UInt32,
+            check: LookupCheck,
+            weight: mi.Float,
+            stains: list[FaceCrossing],
+            casts: mi.Bool,
         ) -> mi.Float:
             assert isinstance(tally, StainTally)
             ray = shadow(
                 self.geometry,
                 self.media,
                 vertex.point,
-                kept.direction,
+                check.direction,
                 vertex.place,
                 casts,
                 thin_ior=self.ior,
                 stains=stains,
             )
-            value = weight * tally.weight(lane, kept.light, casts)
-            tally.credit(lane, vertex.stains[0], value * (ray.transmittance() - kept.expected), casts)
+            value = weight * tally.weight(lane, check.light, casts)
+            tally.credit(lane, vertex.stains[0], value * (ray.transmittance() - check.expected), casts)
             tally.credit(lane, ray.stains[0], value * ray.transmittance(), casts)
             return weight
 
-        def correct(vertex: Vertex, lane: mi.UInt32, kept: Doubt, weight: mi.Float, casts: mi.Bool) -> mi.Float:
+        def correct(vertex: Vertex, lane: mi.UInt32, check: LookupCheck, weight: mi.Float, casts: mi.Bool) -> mi.Float:
             ray = shadow(
-                self.geometry, self.media, vertex.point, kept.direction, vertex.place, casts,
-                measured=self.book.sigma_media, shape=self.plan.shape, thin_ior=self.ior,
+                self.geometry, self.media, vertex.point, check.direction, vertex.place, casts,
+                measured=self.scores.sigma_media, shape=self.plan.shape, thin_ior=self.ior,
             )  # fmt: skip
             self._count(
                 vertex,
                 lane,
-                kept.light,
-                kept.direction,
+                check.light,
+                check.direction,
                 weight * ray.transmittance(),
                 ray.lengths,
                 ray.border,
@@ -176,7 +181,7 @@ class Connections:
                 tally,
             )
             self._count(
-                vertex, lane, kept.light, kept.direction, -weight * kept.expected, kept.lengths, None, casts, tally
+                vertex, lane, check.light, check.direction, -weight * check.expected, check.lengths, None, casts, tally
             )
             return weight
 
@@ -184,49 +189,55 @@ class Connections:
             (vertex, lane, rng, active), active, to_lights, lambda _v, _l, rng, _a: rng, label="connection"
         )
 
-    def _look_around(
+    def _connect_by_maps(
         self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally
-    ) -> tuple[Doubt, mi.PCG32]:
+    ) -> tuple[LookupCheck, mi.PCG32]:
         """Add the contributions that the light maps predict for one light of every group, and keep one of these lights
         with a probability proportional to the assumed error of its look-up.
         """
         maps, groups = self.lights.maps, self.lights.groups
-        doubt = MAP_DOUBT if self.plan.shape is None and not self.plan.stains else 1.0
+        relative_error = MAP_RELATIVE_ERROR if self.plan.shape is None and not self.plan.stains else 1.0
 
         def step(
-            group: mi.UInt32, rng: mi.PCG32, kept: Doubt, vertex: Vertex, lane: mi.UInt32, active: mi.Bool
-        ) -> tuple[mi.UInt32, mi.PCG32, Doubt, Vertex, mi.UInt32, mi.Bool]:
+            group: mi.UInt32, rng: mi.PCG32, check: LookupCheck, vertex: Vertex, lane: mi.UInt32, active: mi.Bool
+        ) -> tuple[mi.UInt32, mi.PCG32, LookupCheck, Vertex, mi.UInt32, mi.Bool]:
             u = rng.next_float32() if groups.size > 1 else mi.Float(0)
             light, brightness = groups.choose(
                 group, vertex.point, lambda direction: self._density(vertex, direction), u
             )
-            seen = maps.look(light, vertex.point, vertex.place, active)
+            lookup = maps.look_up(light, vertex.point, vertex.place, active)
             # The kept vertex represents all that were offered with it, and the chosen light its whole group.
-            weight = vertex.total / dr.maximum(vertex.clear, 1e-30) * brightness
-            expected, lengths = seen.transmittance(self.media), seen.lengths(self.book.sigma_media)
-            importance = weight * dr.select(seen.certain, doubt * expected + MAP_FAILURE * vertex.clear, vertex.clear)
-            expected_sum = kept.expected_sum
+            weight = vertex.total / dr.maximum(vertex.max_transmittance, 1e-30) * brightness
+            expected, lengths = lookup.transmittance(self.media), lookup.lengths(self.scores.sigma_media)
+            importance = weight * dr.select(
+                lookup.certain,
+                relative_error * expected + MAP_ERROR_FLOOR * vertex.max_transmittance,
+                vertex.max_transmittance,
+            )
+            expected_sum = check.expected_sum
             if isinstance(tally, StainTally):
                 cotangent = tally.weight(lane, light, active)
                 importance *= dr.abs(cotangent)
-                expected_sum = [dr.fma(weight * expected, cotangent, kept.expected_sum[0])]
+                expected_sum = [dr.fma(weight * expected, cotangent, check.expected_sum[0])]
             else:
-                self._count(vertex, lane, light, seen.direction, weight * expected, lengths, None, active, tally)
-            total = kept.total + importance
+                self._count(vertex, lane, light, lookup.direction, weight * expected, lengths, None, active, tally)
+            total = check.total + importance
             take = rng.next_float32() * total < importance
-            kept = dr.select(
-                take, Doubt(light, seen.direction, weight, expected, lengths, importance, total, expected_sum), kept
+            check = dr.select(
+                take,
+                LookupCheck(light, lookup.direction, weight, expected, lengths, importance, total, expected_sum),
+                check,
             )
-            kept.total, kept.expected_sum = total, expected_sum
-            return group + 1, rng, kept, vertex, lane, active
+            check.total, check.expected_sum = total, expected_sum
+            return group + 1, rng, check, vertex, lane, active
 
         zero = mi.Float(0)
-        kept = Doubt(
-            mi.UInt32(0), mi.Vector3f(0, 0, 1), zero, zero, [mi.Float(0) for _ in self.book.sigma_media], mi.Float(0),
+        check = LookupCheck(
+            mi.UInt32(0), mi.Vector3f(0, 0, 1), zero, zero, [mi.Float(0) for _ in self.scores.sigma_media], mi.Float(0),
             mi.Float(0), [mi.Float(0)] * self.plan.stains,
         )  # fmt: skip
         state = dr.while_loop(
-            (mi.UInt32(0), rng, kept, vertex, lane, active),
+            (mi.UInt32(0), rng, check, vertex, lane, active),
             lambda group, _r, _k, _v, _l, active: active & (group < groups.count),
             step,
             label="every group of lights",
@@ -249,20 +260,20 @@ class Connections:
         slot, primary = self._slot(vertex, light), active & ~vertex.secondary
         tally.add(lane, slot, value, primary)
         medium = self._medium(vertex)
-        terms = PhaseFunction(self.media, medium).scores(self.book.phase_fields, vertex.omega, direction)
-        lengths_of = dict(zip(self.book.sigma_media, lengths, strict=True))
-        for which, score in enumerate(self.book.complete(vertex.sums, vertex.so_far, medium, terms, lengths_of)):
+        terms = PhaseFunction(self.media, medium).scores(self.scores.phase_fields, vertex.omega, direction)
+        lengths_of = dict(zip(self.scores.sigma_media, lengths, strict=True))
+        for which, score in enumerate(self.scores.complete(vertex.sums, vertex.scatterings, medium, terms, lengths_of)):
             tally.add_derivative(which, lane, slot, value * score, primary)
         border_sums = vertex.border_sums
         if isinstance(medium, Mixed) and self.plan.shape is not None:
-            change = self.book.mixed_motion(
+            change = self.scores.lobe_slope(
                 medium, PhaseFunction(self.media, medium).scores(LOBE_FIELDS, vertex.omega, direction)
             )
             motion = self.geometry.mixture_motion(vertex.point, self.plan.shape, active)
             border_sums = [dr.fma(change, rate, total) for rate, total in zip(motion, border_sums, strict=True)]
         for mode in range(self.modes):
-            on_the_way = border_sums[mode] if border is None else border_sums[mode] + border[mode]
-            factor = dr.select(vertex.secondary, vertex.shape_factor[mode], on_the_way)
+            border_score = border_sums[mode] if border is None else border_sums[mode] + border[mode]
+            factor = dr.select(vertex.secondary, vertex.shape_factor[mode], border_score)
             tally.add_derivative(len(self.plan.scores) + mode, lane, slot, value * factor, active)
 
     def _medium(self, vertex: Vertex) -> mi.UInt32 | Mixed:
@@ -291,7 +302,7 @@ class Connections:
         edges = self.plan.order_edges
         if not edges:
             return light
-        order, bin_index = self.book.order(vertex.so_far), mi.UInt32(0)
+        order, bin_index = self.scores.order(vertex.scatterings), mi.UInt32(0)
         for edge in edges[1:-1]:
             bin_index += dr.select(order >= edge, mi.UInt32(1), mi.UInt32(0))
         return light * (len(edges) - 1) + bin_index

@@ -66,32 +66,34 @@ class Exits:
         begin = mi.Vector2f(*self.geometry.depths(walker.origin.z, self.media.sigma))
         landing = dr.select(hit.valid, dr.fma(walker.omega.z, hit.distance, walker.origin.z), walker.origin.z)
         end = mi.Vector2f(*self.geometry.depths(landing, self.media.sigma))
-        flown, active = sigma * hit.distance, walker.active & ~walker.secondary
+        optical_depth, active = sigma * hit.distance, walker.active & ~walker.secondary
 
         def step(
             which: mi.UInt32, omega: mi.Vector3f, across: mi.Vector2f, begin: mi.Vector2f, end: mi.Vector2f,
-            flown: mi.Float, scattered: mi.Float, lane: mi.UInt32, active: mi.Bool,
+            optical_depth: mi.Float, scattered: mi.Float, lane: mi.UInt32, active: mi.Bool,
         ) -> tuple[mi.UInt32, mi.Vector3f, mi.Vector2f, mi.Vector2f, mi.Vector2f, mi.Float, mi.Float, mi.UInt32,
                    mi.Bool]:  # fmt: skip
             inside, narrowing, mirrored = self._face(dr.gather(mi.Float, self.cosines, which, active))
             sine = dr.sqrt(dr.maximum(1 - dr.square(inside), 0))
-            sent = []
+            contributions = []
             for side, sign in enumerate((-1, 1)):
                 # Collisions have density exp(-depth flown), and their light leaves with transmittance exp(-depth to the
                 # face / cosine).
                 rate = 1 + (-sign / inside) * omega.z
                 size = dr.maximum(dr.abs(rate), MIN_RATE)
-                brightest = dr.select(rate > 0, begin[side] / inside, end[side] / inside + flown)
-                chance = dr.exp(-brightest) * one_minus_exp(size * flown) / size
-                sent.append(chance * phase.density(omega, mi.Vector3f(across.x * sine, across.y * sine, sign * inside)))
+                brightest = dr.select(rate > 0, begin[side] / inside, end[side] / inside + optical_depth)
+                chance = dr.exp(-brightest) * one_minus_exp(size * optical_depth) / size
+                contributions.append(
+                    chance * phase.density(omega, mi.Vector3f(across.x * sine, across.y * sine, sign * inside))
+                )
 
             # Light that a face reflects back crosses the slab to the other face, and so on.
             back = mirrored * dr.exp(-(begin.x + begin.y) / inside)
             strength = scattered * (1 - mirrored) / (narrowing * inside * (1 - dr.square(back)))
             slot = self._first_cosine + 2 * which
-            tally.add(lane, slot, strength * dr.fma(sent[1], back, sent[0]), active)
-            tally.add(lane, slot + 1, strength * dr.fma(sent[0], back, sent[1]), active)
-            return which + 1, omega, across, begin, end, flown, scattered, lane, active
+            tally.add(lane, slot, strength * dr.fma(contributions[1], back, contributions[0]), active)
+            tally.add(lane, slot + 1, strength * dr.fma(contributions[0], back, contributions[1]), active)
+            return which + 1, omega, across, begin, end, optical_depth, scattered, lane, active
 
         state = (
             mi.UInt32(0),
@@ -99,7 +101,7 @@ class Exits:
             mi.Vector2f(azimuth[1], azimuth[0]),
             begin,
             end,
-            flown,
+            optical_depth,
             scattered,
             walker.lane,
             active,

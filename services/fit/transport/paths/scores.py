@@ -10,9 +10,8 @@ import mitsuba as mi
 from services.core.errors import InputError
 from services.fit.optics.free_flight import minus_log1m
 from services.fit.transport.scene.media import Media, Mixed, Score
+from services.fit.transport.scene.tables import NEARLY_ONE
 
-NEARLY_ONE = 1 - 2.0**-24
-"""Largest float32 number below 1."""
 MAX_COUNTED = 3
 """Largest number of media for each of which a kernel counts the scatterings separately."""
 
@@ -81,8 +80,8 @@ class Scores:
         # media mix none.
         self.mixing = mixing
         self.counts_all = media.count <= MAX_COUNTED and not mixing
-        asked = set() if mixing else {s.medium for s in plan.scores if s.field == "alpha"}
-        self.counted = tuple(range(1, media.count + 1)) if self.counts_all else tuple(sorted(asked))
+        requested = set() if mixing else {s.medium for s in plan.scores if s.field == "alpha"}
+        self.counted = tuple(range(1, media.count + 1)) if self.counts_all else tuple(sorted(requested))
 
     def zero(self) -> list[mi.Float]:
         """Scores of a path that has just begun."""
@@ -93,40 +92,40 @@ class Scores:
         rest = 0 if self.counts_all else 1
         return Scatterings([mi.UInt32(0) for _ in self.counted], [mi.Float(0)] * rest, [mi.UInt32(0)] * rest)
 
-    def scatter(self, so_far: Scatterings, medium: mi.UInt32 | Mixed, active: mi.Bool) -> Scatterings:
+    def scatter(self, scatterings: Scatterings, medium: mi.UInt32 | Mixed, active: mi.Bool) -> Scatterings:
         """Scatterings with one more in each active lane."""
         if isinstance(medium, Mixed):
             log_alpha = -minus_log1m(dr.minimum(self.media.pick(self.media.absorbed, medium), NEARLY_ONE))
             return Scatterings(
                 [],
-                [so_far.others[0] + dr.select(active, log_alpha, 0)],
-                [so_far.total[0] + dr.select(active, mi.UInt32(1), 0)],
+                [scatterings.others[0] + dr.select(active, log_alpha, 0)],
+                [scatterings.total[0] + dr.select(active, mi.UInt32(1), 0)],
             )
         counts = [
             dr.select(active & (medium == k), count + 1, count)
-            for k, count in zip(self.counted, so_far.counts, strict=True)
+            for k, count in zip(self.counted, scatterings.counts, strict=True)
         ]
         if self.counts_all:
             return Scatterings(counts, [], [])
         elsewhere = active
         for k in self.counted:
             elsewhere &= medium != k
-        others = so_far.others[0] + dr.select(elsewhere, self.media.pick(self.media.log_alpha, medium), 0)
-        return Scatterings(counts, [others], [so_far.total[0] + dr.select(active, mi.UInt32(1), 0)])
+        others = scatterings.others[0] + dr.select(elsewhere, self.media.pick(self.media.log_alpha, medium), 0)
+        return Scatterings(counts, [others], [scatterings.total[0] + dr.select(active, mi.UInt32(1), 0)])
 
-    def albedo(self, so_far: Scatterings) -> mi.Float:
+    def albedo(self, scatterings: Scatterings) -> mi.Float:
         """Product of the albedos of all scatterings."""
-        exponent = so_far.others[0] if so_far.others else mi.Float(0)
-        for k, count in zip(self.counted, so_far.counts, strict=True):
+        exponent = scatterings.others[0] if scatterings.others else mi.Float(0)
+        for k, count in zip(self.counted, scatterings.counts, strict=True):
             exponent = dr.fma(mi.Float(count), self.media.log_alpha[k - 1], exponent)
         return dr.exp(exponent)
 
-    def order(self, so_far: Scatterings) -> mi.UInt32:
+    def order(self, scatterings: Scatterings) -> mi.UInt32:
         """Number of scatterings."""
-        if so_far.total:
-            return so_far.total[0]
-        total = so_far.counts[0]
-        for count in so_far.counts[1:]:
+        if scatterings.total:
+            return scatterings.total[0]
+        total = scatterings.counts[0]
+        for count in scatterings.counts[1:]:
             total = total + count
         return total
 
@@ -155,7 +154,7 @@ class Scores:
             for s, total in zip(self.plan.scores, sums, strict=True)
         ]
 
-    def mixed_motion(self, medium: Mixed, terms: dict[str, mi.Float]) -> mi.Float:
+    def lobe_slope(self, medium: Mixed, terms: dict[str, mi.Float]) -> mi.Float:
         """Derivative of ln(phase function) with respect to the distance q, per mm: differences of the two media's lobe
         parameters times ``terms``, which holds all fields of the lobes (Eq. 19, corrected).
         """
@@ -165,13 +164,13 @@ class Scores:
             total = dr.fma(self.media.pick(column, medium.first) - self.media.pick(column, medium.second), term, total)
         return total * medium.slope
 
-    def mixed_albedo_motion(self, medium: Mixed) -> mi.Float:
+    def albedo_slope(self, medium: Mixed) -> mi.Float:
         """Derivative of ln(albedo) with respect to the distance q, per mm (Eq. 21)."""
         absorbed = self.media.absorbed
         less = self.media.pick(absorbed, medium.second) - self.media.pick(absorbed, medium.first)
         return less * medium.slope / dr.maximum(1 - self.media.pick(absorbed, medium), 1 - NEARLY_ONE)
 
-    def turn(
+    def deflection(
         self, sums: list[mi.Float], medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], active: mi.Bool
     ) -> list[mi.Float]:
         """Scores of the phase function's parameters after a change of direction: d ln f per scattering (Eq. 12, 13)."""
@@ -188,7 +187,7 @@ class Scores:
     def complete(
         self,
         sums: list[mi.Float],
-        so_far: Scatterings,
+        scatterings: Scatterings,
         medium: mi.UInt32 | Mixed,
         terms: dict[str, mi.Float],
         lengths: dict[int, mi.Float],
@@ -200,15 +199,17 @@ class Scores:
         for s, total in zip(self.plan.scores, sums, strict=True):
             value = total
             if s.field == "alpha" and not self.mixing:
-                value = mi.Float(so_far.counts[self.counted.index(s.medium)]) * self.media.inverse_alpha[s.medium - 1]
+                value = (
+                    mi.Float(scatterings.counts[self.counted.index(s.medium)]) * self.media.inverse_alpha[s.medium - 1]
+                )
             elif s.field == "sigma":
                 value = total - lengths.get(s.medium, mi.Float(0))
             elif s.field in terms:
-                own = (
+                last_term = (
                     medium.share_of(s.medium) * terms[s.field]
                     if isinstance(medium, Mixed)
                     else dr.select(medium == s.medium, terms[s.field], 0)
                 )
-                value = total + own
+                value = total + last_term
             whole.append(value)
         return whole

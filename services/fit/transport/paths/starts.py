@@ -68,11 +68,13 @@ class CameraStart:
         self.seed = dr.opaque(mi.UInt32, seed ^ zlib.crc32(camera.name.encode()))
         self.batches = batches
         pose = np.asarray(camera.camera_from_world)
-        eye = -pose[:3, :3].T @ pose[:3, 3]
+        camera_centre = -pose[:3, :3].T @ pose[:3, 3]
         inverse = pose[:3, :3].T @ np.linalg.inv(np.asarray(camera.K))
-        self._eye = dr.opaque(mi.Point3f, eye.tolist())
+        self._camera_centre = dr.opaque(mi.Point3f, camera_centre.tolist())
         self._columns = [dr.opaque(mi.Vector3f, inverse[:, k].tolist()) for k in range(3)]
-        self._near = dr.opaque(mi.Float, max(float(np.linalg.norm(eye)) - radius_mm - NEAR_MARGIN_MM, 0.0))
+        self._start_distance_mm = dr.opaque(
+            mi.Float, max(float(np.linalg.norm(camera_centre)) - radius_mm - NEAR_MARGIN_MM, 0.0)
+        )
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
         """A path through a random point of the lane's pixel; ``sample`` counts within the batch, from the first that is
@@ -84,7 +86,9 @@ class CameraStart:
         x = (pixel % self.width) + rng.next_float32()
         y = (pixel // self.width) + rng.next_float32()
         omega = dr.normalize(self._columns[0] * x + self._columns[1] * y + self._columns[2])
-        return PathStart(rng, dr.fma(omega, self._near, self._eye), omega, mi.UInt32(0), mi.Float(1))
+        return PathStart(
+            rng, dr.fma(omega, self._start_distance_mm, self._camera_centre), omega, mi.UInt32(0), mi.Float(1)
+        )
 
 
 class LightStart:

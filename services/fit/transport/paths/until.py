@@ -96,12 +96,12 @@ def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums],
 
     assert effort.rel_error is not None
     batches, most, begun_s = effort.batches, effort.max_samples // effort.batches, time.monotonic()
-    done, following = 0, min(FIRST_ROUND, most)
+    done, round_size = 0, min(FIRST_ROUND, most)
     totals: Sums = []
     while True:
-        sums = trace(range(done, done + following), batches)
+        sums = trace(range(done, done + round_size), batches)
         totals = [total + new for total, new in zip(totals, sums, strict=True)] if totals else sums
-        done += following
+        done += round_size
         estimate = _summary(summarise, totals, done, batches, complete=False)
         missing = (estimate.rel_error / effort.rel_error) ** 2
         if missing <= 1:
@@ -110,9 +110,9 @@ def trace_until(trace: Callable[[range, int], Sums], summarise: Callable[[Sums],
         elapsed_s = time.monotonic() - begun_s
         if done >= most or elapsed_s >= effort.max_seconds:
             return estimate
-        wanted = done * (np.clip(SAFETY * missing, MIN_GROWTH, GROWTH) - 1)
+        required = done * (np.clip(SAFETY * missing, MIN_GROWTH, GROWTH) - 1)
         affordable = done * (effort.max_seconds - elapsed_s) / elapsed_s
-        following = max(1, min(math.ceil(min(wanted, affordable)), most - done))
+        round_size = max(1, min(math.ceil(min(required, affordable)), most - done))
 
 
 def _summary(

@@ -42,8 +42,8 @@ class Walk:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
         media.two_lobes |= any(score.field == "beta" for score in plan.scores)
-        self.book = Scores(plan, media, mixing=geometry.mixing)
-        self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.book, self.ior)
+        self.scores = Scores(plan, media, mixing=geometry.mixing)
+        self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.scores, self.ior)
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
@@ -76,14 +76,14 @@ class Walk:
             place=path.place,
             weight=path.weight,
             reference=mi.Float(path.weight),
-            so_far=self.book.unscattered(),
+            scatterings=self.scores.unscattered(),
             steps=[mi.UInt32(0) for _ in range(self.limited)],
-            sums=self.book.zero(),
+            sums=self.scores.zero(),
             border_sums=zeros(self.modes),
-            kept=no_crossing(self.modes),
+            border_crossing=no_crossing(self.modes),
             stains=[FaceCrossing.none(path.rng.next_float32()) for _ in range(self.plan.stains)],
             vertex=None if self.connections is None else self.connections.no_vertex(),
-            turn=mi.UInt32(0),
+            connection_step=mi.UInt32(0),
             secondary=mi.Bool(False),
             shape_factor=zeros(self.modes),
             lane=lane,
@@ -97,13 +97,13 @@ class Walk:
             self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
 
     def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
-        carried = self._carried(walker)
-        flight = self._fly_past_faces(walker, carried, tally) if self.plan.faces else self._fly(walker)
-        carried = self._carried(walker)
-        self._move(walker, flight, carried)
+        throughput = self._throughput(walker)
+        flight = self._fly_past_faces(walker, throughput, tally) if self.plan.faces else self._fly(walker)
+        throughput = self._throughput(walker)
+        self._move(walker, flight, throughput)
         if self.connections is not None:
             self._connect(walker, flight, tally)
-        self._turn(walker, flight)
+        self._deflect(walker, flight)
         ended = self._end(walker, flight)
         if self.plan.most_steps is not None:
             ended = self._cut(walker, ended, self.plan.most_steps, tally)
@@ -112,8 +112,8 @@ class Walk:
         self._renew(walker, ended, limit)
         return walker
 
-    def _carried(self, walker: Walker) -> mi.Float:
-        return walker.weight * self.book.albedo(walker.so_far)
+    def _throughput(self, walker: Walker) -> mi.Float:
+        return walker.weight * self.scores.albedo(walker.scatterings)
 
     def _fly(self, walker: Walker) -> Flight:
         medium = self.geometry.medium(walker.place)
@@ -135,18 +135,18 @@ class Walk:
             )
             mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), contrast)
             reflects = meets & hit.outer & ~hit.opaque
-            entry = self._unmirrored(walker, medium)
+            entry = self._omits_reflection(walker, medium)
             walker.weight *= dr.select(reflects & entry, 1 - mirrored, 1)
             reflects &= ~entry & (walker.rng.next_float32() < mirrored)
         return Flight(medium, sigma, hit, distance, scatters, meets, reflects, meets & hit.opaque)
 
-    def _unmirrored(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
+    def _omits_reflection(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
         """Lanes whose reflection at an outer face is left out: camera rays that would mirror empty space."""
         if not self.geometry.single:
             return mi.Bool(False)
-        return (self.book.order(walker.so_far) == 0) & (medium == 0) & ~walker.secondary
+        return (self.scores.order(walker.scatterings) == 0) & (medium == 0) & ~walker.secondary
 
-    def _fly_past_faces(self, walker: Walker, carried: mi.Float, tally: Tally) -> Flight:
+    def _fly_past_faces(self, walker: Walker, throughput: mi.Float, tally: Tally) -> Flight:
         medium = self.geometry.medium(walker.place)
         sigma = self.media.extinction(medium)
         hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, walker.active)
@@ -160,16 +160,16 @@ class Walk:
         # Count the share that leaves through an outer face.
         collides = one_minus_exp(sigma * hit.distance)
         face = dr.select(walker.omega.z > 0, mi.UInt32(1), mi.UInt32(0))
-        value = carried * (1 - collides) * through
-        lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.book.sigma_media}
+        value = throughput * (1 - collides) * through
+        lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.scores.sigma_media}
         primary = walker.active & leaving & ~walker.secondary
         tally.add(walker.lane, face, value, primary)
         if self.exits is not None:
-            self.exits.count_ring(walker, self.book.order(walker.so_far), hit, face, value, tally)
+            self.exits.count_ring(walker, self.scores.order(walker.scatterings), hit, face, value, tally)
             self.exits.connect(
-                walker, hit, sigma, carried * dr.exp(self.media.pick(self.media.log_alpha, medium)), tally
+                walker, hit, sigma, throughput * dr.exp(self.media.pick(self.media.log_alpha, medium)), tally
             )
-        for which, score in enumerate(self.book.complete(walker.sums, walker.so_far, mi.UInt32(0), {}, lengths)):
+        for which, score in enumerate(self.scores.complete(walker.sums, walker.scatterings, mi.UInt32(0), {}, lengths)):
             tally.add_derivative(which, walker.lane, face, value * score, primary)
         for mode in range(self.modes):
             factor = dr.select(walker.secondary, walker.shape_factor[mode], walker.border_sums[mode])
@@ -183,7 +183,7 @@ class Walk:
         distance = minus_log1m(walker.rng.next_float32() * dr.select(leaving, collides, 1)) / sigma
         scatters = walker.active & dr.select(leaving, ~reflects, distance < hit.distance)
         distance = dr.select(leaving, dr.minimum(distance, hit.distance), distance)
-        first = scatters & (self.book.order(walker.so_far) == 0) & ~walker.secondary
+        first = scatters & (self.scores.order(walker.scatterings) == 0) & ~walker.secondary
         walker.weight *= remains
         # Compare roulette with the weight after one scattering, so that single scattering survives at any albedo.
         walker.reference = dr.select(
@@ -193,10 +193,10 @@ class Walk:
             medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects, mi.Bool(False)
         )
 
-    def _move(self, walker: Walker, flight: Flight, carried: mi.Float) -> None:
+    def _move(self, walker: Walker, flight: Flight, throughput: mi.Float) -> None:
         hit, omega = flight.hit, walker.omega
         length = dr.select(flight.scatters, flight.distance, dr.select(flight.meets, hit.distance, 0))
-        walker.sums = self.book.flight(walker.sums, flight.medium, length, flight.scatters)
+        walker.sums = self.scores.flight(walker.sums, flight.medium, length, flight.scatters)
         crosses = flight.meets & ~flight.reflects & ~flight.bounces
         behind = self.geometry.beyond(walker.place, omega, hit)
         cosine = dr.dot(omega, hit.normal)
@@ -208,14 +208,14 @@ class Walk:
                 dr.fma(jump, shift, total) for shift, total in zip(shifts, walker.border_sums, strict=True)
             ]
             at_border = crosses & ~hit.outer & ~walker.secondary
-            walker.kept = offer(
-                walker.kept,
+            walker.border_crossing = offer(
+                walker.border_crossing,
                 dr.fma(omega, hit.distance, walker.origin),
                 omega,
                 hit,
                 walker.place,
                 behind,
-                carried,
+                throughput,
                 shifts,
                 walker.rng.next_float32(),
                 at_border,
@@ -223,7 +223,7 @@ class Walk:
         if self.geometry.stained:
             stained = crosses & self.geometry.on_stain(hit, walker.place, behind)
             walker.weight *= self.geometry.stain(hit, stained)
-            walker.stains = [kept.offer(hit, stained) for kept in walker.stains]
+            walker.stains = [reservoir.offer(hit, stained) for reservoir in walker.stains]
         reached = self.geometry.advance(walker.origin, omega, hit, crosses)
         walker.origin = dr.select(
             flight.scatters,
@@ -237,9 +237,9 @@ class Walk:
             scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium)
         if self.geometry.mixing:
             scattered_in = self._mixed(walker, flight)
-            walker.sums = self.book.mixed_albedo(walker.sums, scattered_in, flight.scatters | flight.bounces)
-            self._score_mixture(walker, self.book.mixed_albedo_motion(scattered_in), flight.scatters)
-        walker.so_far = self.book.scatter(walker.so_far, scattered_in, flight.scatters | flight.bounces)
+            walker.sums = self.scores.mixed_albedo(walker.sums, scattered_in, flight.scatters | flight.bounces)
+            self._score_mixture(walker, self.scores.albedo_slope(scattered_in), flight.scatters)
+        walker.scatterings = self.scores.scatter(walker.scatterings, scattered_in, flight.scatters | flight.bounces)
 
     def _mixed(self, walker: Walker, flight: Flight) -> Mixed:
         """Mixture of media in which the vertex at the end of a flight scatters."""
@@ -268,35 +268,35 @@ class Walk:
     def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
         assert self.connections is not None
         assert walker.vertex is not None
-        clear = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
+        bound = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
         omega, wall = walker.omega, []
         if self.geometry.opaque:
             omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
         found = Vertex(
-            walker.origin, omega, walker.place, self._carried(walker), clear, walker.so_far, walker.sums,
+            walker.origin, omega, walker.place, self._throughput(walker), bound, walker.scatterings, walker.sums,
             walker.border_sums, walker.secondary, walker.shape_factor, wall, walker.stains, mi.Float(0),
         )  # fmt: skip
         walker.vertex = self.connections.offer(
             walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces
         )
-        walker.turn += 1
-        due = walker.active & (walker.turn == self.connections.turns) & (walker.vertex.total > 0)
+        walker.connection_step += 1
+        due = walker.active & (walker.connection_step == self.connections.period) & (walker.vertex.total > 0)
         walker.rng = self.connections.connect(walker.vertex, walker.lane, walker.rng, due, tally)
         walker.vertex.total = dr.select(due, 0, walker.vertex.total)
-        walker.turn = dr.select(walker.turn == self.connections.turns, 0, walker.turn)
+        walker.connection_step = dr.select(walker.connection_step == self.connections.period, 0, walker.connection_step)
 
-    def _turn(self, walker: Walker, flight: Flight) -> None:
+    def _deflect(self, walker: Walker, flight: Flight) -> None:
         medium = self._mixed(walker, flight) if self.geometry.mixing else flight.medium
         phase, rng = PhaseFunction(self.media, medium), walker.rng
         u_lobe = rng.next_float32() if self.media.two_lobes else None
         u, v = rng.next_float32(), rng.next_float32()
         onward = phase.sample(walker.omega, u_lobe, u, v)
-        walker.sums = self.book.turn(
-            walker.sums, medium, phase.scores(self.book.phase_fields, walker.omega, onward), flight.scatters
+        walker.sums = self.scores.deflection(
+            walker.sums, medium, phase.scores(self.scores.phase_fields, walker.omega, onward), flight.scatters
         )
         if isinstance(medium, Mixed) and self.plan.shape is not None:
             self._score_mixture(
-                walker, self.book.mixed_motion(medium, phase.scores(LOBE_FIELDS, walker.omega, onward)), flight.scatters
+                walker, self.scores.lobe_slope(medium, phase.scores(LOBE_FIELDS, walker.omega, onward)), flight.scatters
             )
         if self.geometry.opaque:
             diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(
@@ -311,12 +311,12 @@ class Walk:
 
     def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
         # Let faded paths survive in proportion to their throughput; end those that met nothing.
-        share = self._carried(walker) / (ROULETTE_WEIGHT * walker.reference)
+        share = self._throughput(walker) / (ROULETTE_WEIGHT * walker.reference)
         faded = (share < 1) & (walker.rng.next_float32() >= share)
         walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
         ended = walker.active & ((~flight.scatters & ~flight.meets) | faded)
         if self.plan.order_edges:
-            ended |= walker.active & (self.book.order(walker.so_far) >= self.plan.order_edges[-1])
+            ended |= walker.active & (self.scores.order(walker.scatterings) >= self.plan.order_edges[-1])
         return ended
 
     def _cut(self, walker: Walker, ended: mi.Bool, most_steps: int, tally: Tally) -> mi.Bool:
@@ -324,23 +324,23 @@ class Walk:
         walker.steps = [count + 1 for count in walker.steps]
         cut = walker.active & ~ended & (walker.steps[0] >= most_steps)
         if self.plan.faces:
-            tally.add(walker.lane, mi.UInt32(2), self._carried(walker), cut & ~walker.secondary)
+            tally.add(walker.lane, mi.UInt32(2), self._throughput(walker), cut & ~walker.secondary)
         return ended | cut
 
     def _start_secondary(self, walker: Walker, ended: mi.Bool, tally: Tally) -> mi.Bool:
         """Start the kept crossing's secondary walk where paths ended; returns the lanes that are wholly finished."""
-        begins = ended & ~walker.secondary & (walker.kept.total > 0)
+        begins = ended & ~walker.secondary & (walker.border_crossing.total > 0)
 
         def begin(walker: Walker, begins: mi.Bool) -> Walker:
-            kept, rng = walker.kept, walker.rng
-            scattering = BorderScattering(self.geometry, self.media, kept)
-            size = sum((dr.abs(shift) for shift in kept.shifts), start=mi.Float(0))
-            strength = kept.throughput * kept.total / kept.importance * size
-            ratios = [shift / size for shift in kept.shifts]
+            crossing, rng = walker.border_crossing, walker.rng
+            scattering = BorderScattering(self.geometry, self.media, crossing)
+            size = sum((dr.abs(shift) for shift in crossing.shifts), start=mi.Float(0))
+            strength = crossing.throughput * crossing.total / crossing.importance * size
+            ratios = [shift / size for shift in crossing.shifts]
 
             # Add the light that the border point scatters directly.
             if self.lights is not None:
-                chosen = self.lights.choose(kept.point, scattering, rng, begins)
+                chosen = self.lights.choose(crossing.point, scattering, rng, begins)
                 point, place = scattering.point(chosen.direction), scattering.place(chosen.direction)
                 ray = shadow(self.geometry, self.media, point, chosen.direction, place, begins, thin_ior=self.ior)
                 value = strength * chosen.total * scattering.balance(chosen.direction) * ray.transmittance()
@@ -355,7 +355,7 @@ class Walk:
             walker.weight = strength * (scattering.sigma_a + scattering.sigma_b) * dr.abs(balance)
             walker.reference = mi.Float(walker.weight)
             walker.shape_factor = [dr.mulsign(ratio, balance) for ratio in ratios]
-            walker.so_far = self.book.unscattered()
+            walker.scatterings = self.scores.unscattered()
             walker.steps = [dr.zeros(mi.UInt32) for _ in walker.steps]
             walker.secondary = mi.Bool(True)
             walker.rng = rng
@@ -369,7 +369,7 @@ class Walk:
             "place",
             "weight",
             "reference",
-            "so_far",
+            "scatterings",
             "steps",
             "secondary",
             "shape_factor",
@@ -385,11 +385,11 @@ class Walk:
             path = self.start.begin(walker.lane, walker.sample, ended)
             walker.rng, walker.origin, walker.omega, walker.place = path.rng, path.origin, path.omega, path.place
             walker.weight, walker.reference = path.weight, mi.Float(path.weight)
-            walker.so_far = self.book.unscattered()
+            walker.scatterings = self.scores.unscattered()
             walker.steps = [mi.UInt32(0) for _ in walker.steps]
             walker.sums = [mi.Float(0) for _ in walker.sums]
             walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
-            walker.kept.total = mi.Float(0)
+            walker.border_crossing.total = mi.Float(0)
             walker.stains = [FaceCrossing.none(walker.rng.next_float32()) for _ in walker.stains]
             if self.plan.shape is not None:
                 walker.secondary = mi.Bool(False)

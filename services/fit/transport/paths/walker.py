@@ -24,23 +24,23 @@ class Walker:
     place: mi.UInt32
     """Solids or slab layer that the origin lies in; see ``geometry``."""
     weight: mi.Float
-    """Throughput without the albedos, which follow from ``so_far``."""
+    """Throughput without the albedos, which follow from ``scatterings``."""
     reference: mi.Float
     """Throughput with which Russian roulette compares the present one."""
-    so_far: Scatterings
+    scatterings: Scatterings
     steps: list[mi.UInt32]
     """Number of flights so far; empty unless it is limited."""
     sums: list[mi.Float]
     """Scores of the media's parameters so far."""
     border_sums: list[mi.Float]
     """Scores of the shape modes so far."""
-    kept: Crossing
+    border_crossing: Crossing
     """Border crossing from which the secondary walk will start."""
     stains: list[FaceCrossing]
     """One of the stained faces crossed; empty unless stain derivatives are computed."""
     vertex: Vertex | None
     """Scattering vertex that waits for its connection to the lights."""
-    turn: mi.UInt32
+    connection_step: mi.UInt32
     """Steps since the last connection."""
     secondary: mi.Bool
     """Whether this is a border crossing's secondary walk; it feeds the shape derivatives alone."""

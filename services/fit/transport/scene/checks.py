@@ -80,12 +80,13 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
     """
     name, lights = view.camera.name, len(recipe.light_positions_mm)
     pose = np.asarray(view.camera.camera_from_world)
-    eye_mm = -pose[:3, :3].T @ pose[:3, 3]
+    camera_centre_mm = -pose[:3, :3].T @ pose[:3, 3]
     if any(
-        (eye_mm >= tooth.outer.vertices_mm.min(axis=0)).all() and (eye_mm <= tooth.outer.vertices_mm.max(axis=0)).all()
+        (camera_centre_mm >= tooth.outer.vertices_mm.min(axis=0)).all()
+        and (camera_centre_mm <= tooth.outer.vertices_mm.max(axis=0)).all()
         for tooth in recipe.teeth
     ):
-        where = ", ".join(f"{c:.4g}" for c in eye_mm)
+        where = ", ".join(f"{c:.4g}" for c in camera_centre_mm)
         raise InputError(
             f"Camera {name} stands at ({where}) mm, where the tooth is; camera_from_world must be in millimetres, as"
             " the meshes are."

@@ -153,7 +153,7 @@ class PhaseFunction:
     def sample(self, omega: mi.Vector3f, u_lobe: mi.Float | None, u: mi.Float, v: mi.Float) -> mi.Vector3f:
         """Direction distributed as the phase function."""
         g = self.g1 if u_lobe is None else dr.select(u_lobe < self.beta, self.g1, self.g2)
-        onward = phase.turn(omega, g, phase.sample_deviation(g, u), v)
+        onward = phase.deflected(omega, g, phase.sample_deviation(g, u), v)
         if self.tables is None or isinstance(self.index, Mixed):
             return onward
         return dr.select(self.tables.known(self.index), self.tables.sample(self.index, omega, u, v), onward)

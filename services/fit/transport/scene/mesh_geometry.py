@@ -152,7 +152,7 @@ class MeshGeometry:
 
     def restain(self, stains: tuple[Stain | None, ...]) -> bool:
         """Put these textures on the teeth; returns whether any changed."""
-        if all(map(_alike, stains, self._stains)):
+        if all(map(_is_same_stain, stains, self._stains)):
             return False
         self._stains, self.textures = stains, None
         if any(stain is not None for stain in stains):
@@ -284,7 +284,7 @@ class MeshGeometry:
         return speeds
 
 
-def _alike(one: Stain | None, other: Stain | None) -> bool:
+def _is_same_stain(one: Stain | None, other: Stain | None) -> bool:
     # Compare by value, because a stain that travelled between processes is another object.
     return one is other or (
         one is not None and other is not None and np.array_equal(one.transmittance, other.transmittance)

@@ -65,7 +65,7 @@ class MixedBorder:
 
     def share(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Share of enamel at a point, and its slope dl/dq, per mm."""
-        x = self._look(self._distance, point, active) * self._inverse_scale
+        x = self._sample_texture(self._distance, point, active) * self._inverse_scale
         # Branch on the sign, so that the exponential stays small.
         small = dr.exp(-dr.abs(x))
         share = dr.select(x >= 0, 1, small) / (1 + small)
@@ -73,9 +73,9 @@ class MixedBorder:
 
     def motion(self, point: mi.Point3f, active: mi.Bool) -> list[mi.Float]:
         """Change of the signed distance q with each mode's weight, mm."""
-        return [self._look(texture, point, active) for texture in self._motion]
+        return [self._sample_texture(texture, point, active) for texture in self._motion]
 
-    def _look(self, texture: mi.Texture3f, point: mi.Point3f, active: mi.Bool) -> mi.Float:
+    def _sample_texture(self, texture: mi.Texture3f, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         # Grid points are texel centres; a texture's first axis is its last coordinate.
         cell = mi.Point3f(point - self._low) * self._inverse_pitch + 0.5
         depth, height, width = self._shape

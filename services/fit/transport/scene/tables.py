@@ -14,7 +14,7 @@ from services.fit.optics.phase_table import PhaseTable
 
 ISOTROPIC = PhaseTable((0.0, np.pi), (1.0, 1.0))
 """Placeholder for a medium that has no table."""
-BELOW_ONE = 1 - 2.0**-24
+NEARLY_ONE = 1 - 2.0**-24
 """Largest float32 number below 1."""
 MIN_WIDTH = 1e-30
 """Smallest width of an interval as a divisor, because nodes may coincide in single precision."""
@@ -58,7 +58,7 @@ class PhaseTables:
         # number.
         forward = dr.gather(mi.Float, self._forward, self._index(medium))
         back = u >= forward
-        u = dr.clip(dr.select(back, (u - forward) / (1 - forward), u / forward), 0, BELOW_ONE)
+        u = dr.clip(dr.select(back, (u - forward) / (1 - forward), u / forward), 0, NEARLY_ONE)
         node = self._last_not_above(self._cumulative, self._half(medium, back), u)
         c0, c1 = self._ends(self._cumulative, node)
         u = dr.clip((u - c0) / (c1 - c0), 0, 1)
@@ -68,7 +68,7 @@ class PhaseTables:
         larger = dr.maximum(p0, p1)
         p0, p1 = p0 / larger, p1 / larger
         t = u * (p0 + p1) / dr.maximum(p0 + dr.sqrt(dr.lerp(dr.square(p0), dr.square(p1), u)), 1e-20)
-        return phase.turn(omega, dr.select(back, mi.Float(-1), mi.Float(1)), dr.lerp(m0, m1, t), v)
+        return phase.deflected(omega, dr.select(back, mi.Float(-1), mi.Float(1)), dr.lerp(m0, m1, t), v)
 
     def _index(self, medium: mi.UInt32) -> mi.UInt32:
         return dr.select(medium == 0, self._count, medium) - 1

@@ -25,7 +25,7 @@ FILE = "steps.npz"
 
 
 @dataclass(frozen=True)
-class Joined:
+class CombinedRenders:
     """Renders of one stage whose derivatives are combined, and residuals of the last of them."""
 
     derivatives: DerivativeSums
@@ -35,7 +35,7 @@ class Joined:
 
 
 @dataclass(frozen=True)
-class Standing:
+class Checkpoint:
     """The state on which a step of the last stages depends, beside the measurements and the options."""
 
     material: Material
@@ -51,55 +51,55 @@ class Standing:
     """See ``GaussNewton.path_noise``."""
     multiple: Array
     """See ``GaussNewton.multiple``."""
-    joined: Joined | None
+    combined: CombinedRenders | None
 
 
 @dataclass(frozen=True)
-class StandingFile:
+class CheckpointFile:
     """The file that stores the newest state of one wavelength's fit in a folder."""
 
     folder: Path
-    of: str
+    fingerprint: str
     """Fingerprint of all that the result depends on; a state with another fingerprint is not read."""
-    told: Callable[[Standing], None] = lambda _: None
+    on_write: Callable[[Checkpoint], None] = lambda _: None
     """Called with each state that is stored."""
 
-    def write(self, standing: Standing) -> None:
+    def write(self, checkpoint: Checkpoint) -> None:
         """Store a state in place of the one before."""
-        arrays: dict[str, Any] = {name: np.array(getattr(standing, name)) for name in _NUMBERS}
-        arrays |= _numbered("path_noise", standing.path_noise) | {"multiple": standing.multiple}
-        if (joined := standing.joined) is not None:
-            arrays |= _numbered("joined_noise", joined.path_noise)
+        arrays: dict[str, Any] = {name: np.array(getattr(checkpoint, name)) for name in _NUMBERS}
+        arrays |= _numbered("path_noise", checkpoint.path_noise) | {"multiple": checkpoint.multiple}
+        if (combined := checkpoint.combined) is not None:
+            arrays |= _numbered("joined_noise", combined.path_noise)
             arrays |= {
-                "halves": joined.derivatives.halves,
-                "own": joined.derivatives.own,
-                "counts": np.array(joined.derivatives.counts),
+                "halves": combined.derivatives.halves,
+                "own": combined.derivatives.own,
+                "counts": np.array(combined.derivatives.counts),
                 **{
-                    f"residuals_{field.name}": np.array(getattr(joined.residuals, field.name))
+                    f"residuals_{field.name}": np.array(getattr(combined.residuals, field.name))
                     for field in fields(ResidualSums)
                 },
             }
-        for field in fields(standing.material):
-            arrays[f"material_{field.name}"] = np.asarray(getattr(standing.material, field.name))
+        for field in fields(checkpoint.material):
+            arrays[f"material_{field.name}"] = np.asarray(getattr(checkpoint.material, field.name))
         stream = io.BytesIO()
-        np.savez(stream, of=np.array(self.of), **arrays)
+        np.savez(stream, of=np.array(self.fingerprint), **arrays)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_atomic(self.folder / FILE, stream.getvalue())
-        self.told(standing)
+        self.on_write(checkpoint)
 
-    def read(self) -> Standing | None:
+    def read(self) -> Checkpoint | None:
         """The newest state; None where the folder holds no whole state of this fit."""
         try:
-            with np.load(io.BytesIO((self.folder / FILE).read_bytes()), allow_pickle=False) as held:
-                arrays = dict(held)
+            with np.load(io.BytesIO((self.folder / FILE).read_bytes()), allow_pickle=False) as content:
+                arrays = dict(content)
         except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             return None
-        if str(arrays.pop("of", "")) != self.of:
+        if str(arrays.pop("of", "")) != self.fingerprint:
             return None
         numbers: dict[str, Any] = {name: arrays[name].item() for name in _NUMBERS}
         noise = _of_numbered("path_noise", arrays)
-        return Standing(
-            _material(arrays), path_noise=noise, multiple=arrays["multiple"], joined=_joined(arrays), **numbers
+        return Checkpoint(
+            _material(arrays), path_noise=noise, multiple=arrays["multiple"], combined=_combined(arrays), **numbers
         )
 
     def remove(self) -> None:
@@ -117,14 +117,14 @@ def _material(arrays: dict[str, Array]) -> Material:
     return Material(scattering, absorption)
 
 
-def _joined(arrays: dict[str, Array]) -> Joined | None:
+def _combined(arrays: dict[str, Array]) -> CombinedRenders | None:
     if "counts" not in arrays:
         return None
     first, second = (int(count) for count in arrays["counts"])
     sums = DerivativeSums(arrays["halves"], arrays["own"], (first, second))
     total, products, count, place = (arrays[f"residuals_{field.name}"] for field in fields(ResidualSums))
     residuals = ResidualSums(total, products, int(count), place)
-    return Joined(sums, residuals, _of_numbered("joined_noise", arrays))
+    return CombinedRenders(sums, residuals, _of_numbered("joined_noise", arrays))
 
 
 def _numbered(name: str, values: tuple[Array, ...]) -> dict[str, Array]:

@@ -24,13 +24,13 @@ MIN_SIGNAL = 0.1
 measured."""
 
 
-TURNS = 10
+STEP_ITERATIONS = 10
 """Number of iterations by which a step and the noise that its length makes agree; the second is within a few per cent
 already."""
 
 
 @dataclass(frozen=True)
-class Seen:
+class MeasuredDirections:
     """The directions that count as measured: columns V (U, K) with V^T reference V = 1, and reference V."""
 
     vectors: Array
@@ -63,13 +63,13 @@ class Seen:
         return np.asarray(half @ half.T)
 
 
-def seen_of(quadratic: Quadratic, prior: Array) -> Seen:
+def measured_directions(quadratic: Quadratic, prior: Array) -> MeasuredDirections:
     """Find the directions of the normal matrix that stand out from its noise and a prior's precision (U, U)."""
     whole = prior + _ridge(quadratic)
     reference = whole + quadratic.noise
     signals, vectors = linalg.eigh(quadratic.matrix, reference)
     chosen = vectors[:, signals > MIN_SIGNAL]
-    return Seen(chosen, reference @ chosen, signals[signals > MIN_SIGNAL], whole)
+    return MeasuredDirections(chosen, reference @ chosen, signals[signals > MIN_SIGNAL], whole)
 
 
 def step_matrix(quadratic: Quadratic, prior: Array, damping: float) -> Array:
@@ -80,7 +80,7 @@ def step_matrix(quadratic: Quadratic, prior: Array, damping: float) -> Array:
 
 
 def broad_step(
-    quadratic: Quadratic, prior: Array, broad: Array, reach: Array, gradient_noise: Array, x: Array
+    quadratic: Quadratic, prior: Array, broad: Array, deviations: Array, gradient_noise: Array, x: Array
 ) -> Array:
     """A second step (U,) from x, along broad directions alone and not damped by the noise of J.
 
@@ -97,29 +97,29 @@ def broad_step(
 
     Args:
         broad: directions (U, K).
-        reach: standard deviations (K,) of the displacement along them.
+        deviations: standard deviations (K,) of the displacement along them.
         gradient_noise: covariance of the gradient (U, U).
     """
     if not broad.size:
         return np.zeros(len(x))
-    own = broad.T @ (quadratic.noise + _ridge(quadratic)) @ broad
-    found, vectors = linalg.eigh(broad.T @ quadratic.matrix @ broad, own)
+    noise_of_broad = broad.T @ (quadratic.noise + _ridge(quadratic)) @ broad
+    eigenvalues, vectors = linalg.eigh(broad.T @ quadratic.matrix @ broad, noise_of_broad)
     axes = broad @ vectors
-    signals = np.maximum(found, 0)
+    signals = np.maximum(eigenvalues, 0)
     sums = 1 + signals[:, None] + signals
-    chance = float(
+    h_squared = float(
         (np.abs(np.einsum("ik,ij,jk->k", axes, quadratic.error, axes, optimize=True)) ** 2 / np.diag(sums)).max()
     )
 
     noise, gradient = axes.T @ gradient_noise @ axes, axes.T @ (quadratic.linear + quadratic.matrix @ x)
-    held = axes.T @ prior @ axes + vectors.T @ (vectors / reach[:, None] ** 2)
-    squares, way = np.zeros(len(signals)), np.zeros(len(signals))
-    for _ in range(TURNS):
-        gain = signals[:, None] * np.linalg.inv(noise + np.diag(chance * sums @ squares))
-        covariance = np.linalg.inv(gain * signals + held)
-        way = -covariance @ (gain @ gradient + axes.T @ (prior @ x))
-        squares = way**2 + np.diag(covariance)
-    return np.asarray(axes @ way)
+    prior_precision = axes.T @ prior @ axes + vectors.T @ (vectors / deviations[:, None] ** 2)
+    squares, displacement = np.zeros(len(signals)), np.zeros(len(signals))
+    for _ in range(STEP_ITERATIONS):
+        gain = signals[:, None] * np.linalg.inv(noise + np.diag(h_squared * sums @ squares))
+        covariance = np.linalg.inv(gain * signals + prior_precision)
+        displacement = -covariance @ (gain @ gradient + axes.T @ (prior @ x))
+        squares = displacement**2 + np.diag(covariance)
+    return np.asarray(axes @ displacement)
 
 
 def noise_ratio(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:

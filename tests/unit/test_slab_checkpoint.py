@@ -1,5 +1,5 @@
-"""Where a slab's fit stands, kept in a file: read again to the last digit, and not at all where it is torn or of
-another fit.
+"""The state of a slab's fit, kept in a file: read back to the last digit, and ignored where the file is cut off or
+belongs to another fit.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from services.fit.slab.model.dictionary import Material, henyey_greenstein
+from services.fit.slab.solve.checkpoint import FILE, Checkpoint, CheckpointFile, CombinedRenders
 from services.fit.slab.solve.mixture import Mixture
 from services.fit.slab.solve.normal import DerivativeSums, ResidualSums
-from services.fit.slab.solve.standing import FILE, Joined, Standing, StandingFile
 
 
-def standing(material: Material, joined: Joined | None = None) -> Standing:
+def checkpoint(material: Material, combined: CombinedRenders | None = None) -> Checkpoint:
     noise = tuple(np.random.default_rng(k).random((4, 2, 2)) for k in range(11))
-    return Standing(material, 1, 2, 7, True, 12, 345_678, noise, np.arange(12.0).reshape(3, 4), joined)
+    return Checkpoint(material, 1, 2, 7, True, 12, 345_678, noise, np.arange(12.0).reshape(3, 4), combined)
 
 
 def parts(one: object) -> list[np.ndarray]:
@@ -30,7 +30,7 @@ def parts(one: object) -> list[np.ndarray]:
     return [] if one is None else [np.asarray(one)]
 
 
-def same(one: Standing, other: Standing) -> bool:
+def same(one: Checkpoint, other: Checkpoint) -> bool:
     pairs = zip(parts(one), parts(other), strict=True)
     return type(one.material) is type(other.material) and all(np.array_equal(a, b) for a, b in pairs)
 
@@ -38,7 +38,7 @@ def same(one: Standing, other: Standing) -> bool:
 MEDIUM = henyey_greenstein(1.2, 0.6, 0.05)
 
 
-JOINED = Joined(
+COMBINED = CombinedRenders(
     DerivativeSums(
         np.random.default_rng(3).random((2, 8, 201)), np.random.default_rng(4).random((2, 201, 201)), (4, 5)
     ),
@@ -47,30 +47,32 @@ JOINED = Joined(
 )
 
 
-@pytest.mark.parametrize("joined", [None, JOINED])
+@pytest.mark.parametrize("combined", [None, COMBINED])
 @pytest.mark.parametrize("material", [MEDIUM, Mixture(MEDIUM.scattering, 0.05, np.array([0.1, 1.1]))])
-def test_a_standing_is_read_as_it_was_written(material: Material, joined: Joined | None, tmp_path: Path) -> None:
-    told: list[Standing] = []
-    file, written = StandingFile(tmp_path / "532", "mark", told.append), standing(material, joined)
+def test_a_checkpoint_is_read_as_it_was_written(
+    material: Material, combined: CombinedRenders | None, tmp_path: Path
+) -> None:
+    written_states: list[Checkpoint] = []
+    file, written = CheckpointFile(tmp_path / "532", "mark", written_states.append), checkpoint(material, combined)
     assert file.read() is None
     file.write(written)
     read = file.read()
     assert read is not None
     assert same(read, written)
-    assert told == [written]
+    assert written_states == [written]
     file.remove()
     assert file.read() is None
 
 
-def test_a_standing_of_another_fit_is_not_read(tmp_path: Path) -> None:
-    StandingFile(tmp_path, "mark").write(standing(MEDIUM))
-    assert StandingFile(tmp_path, "other").read() is None
+def test_a_checkpoint_of_another_fit_is_not_read(tmp_path: Path) -> None:
+    CheckpointFile(tmp_path, "mark").write(checkpoint(MEDIUM))
+    assert CheckpointFile(tmp_path, "other").read() is None
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
 def test_a_torn_file_is_not_read(share: float, tmp_path: Path) -> None:
-    file = StandingFile(tmp_path, "mark")
-    file.write(standing(MEDIUM))
+    file = CheckpointFile(tmp_path, "mark")
+    file.write(checkpoint(MEDIUM))
     content = (tmp_path / FILE).read_bytes()
     (tmp_path / FILE).write_bytes(content[: int(share * len(content))])
     assert file.read() is None

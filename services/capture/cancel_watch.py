@@ -6,13 +6,15 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-LOOK_EVERY_S = 0.05
+CHECK_INTERVAL_S = 0.05
 """Interval between checks in seconds: a tenth of the half second within which a cancel must have darkened the dome. A
 check costs one request to the file system."""
 
 
 @contextmanager
-def interrupting(raise_if_cancelled: Callable[[], None], interrupt: Callable[[Exception], None]) -> Iterator[None]:
+def interrupt_on_cancel(
+    raise_if_cancelled: Callable[[], None], interrupt: Callable[[Exception], None]
+) -> Iterator[None]:
     """Check repeatedly for a cancel during the block, in a separate thread.
 
     Args:
@@ -21,20 +23,20 @@ def interrupting(raise_if_cancelled: Callable[[], None], interrupt: Callable[[Ex
     """
     is_over = threading.Event()
 
-    def look() -> None:
-        while not is_over.wait(LOOK_EVERY_S):
+    def watch() -> None:
+        while not is_over.wait(CHECK_INTERVAL_S):
             try:
                 raise_if_cancelled()
-            except Exception as why:
-                interrupt(why)
+            except Exception as problem:
+                interrupt(problem)
                 return
 
     # Use a daemon thread with a short join, because a disk that hangs may block it for ever and must block nothing
     # else.
-    thread = threading.Thread(target=look, name="capture lookout", daemon=True)
+    thread = threading.Thread(target=watch, name="capture cancel watch", daemon=True)
     thread.start()
     try:
         yield
     finally:
         is_over.set()
-        thread.join(10 * LOOK_EVERY_S)
+        thread.join(10 * CHECK_INTERVAL_S)

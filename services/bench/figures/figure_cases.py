@@ -30,7 +30,7 @@ class Effort:
     """Sizes of the captures and fits, and numbers of paths of the figures' own renders."""
 
     tooth_mm: float
-    lone_mm: float
+    single_view_mm: float
     jaw_mm: float
     step: int
     """Edge in pixels of the squares to whose means teeth are fitted."""
@@ -61,7 +61,7 @@ QUICK = Effort(
 
 
 @dataclass(frozen=True)
-class Cast:
+class FigureCases:
     """Captures and fits of all figures."""
 
     effort: Effort
@@ -138,11 +138,13 @@ class Cast:
         return Case("stained", capture, ("c0", "c1"), ("c0", "c1"), SPREAD_LIGHTS, options)
 
     @property
-    def lone_view(self) -> Case:
+    def single_view(self) -> Case:
         """A fit of one view of the procedural incisor under nine of twelve lights; small, for figures that need many
         fits.
         """
-        capture = self._phantom("lone-view", self.effort.lone_mm, 2 * self.effort.photo_samples, cameras=1, lights=12)
+        capture = self._phantom(
+            "lone-view", self.effort.single_view_mm, 2 * self.effort.photo_samples, cameras=1, lights=12
+        )
         return Case(
             "lone-view", capture, ("c0",), ("c0",), SPREAD_LIGHTS, {"dentin": "known"} | dict(self.effort.tooth_job)
         )

@@ -1,4 +1,4 @@
-"""Streams over a real event table that grows while they listen."""
+"""Event streams from a real event table that grows while they are read."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import sqlalchemy as sql
 
-from services.api.jobs import event_stream as feed
-from services.api.jobs.event_stream import Epoch, EventFeed
+from services.api.jobs import event_stream
+from services.api.jobs.event_stream import Epoch, EventBroadcaster
 from services.api.jobs.lifecycle import Trigger
 from services.api.jobs.records import Lease
 from services.api.jobs.repository import Repository
@@ -28,7 +28,7 @@ STREAMS, STEPS = 40, 60
 
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Repository]:
-    monkeypatch.setattr(feed, "PERIOD_S", 0.002)
+    monkeypatch.setattr(event_stream, "PERIOD_S", 0.002)
     repository = Repository(sqlite_url(tmp_path / "jobs.sqlite"))
     yield repository
     repository.close()
@@ -47,9 +47,9 @@ def work(repository: Repository, lease: Lease) -> None:
 
 @contextmanager
 def working(repository: Repository, *leases: Lease) -> Iterator[None]:
-    """Jobs that work meanwhile.
+    """Jobs that work during the block.
 
-    All have ended when it ends, as one still writing would keep a connection open past the repository's close.
+    All have ended when the block ends; a job still writing would keep a connection open after the repository closes.
     """
     with ThreadPoolExecutor(len(leases)) as threads:
         ends = [threads.submit(work, repository, lease) for lease in leases]
@@ -59,8 +59,8 @@ def working(repository: Repository, *leases: Lease) -> Iterator[None]:
 
 
 @asynccontextmanager
-async def running(repository: Repository) -> AsyncIterator[EventFeed]:
-    one = EventFeed(repository)
+async def running(repository: Repository) -> AsyncIterator[EventBroadcaster]:
+    one = EventBroadcaster(repository)
     task = asyncio.create_task(one.run())
     yield one
     task.cancel()
@@ -109,8 +109,8 @@ def events_in(text: str) -> list[tuple[str, str]]:
 def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(
     repository: Repository, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    monkeypatch.setattr(feed, "MAX_EVENTS", most)
-    monkeypatch.setattr(feed, "PING_S", 0.05)
+    monkeypatch.setattr(event_stream, "MAX_EVENTS", most)
+    monkeypatch.setattr(event_stream, "PING_S", 0.05)
     leases = [start(repository, seed) for seed in range(3)]
     known = repository.events_of(leases[2].job.id).read()[0].id
     places = {leases[0].job.id: 0, leases[2].job.id: known, "absent": 0}
@@ -133,8 +133,8 @@ def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(
 
 
 def test_streams_that_are_equally_far_share_a_read(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
-    lease, reads, read = start(repository), [], feed._read
-    monkeypatch.setattr(feed, "_read", lambda *arguments: reads.append(arguments) or read(*arguments))
+    lease, reads, read = start(repository), [], event_stream._read
+    monkeypatch.setattr(event_stream, "_read", lambda *arguments: reads.append(arguments) or read(*arguments))
     work(repository, lease)
 
     async def watch() -> list[str]:
@@ -148,7 +148,7 @@ def test_streams_that_are_equally_far_share_a_read(repository: Repository, monke
 def test_what_does_not_fit_into_one_read_follows_in_others(
     repository: Repository, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feed, "MAX_EVENTS", 16)
+    monkeypatch.setattr(event_stream, "MAX_EVENTS", 16)
     lease = start(repository)
     work(repository, lease)
 
@@ -160,7 +160,7 @@ def test_what_does_not_fit_into_one_read_follows_in_others(
 
 
 def test_a_silent_stream_says_that_it_lives(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed, "PING_S", 0.01)
+    monkeypatch.setattr(event_stream, "PING_S", 0.01)
     lease = start(repository)
 
     async def watch() -> bytes:
@@ -172,11 +172,11 @@ def test_a_silent_stream_says_that_it_lives(repository: Repository, monkeypatch:
 
 
 def test_a_stream_of_a_job_that_is_deleted_ends(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed, "PING_S", 0.01)
+    monkeypatch.setattr(event_stream, "PING_S", 0.01)
     leases = start(repository), start(repository, seed=2)
 
     async def watch() -> list[str]:
-        one, after = EventFeed(repository), repository.newest_event()
+        one, after = EventBroadcaster(repository), repository.newest_event()
         streams = [one.follow(lease.job.id, after) for lease in leases]
         assert [await anext(stream) for stream in streams] == [b": ping\n\n"] * 2
         for lease in leases:
@@ -194,8 +194,8 @@ def test_a_stream_of_a_job_that_is_deleted_ends(repository: Repository, monkeypa
 def test_a_stalled_stream_keeps_little_and_is_told_everything_later(
     repository: Repository, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feed, "PERIOD_S", 0.0)
-    monkeypatch.setattr(feed, "MAX_EPOCHS", 4)
+    monkeypatch.setattr(event_stream, "PERIOD_S", 0.0)
+    monkeypatch.setattr(event_stream, "MAX_EPOCHS", 4)
     lease = start(repository)
     log = repository.events_of(lease.job.id)
 
@@ -223,15 +223,15 @@ def test_a_stalled_stream_keeps_little_and_is_told_everything_later(
 def test_a_stream_outlasts_a_database_that_is_away_for_a_while(
     repository: Repository, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feed, "PING_S", 0.01)
-    lease, read, answers = start(repository), feed._read, iter([True, False, False])
+    monkeypatch.setattr(event_stream, "PING_S", 0.01)
+    lease, read, answers = start(repository), event_stream._read, iter([True, False, False])
 
-    def read_or_fail(*arguments: Any) -> feed.EventBatch:
+    def read_or_fail(*arguments: Any) -> event_stream.EventBatch:
         if not next(answers, True):
             raise sql.exc.OperationalError("SELECT", None, OSError("away"))
         return read(*arguments)
 
-    monkeypatch.setattr(feed, "_read", read_or_fail)
+    monkeypatch.setattr(event_stream, "_read", read_or_fail)
 
     async def watch() -> str:
         async with running(repository) as one, asyncio.timeout(10):

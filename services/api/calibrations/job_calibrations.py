@@ -12,7 +12,7 @@ from services.core.store import open_stage, read_record
 KIND = "calibration"
 
 
-def made_by(jobs: Jobs, job_id: str) -> Calibration:
+def calibration_of_job(jobs: Jobs, job_id: str) -> Calibration:
     """Return the calibration that a job has made.
 
     Raises:

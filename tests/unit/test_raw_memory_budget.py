@@ -1,4 +1,4 @@
-"""A raw photograph is worked on in strips that keep within a worker's memory, and what becomes of it does not tell."""
+"""A raw photograph is processed in strips that fit into a worker's memory; the strips leave no trace in the result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from services.core.errors import SettingsError
 from services.core.raw.records import RawCamera
-from services.preprocess.raw.room import GIB, PROCESS_BYTES, Room, strips
+from services.preprocess.raw.memory_budget import GIB, PROCESS_BYTES, MemoryBudget, strips
 from services.preprocess.raw.source import RawSource
 from services.preprocess.source import LightImage
 from services.preprocess.stabilisation.stabilise import TERMS
@@ -23,9 +23,9 @@ from tests.support.raw_sensor import Sensor
 
 FULL_SIZE = (5120, 3840)
 TOOTH = Window(231, 3609, 1150, 3970)
-"""Of 20 megapixels, what a tooth of four fifths of their height takes with a margin."""
+"""The part of a 20 megapixel image that a tooth of four fifths of its height takes, with a margin."""
 REGION = Window(0, 3840, 550, 4570)
-"""And where it may come from."""
+"""The part of the photograph from which ``TOOTH`` may be sampled."""
 
 
 def camera(mosaic: str, size: tuple[int, int] = FULL_SIZE) -> RawCamera:
@@ -37,7 +37,7 @@ def camera(mosaic: str, size: tuple[int, int] = FULL_SIZE) -> RawCamera:
     [("RGGB", 1, 2.0), ("RGGB", 3, 2.0), ("RGGB", 3, 8.0), ("none", 1, 2.0), ("none", 3, 3.0)],
 )
 def test_the_plan_keeps_the_bound(mosaic: str, exposures: int, bound_gib: float) -> None:
-    plan = Room(bound_gib * GIB, camera(mosaic), 3, TOOTH, REGION)
+    plan = MemoryBudget(bound_gib * GIB, camera(mosaic), 3, TOOTH, REGION)
     rows = plan.rows(exposures)
     assert plan.peak_bytes(exposures, rows) <= bound_gib * GIB
     assert rows == TOOTH.shape[0] or plan.peak_bytes(exposures, rows + 1) > bound_gib * GIB
@@ -47,12 +47,12 @@ def test_the_plan_keeps_the_bound(mosaic: str, exposures: int, bound_gib: float)
 
 def test_less_than_the_smallest_strips_take_is_refused() -> None:
     with pytest.raises(SettingsError, match=r"camera c takes 1\.\d\d GiB .* leaves 1\.00 to each thread"):
-        Room(GIB, camera("RGGB"), 3, TOOTH, REGION).rows(3)
+        MemoryBudget(GIB, camera("RGGB"), 3, TOOTH, REGION).rows(3)
 
 
 @pytest.fixture(scope="module", params=[("RGGB", True), ("none", True), ("GBRG", False)])
 def raw_folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tooth of 400 pixels in three exposures, through a lens that distorts or not."""
+    """A tooth of 400 pixels in three exposures, with or without lens distortion."""
     mosaic, is_distorted = request.param
     root = tmp_path_factory.mktemp("raw")
     write_mouth(root / "mouth", lights=1, sizes=((640, 480),))
@@ -66,10 +66,10 @@ def raw_folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
 
 
 def moved(source: RawSource, *, apart: bool) -> dict[int, np.ndarray]:
-    """Frames' motion: none, or from one exposure to the next a shift and a turn by a hundredth."""
+    """Motion of the frames: none, or a shift and a turn by a hundredth from one exposure to the next."""
     turned = np.zeros((1, TERMS, 2))
     turned[0, :3] = (1.3, 0.7), (0.0, 2.0), (-2.0, 0.0)
-    return {frame: turned * (place if apart else 0) for place, frame in enumerate(source.matched(0))}
+    return {frame: turned * (place if apart else 0) for place, frame in enumerate(source.matched_frames(0))}
 
 
 def image_within(root: Path, *, apart: bool) -> LightImage:
@@ -83,11 +83,11 @@ def test_strips_leave_no_trace(raw_folder: Path, monkeypatch: pytest.MonkeyPatch
     whole = image_within(raw_folder, apart=apart)
     seen: list[int] = []
 
-    def low(self: Room, exposures: int) -> int:
+    def low(self: MemoryBudget, exposures: int) -> int:
         seen.append(exposures)
         return 70
 
-    monkeypatch.setattr(Room, "rows", low)
+    monkeypatch.setattr(MemoryBudget, "rows", low)
     in_strips = image_within(raw_folder, apart=apart)
     assert 3 in seen
     assert (whole.bits == 0).mean() > 0.5
@@ -99,18 +99,18 @@ def test_strips_leave_no_trace(raw_folder: Path, monkeypatch: pytest.MonkeyPatch
 def test_an_image_takes_what_the_plan_says_at_most(
     raw_folder: Path, monkeypatch: pytest.MonkeyPatch, apart: bool
 ) -> None:
-    """And half of it at least, or the bound would leave memory unused; the process itself apart."""
+    """And at least half of it, or the bound would waste memory; the process itself is not counted."""
     source = RawSource(raw_folder, None, 0.01, 0.002)
     view = read_subject(raw_folder, whole=False).view_of(0, source.description.cameras[0])
     motions = moved(source, apart=apart)
-    plans: list[tuple[Room, int]] = []
-    told = Room.rows
+    plans: list[tuple[MemoryBudget, int]] = []
+    told = MemoryBudget.rows
 
-    def watched(self: Room, exposures: int) -> int:
+    def watched(self: MemoryBudget, exposures: int) -> int:
         plans.append((self, told(self, exposures)))
         return plans[-1][1]
 
-    monkeypatch.setattr(Room, "rows", watched)
+    monkeypatch.setattr(MemoryBudget, "rows", watched)
     tracemalloc.start()
     try:
         kept = next(iter(source.images(view, (0,), motions)))

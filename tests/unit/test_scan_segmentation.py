@@ -1,4 +1,4 @@
-"""Teeth of scans without labels: a real arch with its labels taken away, and clicks that cannot be used."""
+"""Separating teeth in scans without labels: a real arch whose labels are removed, and clicks that cannot be used."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.anatomy.scans.parting import part_by_landmarks
 from services.anatomy.scans.patches import middle_mm, vector_area_mm2
 from services.anatomy.scans.scan import LabelledScan, read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
+from services.anatomy.scans.segmentation import segment_by_landmarks
 from services.core.errors import CaptureInputError
 from services.core.geometry import Mesh
 from tests.support.labelled_scan import CROWN_MM, bumps, write_vtp
@@ -22,7 +22,8 @@ TOPS = {fdi: np.array([[x, y, CROWN_MM]]) for fdi, (x, y) in PLACES.items()}
 
 
 def clicked(scan: LabelledScan, rng: np.random.Generator, sigma_mm: float) -> dict[int, np.ndarray]:
-    # One point a tooth, above its middle near its top, with an error along each axis, on the scan's nearest triangle.
+    # One point for each tooth, above its middle near its top, with an error along each axis, on the nearest triangle of
+    # the scan.
     occlusal = vector_area_mm2(scan.mesh)
     occlusal /= np.linalg.norm(occlusal)
     middles, points = scan.mesh.vertices_mm[scan.mesh.faces].mean(axis=1), {}
@@ -37,9 +38,9 @@ def clicked(scan: LabelledScan, rng: np.random.Generator, sigma_mm: float) -> di
 
 def test_a_real_arch_without_its_labels_gets_them_back() -> None:
     arch = read_scan(shared_path("data/intraoral-arch/Example_01.vtp"))
-    found = part_by_landmarks(arch.mesh, clicked(arch, np.random.default_rng(200), 0.5), "the arch")
+    found = segment_by_landmarks(arch.mesh, clicked(arch, np.random.default_rng(200), 0.5), "the arch")
     is_right, is_tooth = found == arch.fdi, arch.fdi > 0
-    # What is asked for of teeth; 96.5 % were measured, and 94.6 % of the gums. Constants were chosen on teeth 21 to 27.
+    # The requirement for teeth; 96.5 % was measured, and 94.6 % for the gums. Constants were chosen on teeth 21 to 27.
     assert is_right[is_tooth].mean() >= 0.95
     assert is_right[arch.fdi // 10 == 1].mean() >= 0.95
     assert is_right[~is_tooth].mean() >= 0.90
@@ -48,7 +49,7 @@ def test_a_real_arch_without_its_labels_gets_them_back() -> None:
 @pytest.mark.slow
 def test_a_real_arch_without_its_labels_becomes_solids() -> None:
     arch = read_scan(shared_path("data/intraoral-arch/Example_01.vtp"))
-    found = part_by_landmarks(arch.mesh, clicked(arch, np.random.default_rng(201), 1.0), "the arch")
+    found = segment_by_landmarks(arch.mesh, clicked(arch, np.random.default_rng(201), 1.0), "the arch")
     assert (found == arch.fdi)[arch.fdi > 0].mean() >= 0.95
     jaw = jaw_from_scan(LabelledScan(arch.mesh, found), "whole")
     assert [tooth.fdi for tooth in jaw.teeth] == [*range(11, 18), *range(21, 28)]
@@ -61,7 +62,8 @@ def test_a_file_without_labels_is_parted_by_points(tmp_path: Path) -> None:
     scan = read_scan(tmp_path / "scan.vtp", labels=None, points_mm=TOPS)
     assert not scan.is_labelled
     assert scan.teeth == (11, 12, 21, 22)
-    # A bump is labelled from 1 mm above the plate; its crease is lower, one or two triangles of 0.4 mm further out.
+    # A bump is labelled from 1 mm above the plate upwards; the crease around it is lower, one or two triangles of
+    # 0.4 mm further out.
     assert (scan.fdi == FOUR.fdi)[FOUR.fdi > 0].mean() > 0.98
     assert (scan.fdi == FOUR.fdi).mean() > 0.85
 
@@ -82,4 +84,4 @@ def turned(mesh: Mesh) -> Mesh:
 )
 def test_points_that_cannot_be_used_are_named(mesh: Mesh, points_mm: dict[int, np.ndarray], sentence: str) -> None:
     with pytest.raises(CaptureInputError, match=sentence):
-        part_by_landmarks(mesh, points_mm, "the scan")
+        segment_by_landmarks(mesh, points_mm, "the scan")

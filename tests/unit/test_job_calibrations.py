@@ -1,4 +1,4 @@
-"""A calibration job whose asset holds no record is told in a sentence that shows no path of the server."""
+"""A calibration job that names an asset without a record ends in a sentence that shows no path of the server."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from services.api.calibrations.made import made_by
+from services.api.calibrations.job_calibrations import calibration_of_job
 from services.api.jobs.lifecycle import JobState
 from services.client.errors import JobStateError
 from services.core.results import AssetManifest
@@ -20,4 +20,4 @@ def test_an_asset_without_a_record(tmp_path: Path) -> None:
     job = SimpleNamespace(id="j1", spec=SimpleNamespace(kind="calibration"), state=JobState.SUCCEEDED)
     jobs: Any = SimpleNamespace(repository=SimpleNamespace(get=lambda _id: job), folder=lambda _id: tmp_path)
     with pytest.raises(JobStateError, match=r"^Job j1 published no calibration\.json; submit it again\.$"):
-        made_by(jobs, "j1")
+        calibration_of_job(jobs, "j1")

@@ -25,7 +25,7 @@ LATER_OPTIONS = ("dictionary", "particle_index", "particle_absorption")
 """Options that version 0.1.0 did not have."""
 
 
-class Kept(Record):
+class StoredResult(Record):
     """Content of ``fit.json`` in a wavelength's folder; it is written last, so a folder that has it is whole."""
 
     of: str
@@ -48,11 +48,11 @@ def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
     """A digest that identifies all that a wavelength's result depends on."""
     folder, digest = read_folder(root), hashlib.sha256()
     # Leave out options at these defaults, so that results stored by earlier versions are still used.
-    later = {name for name in LATER_OPTIONS if getattr(options, name) == SlabOptions.model_fields[name].default}
-    told = options.model_dump_json(exclude=later)
+    at_default = {name for name in LATER_OPTIONS if getattr(options, name) == SlabOptions.model_fields[name].default}
+    options_json = options.model_dump_json(exclude=at_default)
     # Leave out exposures too where there are none.
     described = folder.model_dump_json(exclude=None if folder.exposures else {"exposures"})
-    for part in (numerics_name(), described, told, f"{wavelength_nm:g}"):
+    for part in (numerics_name(), described, options_json, f"{wavelength_nm:g}"):
         digest.update(part.encode() + b"\n")
     if options.dictionary == "table":
         digest.update(hashlib.sha256(table_file(root).read_bytes()).digest())
@@ -64,7 +64,7 @@ def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
     return digest.hexdigest()
 
 
-def keep(place: Path, mark: str, wavelength: Wavelength) -> None:
+def store_result(place: Path, digest: str, wavelength: Wavelength) -> None:
     """Write a wavelength's result into its folder."""
     place.mkdir(parents=True, exist_ok=True)
     stream = io.BytesIO()
@@ -76,18 +76,20 @@ def keep(place: Path, mark: str, wavelength: Wavelength) -> None:
         names=np.array(wavelength.names),
     )
     write_atomic(place / IMAGES, stream.getvalue())
-    write_record(place / RESULT, Kept(of=mark, fit=wavelength.fit))
+    write_record(place / RESULT, StoredResult(of=digest, fit=wavelength.fit))
 
 
-def read_kept(place: Path) -> Kept | None:
+def read_result(place: Path) -> StoredResult | None:
     """The result stored in a folder; None where the folder holds no whole result."""
     try:
-        return Kept.model_validate_json((place / RESULT).read_bytes())
+        return StoredResult.model_validate_json((place / RESULT).read_bytes())
     except (FileNotFoundError, ValidationError):
         return None
 
 
-def read_images_of(path: Path) -> Images:
-    """Images as ``keep`` wrote them."""
-    with np.load(path, allow_pickle=False) as held:
-        return Images(held["measured"], held["predicted"], held["held_out"], tuple(str(name) for name in held["names"]))
+def read_result_images(path: Path) -> Images:
+    """Images as ``store_result`` wrote them."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return Images(
+            arrays["measured"], arrays["predicted"], arrays["held_out"], tuple(str(name) for name in arrays["names"])
+        )

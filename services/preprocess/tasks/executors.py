@@ -14,7 +14,7 @@ from services.core.records import Priority
 B = TypeVar("B", bound=Callable[[], Any])
 
 
-class Spread(Protocol):
+class Executor(Protocol):
     """Executor of blocks that do not depend on each other."""
 
     threads: int
@@ -27,41 +27,41 @@ class Spread(Protocol):
         """
 
 
-class Here:
+class LocalExecutor:
     """Executor in this process; it runs each block when the caller asks for the next one."""
 
     threads = 1
 
     def run(self, blocks: Sequence[B]) -> Iterator[B]:
-        """See ``Spread``."""
+        """See ``Executor``."""
         for block in blocks:
             block()
             yield block
 
 
-class OnWorkers:
+class DaskExecutor:
     """Executor on the workers that may run the surrounding Dask task.
 
     Args:
         client: Dask client.
         key: key of the surrounding task; the blocks' keys begin with it, which shows to which task they belong.
-        needs: Dask resources that a worker must have to run the blocks.
+        resources: Dask resources that a worker must have to run the blocks.
         priority: priority of the job.
     """
 
-    def __init__(self, client: Any, key: str, needs: dict[str, float], priority: Priority) -> None:
-        self._client, self._key, self._needs, self._priority = client, key, needs, -rank(priority)
+    def __init__(self, client: Any, key: str, resources: dict[str, float], priority: Priority) -> None:
+        self._client, self._key, self._resources, self._priority = client, key, resources, -rank(priority)
         self._submitted = 0
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
-        able = [
+        thread_counts = [
             int(worker["nthreads"])
             for worker in workers
-            if all(worker["resources"].get(name, 0) >= amount for name, amount in needs.items())
+            if all(worker["resources"].get(name, 0) >= amount for name, amount in resources.items())
         ]
-        self.threads = max(1, sum(able))
+        self.threads = max(1, sum(thread_counts))
 
     def run(self, blocks: Sequence[B]) -> Iterator[B]:
-        """See ``Spread``. A block whose worker dies runs again on another worker."""
+        """See ``Executor``. A block whose worker dies runs again on another worker."""
         from distributed import as_completed
 
         pending = {}
@@ -70,7 +70,7 @@ class OnWorkers:
             future = self._client.submit(
                 block,
                 key=f"{self._key}-block-{self._submitted}",
-                resources=self._needs,
+                resources=self._resources,
                 priority=self._priority,
                 pure=False,
             )
@@ -84,7 +84,7 @@ class OnWorkers:
                 self._client.cancel(list(pending))
 
 
-def threads_here() -> int:
+def local_threads() -> int:
     """Number of blocks that may run in this process at once and share its memory: its Dask worker's threads, or 1."""
     from distributed import get_worker
 
@@ -95,7 +95,7 @@ def threads_here() -> int:
 
 
 @contextmanager
-def spread(priority: Priority) -> Iterator[Spread]:
+def open_executor(priority: Priority) -> Iterator[Executor]:
     """Give the executor for blocks: inside a Dask task its cluster, elsewhere this process.
 
     The Dask task occupies no worker thread while it waits for its blocks.
@@ -105,9 +105,9 @@ def spread(priority: Priority) -> Iterator[Spread]:
     try:
         worker = get_worker()
     except ValueError:
-        yield Here()
+        yield LocalExecutor()
         return
     key = worker.get_current_task()
-    needs = dict(worker.state.tasks[key].resource_restrictions or {})
+    resources = dict(worker.state.tasks[key].resource_restrictions or {})
     with worker_client() as client:
-        yield OnWorkers(client, str(key), needs, priority)
+        yield DaskExecutor(client, str(key), resources, priority)

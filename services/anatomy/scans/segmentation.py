@@ -60,8 +60,9 @@ the surface surely is gums."""
 GUMS_PER_MM = 0.3
 """Cost of assigning a square millimetre of likely gums to the teeth, just before it is surely gums, in units of the
 cost of a millimetre of border on a flat surface."""
-FLAT = 0.2
-"""Ratio of the spread of the points across their line to that along it, above which they span the occlusal plane."""
+MIN_SPREAD_RATIO = 0.2
+"""Ratio of the spread of points or crowns across their line to that along it, above which they span the occlusal
+plane."""
 SMOOTH_MM = 0.33
 """Distance over which normals are averaged before the curvature is computed, mm: the noise of a scan has shorter waves,
 and a crease at a neck is as wide."""
@@ -69,10 +70,10 @@ MAX_ROUNDS = 30
 """Largest number of rounds of averaging."""
 CREASE_PER_MM = 0.4
 """Concave curvature, radians per mm, at which a border costs 1/e of one on a flat surface."""
-FLOOR = 0.02
+MIN_BORDER_COST = 0.02
 """Smallest cost of a border relative to one of the same length on a flat surface; it keeps borders along creases
 short."""
-HOLD_MM2 = 20.0
+CREASE_DELAY_MM2 = 20.0
 """Strength by which a crease slows down a front: a path across a concave curvature of b per mm counts 1 + HOLD b² times
 its length."""
 NEAREST_FACES_MM = 0.03
@@ -83,12 +84,12 @@ UNITS_PER_MM = 1000.0
 
 
 @dataclass(frozen=True)
-class _Bends:
+class _FacePairs:
     """Pairs (P,) of neighbouring faces; each pair occurs twice, once in each order."""
 
     one: NDArray[np.int64]
     other: NDArray[np.int64]
-    apart_mm: Array
+    distance_mm: Array
     """Distance between the faces' centres."""
     inwards_per_mm: Array
     """Concave curvature between the faces, radians per mm; 0 where the surface is flat or convex."""
@@ -96,7 +97,7 @@ class _Bends:
     """Length of the edge between the faces."""
 
 
-def part_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) -> NDArray[np.int64]:
+def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) -> NDArray[np.int64]:
     """Find the FDI number (F,) of each triangle of a scan, 0 for gingiva.
 
     Args:
@@ -112,17 +113,17 @@ def part_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) -> 
     teeth = tuple(sorted(points_mm))
     tops = np.array([points_mm[fdi].mean(axis=0) for fdi in teeth]).reshape(-1, 3)
     _require_points(mesh, points_mm, teeth, tops, what)
-    kept = manifold_piece(mesh)
-    surface = compact(Mesh(mesh.vertices_mm, mesh.faces[kept]))
+    is_kept = manifold_piece(mesh)
+    surface = compact(Mesh(mesh.vertices_mm, mesh.faces[is_kept]))
     middles = surface.vertices_mm[surface.faces].mean(axis=1)
     is_core, outside_mm = _fitted_crowns(surface, middles, teeth, tops)
-    bends = _bends(surface, middles)
+    pairs = _face_pairs(surface, middles)
     likely = np.clip((outside_mm - GUMS_MM[0]) / (GUMS_MM[1] - GUMS_MM[0]), 0, 1)
-    is_tooth = _cut(bends, np.asarray(is_core.any(axis=1)), likely, GUMS_PER_MM * areas_mm2(surface))
-    own = np.concatenate([[GINGIVA], teeth])[_reached(bends, is_core, is_tooth)]
+    is_tooth = _minimal_cut(pairs, np.asarray(is_core.any(axis=1)), likely, GUMS_PER_MM * areas_mm2(surface))
+    own = np.concatenate([[GINGIVA], teeth])[_nearest_teeth(pairs, is_core, is_tooth)]
 
     labels = np.full(len(mesh.faces), GINGIVA, dtype=np.int64)
-    labels[kept] = without_specks(surface, smooth_labels(surface.faces, own))
+    labels[is_kept] = without_specks(surface, smooth_labels(surface.faces, own))
     for fdi in teeth:
         if not (labels == fdi).any():
             raise CaptureInputError(
@@ -148,18 +149,18 @@ def _require_points(mesh: Mesh, points_mm: Mapping[int, Array], teeth: tuple[int
             )
     tree = cKDTree(mesh.vertices_mm)
     for fdi in teeth:
-        off_mm = float(tree.query(points_mm[fdi])[0].max())
-        if off_mm > FARTHEST_MM:
+        distance_mm = float(tree.query(points_mm[fdi])[0].max())
+        if distance_mm > FARTHEST_MM:
             raise CaptureInputError(
-                f"A landmark of tooth {fdi} lies {off_mm:.3g} mm from {what}; give xyz_mm in the scan's own"
+                f"A landmark of tooth {fdi} lies {distance_mm:.3g} mm from {what}; give xyz_mm in the scan's own"
                 " coordinates, in mm, and see whether the scan's units are right."
             )
     for k, fdi in enumerate(teeth[:-1]):
-        apart = np.linalg.norm(tops[k + 1 :] - tops[k], axis=1)
-        if apart.min() < NEAREST_MM:
+        distances_mm = np.linalg.norm(tops[k + 1 :] - tops[k], axis=1)
+        if distances_mm.min() < NEAREST_MM:
             raise CaptureInputError(
-                f"Landmarks of teeth {fdi} and {teeth[k + 1 + int(apart.argmin())]} are {apart.min():.2g} mm apart,"
-                " which two teeth never are; correct the one that is on the wrong tooth."
+                f"Landmarks of teeth {fdi} and {teeth[k + 1 + int(distances_mm.argmin())]} are {distances_mm.min():.2g}"
+                " mm apart, which two teeth never are; correct the one that is on the wrong tooth."
             )
     if (tops.mean(axis=0) - middle_mm(mesh)) @ vector_area_mm2(mesh) < 0:
         raise CaptureInputError(
@@ -178,22 +179,22 @@ def _fitted_crowns(
     outside_mm = np.full(len(middles), np.inf)
     nearest = cKDTree(tops).query(middles)[1]
     for k, (fdi, axes) in enumerate(zip(teeth, _axes(surface, teeth, tops), strict=True)):
-        off = middles - tops[k]
-        near = (np.linalg.norm(off, axis=1) < PATCH_MM) & (off @ axes[2] > -PATCH_DEPTH_MM)
+        from_top = middles - tops[k]
+        near = (np.linalg.norm(from_top, axis=1) < PATCH_MM) & (from_top @ axes[2] > -PATCH_DEPTH_MM)
         match = CrownMatch(fdi, compact(Mesh(surface.vertices_mm, surface.faces[near])))
         found = _fitted(match, axes, tops[k])
         half = match.half_size_mm * found.scales[0]
-        place = (middles - found.centres_mm[0]) @ found.axes[0].T
+        from_middle = (middles - found.centres_mm[0]) @ found.axes[0].T
         is_core[:, k] = (
             (nearest == k)
-            & (np.abs(place[:, :2]) < CORE * half[:2]).all(axis=1)
-            & (place[:, 2] > 0)
-            & (place[:, 2] < half[2] + CORE_ABOVE_MM)
-        ) | (np.linalg.norm(off, axis=1) < CLICKED_MM)
+            & (np.abs(from_middle[:, :2]) < CORE * half[:2]).all(axis=1)
+            & (from_middle[:, 2] > 0)
+            & (from_middle[:, 2] < half[2] + CORE_ABOVE_MM)
+        ) | (np.linalg.norm(from_top, axis=1) < CLICKED_MM)
         # Keep the box of an average crown below the point out of the gums too, because a fit may slip to the next
         # tooth.
-        hung = off @ axes.T + [0, 0, match.half_size_mm[2]]
-        for offset, size in ((place, half), (hung, match.half_size_mm)):
+        from_average_middle = from_top @ axes.T + [0, 0, match.half_size_mm[2]]
+        for offset, size in ((from_middle, half), (from_average_middle, match.half_size_mm)):
             beside_mm = np.linalg.norm(np.maximum(np.abs(offset) - size, 0), axis=1)
             outside_mm = np.minimum(outside_mm, beside_mm)
     return is_core, outside_mm
@@ -204,7 +205,7 @@ def _axes(surface: Mesh, teeth: tuple[int, ...], tops: Array) -> Array:
     # a line; x runs along the arch.
     opening = vector_area_mm2(surface)
     _, spread, principal = np.linalg.svd(tops - tops.mean(axis=0), full_matrices=False)
-    plane = len(teeth) > 2 and spread[1] > FLAT * spread[0]
+    plane = len(teeth) > 2 and spread[1] > MIN_SPREAD_RATIO * spread[0]
     occlusal = principal[2] if plane else opening - (opening @ principal[0]) * principal[0]
     occlusal = occlusal * np.sign(occlusal @ opening) / np.linalg.norm(occlusal)
     order = sorted(range(len(teeth)), key=lambda k: side_of_front(teeth[k]) * (teeth[k] % 10))
@@ -219,68 +220,70 @@ def _axes(surface: Mesh, teeth: tuple[int, ...], tops: Array) -> Array:
 def _fitted(match: CrownMatch, axes: Array, top_mm: Array) -> Placements:
     # Choose the best of several starts by the misfit in both directions: a crown shrunk onto one cusp is close to the
     # scan, but the scan is not close to it.
-    found = [match.settled(axes[None], CROWN_POINTS, CROWN_ROUNDS, top_mm + shift * axes[1]) for shift in SHIFTS_MM]
+    found = [match.register(axes[None], CROWN_POINTS, CROWN_ROUNDS, top_mm + shift * axes[1]) for shift in SHIFTS_MM]
     misfits = [float(one.misfits_mm[0] + match.reverse_misfits_mm(one)[0]) for one in found]
     return found[int(np.argmin(misfits))]
 
 
-def _bends(surface: Mesh, middles: Array) -> _Bends:
+def _face_pairs(surface: Mesh, middles: Array) -> _FacePairs:
     across, area = neighbours(surface.faces), areas_mm2(surface)
     one, corner = np.nonzero(across >= 0)
     other = across[one, corner]
     away = middles[other] - middles[one]
-    apart = np.maximum(np.linalg.norm(away, axis=1), NEAREST_FACES_MM)
+    distance_mm = np.maximum(np.linalg.norm(away, axis=1), NEAREST_FACES_MM)
 
     # Average normals repeatedly over a face and its neighbours; the width of this smoothing is the square root of the
     # number of rounds times the distance between faces.
-    rounds = int(np.clip(round((SMOOTH_MM / float(np.median(apart))) ** 2), 1, MAX_ROUNDS))
+    rounds = int(np.clip(round((SMOOTH_MM / float(np.median(distance_mm))) ** 2), 1, MAX_ROUNDS))
     a, b, c = (surface.vertices_mm[surface.faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a) / np.maximum(2 * area, np.finfo(float).tiny)[:, None]
     weight = np.where(across >= 0, area[across], 0.0)
     for _ in range(rounds):
         total = area[:, None] * normals + (weight[..., None] * normals[across]).sum(axis=1)
         normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
-    outwards = ((normals[other] - normals[one]) * away).sum(axis=1) / apart**2
+    outwards = ((normals[other] - normals[one]) * away).sum(axis=1) / distance_mm**2
     start, end = surface.faces[one, corner], surface.faces[one, (corner + 1) % 3]
     border = np.linalg.norm(surface.vertices_mm[start] - surface.vertices_mm[end], axis=1)
-    return _Bends(one, other, apart, np.maximum(-outwards, 0), border)
+    return _FacePairs(one, other, distance_mm, np.maximum(-outwards, 0), border)
 
 
-def _cut(bends: _Bends, is_tooth: NDArray[np.bool_], likely_gums: Array, gums_cost: Array) -> NDArray[np.bool_]:
+def _minimal_cut(
+    pairs: _FacePairs, is_tooth: NDArray[np.bool_], likely_gums: Array, gums_cost: Array
+) -> NDArray[np.bool_]:
     # Faces (F,) on the teeth's side of the cheapest border (minimal cut), with a cost for likely gums on that side.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
     count = len(is_tooth)
-    cost = bends.border_mm * (FLOOR + np.exp(-bends.inwards_per_mm / CREASE_PER_MM))
-    source, sink, endless = count, count + 1, np.iinfo(np.int32).max // 4
+    cost = pairs.border_mm * (MIN_BORDER_COST + np.exp(-pairs.inwards_per_mm / CREASE_PER_MM))
+    source, sink, unlimited = count, count + 1, np.iinfo(np.int32).max // 4
     inner, outer = np.flatnonzero(is_tooth), np.flatnonzero(~is_tooth & (likely_gums > 0))
-    rows = np.concatenate([bends.one, np.full(len(inner), source), outer])
-    columns = np.concatenate([bends.other, inner, np.full(len(outer), sink)])
-    pulled = np.where(likely_gums < 1, UNITS_PER_MM * gums_cost * likely_gums, endless)[outer]
-    capacity = np.concatenate([np.maximum(UNITS_PER_MM * cost, 1), np.full(len(inner), endless), pulled])
+    rows = np.concatenate([pairs.one, np.full(len(inner), source), outer])
+    columns = np.concatenate([pairs.other, inner, np.full(len(outer), sink)])
+    gum_capacity = np.where(likely_gums < 1, UNITS_PER_MM * gums_cost * likely_gums, unlimited)[outer]
+    capacity = np.concatenate([np.maximum(UNITS_PER_MM * cost, 1), np.full(len(inner), unlimited), gum_capacity])
     graph = csr_matrix((capacity.astype(np.int32), (rows, columns)), shape=(count + 2, count + 2))
-    left = graph - maximum_flow(graph, source, sink).flow
-    left.data = np.maximum(left.data, 0)
-    left.eliminate_zeros()
+    residual = graph - maximum_flow(graph, source, sink).flow
+    residual.data = np.maximum(residual.data, 0)
+    residual.eliminate_zeros()
     reached = np.zeros(count + 2, dtype=bool)
-    reached[breadth_first_order(left, source, return_predecessors=False)] = True
+    reached[breadth_first_order(residual, source, return_predecessors=False)] = True
     return reached[:count]
 
 
-def _reached(bends: _Bends, is_core: NDArray[np.bool_], is_tooth: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _nearest_teeth(pairs: _FacePairs, is_core: NDArray[np.bool_], is_tooth: NDArray[np.bool_]) -> NDArray[np.int64]:
     # For each face (F,) 1 + the index of the tooth whose front arrives first; 0 for gums and faces that no front
     # reaches.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 
-    inside = is_tooth[bends.one] & is_tooth[bends.other]
-    cost = bends.apart_mm * (1 + HOLD_MM2 * bends.inwards_per_mm**2)
+    inside = is_tooth[pairs.one] & is_tooth[pairs.other]
+    cost = pairs.distance_mm * (1 + CREASE_DELAY_MM2 * pairs.inwards_per_mm**2)
     count = len(is_tooth)
-    graph = csr_matrix((cost[inside], (bends.one[inside], bends.other[inside])), shape=(count, count))
+    graph = csr_matrix((cost[inside], (pairs.one[inside], pairs.other[inside])), shape=(count, count))
     starts = np.flatnonzero(is_core.any(axis=1) & is_tooth)
     distance, _, origin = dijkstra(graph, indices=starts, min_only=True, return_predecessors=True)
     found = np.zeros(count, dtype=np.int64)
-    there = np.isfinite(distance)
-    found[there] = 1 + is_core.argmax(axis=1)[origin[there]]
+    is_reached = np.isfinite(distance)
+    found[is_reached] = 1 + is_core.argmax(axis=1)[origin[is_reached]]
     return found

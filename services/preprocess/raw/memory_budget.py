@@ -14,9 +14,9 @@ PROCESS_BYTES = 400 * 2**20
 """Bytes of an interpreter with its libraries, and of a scan."""
 MOTION_BYTES = 13
 """Bytes per pixel of the region for relief and outline of the moving bodies, and for the map of the lens."""
-SHOWN_BYTES = 19
+FOOTPRINT_BYTES = 19
 """Bytes per pixel of the view for the footprint, which is mapped from its file."""
-JUDGED_BYTES = 48
+MASKING_BYTES = 48
 """Bytes per pixel of the view while masks are made or arrays are compressed for storage."""
 FLOAT_BYTES = 4
 EXPOSURE_VALUES = 2
@@ -33,7 +33,7 @@ MIN_ROWS = 64
 
 
 @dataclass(frozen=True)
-class Room:
+class MemoryBudget:
     """Memory that one image of a raw camera takes.
 
     Attributes:
@@ -73,13 +73,13 @@ class Room:
     def peak_bytes(self, exposures: int, rows: int) -> float:
         """Largest memory in bytes while an image is made in strips of ``rows`` rows, and then masked and stored."""
         made = self._read_bytes(exposures) + (rows + OVERLAP_ROWS) * self._row_bytes(exposures)
-        return self._held_bytes(exposures) + max(made, JUDGED_BYTES * _pixels(self.window))
+        return self._held_bytes(exposures) + max(made, MASKING_BYTES * _pixels(self.window))
 
     def _held_bytes(self, exposures: int) -> float:
         """Bytes held throughout: process, footprint and motion of the view, black images, and the image being made."""
         image = 2 * FLOAT_BYTES * self.channels + 2
         black = FLOAT_BYTES * exposures * self._sites
-        view = (image + SHOWN_BYTES) * _pixels(self.window)
+        view = (image + FOOTPRINT_BYTES) * _pixels(self.window)
         return PROCESS_BYTES + view + (black + MOTION_BYTES) * _pixels(self.region)
 
     def _read_bytes(self, exposures: int) -> float:

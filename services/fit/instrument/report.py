@@ -12,23 +12,27 @@ from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import instrument_estimates
 
 
-def instrument_report(spec: JobSpec, known: Mapping[str, Uncertainty], manifest: PreparedManifest) -> dict[str, Any]:
+def instrument_report(
+    spec: JobSpec, uncertainties: Mapping[str, Uncertainty], manifest: PreparedManifest
+) -> dict[str, Any]:
     """Fields of a ``FitReport`` on the instrument.
 
     Args:
         spec: the job.
-        known: by channel, the uncertainty at the solution.
+        uncertainties: by channel, the uncertainty at the solution.
         manifest: manifest of the prepared capture, with the uncertainty that its calibration states.
     """
-    errors = {channel: one.domain.errors for channel, one in known.items()}
-    found = {channel: own for channel, one in known.items() if (own := instrument_estimates(one))}
+    errors = {channel: one.domain.errors for channel, one in uncertainties.items()}
+    found = {channel: own for channel, one in uncertainties.items() if (own := instrument_estimates(one))}
     _, moves = move_covariance(manifest.uncertainty, manifest.lights)
-    assumed = assumed_names(errors, [body for body in moves if any(body in one.parts for one in known.values())])
-    faults = {channel: one.faults for channel, one in known.items() if one.faults}
+    assumed = assumed_names(
+        errors, [body for body in moves if any(body in one.parts for one in uncertainties.values())]
+    )
+    faults = {channel: one.faults for channel, one in uncertainties.items() if one.faults}
     return {
         "instrument": found,
         "instrument_prior": {c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in found},
         "assumed": assumed,
-        "instrument_faults": {c: tuple(errors[c].names[fault.place] for fault in own) for c, own in faults.items()},
+        "instrument_faults": {c: tuple(errors[c].names[fault.index] for fault in own) for c, own in faults.items()},
         "instrument_told": instrument_sentences(spec, errors, faults, assumed, manifest.uncertainty),
     }

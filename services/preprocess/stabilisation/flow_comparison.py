@@ -18,7 +18,7 @@ seconds."""
 
 
 @dataclass(frozen=True)
-class SeenFlow:
+class FlowComparison:
     """Flow from the first tracking frame to the one that moved most.
 
     Attributes:
@@ -33,41 +33,42 @@ class SeenFlow:
     teeth: NDArray[np.bool_]
 
 
-def seen_flow(
+def compare_flow(
     frame: int,
     reference: NDArray[np.generic],
     moved: NDArray[np.generic],
     inner: tuple[slice, slice],
-    places: Image,
-    seen: NDArray[np.bool_],
-) -> SeenFlow:
+    positions: Image,
+    teeth_mask: NDArray[np.bool_],
+) -> FlowComparison:
     """Compute the flow to a frame as it is, and to the same frame resampled at the displaced pixels.
 
     Args:
         frame: number of the frame.
         reference, moved: first tracking frame and this one, each (H, W) or (H, W, C), in the window around the view.
         inner: rows and columns of the view in that window, (h, w) pixels.
-        places: (2, h, w), x and y of the displaced pixels as indices into ``moved``.
-        seen: (h, w), pixels that show teeth.
+        positions: (2, h, w), x and y of the displaced pixels as indices into ``moved``.
+        teeth_mask: (h, w), pixels that show teeth.
     """
     import cv2
 
     grey = _grey(moved)
-    back = cv2.remap(grey, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    factor = max(1, -(-max(seen.shape) // FLOW_SIDE_PX))
-    size = max(1, seen.shape[1] // factor), max(1, seen.shape[0] // factor)
+    aligned = cv2.remap(grey, positions[0], positions[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    factor = max(1, -(-max(teeth_mask.shape) // FLOW_SIDE_PX))
+    size = max(1, teeth_mask.shape[1] // factor), max(1, teeth_mask.shape[0] // factor)
     first, second, third = (
-        cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (_grey(reference)[inner], grey[inner], back)
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        for image in (_grey(reference)[inner], grey[inner], aligned)
     )
-    teeth = cv2.resize(seen.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    teeth = cv2.resize(teeth_mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     # Scale all three images alike; with separate scales a change of exposure would appear as motion
     low, high = np.quantile(first[teeth], [0.01, 0.99]) if teeth.any() else (0.0, 1.0)
     first, second, third = (
         (255 * np.clip((image - low) / max(high - low, 1e-30), 0, 1)).astype(np.uint8)
         for image in (first, second, third)
     )
-    scale = np.array([seen.shape[1] / size[0], seen.shape[0] / size[1]], dtype=np.float32)
-    return SeenFlow(frame, scale * _flow(first, second), scale * _flow(first, third), teeth)
+    scale = np.array([teeth_mask.shape[1] / size[0], teeth_mask.shape[0] / size[1]], dtype=np.float32)
+    return FlowComparison(frame, scale * _flow(first, second), scale * _flow(first, third), teeth)
 
 
 def _flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> Image:
