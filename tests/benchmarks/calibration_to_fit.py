@@ -138,7 +138,7 @@ def session(truth: Truth, seed: int) -> Drawn:
     points = _moved(board_from_world, truth.meshes["outer"].vertices_mm)
     seen = [
         (_pinhole(own, camera, guess, points), pose_matrix(guess.pose))
-        for own, camera, guess in zip(description["cameras"], true, found.posed_cameras, strict=True)
+        for own, camera, guess in zip(description["cameras"], true, found.cameras, strict=True)
     ]
     radiance = white.radiance_per_count[:, 0] * COUNTS
     return Drawn(board_from_world, seen, found.positions_mm, white.intensity[:, 0], radiance, stated)

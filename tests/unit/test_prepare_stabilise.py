@@ -159,7 +159,7 @@ def test_each_jaw_gets_its_own_motion() -> None:
         field = np.broadcast_to(-shift.astype(np.float32), (90, 120, 2))
         moved[rows] = warp(texture, field)[rows]
     motion = ViewMotion(view_of(seen), [[0], [1]], frames(2))
-    found = motion.stored(
+    found = motion.stored_field(
         motion.at(frames(2)[1], dict(motion.measure([0, 1], lambda frame: moved if frame.index else texture)))
     )
     # Whole-pixel shifts of a noise-free texture; what is left is the seam between the jaws
