@@ -11,7 +11,7 @@ lock() {
 }
 upgrade=${1:-}
 lock ${upgrade:+"$upgrade"} --extra api --extra postgres --extra capture --output-file deploy/images/api.lock pyproject.toml
-# miepython asks for matplotlib, 55 MB with what that needs alone, to draw; no service has it draw.
+# miepython asks for matplotlib, about 50 MB with what that needs alone, to draw; no service has it draw.
 lock ${upgrade:+"$upgrade"} --extra postgres --extra capture --extra worker --output-file deploy/images/worker.lock \
     --no-emit-package matplotlib --no-emit-package contourpy --no-emit-package cycler --no-emit-package fonttools \
     --no-emit-package kiwisolver --no-emit-package pyparsing --no-emit-package python-dateutil pyproject.toml
