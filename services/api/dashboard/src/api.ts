@@ -315,6 +315,15 @@ export async function allOff(session: Session | null): Promise<AllOff> {
   }
 }
 
+/**
+ * Ask for nothing but that the connection for ALL OFF, the one without the cookie, stays open: a server that a flood of
+ * connections reaches accepts a new one late, and serves an open one at once.
+ */
+export async function keepOffConnection(): Promise<void> {
+  const sent: RequestInit = { credentials: "omit", cache: "no-store", signal: AbortSignal.timeout(DOME_PATIENCE_MS) };
+  await fetch("/v1/health/live", sent).catch(() => undefined);
+}
+
 export const lightUp = (light: number, level: number, on_s: number): Promise<DomeStatus> =>
   ask("/dome/light", "PUT", {}, { light, level, on_s });
 export const darken = (): Promise<DomeStatus> => ask("/dome/light", "DELETE");

@@ -9,6 +9,7 @@ import {
   type DomeState,
   type DomeStatus,
   getDome,
+  keepOffConnection,
   lightUp,
   preflight,
   sentenceOf,
@@ -19,6 +20,8 @@ import { element } from "./element";
 import { LightGrid } from "./lightGrid";
 
 const ASK_AGAIN_MS = 1000;
+/** Pause in ms between requests that keep the connection for ALL OFF open; servers close an idle one after 5 s. */
+const KEEP_OPEN_MS = 2000;
 /** Age in ms beyond which the last state of the dome is shown as unknown. */
 const STALE_MS = 3000;
 /** Time in ms after which the page says that ALL OFF has had no answer. */
@@ -54,6 +57,7 @@ export class DomeView {
   private capturers = "";
   private actionCount = 0;
   private timer = 0;
+  private keeper = 0;
   private clock = 0;
   /** When the dome last reported its state (`performance.now()`, ms), and that state in words. */
   private heardMs: number | null = null;
@@ -107,11 +111,13 @@ export class DomeView {
     );
     this.clock = window.setInterval(() => this.showAge(), 500);
     void this.askAgain();
+    void this.keepOpen();
   }
 
   stop(): void {
     this.isStopped = true;
     window.clearTimeout(this.timer);
+    window.clearTimeout(this.keeper);
     window.clearInterval(this.clock);
   }
 
@@ -205,6 +211,11 @@ export class DomeView {
       this.noAnswer.hidden = isLost || problem instanceof DOMException;
     }
     this.askLater();
+  }
+
+  private async keepOpen(): Promise<void> {
+    if (!document.hidden) await keepOffConnection();
+    if (!this.isStopped) this.keeper = window.setTimeout(() => void this.keepOpen(), KEEP_OPEN_MS);
   }
 
   /** Show the state as unknown. */
