@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.templates.jaw import Jaw, build_jaw
+from services.anatomy.visibility import visible_surfaces
 from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View
 from services.calibrate.registration.pose import RigidPose
-from services.calibrate.registration.visible import visible_surfaces
 from services.core.geometry import Camera, Mesh
 from services.phantom.dome_rig import dome_cameras
 
@@ -82,7 +82,8 @@ def drawn(camera: Camera, teeth: Sequence[Mesh], gums: Mesh, rng: np.random.Gene
     import cv2
 
     fine = _finer(camera)
-    label, depth = visible_surfaces(fine, [*teeth, gums])
+    visible = visible_surfaces(fine, [*teeth, gums])
+    label, depth = visible.mesh, visible.depth_mm
     shown = cv2.GaussianBlur(
         np.where(np.isfinite(depth), depth, depth[np.isfinite(depth)].max()).astype(np.float32), (0, 0), 2
     )

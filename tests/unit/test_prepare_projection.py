@@ -65,6 +65,13 @@ def test_nearer_surface_wins_and_occluders_hide() -> None:
     assert hidden.covered[24, 32 + 15]
 
 
+def test_the_part_of_a_mesh_in_front_of_the_camera_is_seen_where_another_part_is_behind_it() -> None:
+    ball, far_behind = sphere(5), sphere(5, (0, 0, -2000))
+    vertices = np.concatenate([ball.vertices_mm, far_behind.vertices_mm])
+    both = Mesh(vertices, np.concatenate([ball.faces, far_behind.faces + len(ball.vertices_mm)]))
+    np.testing.assert_array_equal(project(CAMERA, [both]).mesh, project(CAMERA, [ball]).mesh)
+
+
 def test_surface_points_project_back_to_their_pixels() -> None:
     view = project(CAMERA, [sphere(5)])
     points = view.points_mm(CAMERA, slice(10, 30))

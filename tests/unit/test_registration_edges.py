@@ -7,12 +7,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.anatomy.visibility import visible_surfaces
 from services.calibrate.registration.appearance import learn_appearance
 from services.calibrate.registration.edges import edges_in_light
 from services.calibrate.registration.landmarks import Click, pose_from_landmarks
 from services.calibrate.registration.outlines import View, pose_from_outlines
 from services.calibrate.registration.pose import RigidPose
-from services.calibrate.registration.visible import visible_surfaces
 from services.core.geometry import Camera, Mesh
 from services.phantom.lab.mouth import landmarks_mm, true_mouth
 from services.phantom.lab.rig import RigSize, true_rig
@@ -114,6 +114,6 @@ def plain(camera: Camera, meshes: list[Mesh], colours: np.ndarray, random: np.ra
     K = ((finer * fx, finer * skew, finer * cx), (0.0, finer * fy, finer * cy), last)
     size = (camera.size[0] * finer, camera.size[1] * finer)
     fine = camera.model_copy(update={"size": size, "K": K})
-    image = colours[visible_surfaces(fine, meshes)[0] + 1]
+    image = colours[visible_surfaces(fine, meshes).mesh + 1]
     image = image.reshape(camera.size[1], finer, camera.size[0], finer, 3).mean(axis=(1, 3))
     return np.asarray((image + random.normal(0, 0.003, image.shape)).astype(np.float32))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.visibility import NOTHING, visible_surfaces
 from services.calibrate.registration.pose import Floats
-from services.calibrate.registration.visible import NOTHING, visible_surfaces
 from services.core.geometry import Camera, Mesh
 
 SMOOTH_PX = 1.5
@@ -46,7 +46,8 @@ def tooth_contours(
 
     An outline runs midway between the two pixels' centres, so that it has no mean offset from the true outline.
     """
-    label, depth = visible_surfaces(camera, [*teeth, *occluders])
+    visible = visible_surfaces(camera, [*teeth, *occluders])
+    label, depth = visible.mesh, visible.depth_mm
     teeth_alone = np.where(label < len(teeth), label, NOTHING).astype(np.int16)
     parts = [_steps(label, depth, teeth_alone, axis) for axis in (0, 1)]
     x, y, nearer, tooth, between, gums = (np.concatenate([part[k] for part in parts]) for k in range(6))
