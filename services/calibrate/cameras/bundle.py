@@ -19,11 +19,9 @@ from services.calibrate.cameras.lens import Lens
 from services.calibrate.cameras.rotations import cross_matrix, left_jacobian, pose_matrix, rotation_matrix
 from services.calibrate.cameras.sightings import Corners, View, joined
 from services.core.errors import CaptureInputError
+from services.core.robust import HUBER_SIGMAS, robust_sigma
 
 Floats = NDArray[np.float64]
-HUBER_SIGMAS = 1.345
-"""Threshold of Huber's loss in σ: with it the estimate is 95 % as efficient as least squares where all errors are
-normal."""
 OUTLIER_SIGMAS = 5.0
 """Residual in σ beyond which a corner is an outlier. A good session has 10⁴ corners, and 2·10⁴ normal coordinates
 exceed 5 σ once in a hundred sessions."""
@@ -37,8 +35,6 @@ of σ."""
 STEP_PRECISION = 1e-10
 """Tolerance of the linear solver within a step. With a looser one the steps are no Gauss–Newton steps, and a hundred of
 them are needed."""
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 MISPLACED_PX, MISPLACED_TIMES = 10.0, 10.0
 """Limits of a photograph's median reprojection error under the first guess: in px, and as a multiple of the median over
 all photographs. The larger one holds. First guesses are off by some pixels, interchanged frames by hundreds."""
@@ -257,7 +253,7 @@ def _without_outliers(
             np.abs(plausible.pixels - project_corners(layout.unpack(values, start), plausible))
             / weights[plausible.camera, None]
         )
-        before, scale = scale, max(MAD_TO_SIGMA * float(np.median(off)), SIGMA_FLOOR_PX)
+        before, scale = scale, max(robust_sigma(off), SIGMA_FLOOR_PX)
         if abs(scale - before) < SETTLED_SCALE * before:
             break
         values, _ = _solve(layout, start, plausible, values, scale * weights, huber=True)

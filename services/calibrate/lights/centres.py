@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.lights.mirror import PosedCamera, outline_errors, sphere_from_outline
-from services.calibrate.lights.positions import EDGE_SHIFT_SE_PX, HUBER_SIGMAS
+from services.calibrate.lights.positions import EDGE_SHIFT_SE_PX
 from services.calibrate.reweighted import solve_reweighted
+from services.core.robust import HUBER_SIGMAS
 
 Floats = NDArray[np.float64]
 EDGE_SE_PX = 0.1

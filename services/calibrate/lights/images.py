@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.lights.mirror import PosedCamera, outline_errors, sphere_from_outline
+from services.core.robust import robust_sigma
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -130,7 +131,7 @@ def find_highlight(grey: Image, outline_px: Floats) -> Floats | None:
     smooth = np.where(inside, cv2.GaussianBlur(part, (0, 0), 1.0), -np.inf)
     row, column = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
     level = float(np.median(part[inside]))
-    scatter = 1.4826 * float(np.median(np.abs(part[inside] - level)))
+    scatter = robust_sigma(part[inside] - level)
     peak = float(smooth[row, column]) - level
     if peak <= MIN_CONTRAST * max(scatter, 1e-12):
         return None
@@ -206,6 +207,6 @@ def _without_outliers(points: Floats, camera: PosedCamera, radius_mm: float) -> 
         if len(points) < MIN_EDGES:
             return points
         off = outline_errors(camera, points, sphere_from_outline(camera, points, radius_mm), radius_mm)
-        scale = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), 0.02)
+        scale = max(robust_sigma(off - np.median(off)), 0.02)
         points = points[np.abs(off - np.median(off)) < OUTLIER_SIGMAS * scale]
     return points

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from services.calibrate.lights.mirror import PosedCamera
 from services.core.errors import CaptureInputError
+from services.core.robust import robust_sigma
 
 Floats = NDArray[np.float64]
 MIN_COSINE_OF_LIGHT = 0.35
@@ -34,8 +35,6 @@ LOBE_SIGMAS = 4.0
 """Smallest exponent of the lobe in its standard errors; a smaller one is set to 0."""
 SIGMA_FLOOR = 1e-6
 """Smallest relative standard deviation of a slope, for exact synthetic photographs."""
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 WRONG_SIGMAS, MIN_WRONG = 8.0, 0.05
 """Limits of a photograph's residual against the fit of the others, in robust standard deviations and as a relative
 error. A photograph beyond both was taken with another light, exposure or level than raw.toml says."""
@@ -225,7 +224,7 @@ def _without_wrong_photographs(design: Floats, logs: Floats) -> NDArray[np.bool_
             (brightness[good] - hat @ brightness[good]) / np.maximum(one_minus_leverage, MIN_FREEDOM),
             0.0,
         )
-        scatter = MAD_TO_SIGMA * float(np.median(np.abs(off)))
+        scatter = robust_sigma(off)
         worst = int(np.argmax(np.abs(off)))
         if abs(off[worst]) <= max(WRONG_SIGMAS * scatter, MIN_WRONG):
             break

@@ -19,20 +19,16 @@ from services.calibrate.cameras.lens import Lens
 from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.lights.problem import MIN_HIGHLIGHTS, Problem, SphereView
 from services.calibrate.reweighted import solve_reweighted
+from services.core.robust import HUBER_SIGMAS, robust_sigma
 
 Floats = NDArray[np.float64]
 EDGE_SHIFT_SE_PX = 0.3
 """Standard deviation of the prior of a camera's edge shift: half a pixel of blur, against a background of another
 brightness."""
-HUBER_SIGMAS = 1.345
-"""Threshold of Huber's loss in σ: with it the estimate is 95 % as efficient as least squares where all errors are
-normal."""
 OUTLIER_SIGMAS = 5.0
 """Residual in σ beyond which a highlight is an outlier."""
 SIGMA_FLOOR_PX = 1e-6
 """Smallest σ of highlights and edges in px, for exact synthetic observations."""
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 ROBUST_ROUNDS = 3
 """Number of robust fits, each followed by an estimate of σ."""
 STEP = 1e-4
@@ -266,8 +262,7 @@ def _without_outliers(weighted: _Weighted, values: Floats) -> tuple[Floats, _Wei
     for _ in range(ROBUST_ROUNDS):
         values = _solve(fixed, values, HUBER_SIGMAS)
         off, edges = problem.highlights(fixed.cameras, values), problem.outlines(fixed.cameras, values)
-        medians = [float(np.median(np.abs(off))), float(np.median(np.abs(edges)))]
-        fixed = replace(fixed, sigmas=np.maximum(MAD_TO_SIGMA * np.array(medians), SIGMA_FLOOR_PX))
+        fixed = replace(fixed, sigmas=np.maximum([robust_sigma(off), robust_sigma(edges)], SIGMA_FLOOR_PX))
     good = np.asarray(np.abs(off).max(axis=1) <= OUTLIER_SIGMAS * fixed.sigmas[0])
     for row in range(len(problem.lights)):
         mine = problem.row == row

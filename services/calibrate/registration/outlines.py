@@ -20,6 +20,7 @@ from services.calibrate.registration.edges import edges_in_light
 from services.calibrate.registration.pose import Floats, PoseStep, RigidPose, millimetres_a_pixel, pixel_derivatives
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Mesh
+from services.core.robust import robust_sigma
 
 NARROW_PX = 3.0
 """Distance to which edges are searched in the last rounds, in which their position is then refined in the light."""
@@ -258,7 +259,7 @@ def _equations(
     across = np.concatenate([across, np.eye(len(SHIFT_PX))[neighbours]], axis=1)
     residual = np.where(found.is_found, found.offset_px - shifts_px[neighbours], 0.0)
     found_px = np.abs(residual[found.is_found])
-    spread = max(1.4826 * float(np.median(found_px)) if len(found_px) else MIN_SPREAD_PX, MIN_SPREAD_PX)
+    spread = max(robust_sigma(found_px) if len(found_px) else MIN_SPREAD_PX, MIN_SPREAD_PX)
     far = np.clip(np.abs(residual) / (TUKEY * spread), 0, 1)
     weight = found.is_found * (1 - far**2) ** 2 * np.where(contour.between, BETWEEN_WEIGHT, 1.0) / spread**2
     return across, residual, weight, spread

@@ -16,6 +16,7 @@ from services.calibrate.session.charts import ColourStep, better_order
 from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep
 from services.core.raw.records import RawFolder
+from services.core.robust import robust_sigma
 
 MAX_EDGE_SHIFT_PX = 1.0
 """Largest edge shift of a camera. Edges are located to half a pixel; if all of them lie further out or in, the sphere's
@@ -243,7 +244,7 @@ def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
 def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensityStep) -> Iterator[str]:
     """Yield a sentence for each photograph of a white sphere whose brightness disagrees with the other photographs."""
     off = intensity.fit.residuals.mean(axis=1)
-    scatter = 1.4826 * float(np.median(np.abs(off)))
+    scatter = robust_sigma(off)
     for number in np.flatnonzero(np.abs(off) > max(MANY_SIGMAS * scatter, MIN_OFF_SHARE)):
         photo = intensity.photos[intensity.fit.used[number]]
         yield (

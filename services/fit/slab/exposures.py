@@ -20,6 +20,7 @@ from services.core.raw.frames import read_counts
 from services.core.raw.merge import Exposure, merge
 from services.core.raw.noise import ROUNDING, LitPair, NoiseModel, read_noise, shot_noise
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
+from services.core.robust import robust_sigma
 from services.core.slab.exposures import SlabExposure
 from services.core.slab.folder import SlabFolder, SlabImage
 
@@ -31,8 +32,6 @@ ASSUMED_NOISE = NoiseModel(read_counts=2.0, counts_per_electron=1.0)
 without."""
 MIN_ABOVE_BLACK_SE = 5.0
 """Number of standard errors of its mean by which a frame must be brighter than black; otherwise the beam was off."""
-SIGMA_OF_MEDIAN = 1.4826
-"""Standard deviation of a normal distribution in units of its median absolute deviation."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,7 @@ class _Stack:
 
 def _error_of_mean(signal: Counts) -> float:
     """Standard error of a frame's mean by its noise; by medians, because a narrow beam on a few pixels is no noise."""
-    spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(signal - np.median(signal))))
+    spread = robust_sigma(signal - np.median(signal))
     return float(np.sqrt((spread**2 + ROUNDING) / signal.size))
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.robust import robust_sigma
+
 Image = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
@@ -112,7 +114,7 @@ def _curve(x: FloatArray, y: FloatArray, observed: FloatArray) -> tuple[float, f
         design = np.stack([y / at_y - x / at_x, y**2 / at_y - x**2 / at_x, 1 / (y + offset) - 1 / (x + offset)], axis=1)
         residual = observed + np.log(at_y / at_x) + np.log1p(offset / y) - np.log1p(offset / x)
         # Weight the residuals robustly (Cauchy), so that blocks at edges that moved have little influence.
-        scale = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-6
+        scale = robust_sigma(residual - np.median(residual)) + 1e-6
         weight = 1 / (1 + (residual / scale) ** 2)
         normal = (design * weight[:, None]).T @ design + 1e-9 * np.eye(3)
         step = np.linalg.solve(normal, -(design * weight[:, None]).T @ residual)

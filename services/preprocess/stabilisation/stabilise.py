@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.robust import robust_sigma
 from services.preprocess.projection import Footprint
 from services.preprocess.scratch import cached_array
 from services.preprocess.window import bands
@@ -196,7 +197,7 @@ class Aligner:
                 residual = (warped - level.feature).ravel()[level.matched]
                 # Weight residuals by Geman-McClure at one robust standard deviation, so that reflections and lips have
                 # little influence
-                scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-6
+                scale = robust_sigma(residual) + 1e-6
                 weight = 1 / (1 + (residual / scale) ** 2) ** 2
                 jacobian = np.concatenate([slope[:, :1] * basis, slope[:, 1:] * basis], axis=1).astype(np.float64)
                 hessian = (jacobian * weight[:, None]).T @ jacobian
