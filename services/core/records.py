@@ -11,10 +11,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, Strict, StringConst
 from pydantic_core import PydanticCustomError
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.files.store_url import StoreUrl
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
-from services.core.store_url import StoreUrl
 
 
 def _no_stand_in(value: Any) -> Any:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from services.core.errors import SettingsError
 from services.core.files.object_store import require_library
+from services.core.files.store_url import STORE_URL
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
-from services.core.store_url import STORE_URL
 
 SETTING = "DENTINE__SERVER__JOB_ROOTS"
 STORES_SETTING = "DENTINE__SERVER__STORES"
