@@ -48,7 +48,8 @@ def run(quick: bool = False, case: str = "images", keep: Keep = lambda _rows: No
     Args:
         quick: take small images.
         case: ``images``: 6 and 18 images, then three slices of 54, together 162. ``workers``: 18 images by one and by
-            two workers, alternately. ``region``: 6 images of teeth of several sizes.
+            two workers, and two captures at once by one worker each, alternately. ``region``: 6 images of teeth of
+            several sizes.
         keep: called with all rows so far after every new one.
 
     Raises:
@@ -70,7 +71,7 @@ def picture(rows: list[Row]) -> Figure:
 
     figure, (axes,) = grid(1)
     axes.plot([row["seconds"] if "seconds" in row else row["clock_s"] for row in rows], "o")
-    varied = ("workers", "tooth_by_height")
+    varied = ("captures", "workers", "tooth_by_height")
     names = [", ".join(f"{row[key]:g} {key}" for key in ("images", *varied) if key in row) for row in rows]
     axes.set_xticks(range(len(rows)), names, rotation=30, ha="right", fontsize=8)
     axes.set(ylabel="s", ylim=(0, None))
@@ -92,11 +93,16 @@ def _images(size: tuple[int, int]) -> Iterator[Row]:
 
 
 def _workers(size: tuple[int, int]) -> Iterator[Row]:
-    """Yield a row for each run, all with the same capture."""
-    with _captured(size, FEWER[1]) as root:
+    """Yield a row for each run. Two captures at once by one worker each wait for nothing of each other, so they show
+    what a second processor of this machine brings at most.
+    """
+    with _captured(size, FEWER[1]) as root, _captured(size, FEWER[1], seed=2) as other:
         for _ in range(TURNS):
             for workers in (1, 2):
-                yield {"images": FEWER[1], "workers": workers, "clock_s": _prepared_on(root, workers)}
+                yield {"images": FEWER[1], "captures": 1, "workers": workers, "clock_s": _prepared_on(root, workers)}
+            with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as apart:
+                seconds = max(apart.map(_prepared_on, (root, other), (1, 1)))
+            yield {"images": 2 * FEWER[1], "captures": 2, "workers": 2, "clock_s": seconds}
 
 
 def _region(size: tuple[int, int]) -> Iterator[Row]:
