@@ -24,8 +24,9 @@ from services.fit.slab.images import Measurements, shot_noise
 from services.fit.slab.model.dictionary import ANGLES_RAD, Material
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import Rig, rig_of
+from services.fit.slab.solve.budget import Budget
 from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
+from services.fit.slab.solve.gauss_newton import GaussNewton
 from services.fit.slab.solve.projected_descent import DescentOptions, descend
 from services.fit.slab.solve.start import start
 

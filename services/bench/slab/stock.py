@@ -25,8 +25,9 @@ from services.fit.slab.dictionaries.hg import COSINES
 from services.fit.slab.images import Measurements, folded
 from services.fit.slab.model.dictionary import Material, hg_values
 from services.fit.slab.model.rig import rig_of
+from services.fit.slab.solve.budget import Budget
 from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
+from services.fit.slab.solve.gauss_newton import GaussNewton
 from services.fit.slab.solve.mixture import Mixtures, unit_atoms
 from services.fit.slab.solve.start import start
 

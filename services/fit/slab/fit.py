@@ -22,8 +22,9 @@ from services.fit.slab.next_measurement import next_measurement
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.atoms import atoms_of
 from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
+from services.fit.slab.solve.budget import Budget
 from services.fit.slab.solve.checkpoint import CheckpointFile
-from services.fit.slab.solve.gauss_newton import Budget, GaussNewton
+from services.fit.slab.solve.gauss_newton import GaussNewton
 from services.fit.slab.solve.start import start
 from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
@@ -131,15 +132,14 @@ def fit_images(
 
 
 def _budget(options: SlabOptions, dictionary: ChosenDictionary) -> Budget:
-    plain = Budget(most_steps=STEPS_OF_ATOMS) if dictionary.names else Budget()
+    plain = Budget(max_steps=STEPS_OF_ATOMS) if dictionary.names else Budget()
     return plain.scaled(options.effort)
 
 
 def final_renders(rig: Rig, material: Material, budget: Budget, seed: int, blocks: Blocks) -> NDArray[np.float64]:
     """Two independent renders of the fit's final material (2, images, pixels)."""
-    paths = 4 * budget.last[-1][0]
     return render(
-        rig, material, seed=seed, step=FINAL_RENDER, batches=2, paths=paths, scores=False, blocks=blocks
+        rig, material, seed=seed, step=FINAL_RENDER, batches=2, paths=budget.final_paths, scores=False, blocks=blocks
     ).images
 
 

@@ -19,6 +19,7 @@ from services.fit.slab.images import Measurements
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
+from services.fit.slab.solve.budget import Budget, Stage
 from services.fit.slab.solve.checkpoint import Checkpoint, CheckpointFile, CombinedRenders
 from services.fit.slab.solve.coordinates import Coordinates
 from services.fit.slab.solve.measured_directions import broad_step, noise_ratio, step_matrix
@@ -49,36 +50,10 @@ MAX_COMBINED_CHANGE = 0.05
 """Largest distance in ln sigma_s at which residuals of several media are combined: the nonlinear part is then below a
 thousandth."""
 MAX_PATH_VARIANCE = 0.5
-"""Largest variance by the paths, in units of that by the measurements, at which the fit of a thick cell may end."""
+"""Largest variance by the paths, in units of that by the measurements, at which the last stage may end."""
 DAMPING = 1.0
 """Levenberg term in units of the noise of J: with 0.3 and with 3 the end was the same within its noise, with 0.05 it
 strayed."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """Work of a fit, counted in paths, so that a fit repeats. Paths are those of a light and batch."""
-
-    batches: int = 8
-    first_paths: int = 4000
-    search_paths: int = 8000
-    """Largest number of paths in the search."""
-    last: tuple[tuple[int, int], ...] = ((15000, 16), (30000, 24))
-    """Paths and batches of each of the last stages."""
-    most_last: int = 4
-    """Largest number of steps of a stage."""
-    most_last_thick: int = 8
-    """The same in a thick cell."""
-    most_steps: int = 10
-
-    def scaled(self, effort: float) -> Budget:
-        """The same budget with ``effort`` times the paths."""
-        return replace(
-            self,
-            first_paths=max(1, round(effort * self.first_paths)),
-            search_paths=max(1, round(effort * self.search_paths)),
-            last=tuple((max(1, round(effort * paths)), batches) for paths, batches in self.last),
-        )
 
 
 @dataclass(frozen=True)
@@ -112,8 +87,6 @@ class Solution:
     misfit_se: float
     data_noise: Array
     """Covariance of the last gradient's noise by the measurements (U, U)."""
-    is_thick: bool
-    """See ``GaussNewton.is_thick``."""
     matrix_error_gradient: Array
     """Error of the last step by the noise of the matrix, as a gradient: ``matrix_error`` times the step (U,)."""
 
@@ -160,7 +133,7 @@ class GaussNewton:
         state = self.init(self.coordinates.initial_medium(material))
         steps = 0
         converged = False
-        while steps < self.budget.most_steps and not converged:
+        while steps < self.budget.max_steps and not converged:
             state, converged = self.step(state)
             steps += 1
         self.is_searching = False
@@ -211,8 +184,13 @@ class GaussNewton:
         while checkpoint.stage < len(self.budget.last):
             if self.checkpoint_file is not None:
                 self.checkpoint_file.write(checkpoint)
-            material, (paths, batches) = checkpoint.material, self.budget.last[checkpoint.stage]
-            equations = self.linearised(material, paths, batches, combine=self.is_thick(material))
+            material, stage = checkpoint.material, self.budget.last[checkpoint.stage]
+            is_thick, is_last = self.is_thick(material), checkpoint.stage + 1 == len(self.budget.last)
+            # Weights of a thin cell contain the noise of all renders that the last stage may combine.
+            share = 1 / stage.thin_steps if is_last and not is_thick and self.combines(material) else 1.0
+            equations = self.linearised(
+                material, stage.paths, stage.batches, combine=is_thick or is_last, noise_share=share
+            )
             x = self.coordinates.unknowns(material)
             # Where residuals of nearby media are combined, the gradient is that at the mean of these media.
             centre = equations.residuals.place if self.combines(material) else x
@@ -223,30 +201,29 @@ class GaussNewton:
             moved = self.coordinates.material_at(x + change)
             gain = predicted_fall(quadratic, prior, x, change) / noise_fall(quadratic, prior, equations.gradient_noise)
             path_variance = 0.0
-            if self.is_thick(material) and self.combines(material) and checkpoint.stage + 1 == len(self.budget.last):
+            if is_last and self.combines(material):
                 data = noise_fall(quadratic, prior, equations.data_noise)
                 path_variance = noise_fall(quadratic, prior, equations.gradient_noise) / data
-            checkpoint = self.next_checkpoint(checkpoint, moved, gain, path_variance)
+            checkpoint = self.next_checkpoint(checkpoint, stage, moved, gain, path_variance)
         return Solution(
             moved, quadratic, equations.gradient_noise, scale, equations.used, checkpoint.search_steps,
             checkpoint.is_converged and gain < UNCONVERGED_RATIO, self.paths,
             self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
-            self.is_thick(moved),
             equations.matrix_error @ (self.coordinates.unknowns(moved) - x),
         )  # fmt: skip
 
-    def next_checkpoint(self, checkpoint: Checkpoint, moved: Material, gain: float, path_variance: float) -> Checkpoint:
+    def next_checkpoint(
+        self, checkpoint: Checkpoint, stage: Stage, moved: Material, gain: float, path_variance: float
+    ) -> Checkpoint:
         """The state before the next step of the stage, or before the first of the next stage where this one has ended.
 
         Args:
             gain: fall that the last step promised, in units of the fall that noise alone promises.
-            path_variance: variance by the paths in units of that by the measurements, where renders of a stage are
-                combined; else 0.
+            path_variance: variance by the paths in units of that by the measurements, where residuals of the last
+                stage's renders are combined; else 0.
         """
         thick = self.is_thick(moved)
-        min_gain, max_steps = (
-            (PROMISE_RATIO_THICK, self.budget.most_last_thick) if thick else (PROMISE_RATIO, self.budget.most_last)
-        )
+        min_gain, max_steps = PROMISE_RATIO_THICK if thick else PROMISE_RATIO, stage.max_steps(thick=thick)
         is_near = abs(math.log(moved.scattering_per_mm / checkpoint.material.scattering_per_mm)) < MAX_COMBINED_CHANGE
         is_over = (
             gain < min_gain and path_variance < MAX_PATH_VARIANCE and (is_near or not thick)
@@ -302,12 +279,15 @@ class GaussNewton:
             second = first + broad_step(quadratic, prior, broad[:, :-1], reach[:-1], noise, first)
         return self.coordinates.similarity_step(self.coordinates.clipped_step(second - x, around), around)
 
-    def linearised(self, material: Material, paths: int, batches: int, *, combine: bool = False) -> NormalEquations:
+    def linearised(
+        self, material: Material, paths: int, batches: int, *, combine: bool = False, noise_share: float = 1.0
+    ) -> NormalEquations:
         """Normal equations of fresh batches.
 
         Args:
             combine: whether derivatives of the stage's earlier renders are added. Weights then stay those of the first
                 of them.
+            noise_share: share of the variance by this number of paths that the weights contain.
         """
         self.renders += 1
         self.paths += paths * batches * len(self.rig.lights)
@@ -334,10 +314,10 @@ class GaussNewton:
         if self.is_broad(material):
             estimates = self.smoother(before, variances, [one / (batches * paths) for one in recent]).of(estimates)
         self.multiple = (multiple + before) / 2
-        noise = [one / (batches * paths) for one in known]
-        if not self.is_thick(material):
-            # In a thin cell each camera sees other scatterings: their noise is hardly correlated, and an estimate of
-            # the correlation would only add noise.
+        noise = [noise_share * one / (batches * paths) for one in known]
+        if not (combine or self.is_thick(material)):
+            # The few batches of the search estimate the correlation of cameras too roughly for weights of a thin cell,
+            # in which the paths' noise is not nearly all of it.
             noise = [one * np.eye(one.shape[1]) for one in noise]
         weights = weights_of(images, variances, noise)
         self.path_noise = tuple((first + second) / 2 for first, second in zip(own, recent, strict=True))

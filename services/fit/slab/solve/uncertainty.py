@@ -52,9 +52,8 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     """Covariances at a solution.
 
     The unbiased matrix is indefinite where it is noise, and the matrix with the noise included would promise too much:
-    so only directions whose curvature stands out count. In thin cells the weights contain the images' Monte Carlo
-    noise, as they do the shot noise. In thick ones, where it is the larger part, the gradient's noise is that measured
-    between batches, and the displacement left to the minimum counts as error.
+    so only directions whose curvature stands out count. The gradient's noise is that of the measurements, and that of
+    the paths as measured between batches; the displacement left to the minimum counts as error.
     """
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
@@ -65,17 +64,15 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     )
     chosen: Array = np.asarray(np.linalg.inv(directions.total + bounds), dtype=np.float64)
     alone: Array = np.asarray(np.linalg.inv(weak_directions.total + weak_bounds), dtype=np.float64)
-    if solution.is_thick:
-        noise = (
-            solution.data_noise
-            + solution.gradient_noise
-            + np.outer(solution.matrix_error_gradient, solution.matrix_error_gradient)
-        )
-        chosen = chosen @ (directions.noise(noise) + priors[0] + bounds) @ chosen
-        remaining = _remaining_square(solution, x, priors[0], chosen)
-        # Flags ask what the prior adds, so the covariance under the weak prior has only the noise that the weights
-        # contain.
-        chosen, alone = chosen + remaining, alone + remaining
+    noise = (
+        solution.data_noise
+        + solution.gradient_noise
+        + np.outer(solution.matrix_error_gradient, solution.matrix_error_gradient)
+    )
+    chosen = chosen @ (directions.noise(noise) + priors[0] + bounds) @ chosen
+    remaining = _remaining_square(solution, x, priors[0], chosen)
+    # Flags ask what the prior adds, so the covariance under the weak prior has only the noise that the weights contain.
+    chosen, alone = chosen + remaining, alone + remaining
     if (chain := coordinates.chain(material)) is None:
         return Uncertainty(chosen, alone, (chosen, alone))
     return Uncertainty(chain @ chosen @ chain.T, chain @ alone @ chain.T, (chosen, alone))
