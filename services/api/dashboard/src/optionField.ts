@@ -169,6 +169,7 @@ function table(text: string): Record<string, unknown> {
 
 function words(name: string): string {
   if (name === "ior") return "Index of refraction";
+  if (name === "fdi") return "FDI number";
   const text = (name.split(".").at(-1) ?? name).replace(/_(s|px|mm|deg)$/, "").replaceAll("_", " ");
   return text[0]?.toUpperCase() + text.slice(1);
 }
