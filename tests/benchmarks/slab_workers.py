@@ -42,10 +42,10 @@ def write_cell(root: Path, *wavelengths_nm: float) -> Path:
     """Write a folder of the cell with images by the fit's own walk and shot noise of 1 %; returns its path."""
     root.mkdir()
     noise = np.random.default_rng(1)
-    folder = near_beam_folder(wavelengths_nm=list(wavelengths_nm))
-    description, entries = folder.model_dump(mode="json"), []
+    folder = near_beam_folder()
+    description, entries = folder.model_dump(mode="json") | {"wavelengths_nm": list(wavelengths_nm)}, []
+    rig = rig_of(folder, folder.wavelengths_nm[0])
     for nm in wavelengths_nm:
-        rig = rig_of(folder, nm)
         images = render(
             rig, henyey_greenstein(*MEDIA[nm]), seed=99, step=0, batches=1, paths=TRUTH_PATHS, scores=False
         ).mean
