@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -18,11 +21,13 @@ from services.core.geometry import Mesh
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.slab.simulate import Layer, simulate_slab, specular_share
 from services.fit.transport.engine import Engine
+from services.fit.transport.lighting.lights import DARKEST_CHANCE, ShadowRay
+from services.fit.transport.paths.connections import Connections, LookupCheck
 from services.fit.transport.platform import prepare_device
 from services.fit.transport.scene.nesting import winding_number
 from services.fit.transport.scene.recipe import SceneRecipe, single_tooth
 from tests.support.slab_tables import total_cases
-from tests.support.small_tooth import LIGHTS_MM, camera_at, whole_view
+from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, whole_view
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
 
 SETS = 2200
@@ -45,6 +50,29 @@ def test_formulas_hold_in_every_corner(corners: Corners) -> None:
     assert sum(row.non_finite for row in rows) == 0
     # Each bound counts the roundings of its formula (``Formula.reason``).
     assert [(row.quantity, row.region, row.error) for row in rows if row.bound is None or row.error > row.bound] == []
+
+
+def test_no_shadow_ray_is_cast_where_its_weight_would_be_0_over_0(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Such a weight, NaN, reached the images on CUDA; LLVM's code made 0 of it. So mark it by infinity, and let no
+    # transmittance be 0.
+    original = Connections._connect_by_maps
+
+    def marked(self: Connections, *args: Any) -> tuple[LookupCheck, mi.PCG32]:
+        check, rng = original(self, *args)
+        underflows = check.importance * DARKEST_CHANCE < float(np.finfo(np.float32).tiny)
+        check.weight = dr.select(underflows & (check.total > 0), mi.Float(float("inf")), check.weight)
+        return check, rng
+
+    def transmittance(ray: ShadowRay) -> mi.Float:
+        return ray.surface * dr.maximum(dr.exp(-ray.depth), 1e-37)
+
+    monkeypatch.setattr(Connections, "_connect_by_maps", marked)
+    monkeypatch.setattr(ShadowRay, "transmittance", transmittance)
+    tissue = Tissue(Medium(1.0, 0.999, g1=0.8), Medium(70.0, 0.9999, g1=0.9))
+    outer, dentin = ellipsoid(SEMI_AXES_MM), DentinShape.known(dentin_shape().base)
+    engine = Engine(single_tooth(outer, dentin, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY)))
+    images = engine.images(tissue, whole_view(camera_at((0.2, 1, 0.1))), samples=256, seed=3)
+    assert np.isfinite(images.mean).all()
 
 
 def test_the_walk_holds_in_every_corner(corners: Corners) -> None:

@@ -26,6 +26,9 @@ shadow rays check."""
 MAP_ERROR_FLOOR = 0.003
 """Bound added to that one, relative to the largest possible contribution of the vertex, so that no connection goes
 unchecked."""
+FAINTEST = 1e-20
+"""Contribution of a vertex, as a share of the lights' mean irradiance, below which it is not worth a shadow ray: it is
+below float32 resolution of any sum, and deep in a dense medium the quotient of such numbers is 0 / 0 in float32."""
 
 
 @dataclass
@@ -122,7 +125,7 @@ class Connections:
             # Correct the maps' transmittance to one light by a shadow ray, cast with a probability proportional to the
             # assumed error.
             chance = dr.clip(ROULETTE_GAIN * check.total * self.lights.inverse_irradiance, DARKEST_CHANCE, 1)
-            casts = active & (check.total > 0) & (rng.next_float32() < chance)
+            casts = active & (check.total * self.lights.inverse_irradiance > FAINTEST) & (rng.next_float32() < chance)
             weight = check.weight * check.total / (check.importance * chance)
             if isinstance(tally, StainTally):
                 tally.credit(lane, vertex.stains[0], check.expected_sum[0], active)
