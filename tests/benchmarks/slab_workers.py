@@ -1,4 +1,4 @@
-"""The time of a slab's fit on one worker and on two, in turns, on an idle machine of two cores; about ten minutes.
+"""The time of a slab's fit on one worker and on two, in turns, on an idle machine of two cores; about 20 minutes.
 
 python -m tests.benchmarks.slab_workers --pairs 3 --json slab_workers.json
 
@@ -34,7 +34,9 @@ from services.fit.slab.results.result import SlabReport
 MEDIA = {532.0: (1.0, 0.8, 0.03), 635.0: (0.8, 0.7, 0.02)}
 """Scattering per mm, mean cosine and absorption per mm by wavelength, nm."""
 NOISE = 0.01
-TRUTH_PATHS = 200_000
+TRUTH_PATHS = 4_000_000
+"""Number of paths per light of the images, so that their own noise is small beside the shot noise: with 200,000 the fit
+met images of far more noise than they stated, and lost its way."""
 WARMING_EFFORT = 0.01
 
 
@@ -114,7 +116,7 @@ def main() -> None:
     """Run the pairs of both cases in turns, and swap the order of one and two workers each time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=3)
-    parser.add_argument("--effort", type=float, default=0.5)
+    parser.add_argument("--effort", type=float, default=1.0)
     parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     rows: list[dict[str, Any]] = json.loads(arguments.json.read_text()) if arguments.json.exists() else []

@@ -21,7 +21,7 @@ from services.core.results import Estimate
 from services.core.slab.dictionaries import DICTIONARIES
 from services.core.slab.folder import SlabFolder, read_folder
 from services.fit.execution.numerics import numerics_name
-from services.fit.slab.diagnosis import mixture_faults
+from services.fit.slab.diagnosis import misfit_faults
 from services.fit.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
 from services.fit.slab.dictionaries.mie import scattered
 from services.fit.slab.fit import fit_slab, write_results
@@ -213,10 +213,15 @@ def test_a_mix_of_a_dictionary_is_found(
 
 
 def test_a_material_that_is_no_mix_is_told() -> None:
-    assert mixture_faults("hg", 520.0, 5.0, 1000) == ()
-    (sentence,) = mixture_faults("hg", 2000.0, 5.0, 1000)
+    assert misfit_faults("hg", 520.0, 5.0, 1000) == ()
+    (sentence,) = misfit_faults("hg", 2000.0, 5.0, 1000)
     assert sentence.startswith("The images differ from the nearest mix of dictionary hg by 2 times their noise")
-    assert mixture_faults("tents", 2000.0, 5.0, 1000) == ()
+
+
+def test_images_that_differ_from_a_fit_by_tents_are_told() -> None:
+    assert misfit_faults("tents", 1000.0, 5.0, 1000) == ()
+    (sentence,) = misfit_faults("tents", 72_000.0, 5.0, 1000)
+    assert sentence.startswith("The images differ from the fit by 12 times their noise")
 
 
 def saved(array: np.ndarray) -> Callable[[Path], None]:

@@ -31,6 +31,9 @@ noise."""
 MAX_MISFIT_SIGMAS = 5.0
 """Largest excess of the squared residuals over the noise, in standard errors, before a dictionary is doubted: the
 chance is 3e-7 a fit."""
+MAX_SQUARES = 2.0
+"""Mean of the squared residuals over their variances above which a fit by tents is doubted: variances that are stated
+only roughly give values near 1."""
 MIN_LIT = 0.5
 """Smallest share of an image's maximum at which a pixel counts for the position of the beam."""
 MAX_BEAM_OFFSET = 1.0
@@ -119,8 +122,11 @@ def similarity_faults(material: Material, width_mm: float, *, scattering: bool, 
     return (f"{what}. Take σs, g and the phase function with their ± alone; to tell them apart, {remedy}.",)
 
 
-def mixture_faults(dictionary: str, misfit: float, misfit_se: float, values: int) -> tuple[str, ...]:
-    """A sentence where no mix of a dictionary of few atoms can make the images; the tents can make any.
+def misfit_faults(dictionary: str, misfit: float, misfit_se: float, values: int) -> tuple[str, ...]:
+    """A sentence where the images differ from the fit by more than their noise.
+
+    A dictionary of few atoms may lack the material. The tents can make any, so with them the images' variances, the
+    description of the cell, or the search is at fault.
 
     Args:
         misfit: half the weighted squares at the solution.
@@ -128,10 +134,19 @@ def mixture_faults(dictionary: str, misfit: float, misfit_se: float, values: int
         values: number of the weighted squares.
     """
     squares, error = 2 * misfit / values, math.hypot(math.sqrt(2 / values), 2 * misfit_se / values)
-    if dictionary == DEFAULT_DICTIONARY or squares <= 1 + MAX_MISFIT_SIGMAS * error:
+    is_default = dictionary == DEFAULT_DICTIONARY
+    if squares <= (MAX_SQUARES if is_default else 1) + MAX_MISFIT_SIGMAS * error:
         return ()
-    what = (
-        f"The images differ from the nearest mix of dictionary {dictionary} by {math.sqrt(squares):.2g} times their"
-        " noise"
-    )
-    return (f"{what}: the material may be no such mix, and then ± say too little; compare with {DEFAULT_DICTIONARY}.",)
+    ratio = math.sqrt(squares)
+    times = f"by {ratio:.0f} times their noise" if ratio >= 10 else f"by {ratio:.2g} times their noise"
+    if is_default:
+        sentence = (
+            f"The images differ from the fit {times}, so its ± say too little: check their variances, and then the"
+            " cell, the beam and the angles that the folder describes."
+        )
+    else:
+        sentence = (
+            f"The images differ from the nearest mix of dictionary {dictionary} {times}: the material may be no such"
+            f" mix, and then ± say too little; compare with {DEFAULT_DICTIONARY}."
+        )
+    return (sentence,)

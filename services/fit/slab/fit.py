@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from services.core.slab.folder import SlabFolder, read_folder
 from services.core.store import write_atomic
-from services.fit.slab.diagnosis import mixture_faults, sample_faults, similarity_faults
+from services.fit.slab.diagnosis import misfit_faults, sample_faults, similarity_faults
 from services.fit.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
 from services.fit.slab.images import Measurements, read_images
 from services.fit.slab.model.dictionary import Material
@@ -116,7 +116,7 @@ def fit_images(
             scattering=parameters.sigma_s.determined,
             reduced=parameters.sigma_s_reduced.determined,
         )
-        + mixture_faults(options.dictionary, solution.misfit, solution.misfit_se, solution.used)
+        + misfit_faults(options.dictionary, solution.misfit, solution.misfit_se, solution.used)
         + _notes(measured, phase, converged=solution.converged)
         + ((advice,) if advice else ()),
         converged=solution.converged,

@@ -27,6 +27,10 @@ MAX_TRAVELLING_BYTES = 32 * 2**20
 """Largest size of a block's sums that may be sent to another worker: its paths take seconds, in which any network
 between workers carries ten times that. Larger sums stay on their worker."""
 
+TASKS_PER_THREAD = 4
+"""Number of tasks into which a render's blocks are divided, per thread of the workers: each task costs some
+milliseconds, and several per thread keep all threads busy until the end."""
+
 
 @dataclass(frozen=True)
 class WavelengthTask:
@@ -79,10 +83,15 @@ def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
     return fit_wavelength(task, blocks)
 
 
-def block_task(_host: Any, trace: Callable[[Block], BlockSums], block: Block, flag: Path) -> BlockSums:
-    """Trace one block of paths."""
-    _raise_if_cancelled(flag)
-    return trace(block)
+def blocks_task(
+    _host: Any, trace: Callable[[Block], BlockSums], blocks: Sequence[Block], flag: Path
+) -> list[BlockSums]:
+    """Trace some blocks of paths, one after the other."""
+    sums = []
+    for block in blocks:
+        _raise_if_cancelled(flag)
+        sums.append(trace(block))
+    return sums
 
 
 def fit_wavelength(
@@ -111,8 +120,12 @@ def _spread(run_on: Executor, task: WavelengthTask) -> Blocks:
     def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> list[BlockSums]:
         _raise_if_cancelled(task.flag)
         name = f"{task.wavelength_nm:g}-{next(numbers)}"
-        pending = [run_on.submit(f"{name}-{k}", block_task, trace, block, task.flag) for k, block in enumerate(some)]
-        return run_on.gather(pending)
+        size = max(1, len(some) // (TASKS_PER_THREAD * run_on.threads()))
+        pending = [
+            run_on.submit(f"{name}-{first}", blocks_task, trace, some[first : first + size], task.flag)
+            for first in range(0, len(some), size)
+        ]
+        return list(itertools.chain.from_iterable(run_on.gather(pending)))
 
     return blocks
 

@@ -42,7 +42,7 @@ def reflectance(cosine, eta):  # type: ignore[no-untyped-def]  # compiled
     return 0.5 * (s * s + p * p)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def sample_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
     """Whether light comes back from a face, its displacement in the glass in units of its lateral direction, and the
     next random state.
@@ -73,7 +73,7 @@ def sample_face(cosine, glass, state):  # type: ignore[no-untyped-def]  # compil
             return True, shift, state
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def sample_reflected_shift(cosine, glass, state):  # type: ignore[no-untyped-def]  # compiled
     """Displacement in the glass of light that comes back, in units of its lateral direction, and the next random
     state.
@@ -128,7 +128,7 @@ def beam_offset(beam, state):  # type: ignore[no-untyped-def]  # compiled
     return radius * math.cos(2 * math.pi * v) * beam[1], radius * math.sin(2 * math.pi * v) * beam[2], state
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def trace(  # type: ignore[no-untyped-def]  # compiled
     key,
     paths,
