@@ -1,4 +1,4 @@
-"""The time of a slab's fit on one worker and on two, in turns, on an idle machine of two cores; about 20 minutes.
+"""The time of a slab's fit on one worker and on two, in turns, on an idle machine of two cores; about 15 minutes.
 
 python -m tests.benchmarks.slab_workers --pairs 3 --json slab_workers.json
 

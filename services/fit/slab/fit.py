@@ -167,7 +167,10 @@ def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> 
             f"The images do not determine the phase function {ranges} degrees; what is given there is the prior's."
         )
     if not converged:
-        notes.append("The search spent its steps before they stopped to help; the last steps were made all the same.")
+        notes.append(
+            "The fit has not converged: its search spent its steps, or its last step still promised far more than noise"
+            " does."
+        )
     return tuple(notes)
 
 

@@ -24,8 +24,8 @@ from services.fit.slab.results.stored import fingerprint, read_result, store_res
 from services.fit.slab.solve.checkpoint import Checkpoint, CheckpointFile
 
 MAX_TRAVELLING_BYTES = 32 * 2**20
-"""Largest size of a block's sums that may be sent to another worker: its paths take seconds, in which any network
-between workers carries ten times that. Larger sums stay on their worker."""
+"""Largest size of the sums that a task may send to another worker: their paths take seconds, in which any network
+between workers carries ten times that. Where one block's are larger, they stay on their worker."""
 
 TASKS_PER_THREAD = 4
 """Number of tasks into which a render's blocks are divided, per thread of the workers: each task costs some
@@ -65,11 +65,12 @@ def run_wavelengths(
     Raises:
         JobCancelledError: between two blocks of paths.
     """
-    if len(tasks) >= run_on.threads(workers) or not all(_may_travel(read_folder(task.root)) for task in tasks):
+    block_bytes = max((_block_bytes(read_folder(task.root)) for task in tasks), default=0)
+    if len(tasks) >= run_on.threads(workers) or block_bytes > MAX_TRAVELLING_BYTES:
         yield from run_on.as_completed([(f"{task.wavelength_nm:g}", wavelength_task, (task,)) for task in tasks])
         return
     for task in tasks:
-        yield fit_wavelength(task, _spread(run_on, task), partial(on_checkpoint, task.wavelength_nm))
+        yield fit_wavelength(task, _spread(run_on, task, block_bytes), partial(on_checkpoint, task.wavelength_nm))
 
 
 def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
@@ -113,14 +114,14 @@ def fit_wavelength(
     return task.place
 
 
-def _spread(run_on: Executor, task: WavelengthTask) -> Blocks:
+def _spread(run_on: Executor, task: WavelengthTask, block_bytes: int) -> Blocks:
     """A function that runs blocks on all workers and gives their sums in the order of the blocks."""
     numbers = itertools.count()
 
     def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> list[BlockSums]:
         _raise_if_cancelled(task.flag)
         name = f"{task.wavelength_nm:g}-{next(numbers)}"
-        size = max(1, len(some) // (TASKS_PER_THREAD * run_on.threads()))
+        size = max(1, min(len(some) // (TASKS_PER_THREAD * run_on.threads()), MAX_TRAVELLING_BYTES // block_bytes))
         pending = [
             run_on.submit(f"{name}-{first}", blocks_task, trace, some[first : first + size], task.flag)
             for first in range(0, len(some), size)
@@ -130,10 +131,9 @@ def _spread(run_on: Executor, task: WavelengthTask) -> Blocks:
     return blocks
 
 
-def _may_travel(folder: SlabFolder) -> bool:
-    """Whether a block's sums are small enough to leave their worker."""
-    values = len(folder.cameras) * folder.pixels.columns * folder.pixels.rows * (KNOTS + 2)
-    return 8 * values <= MAX_TRAVELLING_BYTES
+def _block_bytes(folder: SlabFolder) -> int:
+    """Largest size of a block's sums."""
+    return 8 * len(folder.cameras) * folder.pixels.columns * folder.pixels.rows * (KNOTS + 2)
 
 
 def _raise_if_cancelled(flag: Path) -> None:

@@ -139,11 +139,7 @@ class SlabReport(Record):
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
         summary = FitReport(
             converged=not stopped,
-            advice=(
-                f"The search at {', '.join(stopped)} spent its steps before they stopped to help; raise option effort."
-                if stopped
-                else ""
-            ),
+            advice=(f"The fit at {', '.join(stopped)} has not converged; raise option effort." if stopped else ""),
             parameters={},
             fit_error={f"{fit.wavelength_nm:g}": fit.errors.fit_error for fit in self.fits},
             held_out_error={name: error for name, error in held_out.items() if error is not None},
