@@ -8,8 +8,10 @@ with the standard deviation in ``SPREADS``. Five draws share one set of the fit'
 derivatives with weights from other batches, as at the end of a fit. They are solved as in the last steps of a fit: the
 prior's scale by evidence, then damped steps, the first from the unchanged medium. The ± are those of the fit.
 
-Batches are drawn from a pool without replacement. The combined renders of a fit's last stage have about eight times the
-paths; shot noise is therefore 2.83 times the usual 1 %, so that both have their usual part in the ±.
+Batches are drawn from a pool without replacement. The combined renders of a fit's last stage are about eight and have
+eight times the paths; shot noise is therefore 2.83 times the usual 1 %, so that both have their usual part in the ±.
+Their batches are smaller but nearly as many as a fit's: the variance of 24 batches is itself so uncertain that exact
+95 % intervals would contain the truth in 93.7 % of the draws; with 96 they do in 94.7 %.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ SPREADS = {"sigma_s": 0.03, "sigma_a": 0.01, "g": 0.01}
 """Standard deviations of the change: of sigma_s as a share of it, of sigma_a per mm, of g in units of 1."""
 NOISE = 0.01 * 8**0.5
 """Shot noise of a pixel that has its image's mean, as a share."""
-POOL, BATCHES, PATHS = 192, 24, 30_000
+POOL, BATCHES, PATHS = 768, 96, 7_500
 """Number of the fit's batches in the pool and in one set, and paths of a light and batch."""
 DRAWS_OF_A_SET = 5
 STEPS = 3
@@ -117,7 +119,7 @@ def batch_set(rig: Rig, material: Material, pool: Batches, variances: Array, dra
     weights = weights_of(images, variances, noise)
     batches = Batches(pool.images[chosen], pool.rows[chosen], pool.single_images, pool.single_rows)
     equations = normal_equations(batches, material, unchanged, weights)
-    mean = weights.whitened(derivative_rows(batches.rows.mean(axis=0), material)[None])[0]
+    mean = weights.whitened(derivative_rows(batches.rows.mean(axis=0, dtype=np.float64), material)[None])[0]
     return BatchSet(equations, weights, mean.reshape(-1, mean.shape[-1]))
 
 
@@ -205,7 +207,7 @@ def main() -> None:
     """Draw, and write the shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=2000)
-    parser.add_argument("--pool", type=int, default=POOL, help="batches; each takes 4 MB of memory")
+    parser.add_argument("--pool", type=int, default=POOL, help="batches; each takes 2 MB of memory")
     parser.add_argument("--photons", type=int, default=PHOTONS, help="of each image of the columns")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, required=True)

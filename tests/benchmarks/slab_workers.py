@@ -1,12 +1,13 @@
-"""The time of a slab's fit on one worker and on two, in turns, on an idle machine of two cores; about 15 minutes.
+"""The time of a slab's fit on one worker and on two, in turns, on an idle machine of two cores; about 25 minutes.
 
 python -m tests.benchmarks.slab_workers --pairs 3 --json slab_workers.json
 
-The cell of all slab benchmarks is fitted with two wavelengths, each of which runs whole on one worker, and with one
-wavelength, whose blocks of paths both workers share. Seconds are elapsed time from the submission of the fit's stage to
-its report; both clusters have run a short fit before, so that nothing is compiled in the measured ones. The efficiency
-is the time on one worker over twice the time on two. Results must agree to the last digit. The file keeps the pairs of
-an earlier run, and a new run continues after them.
+The cell of all slab benchmarks is fitted with two wavelengths, each of which runs whole on one worker, with one
+wavelength, whose blocks of paths both workers share, and with three, of which two run whole and the third is shared.
+Seconds are elapsed time from the submission of the fit's stage to its report; both clusters have run a short fit
+before, so that nothing is compiled in the measured ones. The efficiency is the time on one worker over twice the time
+on two. Results must agree to the last digit. The file keeps the pairs of an earlier run, and a new run continues after
+them.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
 from services.fit.slab.results.result import SlabReport
 
-MEDIA = {532.0: (1.0, 0.8, 0.03), 635.0: (0.8, 0.7, 0.02)}
+MEDIA = {532.0: (1.0, 0.8, 0.03), 635.0: (0.8, 0.7, 0.02), 488.0: (1.2, 0.8, 0.04)}
 """Scattering per mm, mean cosine and absorption per mm by wavelength, nm."""
 NOISE = 0.01
 TRUTH_PATHS = 4_000_000
@@ -113,7 +114,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run the pairs of both cases in turns, and swap the order of one and two workers each time."""
+    """Run the pairs of all cases in turns, and swap the order of one and two workers each time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--effort", type=float, default=1.0)
@@ -122,8 +123,9 @@ def main() -> None:
     rows: list[dict[str, Any]] = json.loads(arguments.json.read_text()) if arguments.json.exists() else []
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         cells = {
-            "two wavelengths": write_cell(Path(name) / "two", *MEDIA),
+            "two wavelengths": write_cell(Path(name) / "two", *list(MEDIA)[:2]),
             "blocks of one": write_cell(Path(name) / "one", next(iter(MEDIA))),
+            "three wavelengths": write_cell(Path(name) / "three", *MEDIA),
         }
         clusters = {count: stack.enter_context(workers(count)) for count in (1, 2)}
         for count, client in clusters.items():

@@ -25,6 +25,7 @@ from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, ima
 from services.fit.slab.solve.budget import Budget
 from services.fit.slab.solve.checkpoint import CheckpointFile
 from services.fit.slab.solve.gauss_newton import GaussNewton
+from services.fit.slab.solve.normal import Each
 from services.fit.slab.solve.start import start
 from services.fit.slab.solve.uncertainty import uncertainty_of
 from services.fit.slab.through_beam import index_of
@@ -75,12 +76,14 @@ def fit_images(
     blocks: Blocks,
     dictionary: ChosenDictionary,
     checkpoint_file: CheckpointFile | None = None,
+    each: Each = map,
 ) -> Wavelength:
     """Fit the images of one wavelength by the dictionary that the options name; see ``fit_slab``.
 
     Args:
         checkpoint_file: file from which an interrupted fit continues, and which stores its state before each of the
             last steps.
+        each: function that computes with batch after batch in this process, such as that of a pool of threads.
     """
     begun_s = time.process_time()
     index = index_of(folder, wavelength_nm)
@@ -93,6 +96,7 @@ def fit_images(
         blocks,
         dictionary.coordinates,
         checkpoint_file=checkpoint_file,
+        each=each,
     )
     solution = solver.solve(lambda: start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)

@@ -5,7 +5,9 @@ workers.
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +24,7 @@ from services.fit.slab.model.forward import Block, Blocks, BlockSums
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.stored import fingerprint, read_result, store_result
 from services.fit.slab.solve.checkpoint import Checkpoint, CheckpointFile
+from services.fit.slab.solve.normal import Each
 
 MAX_TRAVELLING_BYTES = 32 * 2**20
 """Largest size of the sums that a task may send to another worker: their paths take seconds, in which any network
@@ -54,9 +57,9 @@ def run_wavelengths(
 ) -> Iterator[Path]:
     """Fit the wavelengths that no earlier attempt has fitted; gives the folder of each as soon as it is done.
 
-    With as many wavelengths as workers or more, each runs whole on one of them. With fewer, one runs after the other
-    here, and its blocks on all workers. A block's sums depend on its description alone and are added in the order of
-    the blocks, so the answer is the same to the last digit.
+    First as many wavelengths as are a multiple of the workers run, each whole on one of them. Those that are left run
+    one after the other here, and their blocks on all workers. A block's sums depend on its description alone and are
+    added in the order of the blocks, so the answer is the same to the last digit.
 
     Args:
         workers: number of workers that the job asked for; some may still be starting.
@@ -66,11 +69,15 @@ def run_wavelengths(
         JobCancelledError: between two blocks of paths.
     """
     block_bytes = max((_block_bytes(read_folder(task.root)) for task in tasks), default=0)
-    if len(tasks) >= run_on.threads(workers) or block_bytes > MAX_TRAVELLING_BYTES:
-        yield from run_on.as_completed([(f"{task.wavelength_nm:g}", wavelength_task, (task,)) for task in tasks])
-        return
-    for task in tasks:
-        yield fit_wavelength(task, _spread(run_on, task, block_bytes), partial(on_checkpoint, task.wavelength_nm))
+    threads = run_on.threads(workers)
+    shared = 0 if block_bytes > MAX_TRAVELLING_BYTES else len(tasks) % threads
+    whole = tasks[: len(tasks) - shared]
+    yield from run_on.as_completed([(f"{task.wavelength_nm:g}", wavelength_task, (task,)) for task in whole])
+    # While this process computes with the workers' sums, they wait, and it may use as many threads as they have.
+    with ThreadPoolExecutor(min(threads, os.cpu_count() or 1)) as pool:
+        for task in tasks[len(whole) :]:
+            on_step = partial(on_checkpoint, task.wavelength_nm)
+            yield fit_wavelength(task, _spread(run_on, task, block_bytes), on_step, pool.map)
 
 
 def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
@@ -96,7 +103,10 @@ def blocks_task(
 
 
 def fit_wavelength(
-    task: WavelengthTask, blocks: Blocks, on_checkpoint: Callable[[Checkpoint], None] = lambda _: None
+    task: WavelengthTask,
+    blocks: Blocks,
+    on_checkpoint: Callable[[Checkpoint], None] = lambda _: None,
+    each: Each = map,
 ) -> Path:
     """Fit one wavelength into its folder, unless an earlier attempt has; a fit that was cut short continues before the
     last step that it saved.
@@ -108,7 +118,7 @@ def fit_wavelength(
         measured = read_images(task.root, folder, task.wavelength_nm)
         dictionary = dictionary_of(task.root, folder, task.wavelength_nm, task.options)
         checkpoint_file = CheckpointFile(task.place, digest, on_checkpoint)
-        fit = fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary, checkpoint_file)
+        fit = fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary, checkpoint_file, each)
         store_result(task.place, digest, fit)
         checkpoint_file.remove()
     return task.place
@@ -133,7 +143,7 @@ def _spread(run_on: Executor, task: WavelengthTask, block_bytes: int) -> Blocks:
 
 def _block_bytes(folder: SlabFolder) -> int:
     """Largest size of a block's sums."""
-    return 8 * len(folder.cameras) * folder.pixels.columns * folder.pixels.rows * (KNOTS + 2)
+    return len(folder.cameras) * folder.pixels.columns * folder.pixels.rows * (8 + 4 * (KNOTS + 1))
 
 
 def _raise_if_cancelled(flag: Path) -> None:

@@ -22,6 +22,7 @@ from services.fit.slab.model.single import single_scattering
 from services.fit.slab.model.tables import tables_of
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
 
 THICK, THICK_SHARE = 4.0, 0.25
 """Optical thickness above which only ``THICK_SHARE`` of the late vertices are connected to cameras: 1.5 times faster
@@ -47,8 +48,9 @@ class BlockSums:
 
     images: Array
     """(cameras, pixels), scattering orders two and up."""
-    rows: Array
-    """Sums of shares and path lengths (cameras, pixels, KNOTS + 1), empty without scores."""
+    rows: Floats
+    """Sums of shares and path lengths (cameras, pixels, KNOTS + 1), empty without scores. They are rounded, far below
+    the noise of the paths, because they are most of what travels between workers."""
     totals: Array
     """Scattered light that leaves by the light's face, by the other face, and that was cut off (3,)."""
 
@@ -67,7 +69,8 @@ class Batches:
     """
 
     images: Array
-    rows: Array
+    rows: Floats
+    """Rounded as those of ``BlockSums``."""
     single_images: Array
     """Light that has scattered once, which is the same in all batches and has no noise (images, pixels)."""
     single_rows: Array
@@ -100,7 +103,7 @@ def run_block(block: Block) -> BlockSums:
         raise NonFiniteError(
             f"A slab's images are not finite at {np.count_nonzero(~np.isfinite(images))} pixels; report the parameters."
         )
-    return BlockSums(images / block.paths, rows / block.paths, totals / block.paths)
+    return BlockSums(images / block.paths, (rows / block.paths).astype(np.float32), totals / block.paths)
 
 
 def render(
@@ -112,13 +115,13 @@ def render(
         Block(rig, light, material, seed, (step, batch), paths, scores) for batch in range(batches) for light in lights
     ]
     first_images, first_rows = single_scattering(rig, material, scores=scores)
-    images = np.repeat(first_images[None], batches, axis=0)
-    rows = np.repeat(first_rows[None], batches, axis=0)
+    images = np.empty((batches, *first_images.shape))
+    rows = np.empty((batches, *first_rows.shape), np.float32)
     for block, sums in zip(tasks, blocks(run_block, tasks), strict=True):
         number, own = block.place[-1], rig.lights[block.light].images
-        images[number, own] += sums.images
+        images[number, own] = first_images[own] + sums.images
         if scores:
-            rows[number, own] += sums.rows
+            rows[number, own] = first_rows[own] + sums.rows
     return Batches(images, rows, first_images, first_rows)
 
 

@@ -23,7 +23,7 @@ from services.fit.slab.solve.budget import Budget, Stage
 from services.fit.slab.solve.checkpoint import Checkpoint, CheckpointFile, CombinedRenders
 from services.fit.slab.solve.coordinates import Coordinates
 from services.fit.slab.solve.measured_directions import broad_step, noise_ratio, step_matrix
-from services.fit.slab.solve.normal import NormalEquations, ResidualSums, normal_equations
+from services.fit.slab.solve.normal import Each, NormalEquations, ResidualSums, normal_equations
 from services.fit.slab.solve.prior import Quadratic, is_thick
 from services.fit.slab.solve.smooth import Smoother, smoother_of
 from services.fit.slab.solve.weights import smoothed_covariance, weights_of
@@ -113,6 +113,8 @@ class GaussNewton:
     """Whether the fit may still be far off: then steps use smooth derivatives and broad directions in any cell."""
     checkpoint_file: CheckpointFile | None = None
     """File that stores the state of the fit and from which the fit continues; None for neither."""
+    each: Each = map
+    """See ``normal_equations``."""
 
     def solve(self, guess: Callable[[], Material]) -> Solution:
         """The solution, from a guess, or from the state that an earlier attempt saved before a step of the last
@@ -328,6 +330,7 @@ class GaussNewton:
             weights,
             None if earlier is None else earlier.derivatives,
             self.nearby_residuals(earlier, material),
+            self.each,
         )
         self.combined = CombinedRenders(equations.derivatives, equations.residuals, known) if combine else None
         return equations.chained(self.coordinates.chain(material))

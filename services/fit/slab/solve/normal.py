@@ -18,7 +18,9 @@ the mean of all their media, with the divisor R (B + E - 1) for residuals of R b
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,10 @@ from services.fit.slab.model.forward import Batches
 from services.fit.slab.solve.weights import Weights
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+
+Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""A function like ``map``."""
 
 UNKNOWNS = KNOTS + 1
 """Number of variables of the forward model's derivatives: ln f at the knots, and sigma_a in per mm."""
@@ -136,12 +142,21 @@ class NormalEquations:
         )
 
 
-def derivative_rows(rows: Array, material: Material) -> Array:
+def derivative_rows(rows: Floats, material: Material) -> Array:
     """Derivatives with respect to ln f and sigma_a from sums of shares and path lengths (..., KNOTS + 1)."""
-    lengths = rows[..., KNOTS:]
-    return np.concatenate(
-        [rows[..., :KNOTS] - lengths * (material.scattering * tent_solid_angles()), -lengths], axis=-1
-    )
+    lengths = rows[..., KNOTS:].astype(np.float64)
+    derivatives = np.empty(rows.shape)
+    np.subtract(rows[..., :KNOTS], lengths * (material.scattering * tent_solid_angles()), out=derivatives[..., :KNOTS])
+    derivatives[..., KNOTS:] = -lengths
+    return derivatives
+
+
+def _summed(arrays: Sequence[Array]) -> Array:
+    """Sum of arrays, one after the other: stacked as for ``np.sum`` they would be copied first."""
+    total = arrays[0].copy()
+    for array in arrays[1:]:
+        total += array
+    return total
 
 
 def normal_equations(
@@ -151,6 +166,7 @@ def normal_equations(
     weights: Weights,
     earlier: DerivativeSums | None = None,
     nearby: ResidualSums | None = None,
+    each: Each = map,
 ) -> NormalEquations:
     """Normal equations from all pixels that have weight.
 
@@ -158,6 +174,7 @@ def normal_equations(
         values: measurements (images, pixels).
         earlier: derivatives of earlier batches, whitened by the same weights.
         nearby: residuals of some of these batches, of nearby media.
+        each: function that works on batch after batch, such as that of a pool of threads.
     """
     residuals = weights.whitened(batches.images - values).reshape(len(batches.images), -1)
     count = len(residuals)
@@ -167,27 +184,31 @@ def normal_equations(
     misfit = 0.5 * float(products.sum())
 
     # One pass sums the derivatives over each half of the batches, the second pairs each batch with the others.
-    jacobians = [weights.whitened(derivative_rows(rows, material)[None])[0] for rows in batches.rows]
+    jacobians = list(each(lambda rows: weights.whitened(derivative_rows(rows, material)[None])[0], batches.rows))
     middle = count // 2
-    halves = np.stack([np.sum(half, axis=0).reshape(-1, UNKNOWNS) for half in (jacobians[:middle], jacobians[middle:])])
+    in_halves = jacobians[:middle], jacobians[middle:]
+    halves = np.stack([half.reshape(-1, UNKNOWNS) for half in each(_summed, in_halves)])
     before = np.zeros_like(halves[0]) if earlier is None else earlier.halves.sum(axis=0)
     others = count - 1 + (0 if earlier is None else earlier.count)
     whole = halves.sum(axis=0) + before
-    own = np.zeros((2, UNKNOWNS, UNKNOWNS))
-    own_data = np.zeros((UNKNOWNS, UNKNOWNS))
-    terms = np.zeros((count, UNKNOWNS))
-    for number, (term, residual, whitened) in enumerate(zip(terms, residuals, jacobians, strict=True)):
-        jacobian = whitened.reshape(-1, UNKNOWNS)
-        own[int(number >= middle)] += jacobian.T @ jacobian
-        scattered = weights.of_measurements(whitened[None])[0].reshape(-1, UNKNOWNS)
-        own_data += scattered.T @ scattered
-        term[:] = (jacobian.T @ (total - residual) + (whole - jacobian).T @ residual) / others
+
+    def products_of(batch: int) -> tuple[Array, Array, Array, Array]:
+        jacobian, residual = jacobians[batch].reshape(-1, UNKNOWNS), residuals[batch]
+        scattered = weights.of_measurements(jacobians[batch][None])[0].reshape(-1, UNKNOWNS)
+        own_product = jacobian.T @ residual
+        term = (jacobian.T @ total - 2 * own_product + whole.T @ residual) / others
+        return jacobian.T @ jacobian, scattered.T @ scattered, own_product, term
+
+    squares, data_squares, own_products, terms = (
+        np.stack(one) for one in zip(*each(products_of, range(count)), strict=True)
+    )
+    own = np.stack([squares[:middle].sum(axis=0), squares[middle:].sum(axis=0)])
+    own_data = data_squares.sum(axis=0)
     present = DerivativeSums(halves, own, (middle, count - middle))
     every = present if earlier is None else earlier + present
     matrix = every.matrix()
     place = np.append(np.log(material.scattering), material.absorption_per_mm)
-    own_products = np.sum([j.reshape(-1, UNKNOWNS).T @ r for j, r in zip(jacobians, residuals, strict=True)], axis=0)
-    sums = ResidualSums(total, own_products, count, place)
+    sums = ResidualSums(total, own_products.sum(axis=0), count, place)
     sums = sums if nearby is None else sums + nearby
     gradient = (whole.T @ sums.total - sums.products) / (sums.count * others)
     # The gradient is a U-statistic of batches: its variance is that of a batch's part, twice the mean over its pairs.
