@@ -104,9 +104,13 @@ def _arriving(folder: SlabFolder, light: Light, index: float) -> tuple[float, ..
     )  # fmt: skip
 
 
-def _leaving(camera: Any, index: float) -> tuple[float, float]:
-    """Return the sine in the medium of light that reaches the camera, and the sign of its z."""
-    return math.sin(math.radians(camera.angle_deg)) / index, -1.0 if camera.side == "front" else 1.0
+def _leaving(camera: Any, index: float) -> tuple[float, float, float, float]:
+    """Return the sine in the medium of light that reaches the camera, the sign of its z, and the position of a
+    perspective camera's centre along x and its height above the face, infinite for an orthographic camera.
+    """
+    angle, distance_mm = math.radians(camera.angle_deg), camera.distance_mm or math.inf
+    position = (distance_mm * math.sin(angle), distance_mm * math.cos(angle)) if camera.distance_mm else (0.0, math.inf)
+    return math.sin(angle) / index, -1.0 if camera.side == "front" else 1.0, *position
 
 
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
@@ -157,6 +161,58 @@ def _send(
 
 
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _reach(sine: float, deep: float, height: float, index: float) -> float:
+    """Return how far to the side light gets from a depth to a height above the face."""
+    outside = index * sine
+    return deep * sine / math.sqrt(1 - sine * sine) + height * outside / math.sqrt(1 - outside * outside)
+
+
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
+def _send_to_centre(
+    image: Array, view: Array, direction: tuple[float, float, float], x: float, y: float, z: float, power: float,
+    phase: Array, sigma_t: float, width: float, index: float, grid: tuple[float, float, float, float, int, int],
+) -> None:  # fmt: skip
+    """Add a collision's light to the image of a perspective camera: directly and after up to three reflections.
+
+    The direction to the centre is found by bisection, and how light spreads on its way there by differences.
+    """
+    x_from, x_to, y_from, y_to, columns, rows = grid
+    _, sign, centre_x, height = view
+    u, v, w = direction
+    side = math.hypot(centre_x - x, y)
+    to_x, to_y = (centre_x - x) / side, -y / side
+    area = (x_to - x_from) * (y_to - y_from) / (columns * rows)
+    for reflections in range(4 if index > 1 else 1):
+        onward = sign > 0 if reflections % 2 == 0 else sign < 0
+        deep = (width - z if onward else z) + reflections * width
+        low, high = 0.0, 1 / index
+        for _ in range(50):
+            sine = (low + high) / 2
+            if _reach(sine, deep, height, index) < side:
+                low = sine
+            else:
+                high = sine
+        cosine, outside = math.sqrt(1 - sine * sine), math.sqrt(1 - index * index * sine * sine)
+        reflectance = _reflectance(cosine, index)
+        step = 1e-6
+        spread = (_reach(sine + step, deep, height, index) - _reach(sine - step, deep, height, index)) / (2 * step)
+        # Solid angle in the medium per area that is perpendicular to the light at the centre; power per such area is
+        # radiance times the face's area times its cosine over the squared distance.
+        per_area = sine / (cosine * side * spread * outside)
+        away = height / outside
+        turned = u * sine * to_x + v * sine * to_y + w * (sign if reflections % 2 == 0 else -sign) * cosine
+        node = math.acos(min(1.0, max(-1.0, turned))) / math.pi * (len(phase) - 1)
+        k = min(int(node), len(phase) - 2)
+        density = phase[k] + (node - k) * (phase[k + 1] - phase[k])
+        value = power * density * (1 - reflectance) * reflectance**reflections * math.exp(-sigma_t * deep / cosine)
+        path = deep * sine / cosine
+        column = math.floor((x + path * to_x - x_from) / (x_to - x_from) * columns)
+        row = math.floor((y + path * to_y - y_from) / (y_to - y_from) * rows)
+        if 0 <= column < columns and 0 <= row < rows:
+            image[row, column] += value * per_area * away * away / outside / area
+
+
+@njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]
 def _trace(
     random: np.random.Generator, photons: int, beam: tuple[float, float, float, float, float, float], views: Array,
     sigma_t: float, albedo: float, phase: Array, cosines: Array, width: float, index: float,
@@ -194,7 +250,12 @@ def _trace(
             weight *= albedo
 
             for camera in range(len(views)):
-                sine, sign = views[camera]
+                sine, sign, _, height = views[camera]
+                if height < math.inf:
+                    _send_to_centre(
+                        images[camera], views[camera], (u, v, w), x, y, z, weight, phase, sigma_t, width, index, grid
+                    )  # fmt: skip
+                    continue
                 for odd in range(2 if index > 1 else 1):
                     start = (sign if odd == 0 else -sign) * math.sqrt(1 - sine * sine)
                     node = math.acos(min(1.0, max(-1.0, u * sine + w * start))) * to_node

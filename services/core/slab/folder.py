@@ -95,12 +95,21 @@ class Light(Record):
 
 
 class SlabCamera(Record):
-    """An orthographic camera that sees light leave a face at an angle."""
+    """A camera that sees light leave a face at an angle, everywhere the same or, in perspective, at x = y = 0."""
 
     name: Name
     side: Side
     angle_deg: Angle
-    kind: Literal["orthographic"] = "orthographic"
+    kind: Literal["orthographic", "perspective"] = "orthographic"
+    distance_mm: Positive | None = Field(
+        default=None, description="of a perspective camera's centre of projection from x = y = 0 on the outer face"
+    )
+
+    @model_validator(mode="after")
+    def _distance_of_its_kind(self) -> SlabCamera:
+        if (self.kind == "perspective") != (self.distance_mm is not None):
+            raise ValueError("a perspective camera has a distance_mm, and no other camera has; add it or leave it out")
+        return self
 
 
 class SlabImage(Record):

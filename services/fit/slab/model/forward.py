@@ -141,7 +141,8 @@ def _arrays(interface: Interface, views: Views) -> tuple[object, ...]:
     light = (views.sine, views.transmittance, views.shift_mm, reflected)
     beam = (views.beam.disc, views.beam.x_mm, views.beam.y_mm)
     mirrors = np.array([1 - interface.transmittance(sine) for sine in views.sines])
-    return glass, light, beam, views.far, views.sines, views.scales, views.shifts_mm, mirrors
+    cameras = views.far, views.sines, views.scales, views.shifts_mm, mirrors, views.distances_mm
+    return glass, light, beam, *cameras
 
 
 def _grid(rig: Rig) -> tuple[float, float, float, float, int, int, bool]:

@@ -58,7 +58,9 @@ class Beam:
 
 @dataclass(frozen=True)
 class Views:
-    """One light and its cameras (C,). Sines are lateral directions in the medium, signed."""
+    """One light and its cameras (C,). Sines are lateral directions in the medium, signed; those of a perspective camera
+    hold at x = y = 0.
+    """
 
     images: NDArray[np.int64]
     """Position of each camera's image in the folder's list."""
@@ -74,6 +76,8 @@ class Views:
     """Radiance outside, averaged over a pixel, for one unit of power per sr in the medium that reaches the face there,
     per mm2."""
     shifts_mm: Array
+    distances_mm: Array
+    """Distance of each camera's centre of projection, infinite for orthographic cameras."""
 
 
 @dataclass(frozen=True)
@@ -148,4 +152,5 @@ def _views(
         sines=sines,
         scales=passed * solid / grid.area_mm2,
         shifts_mm=np.array([interface.glass_shift_mm(s) for s in sines]),
+        distances_mm=np.array([camera.distance_mm or math.inf for _, camera in cameras_of_light]),
     )

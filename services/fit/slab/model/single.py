@@ -18,6 +18,7 @@ from scipy.special import ndtr
 
 from services.fit.slab.model.dictionary import KNOTS, SPACING_RAD, Material
 from services.fit.slab.model.interface import Interface
+from services.fit.slab.model.perspective import leaving_direction
 from services.fit.slab.model.rig import Beam, Grid, Rig, Views
 
 Array = NDArray[np.float64]
@@ -36,6 +37,9 @@ def single_scattering(rig: Rig, material: Material, *, scores: bool) -> tuple[Ar
     rows = np.zeros((*rig.shape, KNOTS + 1) if scores else (0,))
     for views in rig.lights:
         for camera, image in enumerate(views.images):
+            if math.isfinite(views.distances_mm[camera]):
+                add_perspective_view(rig, material, views, camera, images[image], rows[image] if scores else None)
+                continue
             for cosine, lengths, shares in _routes(rig, material, views, camera):
                 # Interpolate f at the route's one angle from its two knots.
                 place = math.acos(min(max(cosine, -1.0), 1.0)) / SPACING_RAD
@@ -109,21 +113,122 @@ def _langevin(x: Array) -> Array:
     return np.where(small, x / 3, 1 / np.tanh(safe) - 1 / safe)
 
 
+def add_perspective_view(
+    rig: Rig, material: Material, views: Views, camera: int, image: Array, rows: Array | None
+) -> None:
+    """Add the light of a perspective camera: that of a pixel has the direction in which light leaves its middle, and
+    what a pixel sees of the beam grows with depth. Reflectances of light that comes back are those of the camera's
+    central direction.
+    """
+    interface, grid, width, sine = rig.interface, rig.grid, rig.width_mm, views.sine
+    inward, central, distance = math.sqrt(1 - sine**2), float(views.sines[camera]), float(views.distances_mm[camera])
+    x, y = (middles.ravel() for middles in np.meshgrid(_middles(_edges_x(grid)), _middles(_edges_y(grid))))
+    outside = interface.index_outside / interface.index
+    lateral_x, lateral_y, cosine_outside = leaving_direction(x, y, central, distance, outside)
+    lateral = np.hypot(lateral_x, lateral_y)
+    outward = np.sqrt(1 - lateral**2)
+    passed = np.array([interface.transmittance(one) for one in lateral]) / interface.transmittance(central)
+    scale = float(views.scales[camera]) * passed * math.sqrt(1 - central**2) / outward
+    shift = np.array([interface.glass_shift_mm(one) for one in lateral]) / np.maximum(lateral, 1e-12)
+    pixels = np.arange(grid.pixels)
+    for before, after in itertools.product(range(MAX_REFLECTIONS + 1), repeat=2):
+        if before + after > MAX_REFLECTIONS:
+            continue
+        is_forward = before % 2 == 0
+        towards_far = bool(views.far[camera]) != (after % 2 == 1)
+        cosines = sine * lateral_x + (inward if is_forward else -inward) * (outward if towards_far else -outward)
+        places = np.arccos(np.clip(cosines, -1, 1)) / SPACING_RAD
+        knots = np.minimum(places.astype(int), KNOTS - 2)
+        lower = (knots + 1 - places) * material.scattering[knots]
+        upper = (places - knots) * material.scattering[knots + 1]
+
+        # Compute, as for an orthographic camera, path lengths and the beam's axis where it leaves in each direction.
+        travelled = np.linspace(0, width, DEPTH_CELLS + 1)[:, None]
+        depth = travelled if is_forward else width - travelled
+        length_in = (before * width + travelled) / inward
+        length_out = (after * width + (width - depth if towards_far else depth)) / outward
+        lengths = length_in + length_out
+        step_in, step_out = width / DEPTH_CELLS / inward, lengths[1:] - lengths[:-1]
+        middle = (lengths[1:] + lengths[:-1]) / 2
+        half = material.extinction_per_mm * step_out / 2
+        density = np.exp(-material.extinction_per_mm * middle) * _sinhc(half)
+        mean_lengths = middle - _langevin(half) * step_out / 2
+        for share, reflected in _reflections(interface, sine, before, central, after):
+            if share <= 0:
+                continue
+            from_axis_x = x - length_in * sine - (length_out + shift) * lateral_x - views.shift_mm - reflected
+            from_axis_y = y - (length_out + shift) * lateral_y
+            growth = _middles(length_out) * outside / distance
+            spread = _spread_over_own(
+                grid, views.beam, from_axis_x, from_axis_y, 1 + growth * (cosine_outside / outward) ** 2, 1 + growth
+            )
+            shares = views.transmittance * scale * step_in * share * density * spread
+            values = shares * (lower + upper)
+            image += values.sum(axis=0)
+            if rows is not None:
+                rows[pixels, knots] += shares.sum(axis=0) * lower
+                rows[pixels, knots + 1] += shares.sum(axis=0) * upper
+                rows[:, KNOTS] += (mean_lengths * values).sum(axis=0)
+
+
+def _spread_over_own(grid: Grid, beam: Beam, x: Array, y: Array, growth_x: Array, growth_y: Array) -> Array:
+    """Share of a cell's light that reaches its pixel (cells, pixels).
+
+    Args:
+        x, y: position of the pixel's middle in the beam, at the edges of cells (cells + 1, pixels).
+        growth_x, growth_y: size of what the pixel sees of the beam, in units of the pixel's (cells, pixels).
+    """
+    halves = 2 if grid.folded else 1
+    half_x, half_y = growth_x * grid.pitch_x_mm / 2, growth_y * grid.pitch_y_mm / 2
+    middle_x, middle_y = _middles(x), _middles(y)
+    if not beam.disc:
+        along = ndtr((middle_x + half_x) / beam.x_mm) - ndtr((middle_x - half_x) / beam.x_mm)
+        across = ndtr((middle_y + half_y) / beam.y_mm) - ndtr((middle_y - half_y) / beam.y_mm)
+        return np.asarray(halves * along * across / (growth_x * growth_y))
+    total = np.zeros(half_x.shape)
+    sweep = np.maximum(np.abs(x[1:] - x[:-1]), 1e-9)
+    for angle in _chord_angles():
+        offset, chord = beam.x_mm * math.sin(angle), beam.y_mm * math.cos(angle)
+        along = _clipped_ramp(middle_x + half_x - offset, sweep) - _clipped_ramp(middle_x - half_x - offset, sweep)
+        across = _clipped_ramp(middle_y + half_y, 2 * chord) - _clipped_ramp(middle_y - half_y, 2 * chord)
+        total += along * across * math.cos(angle) ** 2
+    return np.asarray(2 * halves / DISC_NODES * total / (growth_x * growth_y))
+
+
+def _clipped_ramp(x: Array, width: Array | float) -> Array:
+    """Share of an interval about zero that lies below x."""
+    return np.clip(x / width + 0.5, 0, 1)
+
+
+def _middles(edges: Array) -> Array:
+    return np.asarray((edges[1:] + edges[:-1]) / 2)
+
+
+def _edges_x(grid: Grid) -> Array:
+    return np.asarray(grid.x_from_mm + grid.pitch_x_mm * np.arange(grid.columns + 1))
+
+
+def _edges_y(grid: Grid) -> Array:
+    return np.asarray(grid.y_from_mm + grid.pitch_y_mm * np.arange(grid.rows + 1))
+
+
+def _chord_angles() -> Array:
+    """A disc is a sum of chords: at x offset r sin(t) of weight cos^2(t), y is even within +- r cos(t)."""
+    return np.asarray((np.arange(DISC_NODES) + 0.5) / DISC_NODES * math.pi - math.pi / 2)
+
+
 def _spread(grid: Grid, beam: Beam, starts: Array, ends: Array) -> Array:
     """Share of a cell's light that reaches each pixel (cells, pixels), exit points between ``starts`` and ``ends`` on y
     = 0.
     """
-    edges_x = grid.x_from_mm + grid.pitch_x_mm * np.arange(grid.columns + 1)
-    edges_y = grid.y_from_mm + grid.pitch_y_mm * np.arange(grid.rows + 1)
+    edges_x, edges_y = _edges_x(grid), _edges_y(grid)
     halves = 2 if grid.folded else 1
     if not beam.disc:
         along: Array = np.diff(ndtr((edges_x - (starts + ends)[:, None] / 2) / beam.x_mm), axis=1)
         across: Array = halves * np.diff(ndtr(edges_y / beam.y_mm))
         return np.asarray((along[:, :, None] * across).transpose(0, 2, 1).reshape(len(starts), -1))
-    # A disc is a sum of chords: at x offset r sin(t) of weight cos^2(t), y is even within +- r cos(t).
-    angles = (np.arange(DISC_NODES) + 0.5) / DISC_NODES * math.pi - math.pi / 2
     total = np.zeros((len(starts), grid.rows, grid.columns))
-    for angle in angles:
+    for angle in _chord_angles():
         offset, chord = beam.x_mm * math.sin(angle), beam.y_mm * math.cos(angle)
         along = _overlap(edges_x, starts + offset, ends + offset)
         across = np.diff(np.clip((edges_y + chord) / (2 * chord), 0, 1))

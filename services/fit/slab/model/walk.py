@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from services.fit.slab.model.dictionary import KNOTS, SPACING_RAD
+from services.fit.slab.model.perspective import perspective_view
 from services.fit.slab.model.streams import path_state, uniform
 from services.fit.slab.model.tables import GUIDE
 
@@ -40,6 +41,20 @@ def reflectance(cosine, eta):  # type: ignore[no-untyped-def]  # compiled
     s = (cosine - q) / (cosine + q)
     p = (eta * eta * cosine - q) / (eta * eta * cosine + q)
     return 0.5 * (s * s + p * p)
+
+
+@njit(cache=True, inline="always")
+def face_reflectance(cosine, glass):  # type: ignore[no-untyped-def]  # compiled
+    """Reflectance of a face with or without glass, to and fro in the glass included; ``glass`` as in
+    ``sample_face``.
+    """
+    outside, wall, _ = glass
+    if wall == 0:
+        return reflectance(cosine, outside)
+    near = reflectance(cosine, wall)
+    inner2 = 1 - (1 - cosine * cosine) / (wall * wall)
+    far = reflectance(math.sqrt(inner2), outside / wall) if inner2 > 0 else 1.0
+    return near + (1 - near) ** 2 * far / (1 - near * far)
 
 
 @njit(cache=True, nogil=True)
@@ -143,6 +158,7 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
     scales,
     shifts,
     mirrors,
+    distances,
     grid,
     scores,
     images,
@@ -153,7 +169,8 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
     off).
 
     light: (sine, transmittance, shift, total reflectance along the beam). mirrors: reflectance of a face along each
-    camera. grid: (x from, y from, pitch x, pitch y, columns, rows, folded). Without ``scores`` rows stay as they are.
+    camera. distances: of centres of projection, infinite for orthographic cameras. grid: (x from, y from, pitch x,
+    pitch y, columns, rows, folded). Without ``scores`` rows stay as they are.
     """
     scattering, sigma_t, albedo, cumulative, cosines, densities, guide = medium
     x_from, y_from, pitch_x, pitch_y, columns, row_count, folded = grid
@@ -245,23 +262,34 @@ def trace(  # type: ignore[no-untyped-def]  # compiled
                         out = math.sqrt(1 - lateral * lateral)
                         towards_far = far[camera] != (reflections % 2 == 1)
                         deep = (width - z if towards_far else z) + reflections * width
-                        flight = deep / out
-                        value, knot, lower, upper = interpolate_f(
-                            dx * lateral + (dz if towards_far else -dz) * out, scattering
-                        )
-                        amount = (
-                            share * weight * value / (sigma_t * albedo) * math.exp(-sigma_t * flight) * scales[camera]
-                        )
-                        if reflections > 0:
-                            amount *= (mirrors[camera] / REFLECTED_SHARE) ** reflections
-                        shift = shifts[camera]
+                        onward = dz if towards_far else -dz
+                        shift, in_glass = shifts[camera], 0.0
                         for _ in range(reflections):
                             if glass[1] > 0:
                                 more, state = sample_reflected_shift(out, glass, state)
                                 shift += lateral * more
-                        px = (x + lateral * flight + shift + offset_x - x_from) / pitch_x
-                        py = y + offset_y
-                        py = ((abs(py) if folded else py) - y_from) / pitch_y
+                                in_glass += more
+                        scale, mirror = scales[camera], mirrors[camera]
+                        if distances[camera] == math.inf:
+                            flight = deep / out
+                            toward_camera = dx * lateral + onward * out
+                            exit_x = x + lateral * flight + shift + offset_x
+                            exit_y = y + offset_y
+                        else:
+                            to_x, to_y, own_out, exit_x, exit_y, share_of_parallel = perspective_view(
+                                x + offset_x, y + offset_y, deep, in_glass, lateral, distances[camera], glass
+                            )
+                            flight = deep / own_out
+                            toward_camera = dx * to_x + dy * to_y + onward * own_out
+                            passed = 1 - face_reflectance(own_out, glass)
+                            scale *= share_of_parallel * passed / (1 - mirror) * out / own_out
+                            mirror = 1 - passed
+                        value, knot, lower, upper = interpolate_f(toward_camera, scattering)
+                        amount = share * weight * value / (sigma_t * albedo) * math.exp(-sigma_t * flight) * scale
+                        if reflections > 0:
+                            amount *= (mirror / REFLECTED_SHARE) ** reflections
+                        px = (exit_x - x_from) / pitch_x
+                        py = ((abs(exit_y) if folded else exit_y) - y_from) / pitch_y
                         if px < 0 or py < 0 or px >= columns or py >= row_count:
                             continue
                         pixel = int(py) * columns + int(px)
