@@ -14,6 +14,7 @@ from pydantic import Field, SecretStr, ValidationError
 from services.core.errors import SettingsError
 from services.core.geometry import Record
 from services.core.records import MAX_ON_TIME_S, SIMULATED_DOME, JobSpec
+from services.core.validation import remedied
 
 DATABASE_FILE = "dentine.sqlite"
 """Name of the database in the data folder."""
@@ -265,13 +266,12 @@ def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
         spec = JobSpec.model_validate(dict(tree))
     except ValidationError as problem:
         first = problem.errors()[0]
-        option = ".".join(str(part) for part in first["loc"]) or "options"
+        option = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             known = ", ".join(sorted(JobSpec.model_fields))
             raise SettingsError(f"{origin}: unknown option '{option}'; known options are {known}.") from problem
-        raise SettingsError(
-            f"{origin}: option '{option}': {first['msg'].removeprefix('Value error, ')}; correct it."
-        ) from problem
+        what = f"option '{option}': " if option else ""
+        raise SettingsError(f"{origin}: {what}{remedied(first['msg'])}.") from problem
     for option, path in {
         "capture": spec.capture,
         "calibration": spec.calibration,

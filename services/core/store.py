@@ -50,6 +50,7 @@ from services.core.errors import (
 )
 from services.core.files.object_store import array_location, discard, remote_folder
 from services.core.geometry import Record
+from services.core.validation import fault_of
 
 R = TypeVar("R", bound=Record)
 FORMAT_VERSION = 1
@@ -94,9 +95,7 @@ def read_record(path: Path, kind: type[R]) -> R:
     try:
         return kind.model_validate_json(path.read_bytes())
     except ValidationError as problem:
-        first = problem.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise CaptureInputError(f"{path}: {place}: {first['msg']}; correct it.") from problem
+        raise CaptureInputError(f"{path}: {fault_of(problem.errors()[0], kind)}.") from problem
 
 
 class StageWriter:

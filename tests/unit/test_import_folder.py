@@ -107,7 +107,7 @@ def test_a_calibration_that_cannot_be_read_is_refused_before_anything_is_written
     with pytest.raises(CaptureInputError, match=r"calibration\.json does not exist; check the path\."):
         import_folder(photographs, None, "GBRG", photographs / "calibration.json")
     (photographs / "calibration.json").write_text("{}")
-    with pytest.raises(CaptureInputError, match=r"calibration\.json: .*; correct it\."):
+    with pytest.raises(CaptureInputError, match=r"calibration\.json: .units. is missing; add it\."):
         import_folder(photographs, None, "GBRG", photographs / "calibration.json")
     assert not (photographs / "raw.toml").exists()
 

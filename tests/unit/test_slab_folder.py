@@ -49,7 +49,9 @@ def test_a_pixel_that_is_not_finite_counts_for_nothing(tmp_path: Path) -> None:
 
 
 BAD: dict[str, tuple[Change, str]] = {
-    "unknown key": (lambda d: d.update(colour="red"), "colour"),
+    "unknown key": (lambda d: d.update(colour="red"), "unknown key 'colour'; known keys are beam, cameras, cell"),
+    "unknown key of the cell": (lambda d: d["cell"].update(width=1), "unknown key 'cell.width'; known keys are bo"),
+    "missing key": (lambda d: d["cell"].pop("width_mm"), "'cell.width_mm' is missing; add it"),
     "another kind": (lambda d: d.update(kind="tooth"), "kind"),
     "other units": (lambda d: d.update(units="cm"), "units"),
     "no image": (lambda d: d.update(images=[]), "images"),
@@ -87,6 +89,8 @@ def test_bad_descriptions_are_refused_by_a_sentence(tmp_path: Path, name: str) -
         read_folder(root)
     assert told in str(refused.value)
     assert "\n" not in str(refused.value)
+    assert "Value error" not in str(refused.value)
+    assert str(refused.value).count("; ") == 1  # one remedy
 
 
 @pytest.mark.parametrize(
@@ -95,6 +99,7 @@ def test_bad_descriptions_are_refused_by_a_sentence(tmp_path: Path, name: str) -
         (np.zeros((4, 4)), r"\(4, 4\) instead of floats \(8, 8\)"),
         (np.zeros((8, 8), np.int32), "int32"),
         (np.full((8, 8), np.nan), "no pixel that is finite"),
+        (np.zeros((8, 8)), "holds no light: its mean is not above zero"),
         (b"no image", "cannot be read"),
     ],
 )

@@ -47,6 +47,7 @@ from services.core.errors import (
 )
 from services.core.geometry import Record
 from services.core.redaction import redacted
+from services.core.validation import remedied
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -243,4 +244,4 @@ def _sentence(errors: Sequence[Any]) -> str:
     name = ".".join(str(part) for part in first["loc"][1:]) or str(first["loc"][0])
     if first["type"] == "extra_forbidden":
         return f"Unknown option '{name}'; GET /v1/options lists the known ones."
-    return f"'{name}': {first['msg'].removeprefix('Value error, ')}; correct it."
+    return f"'{name}': {remedied(first['msg'])}."

@@ -23,6 +23,7 @@ def board_command(
     from services.core.errors import SettingsError
     from services.core.raw.targets import Board
     from services.core.store import write_atomic
+    from services.core.validation import remedied
 
     fields: dict[str, object] = {"name": "board", "type": kind, "squares": squares, "square_mm": square_mm}
     if kind != "chessboard":
@@ -32,7 +33,7 @@ def board_command(
     except ValidationError as problem:
         first = problem.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the board"
-        raise SettingsError(f"Option for {where}: {first['msg'].removeprefix('Value error, ')}; correct it.") from None
+        raise SettingsError(f"Option for {where}: {remedied(first['msg'])}.") from None
     write_atomic(out, board_pdf(board))
     print(f"{out}: print it at 100 %, and check that its ruler is 100 mm long. Its entry in raw.toml:")
     print("[[board]]")

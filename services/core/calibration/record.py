@@ -96,6 +96,8 @@ def published_capture(capture: Path) -> tuple[Path, str] | None:
         return capture.parent, capture.name
     if (capture / "capture" / MANIFEST).is_file():
         return capture, "capture"
+    if (capture / "slab.json").is_file():
+        raise CaptureInputError(f'{capture} holds slab.json, which a job of another kind reads; set kind = "slab".')
     raise CaptureInputError(
         f"{capture} holds neither capture.json, {RAW_DESCRIPTION} nor a published capture; check option 'capture'."
     )

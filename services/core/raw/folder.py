@@ -14,6 +14,7 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Record
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
 from services.core.raw.targets import Board, CalibrationFile, Chart, Landmark, ScanFile, SeenPoint, Sphere
+from services.core.validation import fault_text
 
 DESCRIPTION = "raw.toml"
 MAX_DESCRIPTION_BYTES = 16 * 2**20
@@ -125,13 +126,7 @@ def _error_text(problem: ValidationError, tree: Mapping[str, Any]) -> str:
     first = problem.errors()[0]
     entry, kind = _entry_at(first["loc"], tree)
     key = str(first["loc"][-1]) if first["loc"] else ""
-    if first["type"] == "extra_forbidden":
-        return f"{entry}unknown key '{key}'; known keys are {', '.join(sorted(kind.model_fields))}"
-    if first["type"] == "missing" and not key.isdecimal():
-        return f"{entry}'{key}' is missing; add it"
-    message = first["msg"].removeprefix("Value error, ")
-    remedy = "" if "; " in message else "; correct it"
-    return f"{entry}{_key(first['loc'])}{message[:1].lower()}{message[1:]}{remedy}"
+    return fault_text(first, kind, key, place=entry, value=_key(first["loc"]))
 
 
 def _entry_at(location: Sequence[int | str], tree: Mapping[str, Any]) -> tuple[str, type[Record]]:

@@ -55,6 +55,11 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
     for entry, image, own in _linear(root, folder, wavelength_nm):
         variance, assumed = (shot_noise(image), True) if own is None else (own, assumed)
         usable = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
+        if own is None and np.isfinite(image).any() and not image[np.isfinite(image)].mean() > 0:
+            raise CaptureInputError(
+                f"Image file {root / entry.file} holds no light: its mean is not above zero; export it again, or leave"
+                " it out."
+            )
         if not usable.any():
             raise CaptureInputError(
                 f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again."

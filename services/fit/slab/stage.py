@@ -117,7 +117,13 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
             files.append(file)
     images = {fit.wavelength_nm: read_result_images(fit_folder / f"{fit.wavelength_nm:g}.npz") for fit in report.fits}
     verdict = report.verdict()
-    provenance = {"Source": root.name, "Seed": str(spec.seed)}
+    provenance = {
+        "Source": root.name,
+        "Cell": f"{folder.cell.width_mm:g} mm wide, {len(folder.lights)} lights, {len(folder.cameras)} cameras",
+        "Seed": str(spec.seed),
+        "Effort": f"{spec.effort:g}",
+        "Dictionary": spec.dictionary,
+    }
     write_report(context.root / "report.html", report, verdict, images, provenance)
     write_results(report.fits, context.root)
     for fit in report.fits:

@@ -63,9 +63,9 @@ def _volumes(dictionary: ChosenDictionary, weights: Array, uncertainty: Uncertai
 
 
 def _quantity(value: float, slope: Array, uncertainty: Uncertainty, unit: SlabUnit, max_error: float) -> Quantity:
-    """A quantity from its derivatives with respect to the weights; determined where its error by the images alone is at
-    most ``max_error``.
+    """A quantity from its derivatives with respect to the weights; determined where its error, and that by the images
+    alone, are at most ``max_error``.
     """
     by_unknowns = np.append(slope, 0.0)
     chosen, alone = (float(np.sqrt(by_unknowns @ one @ by_unknowns)) for one in uncertainty.of_unknowns)
-    return Quantity(value=value, se=chosen, unit=unit, determined=alone <= max_error)
+    return Quantity(value=value, se=chosen, unit=unit, determined=max(chosen, alone) <= max_error)

@@ -32,8 +32,9 @@ LABELS = {
 ATOM_LABELS = {"volume_fraction": "volume of all spheres", "mean_radius": "mean radius, by volume"}
 RESIDUAL_OF_WHITE = 0.1
 """Share of an image's white at which the residual's colours end."""
-MAX_PICTURES = 12
-"""Largest number of images shown for each wavelength; the held-out ones come first."""
+MAX_PICTURES = 18
+"""Largest number of images shown for each wavelength, those of Gkioulekas et al. (2013); the held-out ones come
+first."""
 
 
 def write_report(
@@ -61,7 +62,10 @@ def write_report(
         parameters=[_row(report, name) for name in LABELS],
         atoms=[(f"{fit.wavelength_nm:g} nm", fit.dictionary, _atoms(fit)) for fit in report.fits if fit.atoms],
         phases=[_phase(fit) for fit in report.fits],
-        pictures=[(f"{fit.wavelength_nm:g} nm", _pictures(images[fit.wavelength_nm])) for fit in report.fits],
+        pictures=[
+            (f"{fit.wavelength_nm:g} nm", _pictures(images[fit.wavelength_nm]), len(images[fit.wavelength_nm].names))
+            for fit in report.fits
+        ],
         residual_bar=gradient(DIVERGING),
         residual_limit=f"{100 * RESIDUAL_OF_WHITE:g} %",
         provenance=list(provenance.items()),

@@ -11,7 +11,7 @@ from pydantic import Field
 from services.core.geometry import Record
 from services.core.results import FitReport, Verdict
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY
-from services.core.verdict import verdict_of
+from services.core.verdict import MAX_ERROR, verdict_of
 from services.fit.slab.model.dictionary import ANGLES_RAD, Material
 from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
 from services.fit.slab.through_beam import Index
@@ -137,9 +137,22 @@ class SlabReport(Record):
         """The verdict on all wavelengths together, where each wavelength takes the place of a channel."""
         held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
+        unlike = [
+            f"{fit.wavelength_nm:g} nm"
+            for fit in self.fits
+            if max(fit.errors.fit_error, fit.errors.held_out_error or 0.0) > MAX_ERROR
+        ]
+        advice = ""
+        if unlike:
+            advice = (
+                f"No material gives such images at {', '.join(unlike)}; compare slab.json with the set-up: widths and"
+                " sizes in mm, angles in degrees with their signs, sides, and which file is which."
+            )
+        elif stopped:
+            advice = f"The fit at {', '.join(stopped)} has not converged; raise option effort."
         summary = FitReport(
             converged=not stopped,
-            advice=(f"The fit at {', '.join(stopped)} has not converged; raise option effort." if stopped else ""),
+            advice=advice,
             parameters={},
             fit_error={f"{fit.wavelength_nm:g}": fit.errors.fit_error for fit in self.fits},
             held_out_error={name: error for name, error in held_out.items() if error is not None},

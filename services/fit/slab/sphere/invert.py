@@ -220,7 +220,8 @@ class _Problem:
             notes.append("The readings tell no scattering.")
         if extinction is None:
             notes.append(
-                f"g = {self.file.g:g} is what was given, not measured; the collimated transmittance would tell it."
+                f"g = {self.file.g:g} is what was given, not measured, and the ± do not hold its error: another g may"
+                " move the other numbers by more than their ±. The collimated transmittance would tell it."
             )
         elif not MIN_G < 1 - reduced / max(extinction - absorption, 1e-12) < MAX_G:
             notes.append(

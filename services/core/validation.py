@@ -1,0 +1,58 @@
+"""What is wrong with a record that somebody wrote, in one sentence with its remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, get_args
+
+from pydantic import BaseModel
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+
+def remedied(message: str) -> str:
+    """Pydantic's message without its prefix, and with a remedy where it has none: one of our own has, after a
+    semicolon.
+    """
+    told = message.removeprefix("Value error, ")
+    return told if "; " in told else f"{told}; correct it"
+
+
+def fault_text(error: ErrorDetails, kind: type[BaseModel], key: str, place: str = "", value: str = "") -> str:
+    """The sentence, without its full stop.
+
+    Args:
+        error: the first of Pydantic's errors.
+        kind: record in which it lies, whose keys are known.
+        key: name of the missing or unknown key.
+        place: begins the sentence.
+        value: name of a wrong value, with a colon; empty for a record as a whole.
+    """
+    if error["type"] == "extra_forbidden":
+        return f"{place}unknown key '{key}'; known keys are {', '.join(sorted(kind.model_fields))}"
+    if error["type"] == "missing" and not key.isdecimal():
+        return f"{place}'{key}' is missing; add it"
+    message = remedied(error["msg"])
+    return f"{place}{value}{message[:1].lower()}{message[1:]}"
+
+
+def fault_of(error: ErrorDetails, kind: type[BaseModel]) -> str:
+    """The sentence, without its full stop, on a file that is one record of this kind."""
+    key = ".".join(str(part) for part in error["loc"])
+    return fault_text(error, _record_at(kind, error["loc"]), key, value=f"{key}: " if key else "")
+
+
+def _record_at(kind: type[BaseModel], location: Sequence[int | str]) -> type[BaseModel]:
+    """The record in which the last part of a location lies."""
+    for step in location[:-1]:
+        if step in kind.model_fields:
+            kind = next(_records_of(kind.model_fields[str(step)].annotation), kind)
+    return kind
+
+
+def _records_of(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _records_of(argument)
