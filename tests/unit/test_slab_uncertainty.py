@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from services.fit.slab.model.dictionary import KNOTS, henyey_greenstein
+from services.fit.slab.results.result import parameters_of, phase_of
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import Solution
 from services.fit.slab.solve.normal import UNKNOWNS
 from services.fit.slab.solve.prior import Quadratic
-from services.fit.slab.solve.uncertainty import uncertainty_of
+from services.fit.slab.solve.uncertainty import Uncertainty, uncertainty_of
+from services.fit.slab.through_beam import Index
 
 MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)
 CURVATURE = 1e4
@@ -59,3 +61,14 @@ def test_a_way_that_noise_explains_does_not() -> None:
     short[-1] = 0.0
     still = standard_error(solution(np.zeros(UNKNOWNS), 0.0))
     assert standard_error(solution(short, 0.0)) == pytest.approx(still, rel=0.25)
+
+
+@pytest.mark.parametrize(("width_mm", "told"), [(1.0, True), (4.0, False)])
+def test_a_very_thick_cell_tells_no_scattering_by_itself(width_mm: float, told: bool) -> None:
+    tiny = 1e-8 * np.eye(UNKNOWNS)
+    uncertainty, index = Uncertainty(tiny, tiny, (tiny, tiny)), Index(1.33, 0.0)
+    parameters = parameters_of(MATERIAL, uncertainty, index, width_mm)
+    assert parameters.sigma_s_reduced.determined
+    assert parameters.sigma_a.determined
+    assert [getattr(parameters, name).determined for name in ("sigma_t", "sigma_s", "g")] == 3 * [told]
+    assert set(phase_of(MATERIAL, uncertainty, width_mm).determined) == {told}

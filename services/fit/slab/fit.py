@@ -105,7 +105,8 @@ def fit_images(
         if not dictionary.names
         else ""
     )
-    parameters, phase = parameters_of(material, uncertainty, index), phase_of(material, uncertainty)
+    parameters = parameters_of(material, uncertainty, index, rig.width_mm)
+    phase = phase_of(material, uncertainty, rig.width_mm)
     first, second = final_renders(rig, material, solver.budget, options.seed, blocks)
     fit = SlabFit(
         wavelength_nm=wavelength_nm,
