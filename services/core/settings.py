@@ -12,9 +12,9 @@ from urllib.parse import quote
 from pydantic import Field, SecretStr, ValidationError
 
 from services.core.errors import SettingsError
+from services.core.files.validation import remedied
 from services.core.geometry import Record
 from services.core.records import MAX_ON_TIME_S, SIMULATED_DOME, JobSpec
-from services.core.validation import remedied
 
 DATABASE_FILE = "dentine.sqlite"
 """Name of the database in the data folder."""

@@ -49,8 +49,8 @@ from services.core.errors import (
     ReadOnlyStoreError,
 )
 from services.core.files.object_store import array_location, discard, remote_folder
+from services.core.files.validation import fault_of
 from services.core.geometry import Record
-from services.core.validation import fault_of
 
 R = TypeVar("R", bound=Record)
 FORMAT_VERSION = 1

@@ -262,24 +262,6 @@ def test_a_wavelength_that_was_cut_short_goes_on_where_it_stood(job: Path, spec:
     assert {one.name for one in task.place.iterdir()} == {"fit.json", IMAGES}
 
 
-def test_wavelengths_that_the_workers_do_not_divide_evenly_are_shared_block_by_block(
-    spec: JobSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class TwoThreads(ManyThreads):
-        def threads(self, expected: int = 1) -> int:
-            return 2 * expected
-
-    monkeypatch.setattr("services.fit.slab.schedule.fit_wavelength", lambda task, *_: task.place)
-    assert spec.capture is not None
-    tasks = [
-        WavelengthTask(spec.capture, nm, SlabOptions(), tmp_path / f"{nm:g}", tmp_path / CANCEL_FLAG)
-        for nm in (488.0, 532.0, 635.0)
-    ]
-    run_on = TwoThreads()
-    assert list(run_wavelengths(run_on, tasks, workers=1)) == [task.place for task in tasks]
-    assert run_on.ran == ["488", "532"]  # the last one is not a task: it is fitted here, and its blocks are tasks
-
-
 def test_sums_too_large_to_travel_stay_on_their_worker(folder: Path, tmp_path: Path) -> None:
     told = json.loads((folder / "slab.json").read_text())
     told["pixels"] |= {"columns": 512, "rows": 512}

@@ -45,9 +45,9 @@ from services.core.errors import (
     RigStoppedError,
     RigUnreachableError,
 )
+from services.core.files.validation import remedied
 from services.core.geometry import Record
 from services.core.redaction import redacted
-from services.core.validation import remedied
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

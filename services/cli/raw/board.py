@@ -21,9 +21,9 @@ def board_command(
 
     from services.calibrate.cameras.printing import board_pdf
     from services.core.errors import SettingsError
+    from services.core.files.validation import remedied
     from services.core.raw.targets import Board
     from services.core.store import write_atomic
-    from services.core.validation import remedied
 
     fields: dict[str, object] = {"name": "board", "type": kind, "squares": squares, "square_mm": square_mm}
     if kind != "chessboard":

@@ -11,10 +11,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from services.core.errors import CaptureInputError
+from services.core.files.validation import fault_text
 from services.core.geometry import Record
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
 from services.core.raw.targets import Board, CalibrationFile, Chart, Landmark, ScanFile, SeenPoint, Sphere
-from services.core.validation import fault_text
 
 DESCRIPTION = "raw.toml"
 MAX_DESCRIPTION_BYTES = 16 * 2**20
