@@ -21,12 +21,12 @@ THICKNESSES = (0.3, 1.0, 3.0, 9.0)
 COSINES = (0.0, 0.7)
 """Values of sigma_s w and of g that a table combines."""
 ALBEDOS = (0.97, 0.6)
-"""Albedo of each table. In the first one every thick medium is brighter than a cell with sigma_t w = 8.3 and an albedo
-of 0.59, and the search began, and ended, at almost no scattering. In one table with the second, dim thin cells began at
-thick dark media, from which a search does not return."""
+"""Albedo of each table; the second is used where the first leads nowhere. Every thick medium of the first is brighter
+than a cell with sigma_t w = 8.3 and an albedo of 0.59, and the search began, and ended, at almost no scattering. In one
+table with the second, dim thin cells began at thick dark media, from which a search does not return."""
 MAX_MISFIT_SHARE = 0.5
-"""Share of the misfit of an earlier table's medium below which a later one's is preferred; it exceeds what noise makes
-of one medium."""
+"""Share of the misfit of no light at all above which a medium explains too little; where a search found its way, it
+began far below."""
 LARGEST_COSINE, SMALLEST_COSINE = 0.8, -0.5
 """Bounds of g. The forward peak of a larger cosine may lie where no camera looks; the fit of all knots finds it from
 here."""
@@ -37,12 +37,12 @@ TABLE_PATHS, STEP_PATHS, BATCHES, STEPS = 1000, 2000, 4, 6
 
 
 def start(rig: Rig, measured: Measurements, seed: int, blocks: Blocks) -> Material:
-    """The best of each table of HG media, improved by Gauss-Newton steps in ln sigma_s, g and sigma_a; and of these the
-    one that fits better.
+    """The best of a table of HG media, improved by Gauss-Newton steps in ln sigma_s, g and sigma_a; of the first table
+    after which it explains most of the light, or else of the last.
     """
     fitted = np.isfinite(measured.variances) & ~measured.held_out[:, None]
     tolerated = measured.variances + (MODEL_ERROR * np.maximum(measured.values, 0)) ** 2
-    numbers = itertools.count(1)
+    numbers, steps = itertools.count(1), itertools.count()
 
     def misfit(point: Array) -> float:
         images = render(
@@ -52,7 +52,8 @@ def start(rig: Rig, measured: Measurements, seed: int, blocks: Blocks) -> Materi
         first, second = images - measured.values
         return float((first * second / tolerated)[fitted].sum())
 
-    steps, improved = itertools.count(), []
+    of_nothing = float((measured.values**2 / tolerated)[fitted].sum())
+    point = np.zeros(3)
     for albedo in ALBEDOS:
         table = [
             np.array([math.log(thickness / rig.width_mm), g, thickness / rig.width_mm * (1 / albedo - 1)])
@@ -62,12 +63,9 @@ def start(rig: Rig, measured: Measurements, seed: int, blocks: Blocks) -> Materi
         point = min(table, key=misfit)
         for _ in range(STEPS):
             point = _improved(rig, measured, point, np.where(fitted, tolerated, np.inf), seed, next(steps), blocks)
-        improved.append((misfit(point), point))
-    (lowest, best), *others = improved
-    for own, point in others:
-        if lowest > 0 and own < MAX_MISFIT_SHARE * lowest:
-            lowest, best = own, point
-    return _material(best)
+        if misfit(point) < MAX_MISFIT_SHARE * of_nothing:
+            break
+    return _material(point)
 
 
 def _material(point: Array) -> Material:
