@@ -10,8 +10,8 @@ prior's scale by evidence, then damped steps, the first from the unchanged mediu
 
 Batches are drawn from a pool without replacement. The combined renders of a fit's last stage are about eight and have
 eight times the paths; shot noise is therefore 2.83 times the usual 1 %, so that both have their usual part in the ±.
-Their batches are smaller but nearly as many as a fit's: the variance of 24 batches is itself so uncertain that exact
-95 % intervals would contain the truth in 93.7 % of the draws; with 96 they do in 94.7 %.
+Their batches are smaller and half as many as a fit's. The variance of 24 batches is itself so uncertain that intervals
+of 1.96 standard errors contain the truth in 93.8 % of draws where paths are all of the noise; with 96 in 94.7 %.
 """
 
 from __future__ import annotations

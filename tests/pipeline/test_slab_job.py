@@ -36,6 +36,7 @@ from services.fit.slab.solve.checkpoint import Checkpoint
 from services.fit.slab.stage import CHECKPOINT, export, run
 from services.fit.transport.platform import prepare_device
 from services.pipeline.stages import run_job, stages_of
+from tests.support.recording_executor import RecordingExecutor
 from tests.support.small_slab import description, write_folder
 
 TRUTHS = {532.0: (1.2, 0.6), 635.0: (0.8, 0.4)}
@@ -205,28 +206,13 @@ def test_a_cancel_ends_the_fit_between_two_blocks(spread: bool, spec: JobSpec, t
     (tmp_path / CANCEL_FLAG).touch()
     task = WavelengthTask(spec.capture, 532.0, SlabOptions(effort=0.05), tmp_path / "532", tmp_path / CANCEL_FLAG)
     with pytest.raises(JobCancelledError):
-        list(run_wavelengths(ManyThreads() if spread else LocalExecutor(InProcessHost()), [task], workers=1))
+        list(run_wavelengths(RecordingExecutor(8) if spread else LocalExecutor(InProcessHost()), [task], workers=1))
     assert not (tmp_path / "532").exists()
-
-
-class ManyThreads(LocalExecutor):
-    """An executor that claims workers for more than one wavelength, and records the names of its tasks."""
-
-    def __init__(self) -> None:
-        super().__init__(InProcessHost())
-        self.ran: list[str] = []
-
-    def threads(self, expected: int = 1) -> int:
-        return 8 * expected
-
-    def submit(self, key: str, task: Any, *args: Any) -> Any:
-        self.ran.append(key)
-        return super().submit(key, task, *args)
 
 
 def test_blocks_on_many_workers_give_the_answer_of_one(job: Path, spec: JobSpec, tmp_path: Path) -> None:
     assert spec.capture is not None
-    options, run_on = SlabOptions(seed=spec.seed, effort=spec.effort), ManyThreads()
+    options, run_on = SlabOptions(seed=spec.seed, effort=spec.effort), RecordingExecutor(8)
     task = WavelengthTask(spec.capture, 532.0, options, tmp_path / "532", tmp_path / CANCEL_FLAG)
     assert list(run_wavelengths(run_on, [task], workers=1)) == [task.place]
     assert len(set(run_on.ran)) == len(run_on.ran) > 100  # each block a task of its own
@@ -247,7 +233,7 @@ def test_a_wavelength_that_was_cut_short_goes_on_where_it_stood(job: Path, spec:
     assert spec.capture is not None
     options = SlabOptions(seed=spec.seed, effort=spec.effort)
     task = WavelengthTask(spec.capture, 532.0, options, tmp_path / "532", tmp_path / CANCEL_FLAG)
-    first, second = ManyThreads(), ManyThreads()
+    first, second = RecordingExecutor(8), RecordingExecutor(8)
     with pytest.raises(CutShortError):
         list(run_wavelengths(first, [task], workers=1, on_checkpoint=cut_short))
     stored: list[Checkpoint] = []
@@ -265,7 +251,7 @@ def test_a_wavelength_that_was_cut_short_goes_on_where_it_stood(job: Path, spec:
 def test_sums_too_large_to_travel_stay_on_their_worker(folder: Path, tmp_path: Path) -> None:
     told = json.loads((folder / "slab.json").read_text())
     told["pixels"] |= {"columns": 512, "rows": 512}
-    root, run_on = write_folder(tmp_path / "cell", told, np.full((8, 8), 0.01)), ManyThreads()
+    root, run_on = write_folder(tmp_path / "cell", told, np.full((8, 8), 0.01)), RecordingExecutor(8)
     task = WavelengthTask(root, 532.0, SlabOptions(), tmp_path / "532", tmp_path / CANCEL_FLAG)
     with pytest.raises(CaptureInputError, match="on the folder's grid"):  # because these images are smaller
         list(run_wavelengths(run_on, [task], workers=1))

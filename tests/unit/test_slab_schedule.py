@@ -3,30 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from services.fit.execution.engine_host import InProcessHost
-from services.fit.execution.executors import LocalExecutor
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.schedule import WavelengthTask, run_wavelengths
+from tests.support.recording_executor import RecordingExecutor
 from tests.support.small_slab import description, write_folder
-
-
-class TwoThreads(LocalExecutor):
-    """An executor that claims two workers, and records the names of its tasks."""
-
-    def __init__(self) -> None:
-        super().__init__(InProcessHost())
-        self.ran: list[str] = []
-
-    def threads(self, expected: int = 1) -> int:
-        return 2 * expected
-
-    def submit(self, key: str, task: Any, *args: Any) -> Any:
-        self.ran.append(key)
-        return super().submit(key, task, *args)
 
 
 def test_wavelengths_that_the_workers_do_not_divide_evenly_are_shared(
@@ -38,6 +21,6 @@ def test_wavelengths_that_the_workers_do_not_divide_evenly_are_shared(
         WavelengthTask(root, nm, SlabOptions(), tmp_path / f"{nm:g}", tmp_path / "cancelled")
         for nm in (488.0, 532.0, 635.0)
     ]
-    run_on = TwoThreads()
+    run_on = RecordingExecutor(2)
     assert list(run_wavelengths(run_on, tasks, workers=1)) == [task.place for task in tasks]
     assert run_on.ran == ["488", "532"]  # the last one is fitted here, and its blocks are tasks

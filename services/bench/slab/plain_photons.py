@@ -108,9 +108,10 @@ def _leaving(camera: Any, index: float) -> tuple[float, float, float, float]:
     """Return the sine in the medium of light that reaches the camera, the sign of its z, and the position of a
     perspective camera's centre along x and its height above the face, infinite for an orthographic camera.
     """
-    angle, distance_mm = math.radians(camera.angle_deg), camera.distance_mm or math.inf
-    position = (distance_mm * math.sin(angle), distance_mm * math.cos(angle)) if camera.distance_mm else (0.0, math.inf)
-    return math.sin(angle) / index, -1.0 if camera.side == "front" else 1.0, *position
+    angle, sign = math.radians(camera.angle_deg), -1.0 if camera.side == "front" else 1.0
+    if camera.distance_mm is None:
+        return math.sin(angle) / index, sign, 0.0, math.inf
+    return math.sin(angle) / index, sign, camera.distance_mm * math.sin(angle), camera.distance_mm * math.cos(angle)
 
 
 @njit(nogil=True, cache=True)  # type: ignore[untyped-decorator]

@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 SCATTERING_PER_MM, ABSORPTION_PER_MM, PHASE = 1.0, 0.03, "HG 0.8"
 TRUTH_PATHS, QUICK_TRUTH_PATHS = 8_000_000, 20_000
 """Number of paths per light of the measured images, all eight batches together. Their noise, which cameras share and
-the images do not state, is a tenth of a pixel's 1 %: with 400,000 paths a fit of full effort lost its way."""
+the images do not state, is below a tenth of a pixel's 1 %: with 400,000 paths a fit of full effort lost its way."""
 EFFORTS, QUICK_EFFORTS = (0.02, 0.1, 0.3, 1.0), (0.02,)
 """Budgets of paths of the default solver, as fractions of its usual one."""
 ITERATIONS, QUICK_ITERATIONS = (20, 80, 320), (5,)

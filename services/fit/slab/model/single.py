@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,31 +62,62 @@ def _routes(rig: Rig, material: Material, views: Views, camera: int) -> Iterator
     """
     width, sine, lateral = rig.width_mm, views.sine, float(views.sines[camera])
     inward, outward = math.sqrt(1 - sine**2), math.sqrt(1 - lateral**2)
-    for before, after in itertools.product(range(MAX_REFLECTIONS + 1), repeat=2):
-        if before + after > MAX_REFLECTIONS:
-            continue
-        is_forward = before % 2 == 0
-        towards_far = bool(views.far[camera]) != (after % 2 == 1)
-        cosine = sine * lateral + (inward if is_forward else -inward) * (outward if towards_far else -outward)
-
-        # Compute the depths of the cells' edges along the pass, and the path lengths to and from them.
-        travelled = np.linspace(0, width, DEPTH_CELLS + 1)
-        depth = travelled if is_forward else width - travelled
-        length_in = (before * width + travelled) / inward
-        length_out = (after * width + (width - depth if towards_far else depth)) / outward
-        lengths = length_in + length_out
+    strength = views.transmittance * float(views.scales[camera]) * (width / DEPTH_CELLS / inward)
+    for passes in _all_passes(bool(views.far[camera])):
+        cosine = sine * lateral + passes.sign * inward * outward
+        length_in, length_out = passes.lengths(width, inward, outward)
+        density, mean_lengths = _attenuated(material.extinction_per_mm, length_in + length_out)
         exits = length_in * sine + length_out * lateral + views.shift_mm + float(views.shifts_mm[camera])
-
-        # Integrate exp(-sigma_t path length) over each cell, which is exact, and take its mean path length.
-        step_in, step_out = width / DEPTH_CELLS / inward, lengths[1:] - lengths[:-1]
-        middle = (lengths[1:] + lengths[:-1]) / 2
-        half = material.extinction_per_mm * step_out / 2
-        density = np.exp(-material.extinction_per_mm * middle) * _sinhc(half)
-        strength = views.transmittance * float(views.scales[camera]) * step_in
-        for share, shift in _reflections(rig.interface, sine, before, lateral, after):
+        for share, shift in _reflections(rig.interface, sine, passes.before, lateral, passes.after):
             spread = _spread(rig.grid, views.beam, exits[:-1] + shift, exits[1:] + shift)
             if share > 0:
-                yield cosine, middle - _langevin(half) * step_out / 2, (strength * share * density)[:, None] * spread
+                yield cosine, mean_lengths, (strength * share * density)[:, None] * spread
+
+
+@dataclass(frozen=True)
+class _Passes:
+    """How often light crosses the cell before and after it scatters."""
+
+    before: int
+    """Reflections of the beam."""
+    after: int
+    """Reflections of the scattered light."""
+    towards_far: bool
+    """Whether the scattered light sets out for the face opposite the light."""
+
+    @property
+    def is_forward(self) -> bool:
+        """Whether the beam travels away from its face where it scatters."""
+        return self.before % 2 == 0
+
+    @property
+    def sign(self) -> int:
+        """Sign of the product of both directions along z."""
+        return 1 if self.is_forward == self.towards_far else -1
+
+    def lengths(self, width: float, inward: float, outward: float | Array) -> tuple[Array, Array]:
+        """Lengths of the path to and from the edges of the cells of depth (cells + 1, ...); ``inward`` and ``outward``
+        are cosines, the latter for each pixel or one for all.
+        """
+        travelled = np.linspace(0, width, DEPTH_CELLS + 1).reshape(-1, *np.ones(np.ndim(outward), dtype=int))
+        depth = travelled if self.is_forward else width - travelled
+        length_in = (self.before * width + travelled) / inward
+        return length_in, (self.after * width + (width - depth if self.towards_far else depth)) / outward
+
+
+def _all_passes(is_far: bool) -> Iterator[_Passes]:
+    """Every way with few reflections to a camera; ``is_far`` is whether it looks at the face opposite the light."""
+    for before, after in itertools.product(range(MAX_REFLECTIONS + 1), repeat=2):
+        if before + after <= MAX_REFLECTIONS:
+            yield _Passes(before, after, towards_far=is_far != (after % 2 == 1))
+
+
+def _attenuated(extinction_per_mm: float, lengths: Array) -> tuple[Array, Array]:
+    """Mean of exp(-sigma_t path length) over each cell, which is exact, and the mean path length that it weighs."""
+    step = lengths[1:] - lengths[:-1]
+    middle = (lengths[1:] + lengths[:-1]) / 2
+    half = extinction_per_mm * step / 2
+    return np.exp(-extinction_per_mm * middle) * _sinhc(half), middle - _langevin(half) * step / 2
 
 
 def _reflections(
@@ -129,40 +161,27 @@ def add_perspective_view(
     outward = np.sqrt(1 - lateral**2)
     passed = np.array([interface.transmittance(one) for one in lateral]) / interface.transmittance(central)
     scale = float(views.scales[camera]) * passed * math.sqrt(1 - central**2) / outward
+    strength = views.transmittance * scale * (width / DEPTH_CELLS / inward)
     shift = np.array([interface.glass_shift_mm(one) for one in lateral]) / np.maximum(lateral, 1e-12)
     pixels = np.arange(grid.pixels)
-    for before, after in itertools.product(range(MAX_REFLECTIONS + 1), repeat=2):
-        if before + after > MAX_REFLECTIONS:
-            continue
-        is_forward = before % 2 == 0
-        towards_far = bool(views.far[camera]) != (after % 2 == 1)
-        cosines = sine * lateral_x + (inward if is_forward else -inward) * (outward if towards_far else -outward)
+    for passes in _all_passes(bool(views.far[camera])):
+        cosines = sine * lateral_x + passes.sign * inward * outward
         places = np.arccos(np.clip(cosines, -1, 1)) / SPACING_RAD
         knots = np.minimum(places.astype(int), KNOTS - 2)
         lower = (knots + 1 - places) * material.scattering[knots]
         upper = (places - knots) * material.scattering[knots + 1]
-
-        # Compute, as for an orthographic camera, path lengths and the beam's axis where it leaves in each direction.
-        travelled = np.linspace(0, width, DEPTH_CELLS + 1)[:, None]
-        depth = travelled if is_forward else width - travelled
-        length_in = (before * width + travelled) / inward
-        length_out = (after * width + (width - depth if towards_far else depth)) / outward
-        lengths = length_in + length_out
-        step_in, step_out = width / DEPTH_CELLS / inward, lengths[1:] - lengths[:-1]
-        middle = (lengths[1:] + lengths[:-1]) / 2
-        half = material.extinction_per_mm * step_out / 2
-        density = np.exp(-material.extinction_per_mm * middle) * _sinhc(half)
-        mean_lengths = middle - _langevin(half) * step_out / 2
-        for share, reflected in _reflections(interface, sine, before, central, after):
+        length_in, length_out = passes.lengths(width, inward, outward)
+        density, mean_lengths = _attenuated(material.extinction_per_mm, length_in + length_out)
+        growth = _middles(length_out) * outside / distance
+        for share, reflected in _reflections(interface, sine, passes.before, central, passes.after):
             if share <= 0:
                 continue
             from_axis_x = x - length_in * sine - (length_out + shift) * lateral_x - views.shift_mm - reflected
             from_axis_y = y - (length_out + shift) * lateral_y
-            growth = _middles(length_out) * outside / distance
             spread = _spread_over_own(
                 grid, views.beam, from_axis_x, from_axis_y, 1 + growth * (cosine_outside / outward) ** 2, 1 + growth
             )
-            shares = views.transmittance * scale * step_in * share * density * spread
+            shares = strength * share * density * spread
             values = shares * (lower + upper)
             image += values.sum(axis=0)
             if rows is not None:

@@ -25,8 +25,8 @@ ALBEDOS = (0.97, 0.6)
 than a cell with sigma_t w = 8.3 and an albedo of 0.59, and the search began, and ended, at almost no scattering. In one
 table with the second, dim thin cells began at thick dark media, from which a search does not return."""
 MAX_MISFIT_SHARE = 0.5
-"""Share of the misfit of no light at all above which a medium explains too little; where a search found its way, it
-began far below."""
+"""Share of the misfit of no light at all above which a medium explains too little. From the first table it was at most
+0.26 for 21 cells whose searches found their way, and 0.8 and 4 for two dark, thick ones."""
 LARGEST_COSINE, SMALLEST_COSINE = 0.8, -0.5
 """Bounds of g. The forward peak of a larger cosine may lie where no camera looks; the fit of all knots finds it from
 here."""
