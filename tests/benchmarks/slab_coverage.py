@@ -45,8 +45,9 @@ Array = NDArray[np.float64]
 
 SCATTERING_PER_MM, COSINE, ABSORPTION_PER_MM = 0.97, 0.8, 0.03
 """Medium in a cell of 1 mm, so that sigma_t w is 1."""
-SPREADS = {"sigma_s": 0.03, "sigma_a": 0.01, "g": 0.01}
-"""Standard deviations of the change: of sigma_s as a share of it, of sigma_a per mm, of g in units of 1."""
+SPREADS = {"sigma_s": 0.006, "sigma_a": 0.002, "g": 0.002}
+"""Standard deviations of the change: of sigma_s as a share of it, of sigma_a per mm, of g in units of 1. Each is about
+one of the ±, which is how far the last step of a fit moves."""
 NOISE = 0.01 * 8**0.5
 """Shot noise of a pixel that has its image's mean, as a share."""
 POOL, BATCHES, PATHS = 768, 96, 7_500

@@ -87,3 +87,22 @@ def test_the_page_shows_wavelengths_coefficients_and_phase_functions(
         expect(page.locator(".job")).not_to_contain_text("No step yet")
         expect(page.locator(".job")).not_to_contain_text("No picture yet")
         looked_at(page, f"slab-{scheme}-{width}")
+
+
+def test_the_form_shows_the_options_of_the_chosen_kind(chromium: Browser, server: tuple[httpx.Client, str]) -> None:
+    client, _ = server
+    with watched_page(chromium, str(client.base_url).rstrip("/"), "light", WIDE[0]) as page:
+        page.goto("/#/submit")
+        page.locator("summary", has_text="Accuracy and time").click()
+        expect(page.locator("#option-max_steps")).to_be_visible()
+        expect(page.locator("summary", has_text="Slab")).to_be_hidden()
+        page.select_option("#option-kind", "slab")
+        page.locator("summary", has_text="Slab").click()
+        expect(page.locator("#option-effort")).to_be_visible()
+        expect(page.locator("#option-max_steps")).to_be_hidden()
+        expect(page.locator("#option-ior")).to_be_hidden()
+        expect(page.locator("summary", has_text="Solver")).to_be_hidden()
+        looked_at(page, "submit-slab")
+        page.select_option("#preset", "standard")
+        expect(page.locator("#option-max_steps")).to_be_visible()
+        expect(page.locator("#option-effort")).to_be_hidden()

@@ -156,7 +156,7 @@ def test_a_folder_that_is_no_capture_is_refused_in_a_sentence(
         page.goto("/")
         choose(page, tmp_path / "other")
         expect(page.get_by_role("alert")).to_contain_text(
-            "The folder holds no file of a capture; choose the one with capture.json."
+            "The folder holds no file of a capture; choose the one with capture.json, raw.toml or slab.json."
         )
         choose(page, tmp_path / "meshes")
         expect(page.get_by_role("alert")).to_contain_text("The capture holds neither capture.json nor manifest.json")

@@ -237,7 +237,11 @@ def test_health_and_options(serve: Any) -> None:
     client = serve()
     assert client.get("/v1/health/live").json()["status"] == "live"
     assert client.get("/v1/health/ready").json()["status"] == "ready"
-    assert client.get("/v1/options").json()["properties"]["ior"]["default"] == 1.631
+    options = client.get("/v1/options").json()
+    assert options["properties"]["ior"]["default"] == 1.631
+    assert "ior" in options["foreign_options"]["slab"]
+    assert "effort" in options["foreign_options"]["tooth"]
+    assert "seed" not in options["foreign_options"]["slab"]
     assert set(client.get("/v1/openapi.json").json()["paths"]) >= {"/v1/jobs", "/v1/jobs/{job_id}/events"}
 
 

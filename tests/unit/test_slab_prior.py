@@ -6,7 +6,7 @@ import numpy as np
 
 from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, henyey_greenstein
 from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.prior import Quadratic, precision, second_differences, widened
+from services.fit.slab.solve.prior import POLE_SCALE, Quadratic, precision, pull_covariance, second_differences, widened
 
 TROUGH = KNOTS // 3
 """Knot of a trough between two rings, three knots wide; ln f bends there by 100 per rad2 and more."""
@@ -53,3 +53,34 @@ def test_evidence_is_asked_for_sharp_scales_at_the_end_alone() -> None:
     sharp = np.asarray(Knots().scale(SHARP, quadratic, sharp=True))
     assert sharp.shape == ANGLES_RAD.shape
     assert sharp[TROUGH] > 5 * np.median(sharp)
+
+
+PEAK = henyey_greenstein(1.0, 0.8, 0.0)
+
+
+def quadratic_of(material: Material, seen_from_deg: float) -> Quadratic:
+    """Images that determine ln f to 1 % at all knots from an angle on, and nothing below it."""
+    weights = np.append(np.where(np.degrees(ANGLES_RAD) >= seen_from_deg, 1e4, 0.0), 1e4)
+    matrix, nothing = np.diag(weights), np.zeros((KNOTS + 1, KNOTS + 1))
+    return Quadratic(matrix, -matrix @ Knots().unknowns(material), nothing, np.zeros(KNOTS + 1), nothing)
+
+
+def test_a_peak_may_be_sharp_where_images_determine_it_and_not_elsewhere() -> None:
+    seen, unseen = (np.asarray(Knots().scale(PEAK, quadratic_of(PEAK, low), sharp=True)) for low in (0.0, 8.0))
+    assert seen[0] > 0.99 * POLE_SCALE
+    assert unseen[0] < 31
+    # Beyond the peak the medium hardly bends, and a peak with a scale of its own leaves the others narrow.
+    assert seen[KNOTS // 2] < 11
+
+
+def test_the_pull_of_the_prior_on_an_unseen_peak_is_more_than_the_prior_says() -> None:
+    quadratic = quadratic_of(PEAK, 8.0)
+    scale = Knots().scale(PEAK, quadratic, sharp=True)
+    told, own = np.diag(Knots().pull_covariance(PEAK, quadratic, scale)), np.diag(precision(scale))
+    assert told[0] > 4 * own[0]
+    assert np.all(told >= 0.999 * own)
+
+
+def test_the_pull_on_media_that_bend_as_the_prior_says_is_its_precision() -> None:
+    scale = np.linspace(3.0, 30.0, KNOTS)
+    np.testing.assert_allclose(pull_covariance(scale, scale), precision(scale), rtol=1e-12)

@@ -25,6 +25,7 @@ from services.api.jobs.records import Deletion, Job
 from services.api.jobs.table import JobFilter
 from services.api.jobs.time_ranges import TimeRange
 from services.core.geometry import Record
+from services.core.job_kinds import foreign_options, job_kinds
 from services.core.owners import Viewer
 from services.core.records import JobName, JobSpec, KindName
 from services.pipeline.database import MAX_ID
@@ -101,7 +102,8 @@ def build_router(
         cancel_pool: threads that cancel jobs.
     """
     router = APIRouter(prefix="/v1", route_class=BodyRoute, responses=refusals(404, 409, 413, 422, 507))
-    schema = json.dumps(JobSpec.model_json_schema())
+    foreign = {kind: sorted(foreign_options(kind, frozenset(JobSpec.model_fields))) for kind in job_kinds()}
+    schema = json.dumps({**JobSpec.model_json_schema(), "foreign_options": foreign})
 
     @in_json
     def detail(job: Job, remaining: TimeRange | None, viewer: Viewer) -> JobDetail:
@@ -272,7 +274,9 @@ def build_router(
 
     @router.get("/options", response_model=dict[str, Any], tags=["options"], dependencies=[needs("read")])
     async def options() -> Response:
-        """JSON schema of a job's options with defaults, units and help."""
+        """JSON schema of a job's options with defaults, units and help; ``foreign_options`` are those that a kind of job
+        does not have.
+        """
         return Response(schema, media_type="application/json")
 
     @router.get("/openapi.json", include_in_schema=False, dependencies=[needs("read")])

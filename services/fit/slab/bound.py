@@ -17,10 +17,10 @@ from services.fit.slab.images import shot_noise
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig
-from services.fit.slab.solve.coordinates import Knots
+from services.fit.slab.solve.coordinates import Knots, seen_poles
 from services.fit.slab.solve.gauss_newton import quadratic_at
 from services.fit.slab.solve.normal import normal_equations
-from services.fit.slab.solve.prior import SCALES, Quadratic, flag_scales, is_thick, precision, widened
+from services.fit.slab.solve.prior import Quadratic, flag_scales, is_thick, precision, sharp_scales
 from services.fit.slab.solve.smooth import smoother_of
 from services.fit.slab.solve.uncertainty import Uncertainty, covariance_of, phase_chain
 from services.fit.slab.solve.weights import independent_weights
@@ -76,7 +76,7 @@ def bound_of(
     quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths, blocks=blocks)
     x = Knots().unknowns(material)
     if scale is None:
-        scale = widened(max(SCALES), material)
+        scale = sharp_scales(material, seen_poles(quadratic))[-1]
     chosen, alone = (covariance_of(quadratic, precision(one)) for one in (scale, flag_scales()))
     uncertainty = Uncertainty(chosen, alone, (chosen, alone))
     return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)

@@ -74,6 +74,8 @@ export interface JobDetail extends Job {
 
 /** Options by name, with a default, limits and help each. */
 export interface OptionsSchema {
+  /** Kind of job -> options that it does not have. */
+  foreign_options: Record<string, string[]>;
   properties: Record<string, OptionSchema>;
   $defs: Record<string, { properties?: Record<string, OptionSchema & { $ref?: string }> }>;
 }

@@ -40,7 +40,8 @@ export class NewJobView {
         ),
         card(
           "Upload a capture",
-          "A folder with capture.json, or raw.toml and photographs as cameras write them, with its meshes. " +
+          "A folder with capture.json, or raw.toml and photographs as cameras write them, with its meshes; " +
+            "for a material in a cell, one with slab.json and its images. " +
             "Only what the server does not know yet is sent; an upload that breaks goes on when you choose the " +
             "folder again.",
           this.upload.root,

@@ -86,15 +86,16 @@ export class OptionField {
     else this.input.value = value === undefined || value === null ? "" : String(value);
   }
 
-  /** Return the value for the job; undefined where it is the default. */
+  /** Return the value for the job; undefined where it is the default or the field is hidden. */
   value(): unknown {
+    if (this.root.hidden) return undefined;
     const value = this.read();
     return JSON.stringify(value) === JSON.stringify(this.schema.default ?? null) ? undefined : value;
   }
 
   /** Whether the value is valid in the browser's view; if not, its message is shown beside the field. */
   check(): boolean {
-    const good = this.input.checkValidity();
+    const good = Boolean(this.root.hidden) || this.input.checkValidity();
     this.accuse(good ? "" : this.input.validationMessage);
     return good;
   }
@@ -103,6 +104,11 @@ export class OptionField {
   accuse(sentence: string): void {
     this.refusal.textContent = sentence;
     this.input.setAttribute("aria-invalid", sentence ? "true" : "false");
+  }
+
+  /** Call a function whenever the user has changed the value. */
+  onChange(act: () => void): void {
+    this.input.addEventListener("change", act);
   }
 
   focus(): void {

@@ -59,6 +59,7 @@ const GROUPS: [string, string[]][] = [
 ];
 const RIG_FIRST = ["dome", "mouth", "level", "exposure_s"];
 const LONGEST_NAME = "80";
+const DEFAULT_KIND = "tooth";
 /** Name of the demonstration as a source, and of the preset with the options that its capture needs. */
 const DEMO = "demo";
 
@@ -75,6 +76,7 @@ export class SubmitView {
   private readonly rigOptions = element("section", {}, element("h3", {}, "Rig"));
   private fields: OptionField[] = [];
   private rigFields: OptionField[] = [];
+  private foreign: OptionsSchema["foreign_options"] = {};
   private presets: Preset[] = [];
   private demo: Preset["options"] = {};
   private filledForDemo = false;
@@ -152,7 +154,18 @@ export class SubmitView {
       if (title === GROUPS[0]?.[0]) group.open = true;
       this.options.append(group);
     }
+    this.foreign = schema.foreign_options;
+    this.fields.find((one) => one.name === "kind")?.onChange(() => this.showKind());
     this.arrange(captures.length > 0);
+  }
+
+  /** Hide the options that the chosen kind of job does not have, and groups that are then empty. */
+  private showKind(): void {
+    const kind = this.fields.find((one) => one.name === "kind")?.value() ?? DEFAULT_KIND;
+    const foreign = new Set(this.foreign[String(kind)]);
+    for (const field of this.fields) field.root.hidden = foreign.has(field.name);
+    for (const group of this.options.children)
+      (group as HTMLElement).hidden = !group.querySelector(".option:not([hidden])");
   }
 
   private offer(calibrations: NamedCalibration[]): void {
@@ -227,6 +240,7 @@ export class SubmitView {
       if (field.name in options) field.set(options[field.name]);
       else field.reset();
     }
+    this.showKind();
   }
 
   private async submit(): Promise<void> {

@@ -34,7 +34,7 @@ class Budget:
     first_paths: int = 4000
     search_paths: int = 8000
     """Largest number of paths in the search."""
-    last: tuple[Stage, ...] = (Stage(15_000, 16, 4, 8), Stage(30_000, 24, 12, 8))
+    last: tuple[Stage, ...] = (Stage(15_000, 16, 4, 8), Stage(30_000, 24, 12, 32))
     """The last stages. Renders of the last one are combined, until their noise is no longer the larger part of the
     ±."""
     max_steps: int = 10

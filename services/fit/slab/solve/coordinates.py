@@ -8,6 +8,7 @@ unknowns converts them by the chain rule.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,8 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
+from services.fit.slab.solve.measured_directions import measured_directions
 from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import RIDGE, SCALES, Quadratic, flag_scales, precision, widened
+from services.fit.slab.solve.prior import (
+    RIDGE,
+    SCALES,
+    Quadratic,
+    flag_scales,
+    near_poles,
+    precision,
+    pull_covariance,
+    sharp_scales,
+)
 
 Array = NDArray[np.float64]
 
@@ -29,6 +40,8 @@ MAX_LN_SCATTERING_CHANGE = 0.3
 BROAD_COSINES = 9
 """Number of multiples of the angle, from 0: the smallest feature is 22 degrees wide, and thick cells resolve none that
 is smaller."""
+MAX_SEEN_ERROR = 0.1
+"""Largest standard error of ln f by the images alone, at half of the knots around a pole, at which the pole is seen."""
 
 
 class Coordinates(Protocol):
@@ -55,6 +68,9 @@ class Coordinates(Protocol):
 
     def precision(self, scale: float | Array) -> Array:
         """Inverse covariance of the prior (U, U) for one scale."""
+
+    def pull_covariance(self, material: Material, quadratic: Quadratic, scale: float | Array) -> Array:
+        """Covariance (U, U) of the prior's pull on a medium like this one, as a gradient."""
 
     def weak_precision(self, material: Material) -> Array:
         """The same for a prior so weak that its information is not taken for a measurement."""
@@ -102,9 +118,23 @@ class Knots:
         """None, because the forward model's derivatives are with respect to these unknowns."""
 
     def scale(self, material: Material, quadratic: Quadratic, *, sharp: bool) -> float | Array:
-        """The scale with the largest evidence; see ``prior.widened`` for a ``sharp`` one."""
-        every: list[float | Array] = [widened(scale, material) if sharp else scale for scale in SCALES]
-        return max(every, key=lambda scale: self.log_evidence(quadratic, scale))
+        """The scale with the largest evidence; a ``sharp`` one is that of ``prior.sharp_scales``, with the poles that
+        the images determine. A peak that no camera sees would follow the noise of the angles beside it.
+        """
+        seen = seen_poles(quadratic) if sharp else ()
+        return self._likeliest(quadratic, sharp_scales(material, seen) if sharp else SCALES)
+
+    def pull_covariance(self, material: Material, quadratic: Quadratic, scale: float | Array) -> Array:
+        """Covariance of the pull on media that bend as the evidence says, which may be more sharply than the prior
+        allows at a pole that the images do not determine.
+        """
+        bends = scale
+        if np.ndim(scale) > 0:
+            bends = np.maximum(scale, self._likeliest(quadratic, sharp_scales(material, near_poles())))
+        return pull_covariance(scale, bends)
+
+    def _likeliest(self, quadratic: Quadratic, scales: Sequence[float | Array]) -> float | Array:
+        return max(scales, key=lambda scale: self.log_evidence(quadratic, scale))
 
     def precision(self, scale: float | Array) -> Array:
         """Inverse covariance of a smooth ln f; the absorption has a flat prior."""
@@ -173,6 +203,13 @@ class Knots:
             if sign > 0
             else -np.inf
         )
+
+
+def seen_poles(quadratic: Quadratic) -> list[Array]:
+    """The poles (see ``prior.near_poles``) around which images alone determine ln f to ``MAX_SEEN_ERROR``."""
+    alone = np.linalg.inv(measured_directions(quadratic, precision(flag_scales())).total)
+    errors = np.sqrt(np.diag(alone)[:KNOTS])
+    return [near for near in near_poles() if np.median(errors[near >= 0.5]) <= MAX_SEEN_ERROR]
 
 
 def reduced_scattering_slope(material: Material) -> Array:

@@ -86,6 +86,10 @@ class Mixtures:
         """Inverse covariance of weights about zero; the absorption has a flat prior."""
         return np.diag(np.append(np.full(self.atoms.shape[1], scale**-2.0), 0.0))
 
+    def pull_covariance(self, material: Material, quadratic: Quadratic, scale: float | Array) -> Array:  # noqa: ARG002 - one for all
+        """That of weights of the prior's own size."""
+        return self.precision(scale)
+
     def weak_precision(self, material: Material) -> Array:
         """The same for weights that may all be many times those of the medium."""
         return self.precision(WEAK_SHARE * material.scattering_per_mm)

@@ -53,7 +53,8 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
 
     The unbiased matrix is indefinite where it is noise, and the matrix with the noise included would promise too much:
     so only directions whose curvature stands out count. The gradient's noise is that of the measurements, and that of
-    the paths as measured between batches; the displacement left to the minimum counts as error.
+    the paths as measured between batches; the displacement left to the minimum counts as error, and so does the prior's
+    pull.
     """
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
@@ -69,7 +70,8 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
         + solution.gradient_noise
         + np.outer(solution.matrix_error_gradient, solution.matrix_error_gradient)
     )
-    chosen = chosen @ (directions.noise(noise) + priors[0] + bounds) @ chosen
+    pull = coordinates.pull_covariance(material, quadratic, solution.scale)
+    chosen = chosen @ (directions.noise(noise) + pull + bounds) @ chosen
     remaining = _remaining_square(solution, x, priors[0], chosen)
     # Flags ask what the prior adds, so the covariance under the weak prior has only the noise that the weights contain.
     chosen, alone = chosen + remaining, alone + remaining
