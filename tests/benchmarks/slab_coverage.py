@@ -48,6 +48,9 @@ SCATTERING_PER_MM, COSINE, ABSORPTION_PER_MM = 0.97, 0.8, 0.03
 SPREADS = {"sigma_s": 0.006, "sigma_a": 0.002, "g": 0.002}
 """Standard deviations of the change: of sigma_s as a share of it, of sigma_a per mm, of g in units of 1. Each is about
 one of the ±, which is how far the last step of a fit moves."""
+DIFFERENCES = {"sigma_s": 0.06, "sigma_a": 0.02, "g": 0.02}
+"""Changes from which derivatives are computed, of either sign. With twice those of ``SPREADS`` the photons' noise in
+them was up to 0.7 of the ±."""
 NOISE = 0.01 * 8**0.5
 """Shot noise of a pixel that has its image's mean, as a share."""
 POOL, BATCHES, PATHS = 768, 96, 7_500
@@ -71,8 +74,7 @@ def changed(share: float = 0.0, absorption_per_mm: float = 0.0, cosine: float = 
 def columns(folder: SlabFolder, rig: Rig, photons: int) -> Array:
     """Derivatives of the images by each kind of change, from differences of plain photons (3, images, pixels)."""
     found = []
-    for number, (name, spread) in enumerate(SPREADS.items()):
-        step = 2 * spread
+    for number, (name, step) in enumerate(DIFFERENCES.items()):
         both = []
         for sign in (1, -1):
             scattering = SCATTERING_PER_MM * (1 + sign * step if name == "sigma_s" else 1)

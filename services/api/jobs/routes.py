@@ -274,8 +274,8 @@ def build_router(
 
     @router.get("/options", response_model=dict[str, Any], tags=["options"], dependencies=[needs("read")])
     async def options() -> Response:
-        """JSON schema of a job's options with defaults, units and help; ``foreign_options`` are those that a kind of job
-        does not have.
+        """JSON schema of a job's options with defaults, units and help; ``foreign_options`` are those that a kind does
+        not have.
         """
         return Response(schema, media_type="application/json")
 
