@@ -76,7 +76,8 @@ export class UploadCard {
   }
 
   private show({ files, leftOut }: Folder): void {
-    if (!files.length) throw new Error("The folder holds no file of a capture; choose the one with capture.json, raw.toml or slab.json.");
+    if (!files.length)
+      throw new Error("The folder holds no file of a capture; choose the one with capture.json, raw.toml or slab.json.");
     this.bar.hidden = false;
     this.note.hidden = false;
     this.leftOut.hidden = leftOut.length === 0;
