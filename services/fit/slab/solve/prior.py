@@ -24,9 +24,6 @@ SCALES = (3.0, 10.0, 30.0)
 beyond 20 degrees. Thick cells have the same: there 1 per rad2 pulled the fit towards a constant ln f along the
 direction that images hardly determine, sigma_s at a constant sigma_s' (200 nm spheres at sigma_t w = 5.4: sigma_s by
 -11 % at 640,000 paths, where 3 does by -2.6 % and 10 by -0.2 %)."""
-SHARP_SCALES = SCALES[1:]
-"""The same for scales that follow the medium's bends. The evidence took 3 in one fit of HG 0.8 at the paper's angles,
-whose errors from 45 to 135 degrees were then 1.7 of their standard errors."""
 SHARPEST, BLUNTEST, POLE_RAD = 600.0, 10.0, math.radians(8)
 """Scales of the weak prior by which values are flagged, per rad2: at the poles and far from them; and the angle from a
 pole at which the first has halved. HG 0.93 bends by 570 at its peak; any narrower prior there would let smoothness pass
@@ -86,10 +83,10 @@ def widened(scale: float, material: Material) -> Array:
 
 
 def sharp_scales(material: Material, poles: Sequence[Array]) -> list[Array]:
-    """Scales at each knot (KNOTS,) for the end of a fit: ``SHARP_SCALES`` widened by the medium's bends, each with and
+    """Scales at each knot (KNOTS,) for the end of a fit: ``SCALES`` widened by the medium's bends, each with and
     without ``POLE_SCALE`` at each of these poles, which are of ``near_poles``.
     """
-    scales = [widened(scale, material) for scale in SHARP_SCALES]
+    scales = [widened(scale, material) for scale in SCALES]
     for near in poles:
         scales += [np.hypot(scale, POLE_SCALE * near) for scale in scales]
     return scales
