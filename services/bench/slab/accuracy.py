@@ -155,10 +155,11 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
             y = np.interp(np.log(row["thickness"]), np.log(THICKNESSES), np.arange(len(THICKNESSES)))
             axes.text(x, y, f"{scale * _error(row, name):.2g}", ha="center", va="center", fontsize=8, color="white",
                       bbox={"facecolor": "black", "alpha": 0.6, "pad": 1.5, "edgecolor": "none"})  # fmt: skip
-        axes.set(title=f"bound (colour) and error of fits (numbers): {title}", xlabel="albedo", ylabel="σt·w")
-        axes.title.set_fontsize(9)
+        axes.set(title=title, xlabel="albedo", ylabel="σt·w")
         axes.set_xticks(np.arange(len(ALBEDOS)), [f"{albedo:g}" for albedo in ALBEDOS])
         axes.set_yticks(np.arange(len(THICKNESSES)), [f"{thickness:g}" for thickness in THICKNESSES])
+    drawn_rows = ["bounds (colour)"] * bool(bounds) + ["errors of fits (numbers)"] * bool(fits)
+    figure.suptitle(" and ".join(drawn_rows))
     return figure
 
 

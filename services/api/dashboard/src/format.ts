@@ -17,7 +17,8 @@ export function unitOfName(name: string): string {
 }
 
 export function valueOf(estimate: Estimate): string {
-  if (estimate.se === null) return significant(estimate.value);
+  // A value that was given and not fitted has a standard error of zero.
+  if (!estimate.se) return significant(estimate.value);
   const decimals = decimalsFor(estimate.se);
   return `${estimate.value.toFixed(decimals)} ± ${estimate.se.toFixed(decimals)}`;
 }

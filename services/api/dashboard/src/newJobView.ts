@@ -26,7 +26,8 @@ export class NewJobView {
       element(
         "p",
         { class: "soft" },
-        "A job turns a capture of a person's teeth into a measured, renderable asset. Three ways to begin:",
+        "A job turns a capture of a person's teeth into a measured, renderable asset, or images of a material in a " +
+          "cell into its scattering properties. Three ways to begin:",
       ),
       element(
         "div",
