@@ -5,13 +5,14 @@ python -m tests.benchmarks.instrument_errors --json instrument_errors.json
 python -m tests.benchmarks.instrument_errors --errors none,gain --pixel-step 3 --json gain.json
 python -m tests.benchmarks.instrument_errors --errors none,far_gain,far_light,far_scan,exchanged --seeds 3 \\
     --instrument on --json faults.json
+python -m tests.benchmarks.instrument_errors --errors drawn --seeds 20 --instrument on --json drawn.json
 
 The stored central incisor, rendered by stock Mitsuba with sensor noise, is photographed by an instrument with one
 error: its images are scaled, or light is added to them, or the stated positions of its lights, scan or dome are wrong.
-The error is two assumed standard errors, or far more, where the fit has to name the fault. Bias is the difference
-between the fits with and without the error for the same seed of the sensor's noise, so that the fit's own errors
-cancel. Fits run in this process, on one thread; ``seconds`` is its processor time, ``samples`` the number of paths of
-its last step.
+The error is two assumed standard errors, or far more, where the fit has to name the fault; with ``drawn`` all errors
+are drawn at once from the covariance that a fit assumes. Bias is the difference between the fits with and without the
+error for the same seed of the sensor's noise, so that the fit's own errors cancel. Fits run in this process, on one
+thread; ``seconds`` is its processor time, ``samples`` the number of paths of its last step.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
+from services.fit.instrument.errors import DEFAULT_MOVE_SE, DEFAULT_SE
+from services.fit.instrument.moves import rigid
 from services.fit.stage import run
 from services.fit.transport.platform import prepare_device
 from tests.support.truths import SIDE_LIGHTS, read, write_capture
@@ -60,9 +63,14 @@ LIGHTS_OFF_MM = 10.0
 """Distance of each stated light from its true position, in a random direction."""
 
 
-def perturb(folder: Path, error: str) -> None:
-    """Change a written capture into that of an instrument with an error: ``none`` or one of ``ERRORS``."""
+def perturb(folder: Path, error: str, seed: int) -> None:
+    """Change a written capture into that of an instrument with an error: ``none`` or one of ``ERRORS``; the errors of
+    ``drawn`` follow from the seed.
+    """
     description = json.loads((folder / "capture.json").read_text())
+    if error == "drawn":
+        draw(folder, description, np.random.default_rng([29, seed]))
+        return
     if error in ("lights", "dome", "far_light"):
         _move_lights(description["lights"], error)
         (folder / "capture.json").write_text(json.dumps(description))
@@ -82,15 +90,7 @@ def perturb(folder: Path, error: str) -> None:
             one["light"] = other.get(one["light"], one["light"])
         (folder / "capture.json").write_text(json.dumps(description))
         return
-    images: dict[str, NDArray[np.float64]] = {
-        one["file"]: np.load(folder / one["file"]) for one in description["images"]
-    }
-    brightest = {
-        camera["name"]: max(
-            images[one["file"]].max() for one in description["images"] if one["camera"] == camera["name"]
-        )
-        for camera in description["cameras"]
-    }
+    images, brightest = photographs(folder, description)
     changed: dict[str, Callable[[dict[str, str], NDArray[np.float64]], NDArray[np.float64]]] = {
         "none": lambda _, image: image,
         "gain": lambda _, image: 1.02 * image,
@@ -102,7 +102,43 @@ def perturb(folder: Path, error: str) -> None:
         np.save(folder / one["file"], changed[error](one, images[one["file"]]))
 
 
-ERRORS = ("gain", "light_gain", "flare", "lights", "dome", "scan", *FAULTS)
+def photographs(folder: Path, description: dict[str, Any]) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
+    """The capture's images by their file, and the value of each camera's brightest pixel by its name."""
+    images = {one["file"]: np.load(folder / one["file"]) for one in description["images"]}
+    brightest = {
+        camera["name"]: max(
+            float(images[one["file"]].max()) for one in description["images"] if one["camera"] == camera["name"]
+        )
+        for camera in description["cameras"]
+    }
+    return images, brightest
+
+
+def draw(folder: Path, description: dict[str, Any], rng: np.random.Generator) -> None:
+    """Change a written capture by errors of gain, lights, flare, scan and dome, drawn from their assumed covariance."""
+    images, brightest = photographs(folder, description)
+    gain = rng.normal(0, DEFAULT_SE["gain"])
+    lights = {light["name"]: rng.normal(0, DEFAULT_SE["light_gain"]) for light in description["lights"]}
+    flare = {name: rng.normal(0, DEFAULT_SE["flare"]) * brightest[name] for name in brightest}
+    for one in description["images"]:
+        photograph = (1 + gain + lights[one["light"]]) * images[one["file"]] + flare[one["camera"]]
+        np.save(folder / one["file"], photograph)
+
+    places_mm = np.array([light["position_mm"] for light in description["lights"]])
+    move = rigid(rng.normal(0, DEFAULT_MOVE_SE["dome"]), places_mm.mean(axis=0))
+    for light, place_mm in zip(description["lights"], places_mm, strict=True):
+        light["position_mm"] = (move[:3, :3] @ place_mm + move[:3, 3]).tolist()
+    (folder / "capture.json").write_text(json.dumps(description))
+
+    scans = sorted((folder / "teeth").rglob("*.ply"))
+    outer_mm = read_mesh(next(path for path in scans if path.stem == "outer")).vertices_mm
+    move = rigid(rng.normal(0, DEFAULT_MOVE_SE["teeth"]), outer_mm.mean(axis=0))
+    for path in scans:
+        mesh = read_mesh(path)
+        write_mesh(path, Mesh(mesh.vertices_mm @ move[:3, :3].T + move[:3, 3], mesh.faces))
+
+
+ERRORS = ("drawn", "gain", "light_gain", "flare", "lights", "dome", "scan", *FAULTS)
 
 
 def _move_lights(lights: list[dict[str, Any]], error: str) -> None:
@@ -128,7 +164,7 @@ def fit(folder: Path, error: str, seed: int = 1, **options: Any) -> dict[str, An
         seed: seed of the sensor's noise.
     """
     write_capture(SUBJECT, folder / "capture", seed=seed)
-    perturb(folder / "capture", error)
+    perturb(folder / "capture", error, seed)
     spec = JobSpec.model_validate(OPTIONS | {"capture": folder / "capture"} | options)
     began = time.process_time()
     prepared_tooth(folder / "job", spec)
@@ -145,6 +181,7 @@ def fit(folder: Path, error: str, seed: int = 1, **options: Any) -> dict[str, An
         "advice": report.advice,
         "named": FAULTS[error](report) if error in FAULTS else None,
         "values": {name: table[name].model_dump() for name in QUANTITIES},
+        "correlation": report.correlations["green"].model_dump(),
         "errors_found": {name: one.model_dump() for name, one in report.instrument.get("green", {}).items()},
         "told": report.instrument_told,
         "held_out_error": report.held_out_error,
