@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import rig_of
 from services.fit.slab.results.result import SlabFit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -74,6 +77,22 @@ def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
         )
         keep(rows)
     return rows
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Draw the squared error of each cell's images with its standard error, as noise makes some of them negative."""
+    from services.bench.plots import grid
+
+    figure, (axes,) = grid(1)
+    squared, spread = (100**2 * np.array([row[key] for row in rows]) for key in ("squared", "squared_se"))
+    axes.errorbar(range(len(rows)), squared, spread, fmt="o", capsize=3)
+    names = [f"{row['width_mm']:g} mm, beams {row['lights']}°" for row in rows]
+    axes.set_xticks(range(len(rows)), names, rotation=20, ha="right", fontsize=8)
+    axes.axhline(2**2, color="0.5", linestyle=":", label="an error of 2 %")
+    axes.legend(fontsize=8)
+    axes.set(ylabel="squared error of images, (%)²", title="the fitted cell, then cells it has not seen")
+    axes.grid(alpha=0.25)
+    return figure
 
 
 def novel_folder(width_mm: float) -> SlabFolder:

@@ -128,6 +128,6 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     for axes, key, title in zip(panels, ("error", "scattering_error"), ("phase function, L2", "σs"), strict=True):
         draw_errors(axes, [row | {"error": row[key]} for row in rows], lines=False)
         axes.axvline(PAPERS_CORE_SECONDS, color="0.5", linestyle=":", label="the paper's 9,600 core-hours")
+        axes.set(title=title, xlim=(axes.get_xlim()[0], 2 * PAPERS_CORE_SECONDS))
         finish(axes, "core-seconds", "relative error")
-        axes.set_title(title)
     return figure
