@@ -147,13 +147,18 @@ class Verdict(Record):
     steps: int
     advice: str = Field(description="what to do where it did not converge, or for a better answer; may be empty")
 
+    @property
+    def held_out_error(self) -> float | None:
+        """The error, if it is that of held-out images."""
+        return self.error.value if self.error_of == "held-out" else None
+
 
 class AssetManifest(Record):
     """Published by the export stage."""
 
     files: tuple[str, ...]
     held_out_error: float | None = Field(
-        default=None, description="mean over channels; null where nothing was fitted to images, as of a calibration"
+        default=None, description="mean over channels; null where no image was held out, and of a calibration"
     )
     converged: bool = Field(default=True, description="whether the fit behind it did")
     advice: str = Field(default="", description="what to do where it did not")

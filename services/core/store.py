@@ -49,7 +49,7 @@ from services.core.errors import (
     ReadOnlyStoreError,
 )
 from services.core.files.object_store import array_location, discard, remote_folder
-from services.core.files.validation import fault_of
+from services.core.files.validation import fault_of, first_error
 from services.core.geometry import Record
 
 R = TypeVar("R", bound=Record)
@@ -95,7 +95,7 @@ def read_record(path: Path, kind: type[R]) -> R:
     try:
         return kind.model_validate_json(path.read_bytes())
     except ValidationError as problem:
-        raise CaptureInputError(f"{path}: {fault_of(problem.errors()[0], kind)}.") from problem
+        raise CaptureInputError(f"{path}: {fault_of(first_error(problem), kind)}.") from problem
 
 
 class StageWriter:

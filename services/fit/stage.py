@@ -164,7 +164,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     verdict = verdict_of(report)
     manifest = AssetManifest(
         files=files,
-        held_out_error=verdict.error.value,
+        held_out_error=verdict.held_out_error,
         converged=verdict.converged,
         advice=report.advice,
         verdict=verdict,

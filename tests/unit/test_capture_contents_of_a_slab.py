@@ -34,7 +34,7 @@ def test_a_folder_with_a_slabs_description_is_a_capture(tmp_path: Path) -> None:
     [
         ({}, frozenset({"b0_l0.npy"}), "slab.json names image file f0_l0.npy, which is not among the files"),
         ({"cell": {"width_mm": 0}}, None, "slab.json: cell.width_mm: "),
-        ({"glass": 1}, None, "slab.json: glass: "),
+        ({"glass": 1}, None, "slab.json: unknown key 'glass'; known keys are "),
         ({"pixels": description()["pixels"] | {"columns": 4096, "rows": 4096}}, None, None),
     ],
 )

@@ -97,6 +97,61 @@ def test_without_noise_that_frames_tell_it_is_assumed(tmp_path: Path) -> None:
     assert read_images(root, read_folder(root), WAVELENGTH_NM).assumed_noise
 
 
+def known_counts(told: dict[str, Any]) -> None:
+    """Gives the sensor's own numbers in place of black frames."""
+    told["exposures"] = [one for one in told["exposures"] if one.get("kind") != "black"]
+    for camera in told["cameras"]:
+        camera["counts"] = {
+            "black": SENSOR.black,
+            "read_noise": SENSOR.read_counts,
+            "per_electron": SENSOR.counts_per_electron,
+        }
+
+
+def test_counts_that_are_known_need_no_black_frames(tmp_path: Path) -> None:
+    measured = [
+        read_images(root, read_folder(root), WAVELENGTH_NM)
+        for root in (
+            write_stack(folder(tmp_path, "frames")),
+            write_stack(folder(tmp_path, "known"), change=known_counts),
+        )
+    ]
+    assert not any(one.assumed_noise for one in measured)
+    by_frames, known = measured
+    # Four black frames add a quarter of a frame's read noise, of which the images share all else.
+    finite = np.isfinite(known.variances) & np.isfinite(by_frames.variances)
+    assert finite.mean() > 0.99
+    z = (known.values - by_frames.values)[finite] / np.sqrt(by_frames.variances[finite])
+    assert 0 < np.sqrt((z**2).mean()) < 0.5
+    # Frames tell the noise to some per cent.
+    assert 0.7 < np.median(known.variances[finite] / by_frames.variances[finite]) < 1.1
+
+
+def folder(parent: Path, name: str) -> Path:
+    (parent / name).mkdir()
+    return parent / name
+
+
+def test_cameras_may_share_a_black_frame(tmp_path: Path) -> None:
+    """As where one camera is moved to several places."""
+
+    def shared(told: dict[str, Any]) -> None:
+        for one in blacks(told):
+            one["file"] = one["file"].replace("b0_", "f0_")
+
+    root = write_stack(tmp_path, change=shared)
+    assert not read_images(root, read_folder(root), WAVELENGTH_NM).assumed_noise
+
+
+def test_a_short_exposure_may_be_too_dim_to_see(tmp_path: Path) -> None:
+    """Where longer ones show light, a short one of less than its noise contradicts nothing."""
+    root, rng, dim = write_stack(tmp_path), np.random.default_rng(9), np.full((EDGE, EDGE, 1), 2.0)
+    for number, time_s in enumerate(TIMES_S):
+        np.save(root / f"f0_l0_{number}.npy", SENSOR.counts(dim, time_s, rng)[..., 0])
+    measured = read_images(root, read_folder(root), WAVELENGTH_NM)
+    assert measured.values[0].mean() == pytest.approx(2 / POWER, rel=0.1)
+
+
 def test_a_beam_on_a_few_pixels_is_light(tmp_path: Path) -> None:
     """Nine pixels of 2,304 are lit: the spread over the image is then that of the light, not of the noise."""
     root, rng, lit = write_stack(tmp_path), np.random.default_rng(8), np.zeros((EDGE, EDGE, 1))
@@ -158,6 +213,9 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         lambda d: d["exposures"][2].update(file="f0_black_1.npy") or d["exposures"].remove(blacks(d)[1]),
         "no brighter than",
     ),
+    "half a noise": (lambda d: d["cameras"][0].update(counts={"read_noise": 2}), "give both or neither"),
+    "two blacks": (lambda d: d["cameras"][0].update(counts={"black": 64}), "keep one of both"),
+    "too far up": (lambda d: d["exposures"][0].update(shift=8), "together more than the 16 bits"),
     "another size": (lambda d: d["pixels"].update(columns=EDGE // 2), "export it at the camera's size"),
 }  # fmt: skip
 

@@ -4,17 +4,20 @@ ended early.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from services.fit.slab.model.dictionary import KNOTS, henyey_greenstein
-from services.fit.slab.results.result import parameters_of, phase_of
+from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, henyey_greenstein
+from services.fit.slab.results.result import Errors, parameters_of, phase_of, with_believable_flags
 from services.fit.slab.solve.coordinates import Knots
 from services.fit.slab.solve.gauss_newton import Solution
 from services.fit.slab.solve.normal import UNKNOWNS
 from services.fit.slab.solve.prior import Quadratic
-from services.fit.slab.solve.uncertainty import Uncertainty, uncertainty_of
+from services.fit.slab.solve.uncertainty import Uncertainty, resolution_deg, uncertainty_of
 from services.fit.slab.through_beam import Index
+from tests.pipeline.test_slab_job import stored_like
 
 MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)
 CURVATURE = 1e4
@@ -40,6 +43,33 @@ def solution(short: np.ndarray, rendering: float) -> Solution:
 def standard_error(one: Solution) -> float:
     """Standard error of the mean of ln f, which the smoothness prior does not affect."""
     return uncertainty_of(one).standard_error(np.append(np.full(KNOTS, 1 / KNOTS), 0.0))
+
+
+def test_images_that_know_each_knot_resolve_its_spacing_and_others_less() -> None:
+    fine, coarse = (resolution_deg(kernels(curvature)) for curvature in (1e9, 100.0))
+    np.testing.assert_allclose(fine, 180 / (KNOTS - 1), rtol=0.01)
+    assert np.median(coarse) > 5
+    assert coarse.max() <= 180
+
+
+def test_kernels_pass_what_is_wide_and_average_what_is_narrow() -> None:
+    averaging, inner = kernels(100.0), slice(KNOTS // 4, 3 * KNOTS // 4)
+    wide, narrow = (np.cos(2 * np.pi * np.degrees(ANGLES_RAD) / period_deg) for period_deg in (90, 3))
+    np.testing.assert_allclose(averaging @ np.ones(KNOTS), 1, rtol=1e-6)
+    np.testing.assert_allclose((averaging @ wide)[inner], wide[inner], atol=0.05)
+    assert np.abs(averaging @ narrow)[inner].max() < 0.05
+
+
+def kernels(curvature: float) -> np.ndarray:
+    """Averaging kernels (KNOTS, KNOTS) of images that give each knot's ln f this curvature."""
+    one = solution(np.zeros(UNKNOWNS), 0.0)
+    matrix = curvature * np.eye(UNKNOWNS)
+    linear = -matrix @ Knots().unknowns(MATERIAL)
+    averaging = uncertainty_of(
+        replace(one, quadratic=replace(one.quadratic, matrix=matrix, linear=linear), data_noise=matrix)
+    ).averaging
+    assert averaging is not None
+    return averaging
 
 
 def test_noise_of_the_paths_widens_the_errors() -> None:
@@ -72,3 +102,15 @@ def test_a_very_thick_cell_tells_no_scattering_by_itself(width_mm: float, told: 
     assert parameters.sigma_a.determined
     assert [getattr(parameters, name).determined for name in ("sigma_t", "sigma_s", "g")] == 3 * [told]
     assert set(phase_of(MATERIAL, uncertainty, width_mm).determined) == {told}
+
+
+def test_a_fit_unlike_its_images_calls_nothing_determined() -> None:
+    like = stored_like(532.0)
+    assert with_believable_flags(like) == like
+    unlike = like.model_copy(
+        update={"errors": Errors(fit_error=0.3, held_out_error=None), "atoms": {"HG 0.8": like.parameters.g}}
+    )
+    judged = with_believable_flags(unlike)
+    assert not any(one.determined for _, one in judged.parameters)
+    assert not judged.atoms["HG 0.8"].determined
+    assert judged.parameters.g.value == like.parameters.g.value

@@ -207,6 +207,8 @@ class TimeRanges:
         position = _position(job, stages.latest, self._repository.events_of(job.id))
         if position is None:
             return TimeRange(reason="It was interrupted; the next stage will tell a time again.")
+        if job.spec.kind == "slab":
+            return TimeRange(reason="That depends on the sample; a wavelength takes some minutes on two cores.")
         size = size_of(self._locate(job.spec), self._describe)
         if size is None:
             return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")

@@ -102,16 +102,20 @@ def photographed(truth: Truth, photons: int, seed: int) -> tuple[Array, Array]:
     return images + shot * np.random.default_rng(seed).normal(size=images.shape), total
 
 
+def write_images(root: Path, truth: Truth, images: Array, variances: Array) -> None:
+    """Write images (images, rows, columns) as the folder of a truth."""
+    (root / "slab.json").write_text(truth.folder.model_dump_json())
+    for entry, image, variance in zip(truth.folder.images, images, variances, strict=True):
+        np.save(root / entry.file, image)
+        assert entry.variance_file is not None
+        np.save(root / entry.variance_file, variance)
+
+
 def fitted(truth: Truth, images: Array, variances: Array, seed: int) -> SlabFit:
     """Fit images (images, rows, columns) of a truth's folder."""
     with tempfile.TemporaryDirectory() as place:
-        root = Path(place)
-        (root / "slab.json").write_text(truth.folder.model_dump_json())
-        for entry, image, variance in zip(truth.folder.images, images, variances, strict=True):
-            np.save(root / entry.file, image)
-            assert entry.variance_file is not None
-            np.save(root / entry.variance_file, variance)
-        (fit,) = fit_slab(root, SlabOptions(seed=seed))
+        write_images(Path(place), truth, images, variances)
+        (fit,) = fit_slab(Path(place), SlabOptions(seed=seed))
     return fit
 
 

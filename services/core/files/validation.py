@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, get_args
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -17,6 +17,14 @@ def remedied(message: str) -> str:
     """
     told = message.removeprefix("Value error, ")
     return told if "; " in told else f"{told}; correct it"
+
+
+def first_error(problem: ValidationError) -> ErrorDetails:
+    """The error to tell first: an unknown key, if there is one, because a key that is missing may be that one
+    misspelt.
+    """
+    errors = problem.errors()
+    return next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
 
 
 def fault_text(error: ErrorDetails, kind: type[BaseModel], key: str, place: str = "", value: str = "") -> str:

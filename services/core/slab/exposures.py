@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -11,6 +11,24 @@ from pydantic import Field, model_validator
 from services.core.geometry import Name, Record
 
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+MAX_BITS = 16
+
+
+class CameraCounts(Record):
+    """What is known of a camera's counts beforehand, in place of what its frames tell."""
+
+    black: NotNegative | None = Field(default=None, description="counts without light, in place of black frames")
+    read_noise: NotNegative | None = Field(
+        default=None, description="standard deviation without light, counts at gain 1"
+    )
+    per_electron: Positive | None = Field(default=None, description="counts per electron at gain 1")
+
+    @model_validator(mode="after")
+    def _noise_has_both_parts(self) -> CameraCounts:
+        if (self.read_noise is None) != (self.per_electron is None):
+            raise ValueError("a camera's noise is read_noise and per_electron; give both or neither")
+        return self
 
 
 class SlabExposure(Record):
@@ -25,8 +43,11 @@ class SlabExposure(Record):
     file: str
     exposure_s: Positive
     gain: Positive = Field(default=1.0, description="linear factor from light to counts, beside the exposure")
-    bits: Annotated[int, Field(ge=1, le=16)] | None = Field(
+    bits: Annotated[int, Field(ge=1, le=MAX_BITS)] | None = Field(
         default=None, description="significant bits of a count; needed wherever files hold whole numbers"
+    )
+    shift: Annotated[int, Field(ge=0, lt=MAX_BITS)] = Field(
+        default=0, description="how many bits the file moves counts up: 4 for 12 bits in the high bits of 16"
     )
     saturation_counts: Positive | None = Field(
         default=None, description="counts from which on a pixel is taken for full; default: the largest of its bits"
@@ -39,6 +60,11 @@ class SlabExposure(Record):
             raise ValueError(f"exposure {self.file} of kind {self.kind} {what}")
         if self.bits is None and self.saturation_counts is None:
             raise ValueError(f"exposure {self.file} does not say when a pixel is full; give bits or saturation_counts")
+        if self.bits is not None and self.bits + self.shift > MAX_BITS:
+            raise ValueError(
+                f"exposure {self.file} has bits {self.bits} and shift {self.shift}, together more than the {MAX_BITS}"
+                " bits of a file"
+            )
         if self.bits is not None and self.saturation_counts is not None and self.saturation_counts > 2**self.bits - 1:
             most = 2**self.bits - 1
             raise ValueError(
@@ -54,9 +80,20 @@ class SlabExposure(Record):
         return self.wavelength_nm == wavelength_nm
 
 
-def exposures_fault(exposures: Sequence[SlabExposure], wavelengths_nm: Sequence[float]) -> str | None:
-    """The first contradiction between the exposures of a folder, as a clause; None if there is none."""
-    if twice := [file for file, count in Counter(one.file for one in exposures).items() if count > 1]:
+def exposures_fault(
+    exposures: Sequence[SlabExposure], wavelengths_nm: Sequence[float], known_black: Collection[str] = ()
+) -> str | None:
+    """The first contradiction between the exposures of a folder, as a clause; None if there is none.
+
+    Args:
+        exposures: all of the folder.
+        wavelengths_nm: those of the folder.
+        known_black: names of the cameras whose counts without light are known beforehand.
+    """
+    # Cameras may share a black frame, as where one camera is moved to several places.
+    uses = Counter((one.file, one.camera if one.kind == "black" else "", one.wavelength_nm) for one in exposures)
+    lit = Counter(one.file for one in exposures if one.kind == "light")
+    if twice := [use[0] for use, count in uses.items() if count > 1] + [file for file in lit if lit[file] > 1]:
         return f"file {min(twice)} is listed in two exposures; keep one of them"
     for one in exposures:
         if one.wavelength_nm is not None and one.wavelength_nm not in wavelengths_nm:
@@ -65,13 +102,15 @@ def exposures_fault(exposures: Sequence[SlabExposure], wavelengths_nm: Sequence[
                 " correct it"
             )
     black = [one for one in exposures if one.kind == "black"]
+    if both := [one.camera for one in black if one.camera in known_black]:
+        return f"camera {both[0]} has black frames and a known black of its counts; keep one of both"
     for one in exposures:
-        if one.kind == "black":
+        if one.kind == "black" or one.camera in known_black:
             continue
         wavelength_nm = wavelengths_nm[0] if one.wavelength_nm is None else one.wavelength_nm
         if not any(dark.camera == one.camera and dark.holds_at(wavelength_nm, wavelengths_nm) for dark in black):
             return (
                 f"camera {one.camera} has no black exposure, so the zero of {one.file} is unknown; take one with the"
-                " beam off and list it with kind black"
+                " beam off and list it with kind black, or give the camera counts with black"
             )
     return None

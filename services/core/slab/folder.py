@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import Name, Record
-from services.core.slab.exposures import SlabExposure, exposures_fault
+from services.core.slab.exposures import CameraCounts, SlabExposure, exposures_fault
 from services.core.store import read_record
 
 Positive = Annotated[float, Field(gt=0)]
@@ -104,6 +104,7 @@ class SlabCamera(Record):
     distance_mm: Positive | None = Field(
         default=None, description="of a perspective camera's centre of projection from x = y = 0 on the outer face"
     )
+    counts: CameraCounts | None = Field(default=None, description="what is known of its counts; of exposures alone")
 
     @model_validator(mode="after")
     def _distance_of_its_kind(self) -> SlabCamera:
@@ -156,7 +157,9 @@ class SlabFolder(Record):
         self._require_index()
         if bool(self.images) == bool(self.exposures):
             raise ValueError("a slab folder lists either images or exposures; give one of both")
-        if fault := exposures_fault(self.exposures, self.wavelengths_nm):
+        if self.images and (counted := [camera.name for camera in self.cameras if camera.counts is not None]):
+            raise ValueError(f"camera {counted[0]} has counts, but images hold no counts; leave them out")
+        if fault := exposures_fault(self.exposures, self.wavelengths_nm, self._known_black()):
             raise ValueError(fault)
         seen: set[tuple[str, str, float]] = set()
         for image in self._entries():
@@ -169,6 +172,9 @@ class SlabFolder(Record):
                 )
             seen.add(key)
         return self
+
+    def _known_black(self) -> frozenset[str]:
+        return frozenset(one.name for one in self.cameras if one.counts is not None and one.counts.black is not None)
 
     def _require_index(self) -> None:
         angles = {light.name: light.angle_deg for light in self.lights}

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from services.core.errors import DentineError, SettingsError
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES
+from services.core.verdict import NOT_CONVERGED_STATUS
 
 
 def main(
@@ -25,6 +26,7 @@ def main(
     """Measure a material's scattering from images of a cell."""
     from services.fit.slab.fit import fit_slab, write_results
     from services.fit.slab.options import SlabOptions
+    from services.fit.slab.results.result import SlabReport
 
     try:
         try:
@@ -55,6 +57,10 @@ def main(
             )
         for note in fit.notes:
             print(f"  {note}")
+    verdict = SlabReport(fits=tuple(fits)).verdict()
+    if not verdict.converged:
+        print(f"{verdict.headline} {verdict.advice}".rstrip(), file=sys.stderr)
+        raise typer.Exit(NOT_CONVERGED_STATUS)
 
 
 if __name__ == "__main__":

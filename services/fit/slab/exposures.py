@@ -1,12 +1,13 @@
 """Merge the exposures of one wavelength into linear images with variances, as those of all raw cameras are.
 
-A camera's noise is measured from its own frames: read noise from black frames of one exposure, counts per electron from
-pairs of frames of one light. Light and camera stand still, so two frames of different exposure make a pair as well as
-two of the same.
+A camera's noise is known beforehand or measured from its own frames: read noise from black frames of one exposure,
+counts per electron from pairs of frames of one light. Light and camera stand still, so two frames of different exposure
+make a pair as well as two of the same.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -21,7 +22,7 @@ from services.core.raw.merge import Exposure, merge
 from services.core.raw.noise import ROUNDING, LitPair, NoiseModel, read_noise, shot_noise
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
 from services.core.robust import robust_sigma
-from services.core.slab.exposures import SlabExposure
+from services.core.slab.exposures import CameraCounts, SlabExposure
 from services.core.slab.folder import SlabFolder, SlabImage
 
 Array = NDArray[np.float64]
@@ -83,6 +84,7 @@ class _Stack:
             name=frame.camera,
             size=(pixels.columns, pixels.rows),
             bits=frame.bits,
+            shift=frame.shift,
             saturation_counts=frame.saturation_counts,
             channels=("light",),
         )
@@ -94,8 +96,19 @@ class _Stack:
         described = RawFolder(units="mm", camera=(camera,), light=lights, frame=(raw,))
         return read_counts(self.root, described, raw)[..., 0].astype(np.float32)
 
-    def black(self, frame: SlabExposure) -> tuple[Counts, int]:
-        """Mean of the black frames nearest in gain, then in exposure, and their number."""
+    @property
+    def known(self) -> CameraCounts:
+        """What is known of the camera's counts beforehand."""
+        (camera,) = (one for one in self.folder.cameras if one.name == self.frames[0].camera)
+        return camera.counts or CameraCounts()
+
+    def black(self, frame: SlabExposure) -> tuple[Counts, float]:
+        """Mean of the black frames nearest in gain, then in exposure, and their number; infinitely many where the
+        counts without light are known.
+        """
+        if self.known.black is not None:
+            pixels = self.folder.pixels
+            return np.full((pixels.rows, pixels.columns), self.known.black, np.float32), math.inf
         black = [one for one in self.frames if one.kind == "black"]
         nearest = min(black, key=lambda one: (abs(np.log(one.gain / frame.gain)), _times_apart(one, frame)))
         own = [one for one in black if (one.gain, one.exposure_s) == (nearest.gain, nearest.exposure_s)]
@@ -115,21 +128,26 @@ class _Stack:
         """All exposures of an image's light.
 
         Raises:
-            CaptureInputError: a frame is no brighter than black.
+            CaptureInputError: a frame is no brighter than black, and the others do not say that it may be.
         """
-        found = []
-        for frame in (one for one in self.frames if one.light == image.light):
-            exposure = self.exposure(frame, noise)
-            if float(np.mean(exposure.signal)) <= MIN_ABOVE_BLACK_SE * _error_of_mean(exposure.signal):
+        frames = [one for one in self.frames if one.light == image.light]
+        found = [self.exposure(one, noise) for one in frames]
+        means = [float(np.mean(one.signal)) for one in found]
+        seen = [MIN_ABOVE_BLACK_SE * _error_of_mean(one.signal) for one in found]
+        # A full pixel counts for less than its light, so these are the least counts per factor of exposure.
+        rates = [mean / one.factor for mean, one, least in zip(means, found, seen, strict=True) if mean > least]
+        for frame, one, mean, least in zip(frames, found, means, seen, strict=True):
+            if mean <= least and (not rates or max(rates) * one.factor > 2 * least):
                 raise CaptureInputError(
                     f"Frame {self.root / frame.file} (camera {frame.camera}, light {frame.light}) is no brighter than"
-                    " the camera's black frames; expose it for longer, or leave it out."
+                    " black; expose it for longer, or leave it out."
                 )
-            found.append(exposure)
         return found
 
     def noise(self) -> NoiseModel | None:
-        """Noise of the camera, from its frames; None where they do not determine it."""
+        """Noise of the camera, known or from its frames; None where they do not determine it."""
+        if self.known.read_noise is not None and self.known.per_electron is not None:
+            return NoiseModel(self.known.read_noise, self.known.per_electron)
         read = self._read_counts()
         measured = shot_noise(self._pairs(), read)
         return None if measured is None else NoiseModel(measured[1], measured[0])

@@ -21,7 +21,15 @@ from services.fit.slab.model.rig import Rig, rig_of
 from services.fit.slab.next_measurement import next_measurement
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.atoms import atoms_of
-from services.fit.slab.results.result import Errors, PhaseFunction, SlabFit, image_error, parameters_of, phase_of
+from services.fit.slab.results.result import (
+    Errors,
+    PhaseFunction,
+    SlabFit,
+    image_error,
+    parameters_of,
+    phase_of,
+    with_believable_flags,
+)
 from services.fit.slab.solve.budget import Budget
 from services.fit.slab.solve.checkpoint import CheckpointFile
 from services.fit.slab.solve.gauss_newton import GaussNewton
@@ -48,6 +56,8 @@ class Wavelength:
     held_out: NDArray[np.bool_]
     names: tuple[str, ...]
     """Camera and light of each image."""
+    averaging: NDArray[np.float64] | None = None
+    """Averaging kernels of the phase function; see ``Uncertainty``."""
 
 
 def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = map) -> tuple[SlabFit, ...]:
@@ -133,7 +143,15 @@ def fit_images(
     )
     shape = len(measured.values), rig.grid.rows, rig.grid.columns
     measured_images = np.where(np.isfinite(measured.variances), measured.values, np.nan).reshape(shape)
-    return Wavelength(fit, measured_images, (0.5 * (first + second)).reshape(shape), measured.held_out, measured.names)
+    fit = with_believable_flags(fit)
+    return Wavelength(
+        fit,
+        measured_images,
+        (0.5 * (first + second)).reshape(shape),
+        measured.held_out,
+        measured.names,
+        uncertainty.averaging,
+    )
 
 
 def _budget(options: SlabOptions, dictionary: ChosenDictionary) -> Budget:
@@ -170,6 +188,12 @@ def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> 
         ranges = " and ".join([", ".join(bands[:-1]), bands[-1]] if bands[1:] else bands)
         notes.append(
             f"The images do not determine the phase function {ranges} degrees; what is given there is the prior's."
+        )
+    if phase.resolution_deg:
+        finest, coarsest = min(phase.resolution_deg), max(phase.resolution_deg)
+        notes.append(
+            f"The images resolve structure of the phase function of {finest:.0f} to {coarsest:.0f} degrees, by its"
+            " angle. Narrower structure, such as rings of spheres, is averaged, and each ± is that of the average."
         )
     if not converged:
         notes.append(

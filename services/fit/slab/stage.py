@@ -131,7 +131,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         write_atomic(context.root / f"phase_{fit.wavelength_nm:g}.svg", picture.encode())
     manifest = AssetManifest(
         files=tuple(files),
-        held_out_error=verdict.error.value,
+        held_out_error=verdict.held_out_error,
         converged=verdict.converged,
         advice=verdict.advice,
         verdict=verdict,

@@ -13,7 +13,13 @@ from services.core.results import FitReport, Verdict
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY
 from services.core.verdict import MAX_ERROR, verdict_of
 from services.fit.slab.model.dictionary import ANGLES_RAD, Material
-from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty, phase_errors, slopes
+from services.fit.slab.solve.uncertainty import (
+    LARGEST_COEFFICIENT_SHARE,
+    Uncertainty,
+    phase_errors,
+    resolution_deg,
+    slopes,
+)
 from services.fit.slab.through_beam import Index
 
 SlabUnit = Literal["1/mm", "1", "um"]
@@ -46,6 +52,13 @@ class PhaseFunction(Record):
     value_per_sr: tuple[float, ...]
     se_per_sr: tuple[float, ...]
     determined: tuple[bool, ...]
+    resolution_deg: tuple[float, ...] = Field(
+        default=(),
+        description=(
+            "width of the narrowest structure that the images resolve at each angle; standard errors are those of the"
+            " phase function averaged over it; empty of a dictionary with few atoms"
+        ),
+    )
 
     def undetermined_bands_deg(self) -> tuple[tuple[float, float], ...]:
         """Ranges of angle, degrees, whose values come from the prior."""
@@ -124,6 +137,7 @@ def phase_of(material: Material, uncertainty: Uncertainty, width_mm: float) -> P
         value_per_sr=tuple(material.phase_per_sr.tolist()),
         se_per_sr=tuple(errors.tolist()),
         determined=tuple(determined.tolist()),
+        resolution_deg=() if uncertainty.averaging is None else tuple(resolution_deg(uncertainty.averaging).tolist()),
     )
 
 
@@ -137,6 +151,26 @@ def image_error(
     return float(np.sqrt(max(square, 0.0)))
 
 
+def is_unlike(fit: SlabFit) -> bool:
+    """Whether the images are so far from those of the fit that none of its numbers is believed."""
+    return max(fit.errors.fit_error, fit.errors.held_out_error or 0.0) > MAX_ERROR
+
+
+def with_believable_flags(fit: SlabFit) -> SlabFit:
+    """The fit, with nothing called determined where it is unlike its images."""
+    if not is_unlike(fit):
+        return fit
+    unknown = {"determined": False}
+    parameters = {name: one.model_copy(update=unknown) for name, one in fit.parameters}
+    return fit.model_copy(
+        update={
+            "parameters": fit.parameters.model_copy(update=parameters),
+            "phase": fit.phase.model_copy(update={"determined": (False,) * len(fit.phase.determined)}),
+            "atoms": {name: one.model_copy(update=unknown) for name, one in fit.atoms.items()},
+        }
+    )
+
+
 class SlabReport(Record):
     """Published by the fit stage of a slab: all its wavelengths."""
 
@@ -146,11 +180,7 @@ class SlabReport(Record):
         """The verdict on all wavelengths together, where each wavelength takes the place of a channel."""
         held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
-        unlike = [
-            f"{fit.wavelength_nm:g} nm"
-            for fit in self.fits
-            if max(fit.errors.fit_error, fit.errors.held_out_error or 0.0) > MAX_ERROR
-        ]
+        unlike = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if is_unlike(fit)]
         advice = ""
         if unlike:
             advice = (

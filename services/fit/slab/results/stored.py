@@ -6,6 +6,7 @@ import hashlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +51,9 @@ def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
     # Leave out options at these defaults, so that results stored by earlier versions are still used.
     at_default = {name for name in LATER_OPTIONS if getattr(options, name) == SlabOptions.model_fields[name].default}
     options_json = options.model_dump_json(exclude=at_default)
-    # Leave out exposures too where there are none.
-    described = folder.model_dump_json(exclude=None if folder.exposures else {"exposures"})
+    # Leave out exposures too where there are none, and what is of exposures alone.
+    of_exposures: dict[str, Any] = {"exposures": True, "cameras": {"__all__": {"counts"}}}
+    described = folder.model_dump_json(exclude=None if folder.exposures else of_exposures)
     for part in (numerics_name(), described, options_json, f"{wavelength_nm:g}"):
         digest.update(part.encode() + b"\n")
     if options.dictionary == "table":
@@ -74,6 +76,7 @@ def store_result(place: Path, digest: str, wavelength: Wavelength) -> None:
         predicted=wavelength.predicted,
         held_out=wavelength.held_out,
         names=np.array(wavelength.names),
+        averaging=np.zeros((0, 0)) if wavelength.averaging is None else wavelength.averaging.astype(np.float32),
     )
     write_atomic(place / IMAGES, stream.getvalue())
     write_record(place / RESULT, StoredResult(of=digest, fit=wavelength.fit))

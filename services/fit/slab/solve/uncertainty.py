@@ -4,12 +4,20 @@ do not determine.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.model.dictionary import KNOTS, Material, cosine_moments, tent_solid_angles
+from services.fit.slab.model.dictionary import (
+    ANGLES_RAD,
+    KNOTS,
+    SPACING_RAD,
+    Material,
+    cosine_moments,
+    tent_solid_angles,
+)
 from services.fit.slab.solve.gauss_newton import Solution
 from services.fit.slab.solve.measured_directions import measured_directions
 from services.fit.slab.solve.prior import Quadratic
@@ -18,6 +26,9 @@ Array = NDArray[np.float64]
 
 LARGEST_SHARE = 0.1
 """Largest standard error, as a share of the value, at which a value of the phase function is determined."""
+RESOLVED_NEAR_RAD = math.radians(10)
+"""Distance from an angle within which degrees of freedom count for its resolution; cameras see single angles near the
+poles, of which each knot by itself would tell the nearest one."""
 LARGEST_COEFFICIENT_SHARE = 0.05
 """Largest standard error at which a coefficient is determined, as a share of its value, and for g in units of 1."""
 
@@ -32,6 +43,10 @@ class Uncertainty:
     """Covariance with a prior so weak that it adds no information; flags are judged by it."""
     of_unknowns: tuple[Array, Array]
     """Both covariances in the solver's own unknowns (U, U)."""
+    averaging: Array | None = None
+    """Averaging kernels (KNOTS, KNOTS): the change of the answer's ln f by the true one's. The answer has the structure
+    that they pass, and the covariance is that of the true phase function seen through them. None of a dictionary with
+    few atoms."""
 
     def standard_error(self, slope: Array) -> float:
         """Standard error of a quantity, from its derivatives with respect to ln f and sigma_a (KNOTS + 1,)."""
@@ -76,7 +91,8 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     # Flags ask what the prior adds, so the covariance under the weak prior has only the noise that the weights contain.
     chosen, alone = chosen + remaining, alone + remaining
     if (chain := coordinates.chain(material)) is None:
-        return Uncertainty(chosen, alone, (chosen, alone))
+        averaging = np.linalg.inv(directions.total) @ directions.curvature
+        return Uncertainty(chosen, alone, (chosen, alone), averaging[:KNOTS, :KNOTS])
     return Uncertainty(chain @ chosen @ chain.T, chain @ alone @ chain.T, (chosen, alone))
 
 
@@ -138,3 +154,15 @@ def phase_errors(material: Material, uncertainty: Uncertainty) -> tuple[Array, N
         for covariance in (uncertainty.covariance, uncertainty.images_alone)
     )
     return errors * material.phase_per_sr, alone <= LARGEST_SHARE
+
+
+def resolution_deg(averaging: Array) -> Array:
+    """Width (KNOTS,), degrees, of the narrowest structure that the images resolve at each knot.
+
+    It is the range of angles near the knot over the degrees of freedom for signal in it, which are the sum of the
+    averaging kernels' diagonal (Rodgers 2000, Inverse Methods for Atmospheric Sounding, 2.4 and 3.1).
+    """
+    near = np.abs(ANGLES_RAD[:, None] - ANGLES_RAD) <= RESOLVED_NEAR_RAD
+    freedom = near @ np.clip(np.diag(averaging), 0, 1)
+    range_deg = np.degrees(SPACING_RAD) * near.sum(axis=1)
+    return np.asarray(np.minimum(range_deg / np.maximum(freedom, 1e-9), 180.0))
