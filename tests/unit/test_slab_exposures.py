@@ -204,6 +204,9 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "not said when full": (lambda d: d["exposures"][0].pop("bits"), "give bits or saturation_counts"),
     "fuller than full": (lambda d: d["exposures"][0].update(saturation_counts=5000), "more than 12 bits hold"),
     "the same file twice": (lambda d: d["exposures"].append(d["exposures"][0]), "is listed in two exposures"),
+    "a light and a black": (
+        lambda d: d["exposures"][0].update(file="b0_black_0.npy"), "b0_black_0.npy is listed in two exposures"
+    ),
     "no time": (lambda d: d["exposures"][0].update(exposure_s=0), "exposure_s"),
     "unknown light": (lambda d: d["exposures"][0].update(light="x"), "names light x"),
     "unknown wavelength": (lambda d: d["exposures"][0].update(wavelength_nm=700), "wavelength_nm 700"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 from typing import Annotated, Literal
 
@@ -90,10 +90,10 @@ def exposures_fault(
         wavelengths_nm: those of the folder.
         known_black: names of the cameras whose counts without light are known beforehand.
     """
-    # Cameras may share a black frame, as where one camera is moved to several places.
-    uses = Counter((one.file, one.camera if one.kind == "black" else "", one.wavelength_nm) for one in exposures)
-    lit = Counter(one.file for one in exposures if one.kind == "light")
-    if twice := [use[0] for use, count in uses.items() if count > 1] + [file for file in lit if lit[file] > 1]:
+    uses = defaultdict[str, list[SlabExposure]](list)
+    for one in exposures:
+        uses[one.file].append(one)
+    if twice := [file for file, own in uses.items() if len(own) > 1 and not _is_shared_black(own)]:
         return f"file {min(twice)} is listed in two exposures; keep one of them"
     for one in exposures:
         if one.wavelength_nm is not None and one.wavelength_nm not in wavelengths_nm:
@@ -114,3 +114,11 @@ def exposures_fault(
                 " beam off and list it with kind black, or give the camera counts with black"
             )
     return None
+
+
+def _is_shared_black(entries: Sequence[SlabExposure]) -> bool:
+    """Whether entries of one file are the black frame of different cameras, as where one camera is moved to several
+    places.
+    """
+    cameras = {(one.camera, one.wavelength_nm) for one in entries}
+    return len(cameras) == len(entries) and all(one.kind == "black" for one in entries)

@@ -52,7 +52,7 @@ def main(
         quantities = {name: getattr(fit.parameters, name) for name in type(fit.parameters).model_fields}
         for name, quantity in (quantities | {name: atom for name, atom in fit.atoms.items() if atom.value > 0}).items():
             print(
-                f"  {name:22} {quantity.value:9.5f} ± {quantity.se:.5f}"
+                f"  {name:22} {quantity.value:9.5f} {f'± {quantity.se:.5f}' if quantity.se else 'given':9}"
                 f" {quantity.unit}{'' if quantity.determined else '  not determined'}"
             )
         for note in fit.notes:

@@ -192,8 +192,9 @@ def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> 
     if phase.resolution_deg:
         finest, coarsest = min(phase.resolution_deg), max(phase.resolution_deg)
         notes.append(
-            f"The images resolve structure of the phase function of {finest:.0f} to {coarsest:.0f} degrees, by its"
-            " angle. Narrower structure, such as rings of spheres, is averaged, and each ± is that of the average."
+            f"The images resolve structure of the phase function that is {finest:.0f} to {coarsest:.0f} degrees wide,"
+            " depending on the angle. Narrower structure, such as rings of spheres, is averaged, and each ± is that of"
+            " the average."
         )
     if not converged:
         notes.append(
