@@ -44,6 +44,8 @@ def run_and_report(spec: JobSpec, out: Path, workers: int | None, *, as_json: bo
     from services.pipeline.stages import run_job
 
     require_apart(spec, out)
+    if not (out / "job.json").is_file():
+        require_readable(spec)
     with cancelling_on_signals(out), ProgressView() as view:
         asset = run_job(spec, out, view, workers)
     if not view.events:
@@ -73,6 +75,18 @@ def _errors(asset: AssetManifest) -> str:
     from services.core.verdict import percent
 
     return f"{verdict.error_of} error: {percent(verdict.error)}"
+
+
+def require_readable(spec: JobSpec) -> None:
+    """Refuse at once what a slab's fit would refuse when its workers have started.
+
+    Raises:
+        CaptureInputError: slab.json is absent or wrong, or names a file that is absent.
+    """
+    if spec.kind == "slab" and spec.capture is not None:
+        from services.core.slab.folder import read_folder
+
+        read_folder(spec.capture)
 
 
 def require_apart(spec: JobSpec, out: Path) -> None:

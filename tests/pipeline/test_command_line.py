@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.live_server import toy_server
+from tests.support.small_slab import description
 
 DENTINE = [sys.executable, "-m", "services"]
 
@@ -41,6 +42,17 @@ def job_file(tmp_path: Path) -> Path:
     path = tmp_path / "job.toml"
     path.write_text('capture = "/"\n')
     return path
+
+
+def test_a_slab_that_cannot_be_read_is_told_before_anything_is_started(tmp_path: Path) -> None:
+    told = description(cell={"width_mm": 1.0, "indexx": 1.33})
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell" / "slab.json").write_text(json.dumps(told))
+    (tmp_path / "job.toml").write_text('kind = "slab"\ncapture = "cell"\n')
+    answer = dentine("run", str(tmp_path / "job.toml"), "--out", str(tmp_path / "out"))
+    assert answer.returncode != 0
+    assert "unknown key 'cell.indexx'; known keys are boundary, glass, index" in sentence(answer)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
