@@ -44,9 +44,9 @@ def run_and_report(spec: JobSpec, out: Path, workers: int | None, *, as_json: bo
     from services.pipeline.stages import run_job
 
     require_apart(spec, out)
-    if not (out / "job.json").is_file():
-        require_readable(spec)
     with cancelling_on_signals(out), ProgressView() as view:
+        if not (out / "job.json").is_file():
+            require_readable(spec)
         asset = run_job(spec, out, view, workers)
     if not view.events:
         print("Every stage was published already; nothing ran.", file=sys.stderr)
