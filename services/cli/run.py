@@ -45,6 +45,7 @@ def run_and_report(spec: JobSpec, out: Path, workers: int | None, *, as_json: bo
 
     require_apart(spec, out)
     with cancelling_on_signals(out), ProgressView() as view:
+        # A job that goes on was read before, and may need its capture no more.
         if not (out / "job.json").is_file():
             require_readable(spec)
         asset = run_job(spec, out, view, workers)

@@ -49,7 +49,7 @@ from services.core.errors import (
     ReadOnlyStoreError,
 )
 from services.core.files.object_store import array_location, discard, remote_folder
-from services.core.files.validation import fault_of, first_error
+from services.core.files.validation import parse_record
 from services.core.geometry import Record
 
 R = TypeVar("R", bound=Record)
@@ -92,10 +92,7 @@ def read_record(path: Path, kind: type[R]) -> R:
     """
     if not path.is_file():
         raise CaptureInputError(f"{path} does not exist; check the path.")
-    try:
-        return kind.model_validate_json(path.read_bytes())
-    except ValidationError as problem:
-        raise CaptureInputError(f"{path}: {fault_of(first_error(problem), kind)}.") from problem
+    return parse_record(path.read_bytes(), kind, str(path))
 
 
 class StageWriter:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import from_json
@@ -12,15 +12,13 @@ from pydantic_core import from_json
 from services.core.errors import CaptureInputError
 from services.core.files.image_headers import declared
 from services.core.files.image_metadata import metadata_fault
-from services.core.files.validation import fault_of, first_error
-from services.core.geometry import Record
+from services.core.files.validation import fault_of, first_error, parse_record
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
 from services.core.raw.records import RawFolder
 from services.core.records import CaptureManifest, FolderCapture
 from services.core.settings import UploadLimits
 from services.core.slab.folder import SlabFolder
 
-R = TypeVar("R", bound=Record)
 MAX_TIMES_PACKED = 1100
 """Largest ratio of the size that an image declares to the size of its file. Deflate packs at most 1032 to 1, so a
 larger ratio belongs to a decompression bomb or a torn file."""
@@ -49,11 +47,11 @@ def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[
     pure = PurePosixPath(name)
     try:
         if name == "capture.json":
-            return _description_fault(name, _record(path, name, FolderCapture), limits, names)
+            return _description_fault(name, parse_record(path.read_bytes(), FolderCapture, name), limits, names)
         if name == DESCRIPTION:
             return _raw_fault(name, parse_raw_folder(path.read_bytes(), name), limits, names)
         if name == "slab.json":
-            return _slab_fault(name, _record(path, name, SlabFolder), limits, names)
+            return _slab_fault(name, parse_record(path.read_bytes(), SlabFolder, name), limits, names)
         if name == "manifest.json":
             return _published_fault(name, from_json(path.read_bytes()), limits, names)
         if pure.name == "zarr.json":
@@ -65,13 +63,6 @@ def content_fault(path: Path, name: str, limits: UploadLimits, names: frozenset[
         return f"{name}: {fault_of(first_error(problem), CaptureManifest)}."
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError, AttributeError) as problem:
         return f"{name} cannot be read: {str(problem) or type(problem).__name__}; export it again."
-
-
-def _record(path: Path, name: str, kind: type[R]) -> R:
-    try:
-        return kind.model_validate_json(path.read_bytes())
-    except ValidationError as problem:
-        raise CaptureInputError(f"{name}: {fault_of(first_error(problem), kind)}.") from problem
 
 
 def _image_fault(path: Path, name: str, suffix: str, limits: UploadLimits) -> str | None:

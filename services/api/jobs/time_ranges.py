@@ -208,7 +208,7 @@ class TimeRanges:
         if position is None:
             return TimeRange(reason="It was interrupted; the next stage will tell a time again.")
         if job.spec.kind == "slab":
-            return TimeRange(reason="That depends on the sample; a wavelength takes some minutes on two cores.")
+            return TimeRange(reason="That depends on the sample; a wavelength takes a minute or more on two cores.")
         size = size_of(self._locate(job.spec), self._describe)
         if size is None:
             return TimeRange(reason="The size of its capture cannot be read, so it cannot be compared with other jobs.")

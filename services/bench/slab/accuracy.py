@@ -158,8 +158,8 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
         axes.set(title=title, xlabel="albedo", ylabel="σt·w")
         axes.set_xticks(np.arange(len(ALBEDOS)), [f"{albedo:g}" for albedo in ALBEDOS])
         axes.set_yticks(np.arange(len(THICKNESSES)), [f"{thickness:g}" for thickness in THICKNESSES])
-    drawn_rows = ["bounds (colour)"] * bool(bounds) + ["errors of fits (numbers)"] * bool(fits)
-    figure.suptitle(" and ".join(drawn_rows))
+    kinds = ["bounds (colour)"] * bool(bounds) + ["errors of fits (numbers)"] * bool(fits)
+    figure.suptitle(" and ".join(kinds))
     return figure
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from services.core.errors import CaptureInputError
+
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
+
+R = TypeVar("R", bound=BaseModel)
 
 
 def remedied(message: str) -> str:
@@ -17,6 +21,21 @@ def remedied(message: str) -> str:
     """
     told = message.removeprefix("Value error, ")
     return told if "; " in told else f"{told}; correct it"
+
+
+def parse_record(content: bytes, kind: type[R], origin: str) -> R:
+    """Read a record from JSON.
+
+    Args:
+        origin: the file's name, with which a message begins.
+
+    Raises:
+        CaptureInputError: it is no JSON, or no record of this kind; the message names the first wrong field.
+    """
+    try:
+        return kind.model_validate_json(content)
+    except ValidationError as problem:
+        raise CaptureInputError(f"{origin}: {fault_of(first_error(problem), kind)}.") from problem
 
 
 def first_error(problem: ValidationError) -> ErrorDetails:

@@ -76,7 +76,6 @@ def store_result(place: Path, digest: str, wavelength: Wavelength) -> None:
         predicted=wavelength.predicted,
         held_out=wavelength.held_out,
         names=np.array(wavelength.names),
-        averaging=np.zeros((0, 0)) if wavelength.averaging is None else wavelength.averaging.astype(np.float32),
     )
     write_atomic(place / IMAGES, stream.getvalue())
     write_record(place / RESULT, StoredResult(of=digest, fit=wavelength.fit))

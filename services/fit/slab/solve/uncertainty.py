@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 LARGEST_SHARE = 0.1
 """Largest standard error, as a share of the value, at which a value of the phase function is determined."""
 RESOLVED_NEAR_RAD = math.radians(10)
-"""Distance from an angle within which degrees of freedom count for its resolution; cameras see single angles near the
-poles, of which each knot by itself would tell the nearest one."""
+"""Distance from an angle within which degrees of freedom count for its resolution. Near the poles images are of single
+angles, so that the kernels' diagonal jumps from knot to knot there."""
 LARGEST_COEFFICIENT_SHARE = 0.05
 """Largest standard error at which a coefficient is determined, as a share of its value, and for g in units of 1."""
 
