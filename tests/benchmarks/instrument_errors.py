@@ -53,14 +53,13 @@ SCAN_OFF_MM, FAR_SCAN_MM, DOME_OFF_MM, FAR_LIGHT_MM = 0.1, 1.0, 4.0, 30.0
 """Position errors: twice the assumed standard errors of scan and dome (``*_OFF_MM``), and errors far beyond any assumed
 standard error (``FAR_*``)."""
 FAULTS: Mapping[str, Callable[[FitReport], bool]] = {
-    "far_gain": lambda report: "gain.green" in report.instrument_faults.get("green", ()),
     "far_light": lambda report: f"light_gain.{FAR_LIGHT}" in report.instrument_faults.get("green", ()),
     "far_scan": lambda report: "mm apart" in report.advice,
     "exchanged": lambda report: all(name in report.advice for name in ("seem exchanged", *EXCHANGED)),
 }
 """By error: a function that says whether the report names the fault."""
-LIGHTS_OFF_MM = 10.0
-"""Distance of each stated light from its true position, in a random direction."""
+LIGHTS_OFF_MM = 4.0
+"""Distance of each stated light from its true position, in a random direction; of the dome, 2 mm are assumed."""
 
 
 def perturb(folder: Path, error: str, seed: int) -> None:
@@ -91,12 +90,16 @@ def perturb(folder: Path, error: str, seed: int) -> None:
         (folder / "capture.json").write_text(json.dumps(description))
         return
     images, brightest = photographs(folder, description)
+    lights = [light["name"] for light in description["lights"]]
+    each = dict(zip(lights, 0.02 * np.random.default_rng(11).standard_normal(len(lights)), strict=True))
     changed: dict[str, Callable[[dict[str, str], NDArray[np.float64]], NDArray[np.float64]]] = {
         "none": lambda _, image: image,
         "gain": lambda _, image: 1.02 * image,
         "far_gain": lambda _, image: 1.1 * image,
         "light_gain": lambda one, image: 1.02 * image if one["light"] == LIGHT else image,
-        "flare": lambda one, image: image + 0.02 * brightest[one["camera"]],
+        "light_gains": lambda one, image: (1 + each[one["light"]]) * image,
+        "flare": lambda one, image: image + 0.006 * brightest[one["camera"]],
+        "far_flare": lambda one, image: image + 0.02 * brightest[one["camera"]],
     }
     for one in description["images"]:
         np.save(folder / one["file"], changed[error](one, images[one["file"]]))
@@ -138,7 +141,9 @@ def draw(folder: Path, description: dict[str, Any], rng: np.random.Generator) ->
         write_mesh(path, Mesh(mesh.vertices_mm @ move[:3, :3].T + move[:3, 3], mesh.faces))
 
 
-ERRORS = ("drawn", "gain", "light_gain", "flare", "lights", "dome", "scan", *FAULTS)
+ERRORS = (
+    "drawn", "gain", "light_gain", "light_gains", "flare", "lights", "dome", "scan", "far_gain", "far_flare", *FAULTS,
+)  # fmt: skip
 
 
 def _move_lights(lights: list[dict[str, Any]], error: str) -> None:
@@ -227,7 +232,9 @@ def main() -> None:
     parser.add_argument(
         "--json", type=Path, required=True, help="where results go; fits that are in it are not run again"
     )
-    parser.add_argument("--errors", default="none,gain,light_gain,flare,lights,dome,scan", help=f"none or of {ERRORS}")
+    parser.add_argument(
+        "--errors", default="none,gain,light_gain,light_gains,flare,lights,dome,scan", help=f"none or of {ERRORS}"
+    )
     parser.add_argument("--seeds", type=int, default=1, help="fits of each, by seeds of the sensor's noise from 1")
     parser.add_argument("--instrument", default="on,off")
     parser.add_argument("--pixel-step", type=int, default=2)

@@ -103,6 +103,14 @@ def test_a_light_that_is_far_off_is_named(tmp_path: Path) -> None:
     assert abs(found.value + 0.1) < 4 * found.se
 
 
+def test_a_gain_that_is_far_off_keeps_its_prior(tmp_path: Path) -> None:
+    report = fit(tmp_path, gains=(1.1,) * 6)
+    found: Estimate = report.instrument["green"]["gain.green"]
+    assert found.se is not None
+    assert found.se <= report.instrument_prior["green"]["gain.green"] * (1 + 1e-9)
+    assert "gain.green" not in report.instrument_faults.get("green", ())
+
+
 def test_photographs_that_were_exchanged_are_named(tmp_path: Path) -> None:
     write_prepared(tmp_path)
 

@@ -213,7 +213,27 @@ def test_a_shift_within_its_noise_adds_no_error() -> None:
     shift, zero = np.array([[1.0, 0.5, -0.2]]), np.zeros(3)
     for noise, expected in ((0.0, np.outer(shift[0], shift[0])), (1.0, np.zeros((3, 3)))):
         sums = ClosingSums(zero, np.eye(3), np.eye(3), np.eye(3), shift, noise * np.eye(3)[None])
-        np.testing.assert_allclose(sums.shift_covariance, expected)
+        for is_combined in (False, True):
+            np.testing.assert_allclose(sums.shift_covariance([0], is_combined=is_combined), expected)
+
+
+def test_noise_of_a_shift_does_not_pass_for_a_direction_that_can_be_avoided() -> None:
+    # True shifts of any direction in six coordinates, measured with noise of variance 1 each. Of all combinations with
+    # v_0 = 1, take the one that the stated covariance C takes for the least moved, v = C^-1 e_0 / e_0'C^-1 e_0.
+    rng, first, noise = np.random.default_rng(8), np.eye(6)[0], np.eye(6)
+    stated, shown = [], []
+    for _ in range(4000):
+        true = 1.5 * rng.standard_normal(6)
+        shift = true + rng.standard_normal(6)
+        sums = ClosingSums(np.zeros(6), noise, noise, noise, shift[None], noise[None])
+        covariance = sums.shift_covariance([0], is_combined=True)
+        best = np.linalg.solve(covariance + 1e-2 * noise, first)
+        best /= best[0]
+        stated.append(float(best @ covariance @ best))
+        shown.append(float(best @ true) ** 2)
+    # The prior of the true shifts is estimated from one of them, with an error of (2 / 6)^1/2 in |b|^2. With k b b',
+    # which has the same trace, 0.0001 are stated.
+    assert np.mean(shown) == pytest.approx(np.mean(stated), rel=0.3)
 
 
 def test_the_measurement_survives_the_journal() -> None:

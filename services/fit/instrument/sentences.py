@@ -19,7 +19,6 @@ SIZES = {
     "dome": "2 mm and 0.1° for where the dome stands",
 }
 REMEDY = {
-    "gain": "measure the gain again on the white sphere",
     "light_gain": "check that light, its cable and its name, and measure it again",
     "flare": "look for stray light and a dirty lens, and measure the flare again",
 }
@@ -76,9 +75,14 @@ def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> 
     if names:
         sizes = list(_sizes(names, {name for own in errors.values() for name in own.names}))
         listed = sizes[0] if len(sizes) == 1 else f"{', '.join(sizes[:-1])} and {sizes[-1]}"
+        gain = (
+            " Images hardly show a gain that is farther off; absorption is then wrong: measure it on a white standard."
+            if any(kind_of_error(name) == "gain" for name in names)
+            else ""
+        )
         yield (
             f"Assumed, as the calibration does not state how wrong it may be: {listed}. "
-            "The ± depend on these; give uncertainty in capture.json."
+            f"The ± depend on these; give uncertainty in capture.json.{gain}"
         )
 
 

@@ -59,20 +59,31 @@ class ClosingSums:
             sums, shifts=sums.shifts.reshape(-1, count), shift_noise=sums.shift_noise.reshape(-1, count, count)
         )
 
-    @property
-    def shift_covariance(self) -> Array:
-        """Covariance (F, F) of the gradient by the changes: sum of b b' over the shifts b, each shortened to its
-        expected length without noise.
-        """
-        return self.shifts_of(range(len(self.shifts)))
+    def shift_covariance(self, chosen: Iterable[int], *, is_combined: bool) -> Array:
+        """Covariance (F, F) of the gradient by the chosen changes: the sum over them of b b', each shift b shortened to
+        its expected length without noise, k |b|^2 for k b b'.
 
-    def shifts_of(self, chosen: Iterable[int]) -> Array:
-        """The same covariance for the chosen changes alone."""
+        Args:
+            is_combined: whether the solution is combined with the instrument's prior afterwards. In k b b' noise would
+                pass for a known direction, which the combination would avoid, at an error far below the true one. So
+                each term is then the expectation of the true b b' given b and its noise N, k^2 b b' + k N, which has
+                the same trace (a normal prior of the shift's scale; Efron and Morris 1973).
+        """
         total = np.zeros_like(self.response)
         for k in chosen:
-            shift, square = self.shifts[k], float(self.shifts[k] @ self.shifts[k])
-            total += max(0.0, 1 - float(np.trace(self.shift_noise[k])) / max(square, 1e-300)) * np.outer(shift, shift)
+            shift, noise = self.shifts[k], self.shift_noise[k]
+            kept = max(0.0, 1 - float(np.trace(noise)) / max(float(shift @ shift), 1e-300))
+            known = kept if is_combined else 1.0
+            total += kept * (known * np.outer(shift, shift) + is_combined * positive_part(noise))
         return total
+
+
+def positive_part(matrix: Array) -> Array:
+    """The matrix without its negative eigenvalues, which a covariance estimated from products of two seeds may have
+    although no true covariance has them.
+    """
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def closing_sums(

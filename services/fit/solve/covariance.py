@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from services.fit.instrument.errors import kind_of_error
 from services.fit.optics.domain import Domain
-from services.fit.solve.closing import ClosingSums, Response, response
+from services.fit.solve.closing import ClosingSums, Response, positive_part, response
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import NormalEquations
 from services.fit.solve.recombination import Fault
@@ -296,10 +296,14 @@ def uncertainty(
         rendered, response_noise = positive_part(pooled.noise), np.diag(solved.variance @ (taken + pooled.carried) ** 2)
         kinds = ["mean_cosine"] * (len(sums.shifts) - len(moved)) + list(moved)
         parts |= {"rendering": rendered + response_noise}
-        parts |= {
-            kind: sums.shifts_of(k for k, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds)
+        shifts = {
+            kind: sums.shift_covariance(
+                (k for k, own in enumerate(kinds) if own == kind), is_combined=bool(domain.errors.names)
+            )
+            for kind in dict.fromkeys(kinds)
         }
-        meat = meat + rendered + sums.shift_covariance + response_noise
+        parts |= shifts
+        meat = meat + rendered + sum(shifts.values()) + response_noise
         remaining_gradient = (
             pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, taken) - prior @ taken
         )
@@ -335,11 +339,3 @@ def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
         half = t[count:].T @ (factor * (kinds == kind))
         parts[kind] = half @ half.T
     return parts
-
-
-def positive_part(matrix: Array) -> Array:
-    """The matrix without its negative eigenvalues, which a covariance estimated from products of two seeds may have
-    although no true covariance has them.
-    """
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

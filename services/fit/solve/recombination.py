@@ -16,6 +16,7 @@ of the prior.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,8 +113,8 @@ class Fault:
     """``size`` over its standard error, which covers the images' errors and the prior's."""
 
 
-def faults(deviations: Array, found: Recombination) -> tuple[Fault, ...]:
-    """Errors that lie more than ``FAULT_Z`` standard errors from their prior, the most significant first.
+def faults(deviations: Array, found: Recombination, tested: Iterable[int]) -> tuple[Fault, ...]:
+    """Tested errors that lie more than ``FAULT_Z`` standard errors from their prior, the most significant first.
 
     A prior that is off by f moves d by f h, with h the error's own column of 1 - B[e], so f = h'D^-1 d / h'D^-1 h is
     the estimate of f from all errors together. The faults are removed one by one before the others are tested, because
@@ -122,12 +123,13 @@ def faults(deviations: Array, found: Recombination) -> tuple[Fault, ...]:
     Args:
         deviations: d (K,), errors of the first solution less their prior's mean.
         found: the first solution and its prior.
+        tested: indices of the errors that may be faults; the prior of all others is believed.
     """
     moves, weight = (
         np.eye(len(deviations)) - found.error_response,
         _inverse(found.difference_covariance, np.sqrt(np.diag(found.prior))),
     )
-    remaining, detected = set(range(len(deviations))), list[Fault]()
+    remaining, detected = set(tested), list[Fault]()
     while remaining:
         information = {k: float(moves[:, k] @ weight @ moves[:, k]) for k in remaining}
         sizes = {k: float(moves[:, k] @ weight @ deviations) / max(information[k], 1e-300) for k in remaining}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.instrument.errors import kind_of_error
+from services.fit.instrument.errors import CHECKED_BY_IMAGES, kind_of_error
 from services.fit.optics.domain import Domain
 from services.fit.solve.recombination import Fault, Recombination, faults
 
@@ -98,7 +98,8 @@ def combine_with_prior(
         return CombinedSolution(x, whole, parts_before, sandwich, ())
     sandwich = replace(sandwich, prior=domain.errors.matrix)
     found = Recombination(whole, sandwich.response(sandwich.inverse), sandwich.prior)
-    detected = faults(x[count:], found)
+    tested = (k for k, name in enumerate(domain.errors.names) if kind_of_error(name) in CHECKED_BY_IMAGES)
+    detected = faults(x[count:], found, tested)
     rejected = tuple(fault.index for fault in detected)
     change = found.change(rejected)
     updated = found.updated(change)
