@@ -51,6 +51,12 @@ def test_a_faulty_image_is_told_with_its_number_and_remedy(image: NDArray[np.flo
     assert told.startswith(sentence)
 
 
+def test_no_cell_is_proposed_that_nobody_sells() -> None:
+    clear, dense = (henyey_greenstein(sigma, 0.5, 0.0) for sigma in (0.01, 1e6))
+    assert sample_faults(clear, 1.0)[0].endswith("concentrate it 2e+02-fold.")
+    assert sample_faults(dense, 1.0)[0].endswith("dilute it 5e+05-fold.")
+
+
 def test_pixels_that_lie_beside_the_beam_are_told() -> None:
     (told,) = grid_faults(PIXELS.model_copy(update={"x_mm": (1.0, 9.0)}))
     assert told == "The beam meets the cell at x = 0, beside the pixels; correct pixels.x_mm."

@@ -22,7 +22,7 @@ from tests.support.raw_sensor import Sensor
 from tests.support.small_slab import WAVELENGTH_NM, description
 
 EDGE = 48
-POWER = 250.0
+POWER = 2500.0
 """Counts per s that the whole beam would give; exposures are divided by it."""
 TIMES_S = (0.05, 0.4, 3.2)
 SENSOR = Sensor()
@@ -87,6 +87,9 @@ def test_pixels_that_are_full_in_all_exposures_count_for_nothing(tmp_path: Path)
     assert abs(int(lost.sum()) - int(bright.sum())) <= 4
     assert lost.any()
     assert np.isfinite(measured.values).all()
+    told = [fault for fault in measured.faults if "full in every exposure" in fault]
+    assert len(told) == 4
+    assert told[0].startswith("In image f0 under l0 ")
 
 
 def test_without_noise_that_frames_tell_it_is_assumed(tmp_path: Path) -> None:
@@ -197,7 +200,16 @@ def blacks(told: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 BAD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "images too": (lambda d: d.update(description()), "either images or exposures"),
+    "images too": (lambda d: d.update(description()), "either images or exposures, not both"),
+    "no power": (lambda d: d["beam"].pop("power"), "beam has no power, by which exposures are divided"),
+    "times in hours": (
+        lambda d: [one.update(exposure_s=one["exposure_s"] / 3600) for one in d["exposures"]],
+        "times the beam's power per sr, and beside the beam no material sends more than 100; correct beam.power",
+    ),
+    "full": (
+        lambda d: [one.update(saturation_counts=1) for one in d["exposures"]],
+        "All exposures of image f0 under l0 at 532 nm are full in every pixel, the first of them",
+    ),
     "no black": (lambda d: [d["exposures"].remove(one) for one in blacks(d)], "camera f0 has no black exposure"),
     "lit black": (lambda d: blacks(d)[0].update(light="l0"), "has no light on"),
     "light not named": (lambda d: d["exposures"][0].pop("light"), "must name its light"),

@@ -20,7 +20,7 @@ Change = Callable[[dict[str, Any]], object]
 
 
 def test_images_are_folded_at_the_plane_of_the_beams(tmp_path: Path) -> None:
-    image = np.arange(64.0).reshape(8, 8) + 1
+    image = 1e-3 * (np.arange(64.0).reshape(8, 8) + 1)
     root = write_folder(tmp_path, description(), image)
     measured = read_images(root, read_folder(root), WAVELENGTH_NM)
     assert measured.values.shape == (4, 32)
@@ -100,6 +100,7 @@ def test_bad_descriptions_are_refused_by_a_sentence(tmp_path: Path, name: str) -
         (np.zeros((8, 8), np.int32), "int32"),
         (np.full((8, 8), np.nan), "no pixel that is finite"),
         (np.zeros((8, 8)), "holds no light: its mean is not above zero"),
+        (np.full((8, 8), 50.0), r"f0_l0.npy .* beside the beam no material sends more than 100; give radiance per"),
         (b"no image", "cannot be read"),
     ],
 )

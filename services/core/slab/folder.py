@@ -52,8 +52,8 @@ class Beam(Record):
     power: Positive = Field(
         default=1.0,
         description=(
-            "before any Fresnel loss; images are given per unit of it, exposures are divided by it, so there it is what"
-            " the camera would count of the whole beam: counts per s at gain 1, mm2 and sr"
+            "before any Fresnel loss; images are given per unit of it. Exposures need it and are divided by it, so"
+            " there it is what the camera would count of the whole beam: counts per s at gain 1, mm2 and sr"
         ),
     )
 
@@ -156,9 +156,13 @@ class SlabFolder(Record):
                 raise ValueError(f"{what} {min(twice)} is listed twice; give each {what} a name of its own")
         self._require_index()
         if bool(self.images) == bool(self.exposures):
-            raise ValueError("a slab folder lists either images or exposures; give one of both")
+            raise ValueError("a slab folder lists either images or exposures, not both; keep one of these lists")
         if self.images and (counted := [camera.name for camera in self.cameras if camera.counts is not None]):
             raise ValueError(f"camera {counted[0]} has counts, but images hold no counts; leave them out")
+        if self.exposures and "power" not in self.beam.model_fields_set:
+            raise ValueError(
+                "beam has no power, by which exposures are divided; give it in counts per s at gain 1, mm2 and sr"
+            )
         if fault := exposures_fault(self.exposures, self.wavelengths_nm, self._known_black()):
             raise ValueError(fault)
         seen: set[tuple[str, str, float]] = set()

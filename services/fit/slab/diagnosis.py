@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY
-from services.core.slab.folder import Beam, PixelGrid
+from services.core.slab.folder import Beam, Light, PixelGrid, SlabCamera
 from services.fit.slab.model.dictionary import Material
 
 Array = NDArray[np.float64]
@@ -22,6 +22,8 @@ THINNEST, THICKEST = 0.1, 10.0
 little but noise, above, light has forgotten each single deflection."""
 BEST = 2.0
 """Value of sigma_t w to aim at: many photons scatter, and most of those that do only a few times."""
+CELLS_MM = 0.01, 100.0
+"""Narrowest and widest cell that is proposed: those that are sold."""
 MIN_ALBEDO = 0.2
 """Smallest albedo. Below it most of the light that scatters is absorbed before it leaves, and higher orders add
 nothing."""
@@ -34,10 +36,27 @@ chance is 3e-7 a fit."""
 MAX_SQUARES = 2.0
 """Mean of the squared residuals over their variances above which a fit by tents is doubted: variances that are stated
 only roughly give values near 1."""
+BESIDE_BEAM_DEG = 5.0
+"""Deflection from which ``MAX_POWER_PER_SR`` holds, in air, degrees."""
+MAX_POWER_PER_SR = 100.0
+"""Largest share of the beam's power that any material sends beside the beam, per sr. If all light went evenly into the
+cone of ``BESIDE_BEAM_DEG`` around the beam, it would be 1 / (2 pi (1 - cos 5 deg)) = 42."""
 MIN_LIT = 0.5
 """Smallest share of an image's maximum at which a pixel counts for the position of the beam."""
 MAX_BEAM_OFFSET = 1.0
 """Largest distance of the beam from y = 0, in pixels and in sizes of the beam, whichever is more."""
+
+
+def power_per_sr(image: Array, pixels: PixelGrid, camera: SlabCamera) -> float:
+    """Share of the beam's power that an image (rows, columns) shows leaving towards its camera, per sr."""
+    (x_low, x_high), (y_low, y_high) = pixels.x_mm, pixels.y_mm
+    area_mm2 = (x_high - x_low) * (y_high - y_low) / image.size
+    return float(np.nansum(image)) * area_mm2 * math.cos(math.radians(camera.angle_deg))
+
+
+def is_beside_beam(camera: SlabCamera, light: Light) -> bool:
+    """Whether a camera looks at least ``BESIDE_BEAM_DEG`` beside the way that the light's beam goes on."""
+    return camera.side == light.side or abs(camera.angle_deg - light.angle_deg) >= BESIDE_BEAM_DEG
 
 
 def image_faults(name: str, image: Array, pixels: PixelGrid, beam: Beam) -> tuple[str, ...]:
@@ -90,10 +109,10 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
     known = f"σt·w is about {thickness:.2g}, and images tell a phase function from {THINNEST:g} to {THICKEST:g}"
     faults = []
     if thickness < THINNEST:
-        what = f"concentrate it {BEST / thickness:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
+        what = f"concentrate it {BEST / thickness:.2g}-fold{_or_a_cell_of(width_mm * BEST / thickness)}"
         faults.append(f"The sample is too thin: {known}; {what}.")
     if thickness > THICKEST:
-        what = f"dilute it {thickness / BEST:.2g}-fold, or take a cell of {width_mm * BEST / thickness:.2g} mm"
+        what = f"dilute it {thickness / BEST:.2g}-fold{_or_a_cell_of(width_mm * BEST / thickness)}"
         faults.append(f"The sample is too thick: {known}; {what}.")
     if albedo < MIN_ALBEDO:
         faults.append(
@@ -102,6 +121,11 @@ def sample_faults(material: Material, width_mm: float) -> tuple[str, ...]:
             " thinner cell."
         )
     return tuple(faults)
+
+
+def _or_a_cell_of(width_mm: float) -> str:
+    low_mm, high_mm = CELLS_MM
+    return f", or take a cell of {width_mm:.2g} mm" if low_mm <= width_mm <= high_mm else ""
 
 
 def similarity_faults(material: Material, width_mm: float, *, scattering: bool, reduced: bool) -> tuple[str, ...]:

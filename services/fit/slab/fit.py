@@ -26,6 +26,7 @@ from services.fit.slab.results.result import (
     PhaseFunction,
     SlabFit,
     image_error,
+    is_unlike,
     parameters_of,
     phase_of,
     with_believable_flags,
@@ -110,19 +111,21 @@ def fit_images(
     )
     solution = solver.solve(lambda: start(rig, measured, options.seed, blocks))
     material, uncertainty = solution.material, uncertainty_of(solution)
-    advice = (
-        next_measurement(folder, wavelength_nm, index.value, measured, material, solution.scale, options.seed, blocks)
-        if not dictionary.names
-        else ""
-    )
+    first, second = final_renders(rig, material, solver.budget, options.seed, blocks)
+    errors = _errors(measured, first, second)
     parameters = parameters_of(material, uncertainty, index, rig.width_mm)
     phase = phase_of(material, uncertainty, rig.width_mm)
-    first, second = final_renders(rig, material, solver.budget, options.seed, blocks)
+    # Nothing is worth measuring next for a material whose images these are not.
+    advice = (
+        next_measurement(folder, wavelength_nm, index.value, measured, material, solution.scale, options.seed, blocks)
+        if not dictionary.names and not is_unlike(errors)
+        else ""
+    )
     fit = SlabFit(
         wavelength_nm=wavelength_nm,
         parameters=parameters,
         phase=phase,
-        errors=_errors(measured, first, second),
+        errors=errors,
         notes=measured.faults
         + sample_faults(material, rig.width_mm)
         + similarity_faults(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.slab.folder import SlabFolder, SlabImage
-from services.fit.slab.diagnosis import grid_faults, image_faults
+from services.fit.slab.diagnosis import MAX_POWER_PER_SR, grid_faults, image_faults, is_beside_beam, power_per_sr
 from services.fit.slab.exposures import merged_images
 from services.fit.slab.model.rig import Grid, grid_of
 
@@ -53,6 +53,16 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
         )
     values, variances, faults, assumed = [], [], list(grid_faults(folder.pixels)), False
     for entry, image, own in _linear(root, folder, wavelength_nm):
+        name = f"{entry.camera} under {entry.light}"
+        if folder.exposures and (full := int(np.isnan(image).sum())):
+            if full == image.size:
+                raise CaptureInputError(
+                    f"All exposures of image {name} at {wavelength_nm:g} nm are full in every pixel, the first of them"
+                    f" {root / entry.file}; expose for less long."
+                )
+            faults.append(
+                f"In image {name} {full} pixels are full in every exposure and left out; add a shorter exposure."
+            )
         variance, assumed = (shot_noise(image), True) if own is None else (own, assumed)
         usable = np.isfinite(image) & np.isfinite(variance) & (variance > 0)
         if own is None and np.isfinite(image).any() and not image[np.isfinite(image)].mean() > 0:
@@ -64,7 +74,8 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
             raise CaptureInputError(
                 f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again."
             )
-        faults += image_faults(f"{entry.camera} under {entry.light}", image, folder.pixels, folder.beam)
+        _require_less_than_the_beam(folder, entry, np.where(usable, image, np.nan), root)
+        faults += image_faults(name, image, folder.pixels, folder.beam)
         value, value_variance = folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
         values.append(value)
         variances.append(value_variance)
@@ -75,6 +86,23 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
         np.stack(values), np.stack(variances), held_out,
         tuple(f"{entry.camera} under {entry.light}" for entry in entries), assumed, tuple(faults),
     )  # fmt: skip
+
+
+def _require_less_than_the_beam(folder: SlabFolder, entry: SlabImage, image: Array, root: Path) -> None:
+    # Raises CaptureInputError where an image is so bright that its unit must be wrong.
+    (camera,) = (one for one in folder.cameras if one.name == entry.camera)
+    (light,) = (one for one in folder.lights if one.name == entry.light)
+    share = power_per_sr(image, folder.pixels, camera)
+    if is_beside_beam(camera, light) and share > MAX_POWER_PER_SR:
+        remedy = (
+            "correct beam.power and the exposures' exposure_s"
+            if folder.exposures
+            else "give radiance per unit of the beam's power, per mm2 and sr"
+        )
+        raise CaptureInputError(
+            f"Image file {root / entry.file} (camera {entry.camera}, light {entry.light}) shows {share:.2g} times the"
+            f" beam's power per sr, and beside the beam no material sends more than {MAX_POWER_PER_SR:g}; {remedy}."
+        )
 
 
 def _linear(root: Path, folder: SlabFolder, wavelength_nm: float) -> Iterator[tuple[SlabImage, Array, Array | None]]:

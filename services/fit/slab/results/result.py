@@ -151,14 +151,14 @@ def image_error(
     return float(np.sqrt(max(square, 0.0)))
 
 
-def is_unlike(fit: SlabFit) -> bool:
+def is_unlike(errors: Errors) -> bool:
     """Whether the images are so far from those of the fit that none of its numbers is believed."""
-    return max(fit.errors.fit_error, fit.errors.held_out_error or 0.0) > MAX_ERROR
+    return max(errors.fit_error, errors.held_out_error or 0.0) > MAX_ERROR
 
 
 def with_believable_flags(fit: SlabFit) -> SlabFit:
     """The fit, with nothing called determined where it is unlike its images."""
-    if not is_unlike(fit):
+    if not is_unlike(fit.errors):
         return fit
     unknown = {"determined": False}
     parameters = {name: one.model_copy(update=unknown) for name, one in fit.parameters}
@@ -180,12 +180,13 @@ class SlabReport(Record):
         """The verdict on all wavelengths together, where each wavelength takes the place of a channel."""
         held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
         stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
-        unlike = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if is_unlike(fit)]
+        unlike = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if is_unlike(fit.errors)]
         advice = ""
         if unlike:
             advice = (
                 f"No material gives such images at {', '.join(unlike)}; compare slab.json with the set-up: widths and"
-                " sizes in mm, angles in degrees with their signs, sides, and which file is which."
+                " sizes in mm, angles in degrees with their signs, sides, which file is which, and the unit of images"
+                " or, of exposures, beam.power and exposure_s."
             )
         elif stopped:
             advice = f"The fit at {', '.join(stopped)} has not converged; raise option effort."
