@@ -42,8 +42,8 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
     """The images of one wavelength, per unit of the beam's power.
 
     Raises:
-        CaptureInputError: a file cannot be read, has another shape, or has no usable pixel; or no image is left to be
-            fitted.
+        CaptureInputError: a file cannot be read, has another shape, has no usable pixel, or shows more light than the
+            beam can send there; or no image is left to be fitted.
     """
     grid = grid_of(folder.pixels)
     entries = folder.images_at(wavelength_nm)
