@@ -36,7 +36,7 @@ LINEAR_REACH = 0.1
 
 CHECKED_BY_IMAGES = frozenset({"light_gain", "flare"})
 """Kinds of errors that images show to be faults of the calibration. The gain of all is not among them, because images
-can hardly tell it from absorption: freed of its prior it follows the model's own errors and those of the scan's place.
+can hardly tell it from absorption: freed of its prior it follows other errors, such as the model's own.
 Of 36 good captures 4 put it 11 to 15 % too low, with absorption 35 to 65 % too low, and of 7 with a gain 10 % too high
 none showed it."""
 MAX_ERROR = 10.0
