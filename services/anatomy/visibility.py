@@ -61,7 +61,7 @@ def visible_surfaces(
     for number, mesh in enumerate(meshes):
         image, depth = camera.project(mesh.vertices_mm)
         faces = mesh.faces[(depth[mesh.faces] > 0).all(axis=1)]
-        normals = vertex_normals(mesh) if with_normals else None
+        normals = vertex_normals(mesh)[faces] if with_normals else None
         corners = image[faces] - offset_px
         # Keep triangles that face the camera (y points down, so their area is negative) and touch the image.
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -71,30 +71,30 @@ def visible_surfaces(
         span = np.maximum(high - low + 1, 0)
         count = np.where(area < 0, span[:, 0] * span[:, 1], 0)
         for batch in _batches(np.flatnonzero(count), count):
-            # Enumerate every sample inside each triangle's bounding box.
-            triangle = np.repeat(batch, count[batch])
-            step = np.arange(len(triangle)) - np.repeat(np.cumsum(count[batch]) - count[batch], count[batch])
-            x, y = low[triangle, 0] + step % span[triangle, 0], low[triangle, 1] + step // span[triangle, 0]
+            row = _rows_inside(batch, corners[:, 0], edge1, edge2, area, low, high)
             # Compute barycentric coordinates; edges count as inside, so that adjacent triangles leave no gap.
-            x_from, y_from = x - corners[triangle, 0, 0], y - corners[triangle, 0, 1]
-            b1 = (x_from * edge2[triangle, 1] - y_from * edge2[triangle, 0]) / area[triangle]
-            b2 = (edge1[triangle, 0] * y_from - edge1[triangle, 1] * x_from) / area[triangle]
+            member, step = _enumerate(row.length)
+            x = row.first[member] + step
+            x0, height1, height2, doubled_area, rise1, rise2 = row.constants[:, member]
+            b1 = ((x - x0) * height2 - rise2) / doubled_area
+            b2 = (rise1 - height1 * (x - x0)) / doubled_area
             b0 = 1 - b1 - b2
             inside = np.flatnonzero((b0 >= ROUNDING) & (b1 >= ROUNDING) & (b2 >= ROUNDING))
-            triangle, sample = triangle[inside], (y * columns + x)[inside]
-            barycentric = np.stack([b0[inside], b1[inside], b2[inside]], axis=1)
+            member = member[inside]
+            sample = row.y[member] * columns + x[inside]
             # 1/depth is linear in the image, so weights over depth are perspective-correct.
-            weights = barycentric / depth[faces[triangle]]
-            inverse = weights.sum(axis=1)
-            # Of the candidates for one sample keep the nearest: sorted by nearness, the last write wins.
+            weights = np.stack([b0[inside], b1[inside], b2[inside]]) / depth[faces[row.triangle].T][:, member]
+            inverse = weights.sum(axis=0)
+            # Of the candidates for one sample keep the nearest.
             nearer = np.flatnonzero(inverse > nearness[sample])
-            nearer = nearer[np.argsort(inverse[nearer], kind="stable")]
-            sample = sample[nearer]
-            nearness[sample] = inverse[nearer]
-            label[sample] = number
+            np.maximum.at(nearness, sample[nearer], inverse[nearer])
+            nearer = nearer[inverse[nearer] == nearness[sample[nearer]]]
+            label[sample[nearer]] = number
             if normals is not None:
-                normal[sample] = np.einsum("nk,nkd->nd", weights[nearer], normals[faces[triangle[nearer]]])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+                of_corners = normals[row.triangle[member[nearer]]]
+                mean = np.einsum("kn,nkd->nd", weights[:, nearer], of_corners).astype(np.float32)
+                length = np.linalg.norm(mean, axis=1, keepdims=True)
+                normal[sample[nearer]] = mean / np.maximum(length, 1e-30)
     shape = (rows, columns)
     with np.errstate(divide="ignore"):
         depth_mm = (1 / nearness).reshape(shape)
@@ -110,6 +110,64 @@ def vertex_normals(mesh: Mesh) -> Floats:
         for axis in range(3):
             normals[:, axis] += np.bincount(mesh.faces[:, k], weighted[:, axis], minlength=len(normals))
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of samples inside triangles, one triangle after the other; all arrays have one entry per row."""
+
+    triangle: NDArray[np.intp]
+    y: NDArray[np.int64]
+    first: NDArray[np.int64]
+    length: NDArray[np.int64]
+    constants: Floats
+    """What barycentric coordinates along a row are computed from: x of corner 0, heights of both edges, twice the area,
+    and for both edges the width times the row's distance from corner 0 (6, rows)."""
+
+
+def _rows_inside(
+    triangles: NDArray[np.intp],
+    corner: Floats,
+    edge1: Floats,
+    edge2: Floats,
+    area: Floats,
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+) -> _Rows:
+    """Bound the columns of each row of samples that lie inside a triangle.
+
+    Args:
+        triangles: indices of triangles into the other arrays.
+        corner: corner 0 of all triangles (F, 2), in samples.
+        edge1: edge from corner 0 to corner 1 (F, 2).
+        edge2: edge from corner 0 to corner 2 (F, 2).
+        area: twice the signed area (F,).
+        low: first column and row of each bounding box (F, 2).
+        high: last column and row of each bounding box (F, 2).
+    """
+    owner, step = _enumerate(high[triangles, 1] - low[triangles, 1] + 1)
+    triangle = triangles[owner]
+    y = low[triangle, 1] + step
+    y_from = y - corner[triangle, 1]
+    height1, height2, doubled_area = edge1[triangle, 1], edge2[triangle, 1], area[triangle]
+    rise1, rise2 = edge1[triangle, 0] * y_from, y_from * edge2[triangle, 0]
+    # Along a row each barycentric coordinate is linear. Take twice the tolerance, so that rounding loses no sample.
+    start = np.stack([doubled_area + rise2 - rise1, -rise2, rise1]) / doubled_area
+    slope = np.stack([height1 - height2, height2, -height1]) / doubled_area
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = corner[triangle, 0] + (2 * ROUNDING - start) / slope
+    first = np.where(slope > 0, np.ceil(crossing), low[triangle, 0]).max(axis=0)
+    last = np.where(slope < 0, np.floor(crossing), high[triangle, 0]).min(axis=0)
+    first = np.clip(first, low[triangle, 0], high[triangle, 0] + 1).astype(np.int64)
+    last = np.clip(last, low[triangle, 0] - 1, high[triangle, 0]).astype(np.int64)
+    constants = np.stack([corner[triangle, 0], height1, height2, doubled_area, rise1, rise2])
+    return _Rows(triangle, y, first, np.maximum(last - first + 1, 0), constants)
+
+
+def _enumerate(lengths: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Index of the group, and place in the group, of each member of groups of the given lengths."""
+    group = np.repeat(np.arange(len(lengths)), lengths)
+    return group, np.arange(len(group)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
 
 
 def _batches(triangles: NDArray[np.intp], count: NDArray[np.int64]) -> list[NDArray[np.intp]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -12,8 +13,10 @@ from playwright.sync_api import Browser, expect
 
 from services.api.app import create_app
 from services.core.records import JobSpec
+from services.core.results import FitReport
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
+from services.core.verdict import VERDICT, verdict_of
 from services.fit.slab.model.dictionary import ANGLES_RAD, hg_values
 from services.fit.slab.results.chart import phase_picture
 from services.fit.slab.results.result import PhaseFunction
@@ -22,10 +25,19 @@ from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
 from tests.browser.scripted_job import expect_state
 from tests.support.live_server import serving
 from tests.support.small_slab import description, write_folder
+from tests.support.uploading import write_capture
 
 pytestmark = pytest.mark.browser
 
 WAVELENGTHS_NM = (532, 635)
+
+
+def verdict() -> dict[str, Any]:
+    """Data of the event with which a fit of images without held-out ones finishes."""
+    errors = {"532": 0.0031, "635": 0.0035}
+    told: dict[str, Any] = {"fit_error": errors, "held_out_error": {}, "steps": 9, "seconds": 1.0}
+    report = FitReport(converged=True, advice="", parameters={}, **told)
+    return {VERDICT: verdict_of(report).model_dump(mode="json")}
 
 
 def slab_job(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
@@ -36,7 +48,7 @@ def slab_job(_spec: JobSpec, folder: Path, events: EventAddress) -> None:
             data = {"wavelength_nm": float(nm), "wavelengths": len(WAVELENGTHS_NM)}
             message = f"{nm} nm: σs 1.204 ± 0.008 per mm; error on fitted images 0.31 %."
             log.append(fit, StageEvent(stage="fit", kind="progress", done=number / 2, message=message, data=data))
-        log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message="Converged."))
+        log.append(fit, StageEvent(stage="fit", kind="finished", done=1.0, message="Converged.", data=verdict()))
         export = log.begin_stage("export")
         sigma = '"sigma_s": {"value": 1.204, "se": 0.008, "unit": "1/mm", "determined": true}'
         row = f'{{{sigma}, "g": {{"value": 0.61, "se": 0.2, "unit": "1", "determined": false}}}}'
@@ -76,6 +88,9 @@ def test_the_page_shows_wavelengths_coefficients_and_phase_functions(
             [f"{nm} nm: σs 1.204 ± 0.008 per mm; error on fitted images 0.31 %." for nm in WAVELENGTHS_NM]
         )
         expect(page.locator("thead th")).to_have_text(["parameter", "unit", "532 nm", "635 nm"])
+        expect(page.locator("tbody th")).to_have_text(["scattering σs", "mean cosine g"])
+        expect(page.locator("table caption")).to_have_text("Result: value ± one standard error.")
+        expect(page.locator(".verdict")).to_contain_text("532 nm 0.31 %, 635 nm 0.35 %")
         expect(page.locator("td.number").first).to_have_text("1.2040 ± 0.0080")
         expect(page.locator(".phases img")).to_have_count(2)
         picture = page.get_by_alt_text("Phase function at 532 nm")
@@ -106,3 +121,23 @@ def test_the_form_shows_the_options_of_the_chosen_kind(chromium: Browser, server
         page.select_option("#preset", "standard")
         expect(page.locator("#option-max_steps")).to_be_visible()
         expect(page.locator("#option-effort")).to_be_hidden()
+
+
+def test_a_slabs_capture_chooses_the_kind_of_its_job(
+    chromium: Browser, server: tuple[httpx.Client, str], tmp_path: Path
+) -> None:
+    client, _ = server
+    folders = write_capture(tmp_path / "tooth"), write_folder(tmp_path / "cell", description())
+    with watched_page(chromium, str(client.base_url).rstrip("/"), "light", WIDE[0]) as page:
+        for folder, kind in zip(folders, ("tooth", "slab"), strict=True):
+            page.goto("/#/new")
+            page.set_input_files("#folder", str(folder))
+            expect(page.get_by_role("heading", name="Submit a job")).to_be_visible()
+            expect(page.locator("#option-kind")).to_have_value(kind)
+        expect(page.locator("#option-ior")).to_be_hidden()
+        page.select_option("#preset", "quick")
+        expect(page.locator("#option-kind")).to_have_value("slab")
+        of_tooth = client.get("/v1/captures").json()["captures"][1]["id"]
+        page.select_option("#capture", of_tooth)
+        expect(page.locator("#option-kind")).to_have_value("tooth")
+        expect(page.locator("#option-ior")).to_be_visible()

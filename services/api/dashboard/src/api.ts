@@ -96,6 +96,11 @@ export interface Capture {
   bytes: number;
 }
 
+/** A capture with its files. */
+export interface CaptureDetail extends Capture {
+  files: { path: string }[];
+}
+
 /** A calibration by name, as it is listed. */
 export interface NamedCalibration {
   name: string;
@@ -287,6 +292,7 @@ export const getOptions = (): Promise<OptionsSchema> => ask("/options");
 export const listPresets = (): Promise<Preset[]> => ask("/presets");
 export const getPreset = (name: string): Promise<Preset> => ask(`/presets/${name}`);
 export const listCaptures = (): Promise<{ captures: Capture[] }> => ask("/captures?limit=500");
+export const getCapture = (id: string): Promise<CaptureDetail> => ask(`/captures/${id}`);
 export const listCalibrations = (): Promise<NamedCalibration[]> => ask("/calibrations");
 /** Store the calibration that a job has made under a name. */
 export const keepCalibration = (job: string, name: string): Promise<NamedCalibration> =>

@@ -21,7 +21,7 @@ import { badgeOf, bytes, remaining, when } from "./format";
 import { JobActions } from "./jobActions";
 import { LossChart } from "./lossChart";
 import { ParameterTable } from "./parameterTable";
-import { SlabView } from "./slabView";
+import { quantityOf, SlabView } from "./slabView";
 import { StageList } from "./stageList";
 import { VerdictCard } from "./verdictCard";
 
@@ -202,10 +202,15 @@ export class JobView {
     const { text, state } = badgeOf(job);
     this.state.textContent = text;
     this.state.dataset["state"] = state;
-    this.verdict.show(job.verdict);
+    this.verdict.show(job.verdict, (channel) => this.channelName(channel));
     this.chart.conclude(job.verdict);
     this.failure.hidden = job.failure === null;
     this.failure.textContent = job.failure ? `${job.failure.stage ?? "job"}: ${job.failure.message}` : "";
+  }
+
+  /** Return the name of a channel for people; a channel of a slab is a wavelength in nm. */
+  private channelName(channel: string): string {
+    return this.isSlab ? `${channel} nm` : channel;
   }
 
   private changed(job: Job, again: boolean): void {
@@ -229,9 +234,13 @@ export class JobView {
       if (this.isStopped) return;
       this.list(files);
       this.slab.list(files);
-      const heading = (channel: string) => (this.isSlab ? `${channel} nm` : channel);
       this.parameterTable.hidden = !files.some((file) => file.path === "parameters.json");
-      if (!this.parameterTable.hidden) this.parameters.showResult(await getParameters(this.id), heading);
+      if (!this.parameterTable.hidden) 
+        this.parameters.showResult(
+          await getParameters(this.id),
+          (channel) => this.channelName(channel),
+          (name) => (this.isSlab ? quantityOf(name) : name),
+        );
       this.filesRefusal.hidden = true;
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;

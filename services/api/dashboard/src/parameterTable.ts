@@ -41,8 +41,13 @@ export class ParameterTable {
     this.current.clear();
   }
 
-  /** Show the published result; `heading` returns the heading of the column of a channel. */
-  showResult(result: Parameters, heading: (channel: string) => string = (channel) => channel): void {
+  /**
+   * Show the published result.
+   *
+   * @param heading - returns the heading of the column of a channel.
+   * @param label - returns the heading of the row of a parameter.
+   */
+  showResult(result: Parameters, heading: (channel: string) => string, label: (name: string) => string): void {
     this.isFinal = true;
     const channels = Object.keys(result);
     const all = [...new Set(channels.flatMap((channel) => Object.keys(result[channel] ?? {})))];
@@ -52,8 +57,10 @@ export class ParameterTable {
       return first ? unitOf(first) : "";
     };
     const left = names.length < all.length ? " Those of single atoms of the dictionary are in the report." : "";
+    const hasSources = Object.values(result).some((own) => Object.values(own).some((one) => sourcesOf(one)));
+    const sources = hasSources ? ", and what most of its square is made of" : "";
     this.fill(
-      `Result: value ± one standard error, and what most of its square is made of.${left}`,
+      `Result: value ± one standard error${sources}.${left}`,
       channels,
       names,
       unit,
@@ -69,6 +76,7 @@ export class ParameterTable {
         ];
       },
       heading,
+      label,
     );
   }
 
@@ -79,6 +87,7 @@ export class ParameterTable {
     unit: (name: string) => string,
     cell: (name: string, channel: string) => (string | HTMLElement)[],
     heading: (channel: string) => string = (channel) => channel,
+    label: (name: string) => string = (name) => name,
   ): void {
     const head = element(
       "tr",
@@ -89,7 +98,7 @@ export class ParameterTable {
       element(
         "tr",
         {},
-        element("th", { scope: "row" }, ...breakable(name)),
+        element("th", { scope: "row" }, ...breakable(label(name))),
         element("td", {}, unit(name)),
         ...channels.map((channel) => element("td", { class: "number" }, ...cell(name, channel))),
       ),

@@ -4,6 +4,23 @@ import { type Artifact, artifactUrl, type JobEvent } from "./api";
 import { element } from "./element";
 import { showPicture } from "./lanes";
 
+/** Names of a slab's quantities, as in its report. */
+const QUANTITIES: Record<string, string> = {
+  sigma_t: "extinction σt",
+  sigma_s: "scattering σs",
+  sigma_a: "absorption σa",
+  sigma_s_reduced: "reduced scattering σs′",
+  g: "mean cosine g",
+  index: "index of refraction",
+  volume_fraction: "volume of all spheres",
+  mean_radius: "mean radius, by volume",
+};
+
+/** Return the name of a slab's quantity for people. */
+export function quantityOf(parameter: string): string {
+  return QUANTITIES[parameter] ?? parameter;
+}
+
 const PICTURE = /^phase_(.+)\.svg$/;
 
 export class SlabView {

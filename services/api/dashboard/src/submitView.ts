@@ -2,6 +2,7 @@
 
 import {
   type Capture,
+  getCapture,
   getOptions,
   listCalibrations,
   listCaptures,
@@ -60,6 +61,9 @@ const GROUPS: [string, string[]][] = [
 const RIG_FIRST = ["dome", "mouth", "level", "exposure_s"];
 const LONGEST_NAME = "80";
 const DEFAULT_KIND = "tooth";
+const SLAB_KIND = "slab";
+/** File that makes a capture one of a slab. */
+const SLAB_DESCRIPTION = "slab.json";
 /** Name of the demonstration as a source, and of the preset with the options that its capture needs. */
 const DEMO = "demo";
 
@@ -80,6 +84,8 @@ export class SubmitView {
   private presets: Preset[] = [];
   private demo: Preset["options"] = {};
   private filledForDemo = false;
+  /** Whether the selected capture is one of a slab; false until its files are known. */
+  private isSlabSelected = false;
 
   /** `chosen` is the id of a capture, or "rig"; if it is empty, the newest capture is selected. */
   constructor(private readonly chosen: string) {
@@ -87,7 +93,9 @@ export class SubmitView {
     this.source.addEventListener("change", () => {
       this.showSource();
       if (this.isDemo !== this.filledForDemo) this.takePreset();
+      void this.recogniseCapture();
     });
+    this.capture.addEventListener("change", () => void this.recogniseCapture());
     this.preset.addEventListener("change", () => this.takePreset());
     this.root.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -108,6 +116,7 @@ export class SubmitView {
       captures.captures.filter((one) => one.state === "committed"),
     );
     this.offer(calibrations);
+    await this.recogniseCapture();
   }
 
   stop(): void {}
@@ -157,6 +166,16 @@ export class SubmitView {
     this.foreign = schema.foreign_options;
     this.fields.find((one) => one.name === "kind")?.onChange(() => this.showKind());
     this.arrange(captures.length > 0);
+  }
+
+  /** Choose the kind of job that the selected capture is for, where its files tell. */
+  private async recogniseCapture(): Promise<void> {
+    const id = this.source.value === "capture" ? this.capture.value : "";
+    const isSlab = id !== "" && (await isOfSlab(id));
+    // Another capture may have been selected meanwhile
+    if ((id && id !== this.capture.value) || isSlab === this.isSlabSelected) return;
+    this.isSlabSelected = isSlab;
+    this.takePreset();
   }
 
   /** Hide the options that the chosen kind of job does not have, and groups that are then empty. */
@@ -230,12 +249,16 @@ export class SubmitView {
     if (place) place.hidden = this.source.value !== "capture";
   }
 
-  /** Fill the form with the preset's options; those that the demonstration's capture needs have precedence. */
+  /** Fill the form with the preset's options; those that the capture needs have precedence. */
   private takePreset(): void {
     const preset = this.presets.find((one) => one.name === this.preset.value);
     this.summary.textContent = preset?.summary ?? "";
     this.filledForDemo = this.isDemo;
-    const options = { ...preset?.options, ...(this.isDemo ? this.demo : {}) };
+    const options: Preset["options"] = {
+      ...preset?.options,
+      ...(this.isDemo ? this.demo : {}),
+      ...(this.isSlabSelected ? { kind: SLAB_KIND } : {}),
+    };
     for (const field of this.fields) {
       if (field.name in options) field.set(options[field.name]);
       else field.reset();
@@ -288,6 +311,16 @@ export class SubmitView {
     }
     this.refusal.hidden = false;
     this.refusal.textContent = sentence;
+  }
+}
+
+/** Whether a capture is one of a slab; false where the server cannot say so now, as the kind can be chosen by hand. */
+async function isOfSlab(capture: string): Promise<boolean> {
+  try {
+    return (await getCapture(capture)).files.some((file) => file.path === SLAB_DESCRIPTION);
+  } catch (problem) {
+    if (problem instanceof Unauthenticated) throw problem;
+    return false;
   }
 }
 

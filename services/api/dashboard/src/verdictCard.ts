@@ -12,13 +12,14 @@ export class VerdictCard {
     this.root.hidden = true;
   }
 
-  show(verdict: Verdict | null): void {
+  /** Show a verdict; `nameOf` returns the name of a channel. */
+  show(verdict: Verdict | null, nameOf: (channel: string) => string): void {
     this.root.hidden = verdict === null;
     const json = JSON.stringify(verdict);
     if (!verdict || json === this.shown) return; // an alert that is shown already is not set again
     this.shown = json;
     const thickness = verdict.enamel_thickness;
-    const errors = Object.entries(verdict.channels).map(([channel, error]) => `${channel} ${figureOf(error)}`);
+    const errors = Object.entries(verdict.channels).map(([channel, error]) => `${nameOf(channel)} ${figureOf(error)}`);
     const note =
       verdict.error_of === "held-out"
         ? errors.join(", ")
