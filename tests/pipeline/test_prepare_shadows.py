@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -16,6 +17,8 @@ from services.core.records import MaskBit
 from services.preprocess.masking.shadows import expected_irradiance
 from services.preprocess.projection import project
 from services.preprocess.quality import QualityReport
+from services.preprocess.source import Bits
+from services.preprocess.tasks import blocks
 from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.blocks import Block
 from tests.support.folder_captures import prepare
@@ -97,6 +100,25 @@ def test_shading_that_was_cut_off_is_done_again_on_another_worker(
     for path in (tmp_path / "whole" / "prepared").rglob("*"):
         if path.is_file() and path.name != "manifest.json":
             assert (tmp_path / "cut_off" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+
+
+def test_a_shadow_is_found_among_pixels_that_are_masked_as_highlights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A highlight adds light, so what is dark in spite of it is shadowed."""
+    (tmp_path / "capture").mkdir()
+    shadow = write_capture(tmp_path / "capture", lights=8)
+    kept = blocks.valid_bits
+
+    def all_highlights(*args: Any) -> Bits:
+        of_light = args[3].name == f"l{SHADED}"
+        return kept(*args) | np.uint16(MaskBit.HIGHLIGHT if of_light else 0)
+
+    monkeypatch.setattr(blocks, "valid_bits", all_highlights)
+    prepare(tmp_path / "capture", tmp_path / "asked", shadows=True)
+    flagged = shadows(tmp_path / "asked")[SHADED]
+    assert flagged[shadow].mean() > 0.9
+    assert flagged[~shadow].mean() < 0.03
 
 
 def test_few_lights_tell_of_no_shadow(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ MIN_LIGHTS = 6
 unshadowed brightness is unknown."""
 SHADOWED = 0.5
 """Confidence above which a pixel is flagged: it is then more likely shadowed than not."""
-NO_VALUE = np.uint16(MaskBit.HIGHLIGHT | MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.MOTION | MaskBit.UNLIT)
+NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.MOTION | MaskBit.UNLIT)
 """Mask bits of pixels whose value is not the brightness of the tooth."""
 
 
@@ -108,9 +108,16 @@ def _pixel_mm(camera: Camera, footprint: Footprint) -> float:
 
 
 def _brightness(files: AttemptFiles, view: View, light: int, coarse: _Coarse) -> tuple[Image, Image]:
-    """Mean of an image over channels (h, w) and its variance (h, w), infinite in squares without a usable pixel."""
+    """Mean of an image over channels (h, w) and its variance (h, w), infinite in squares without a usable pixel.
+
+    Highlights are used only in squares without another pixel. They add light, so a square that is dark nevertheless
+    lies in a shadow.
+    """
     radiance, variance, valid = (_read(files, view, name, light) for name in ("radiance", "variance", "valid"))
-    weight = (view.footprint.covered & (valid & NO_VALUE == 0)).astype(np.float32)
+    usable = view.footprint.covered & (valid & NO_VALUE == 0)
+    plain = (usable & (valid & np.uint16(MaskBit.HIGHLIGHT) == 0)).astype(np.float32)
+    has_plain = _upsampled(np.sign(_block_sums(plain, coarse.step)), coarse.step, usable) > 0
+    weight = np.where(has_plain, plain, usable.astype(np.float32))
     value, sums = coarse.mean(radiance.mean(axis=-1), weight)
     spread, _ = coarse.mean(variance.mean(axis=-1) / variance.shape[-1], weight)
     return value, np.where(sums > 0, spread / np.maximum(sums, 1), np.inf).astype(np.float32)

@@ -45,7 +45,7 @@ class ShadowRule:
     smooth_mm: float = 0.5
     """Standard deviation of the Gaussian that smooths brightness before the comparison, so that one pixel's noise
     decides nothing. It is finer than the spread of light."""
-    min_relative_irradiance: float = 0.4
+    min_relative_irradiance: float = 0.25
     """Smallest irradiance, as a fraction of that of the pixel's best light, of a light that counts for the pixel's
     unshadowed brightness. Grazing lights are left out because their irradiance is the least certain."""
     min_cosine: float = 0.03
@@ -55,7 +55,7 @@ class ShadowRule:
     and a maximum would be chosen by noise."""
     certain: float = 0.47
     """Ratio below which a pixel is shadowed by definition."""
-    possible: float = 0.57
+    possible: float = 0.5
     """Ratio below which a pixel is shadowed if it is connected to a certain one, because light that has spread inside
     the tooth brightens a shadow's rim."""
     model_error: float = 0.12

@@ -12,7 +12,7 @@ from services.preprocess.masking.masks import HandMasks
 from services.preprocess.source import Source
 from services.preprocess.stabilisation.motion import stored_step
 
-FORMAT = 9
+FORMAT = 10
 """Version of the prepared store and of the work files that one attempt leaves for the next. Raise it whenever either
 format changes, or when the same input gives other pixels."""
 OPTIONS_WITHOUT_EFFECT = frozenset({"workers", "priority", "memory_gib"})
