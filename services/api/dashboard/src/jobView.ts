@@ -235,12 +235,13 @@ export class JobView {
       this.list(files);
       this.slab.list(files);
       this.parameterTable.hidden = !files.some((file) => file.path === "parameters.json");
-      if (!this.parameterTable.hidden) 
+      if (!this.parameterTable.hidden) {
         this.parameters.showResult(
           await getParameters(this.id),
           (channel) => this.channelName(channel),
           (name) => (this.isSlab ? quantityOf(name) : name),
         );
+      }
       this.filesRefusal.hidden = true;
     } catch (problem) {
       if (problem instanceof Unauthenticated) throw problem;
