@@ -1,6 +1,7 @@
 """Shares of the shadowed pixels that preparation finds and of the lit pixels that it flags, on a virtual jaw with lips.
 
-dentine phantom --out JAW --jaw --lips --renderer mitsuba --subject 7 --pixel-mm 0.5 --cameras 2 --lights 12 --samples 64
+dentine phantom --out JAW --jaw --lips --renderer mitsuba --subject 7
+    --pixel-mm 0.5 --cameras 2 --lights 12 --samples 64
 python -m tests.benchmarks.shadows JAW --json shadows.json
 
 Noise of a sensor is added to the images, which are then prepared with the option ``shadows``. The truth follows from
