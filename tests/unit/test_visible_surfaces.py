@@ -38,12 +38,7 @@ def nearest(
         edges = np.stack([corners[1] - corners[0], corners[2] - corners[0]], axis=1)
         if np.linalg.det(edges) >= 0:
             continue  # it faces away
-        b1, b2 = (
-            np.moveaxis(np.stack([x, y], axis=-1) - corners[0], -1, 0)
-            .reshape(2, -1)
-            .T.dot(np.linalg.inv(edges).T)
-            .T.reshape(2, *x.shape)
-        )
+        b1, b2 = np.moveaxis((np.stack([x, y], axis=-1) - corners[0]) @ np.linalg.inv(edges).T, -1, 0)
         barycentric = np.stack([1 - b1 - b2, b1, b2])
         lowest, inverse = barycentric.min(axis=0), (barycentric / depths[:, None, None]).sum(axis=0)
         is_clear &= (np.abs(lowest) > 1e-6) & ((lowest < 0) | (np.abs(inverse / np.maximum(nearness, 1e-9) - 1) > 1e-9))

@@ -54,10 +54,9 @@ class ShadowRule:
     """Quantile of a pixel's ratios under all lights that is taken as the unshadowed one. Most lights are not shadowed,
     and a maximum would be chosen by noise."""
     certain: float = 0.47
-    """Ratio below which a pixel is shadowed by definition."""
+    """Ratio below which a pixel is shadowed wherever it lies, a little below the one half that defines a shadow."""
     possible: float = 0.5
-    """Ratio below which a pixel is shadowed if it is connected to a certain one, because light that has spread inside
-    the tooth brightens a shadow's rim."""
+    """Ratio below which a pixel is shadowed if it is connected to a certain one: the one half that defines a shadow."""
     model_error: float = 0.12
     """Relative error of the expected brightness: view-dependent reflection and light that leaves far from where it
     entered."""
