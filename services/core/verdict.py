@@ -64,7 +64,11 @@ def mean_figure(errors: Mapping[str, float], ses: Mapping[str, float]) -> Figure
 
 
 def percent(figure: Figure) -> str:
-    """A figure in percent, rounded to two significant digits of its standard error, with one to three decimals."""
+    """A figure in percent, rounded to two significant digits of its standard error, with one to three decimals; an
+    error without one that is zero is what is left of a difference smaller than its noise.
+    """
+    if figure.se is None and figure.value == 0:
+        return "below the noise"
     if figure.se is None:
         return f"{100 * figure.value:.1f} %" if figure.value >= 0.01 else f"{100 * figure.value:.2f} %"
     se = 100 * figure.se

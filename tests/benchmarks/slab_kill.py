@@ -27,7 +27,7 @@ from typing import Any
 
 import psutil
 
-from tests.pipeline.test_slab_job import TRUTHS, write_cell
+from tests.support.small_slab import TRUTHS, write_cell
 
 RESULTS = ("parameters.json", "phase.json", "errors.json")
 VICTIMS = ("all", "worker")

@@ -18,17 +18,13 @@ from services.core.errors import CaptureInputError, JobCancelledError, SettingsE
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.settings import job_from_tree
-from services.core.slab.folder import SlabFolder
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.execution.engine_host import InProcessHost
 from services.fit.execution.executors import LocalExecutor
 from services.fit.slab.dictionaries.hg import COSINES
-from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein, hg_values
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import rig_of
+from services.fit.slab.model.dictionary import ANGLES_RAD, hg_values
 from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
 from services.fit.slab.results.stored import IMAGES, StoredResult, read_result
 from services.fit.slab.results.tabphase import tabphase_values
 from services.fit.slab.schedule import WavelengthTask, run_wavelengths
@@ -37,36 +33,7 @@ from services.fit.slab.stage import CHECKPOINT, export, run
 from services.fit.transport.platform import prepare_device
 from services.pipeline.stages import run_job, stages_of
 from tests.support.recording_executor import RecordingExecutor
-from tests.support.small_slab import description, write_folder
-
-TRUTHS = {532.0: (1.2, 0.6), 635.0: (0.8, 0.4)}
-"""Scattering per mm and mean cosine by wavelength in nm. Only the slow test uses the second wavelength."""
-ABSORPTION_PER_MM = 0.05
-
-
-def write_cell(root: Path, *wavelengths_nm: float) -> Path:
-    """Write a cell's folder with two lights, two cameras and 1 % noise; each wavelength's first image is held out."""
-    told, noise = description(wavelengths_nm=list(wavelengths_nm)), np.random.default_rng(1)
-    shown = [(nm, image) for nm in wavelengths_nm for image in told["images"]]
-    told["images"] = [{**image, "wavelength_nm": nm, "file": f"{nm:g}_{image['file']}"} for nm, image in shown]
-    for k in range(len(wavelengths_nm)):
-        told["images"][k * len(shown) // len(wavelengths_nm)]["held_out"] = True
-    described = SlabFolder.model_validate(told)
-    for nm in wavelengths_nm:
-        rig, medium = rig_of(described, nm), henyey_greenstein(*TRUTHS[nm], ABSORPTION_PER_MM)
-        images = render(rig, medium, seed=99, step=0, batches=1, paths=50_000, scores=False).mean
-        entries = [image for image in described.images if image.wavelength_nm == nm]
-        for entry, image in zip(entries, images, strict=True):
-            half = image.reshape(rig.grid.rows, rig.grid.columns)
-            whole = np.concatenate([half[::-1], half])
-            np.save(root / entry.file, whole + 0.01 * np.sqrt(whole * whole.mean()) * noise.normal(size=whole.shape))
-    # The folder does not state the index. It follows from the through-beam, as the cell has no glass.
-    sine = described.cell.index_outside * np.sin(np.radians(told["lights"][1]["angle_deg"])) / told["cell"]["index"]
-    peak_mm = told["cell"]["width_mm"] * sine / np.sqrt(1 - sine**2)
-    told["through_beam"] = [{"light": told["lights"][1]["name"], "peak_x_mm": float(peak_mm), "se_mm": 1e-4}]
-    told["cell"] = told["cell"] | {"index": None}
-    (root / "slab.json").write_text(json.dumps(told))
-    return root
+from tests.support.small_slab import TRUTHS, made_up_fit, write_cell, write_folder
 
 
 def require_truths(root: Path, *wavelengths_nm: float) -> None:
@@ -279,31 +246,13 @@ def test_a_wavelength_is_told_before_the_next_one_is_fitted(
         wavelength_nm = float(place.name)
         place.mkdir(parents=True, exist_ok=True)
         (place / IMAGES).touch()
-        fit = stored_like(wavelength_nm)
+        fit = made_up_fit(wavelength_nm)
         return StoredResult(of="", fit=fit)
 
     monkeypatch.setattr("services.fit.slab.schedule.fit_wavelength", fit)
     monkeypatch.setattr("services.fit.slab.results.stored.read_result", stored_result)
     run(JobSpec(kind="slab", capture=root), Told(tmp_path / "job"))
     assert order == ["fitted 532", "told 532 at 0.5", "fitted 635", "told 635 at 1.0"]
-
-
-def stored_like(wavelength_nm: float) -> SlabFit:
-    """A stored fit with made-up values."""
-    one = Quantity(value=1.0, se=0.1, unit="1/mm", determined=True)
-    parameters = Parameters(sigma_t=one, sigma_s=one, sigma_a=one, sigma_s_reduced=one, g=one, index=one)
-    phase = PhaseFunction(theta_deg=(), value_per_sr=(), se_per_sr=(), determined=())
-    return SlabFit(
-        wavelength_nm=wavelength_nm,
-        parameters=parameters,
-        phase=phase,
-        errors=Errors(fit_error=0.01, held_out_error=None),
-        notes=(),
-        converged=True,
-        steps=1,
-        paths=1,
-        core_seconds=1.0,
-    )
 
 
 def test_a_folder_of_no_slab_is_refused(tmp_path: Path) -> None:

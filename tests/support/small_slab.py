@@ -9,9 +9,15 @@ from typing import Any
 import numpy as np
 
 from services.core.slab.folder import SlabFolder
+from services.fit.slab.model.dictionary import henyey_greenstein
+from services.fit.slab.model.forward import render
 from services.fit.slab.model.rig import Rig, rig_of
+from services.fit.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
 
 WAVELENGTH_NM = 532.0
+TRUTHS = {532.0: (1.2, 0.6), 635.0: (0.8, 0.4)}
+"""Scattering per mm and mean cosine by wavelength in nm."""
+ABSORPTION_PER_MM = 0.05
 
 
 def description(**changes: Any) -> dict[str, Any]:
@@ -53,3 +59,46 @@ def write_folder(root: Path, told: dict[str, Any], image: np.ndarray | None = No
     for entry in told["images"]:
         np.save(root / entry["file"], pixels)
     return root
+
+
+def write_cell(root: Path, *wavelengths_nm: float) -> Path:
+    """Write a cell's folder with two lights, two cameras and 1 % noise; each wavelength's first image is held out."""
+    told, noise = description(wavelengths_nm=list(wavelengths_nm)), np.random.default_rng(1)
+    shown = [(nm, image) for nm in wavelengths_nm for image in told["images"]]
+    told["images"] = [{**image, "wavelength_nm": nm, "file": f"{nm:g}_{image['file']}"} for nm, image in shown]
+    for k in range(len(wavelengths_nm)):
+        told["images"][k * len(shown) // len(wavelengths_nm)]["held_out"] = True
+    described = SlabFolder.model_validate(told)
+    for nm in wavelengths_nm:
+        rig, medium = rig_of(described, nm), henyey_greenstein(*TRUTHS[nm], ABSORPTION_PER_MM)
+        images = render(rig, medium, seed=99, step=0, batches=1, paths=50_000, scores=False).mean
+        entries = [image for image in described.images if image.wavelength_nm == nm]
+        for entry, image in zip(entries, images, strict=True):
+            half = image.reshape(rig.grid.rows, rig.grid.columns)
+            whole = np.concatenate([half[::-1], half])
+            np.save(root / entry.file, whole + 0.01 * np.sqrt(whole * whole.mean()) * noise.normal(size=whole.shape))
+    # The folder does not state the index. It follows from the through-beam, as the cell has no glass.
+    sine = described.cell.index_outside * np.sin(np.radians(told["lights"][1]["angle_deg"])) / told["cell"]["index"]
+    peak_mm = told["cell"]["width_mm"] * sine / np.sqrt(1 - sine**2)
+    told["through_beam"] = [{"light": told["lights"][1]["name"], "peak_x_mm": float(peak_mm), "se_mm": 1e-4}]
+    told["cell"] = told["cell"] | {"index": None}
+    (root / "slab.json").write_text(json.dumps(told))
+    return root
+
+
+def made_up_fit(wavelength_nm: float = WAVELENGTH_NM) -> SlabFit:
+    """A fit's result with made-up values."""
+    one = Quantity(value=1.0, se=0.1, unit="1/mm", determined=True)
+    parameters = Parameters(sigma_t=one, sigma_s=one, sigma_a=one, sigma_s_reduced=one, g=one, index=one)
+    phase = PhaseFunction(theta_deg=(), value_per_sr=(), se_per_sr=(), determined=())
+    return SlabFit(
+        wavelength_nm=wavelength_nm,
+        parameters=parameters,
+        phase=phase,
+        errors=Errors(fit_error=0.01, held_out_error=None),
+        notes=(),
+        converged=True,
+        steps=1,
+        paths=1,
+        core_seconds=1.0,
+    )

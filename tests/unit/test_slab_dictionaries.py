@@ -213,15 +213,18 @@ def test_a_mix_of_a_dictionary_is_found(
 
 
 def test_a_material_that_is_no_mix_is_told() -> None:
-    assert misfit_faults("hg", 520.0, 5.0, 1000) == ()
-    (sentence,) = misfit_faults("hg", 2000.0, 5.0, 1000)
+    assert misfit_faults("hg", 520.0, 5.0, 1000, converged=True) == ()
+    (sentence,) = misfit_faults("hg", 2000.0, 5.0, 1000, converged=True)
     assert sentence.startswith("The images differ from the nearest mix of dictionary hg by 2 times their noise")
 
 
 def test_images_that_differ_from_a_fit_by_tents_are_told() -> None:
-    assert misfit_faults("tents", 1000.0, 5.0, 1000) == ()
-    (sentence,) = misfit_faults("tents", 72_000.0, 5.0, 1000)
+    assert misfit_faults("tents", 1000.0, 5.0, 1000, converged=True) == ()
+    (sentence,) = misfit_faults("tents", 72_000.0, 5.0, 1000, converged=True)
     assert sentence.startswith("The images differ from the fit by 12 times their noise")
+    assert ": check their variances, and the cell," in sentence
+    (sentence,) = misfit_faults("tents", 72_000.0, 5.0, 1000, converged=False)
+    assert ": let the fit converge first, and then check their variances" in sentence
 
 
 def saved(array: np.ndarray) -> Callable[[Path], None]:

@@ -17,7 +17,7 @@ from services.fit.slab.solve.normal import UNKNOWNS
 from services.fit.slab.solve.prior import Quadratic
 from services.fit.slab.solve.uncertainty import Uncertainty, resolution_deg, uncertainty_of
 from services.fit.slab.through_beam import Index
-from tests.pipeline.test_slab_job import stored_like
+from tests.support.small_slab import made_up_fit
 
 MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)
 CURVATURE = 1e4
@@ -105,7 +105,7 @@ def test_a_very_thick_cell_tells_no_scattering_by_itself(width_mm: float, told: 
 
 
 def test_a_fit_unlike_its_images_calls_nothing_determined() -> None:
-    like = stored_like(532.0)
+    like = made_up_fit(532.0)
     assert with_believable_flags(like) == like
     unlike = like.model_copy(
         update={"errors": Errors(fit_error=0.3, held_out_error=None), "atoms": {"HG 0.8": like.parameters.g}}

@@ -81,6 +81,7 @@ def test_a_report_of_an_earlier_version_is_judged_without_standard_errors() -> N
         (0.05, 0.0, "5.00 ± 0.00 %"),
         (0.074, None, "7.4 %"),
         (0.004, None, "0.40 %"),
+        (0.0, None, "below the noise"),
     ],
 )
 def test_a_figure_has_as_many_digits_as_its_standard_error_allows(value: float, se: float | None, told: str) -> None:

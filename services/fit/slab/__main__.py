@@ -10,8 +10,9 @@ import typer
 from pydantic import ValidationError
 
 from services.core.errors import DentineError, SettingsError
+from services.core.results import Figure
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES
-from services.core.verdict import NOT_CONVERGED_STATUS
+from services.core.verdict import NOT_CONVERGED_STATUS, percent
 
 
 def main(
@@ -45,10 +46,8 @@ def main(
         raise typer.Exit(error.exit_status) from error
     write_results(fits, out)
     for fit in fits:
-        print(
-            f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error"
-            f" {100 * fit.errors.fit_error:.2f} %"
-        )
+        fit_error = percent(Figure(value=fit.errors.fit_error, se=None))
+        print(f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error {fit_error}")
         quantities = {name: getattr(fit.parameters, name) for name in type(fit.parameters).model_fields}
         for name, quantity in (quantities | {name: atom for name, atom in fit.atoms.items() if atom.value > 0}).items():
             print(

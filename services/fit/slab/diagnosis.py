@@ -146,16 +146,17 @@ def similarity_faults(material: Material, width_mm: float, *, scattering: bool, 
     return (f"{what}. Take σs, g and the phase function with their ± alone; to tell them apart, {remedy}.",)
 
 
-def misfit_faults(dictionary: str, misfit: float, misfit_se: float, values: int) -> tuple[str, ...]:
+def misfit_faults(dictionary: str, misfit: float, misfit_se: float, values: int, *, converged: bool) -> tuple[str, ...]:
     """A sentence where the images differ from the fit by more than their noise.
 
     A dictionary of few atoms may lack the material. The tents can make any, so with them the images' variances, the
-    description of the cell, or the search is at fault.
+    description of the cell, or a search that has not converged is at fault.
 
     Args:
         misfit: half the weighted squares at the solution.
         misfit_se: Monte Carlo error of the misfit.
         values: number of the weighted squares.
+        converged: whether the solver has converged.
     """
     squares, error = 2 * misfit / values, math.hypot(math.sqrt(2 / values), 2 * misfit_se / values)
     is_default = dictionary == DEFAULT_DICTIONARY
@@ -164,9 +165,10 @@ def misfit_faults(dictionary: str, misfit: float, misfit_se: float, values: int)
     ratio = math.sqrt(squares)
     times = f"by {ratio:.0f} times their noise" if ratio >= 10 else f"by {ratio:.2g} times their noise"
     if is_default:
+        remedy = "check" if converged else "let the fit converge first, and then check"
         sentence = (
-            f"The images differ from the fit {times}, so its ± say too little: check their variances, and then the"
-            " cell, the beam and the angles that the folder describes."
+            f"The images differ from the fit {times}, so its ± say too little: {remedy} their variances, and the cell,"
+            " the beam and the angles that the folder describes."
         )
     else:
         sentence = (

@@ -134,7 +134,9 @@ def fit_images(
             scattering=parameters.sigma_s.determined,
             reduced=parameters.sigma_s_reduced.determined,
         )
-        + misfit_faults(options.dictionary, solution.misfit, solution.misfit_se, solution.used)
+        + misfit_faults(
+            options.dictionary, solution.misfit, solution.misfit_se, solution.used, converged=solution.converged
+        )
         + _notes(measured, phase, converged=solution.converged)
         + ((advice,) if advice else ()),
         converged=solution.converged,

@@ -6,20 +6,20 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from services.core.errors import CaptureInputError
 from services.core.job_kinds import SLAB_OPTIONS
 from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
-from services.core.results import AssetManifest
+from services.core.results import AssetManifest, Figure
 from services.core.slab.folder import SlabFolder, read_folder
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
-from services.core.verdict import VERDICT
+from services.core.verdict import VERDICT, percent
 
 if TYPE_CHECKING:
-    from services.fit.slab.results.result import SlabReport
+    from services.fit.slab.results.result import SlabFit, SlabReport
     from services.fit.slab.solve.checkpoint import Checkpoint
 
 CHECKPOINT = "fit-checkpoint"
@@ -152,13 +152,11 @@ def _folder(spec: JobSpec) -> tuple[Path, SlabFolder]:
     return spec.capture, read_folder(spec.capture)
 
 
-def _progress_message(fit: Any) -> str:
+def _progress_message(fit: SlabFit) -> str:
     parameters = fit.parameters
     parts = (
         f"{label} {value.value:.4g} ± {value.se:.1g}"
         for label, value in (("σs", parameters.sigma_s), ("σs′", parameters.sigma_s_reduced))
     )
-    return (
-        f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images"
-        f" {100 * fit.errors.fit_error:.2f} %."
-    )
+    error = percent(Figure(value=fit.errors.fit_error, se=None))
+    return f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images {error}."

@@ -51,6 +51,7 @@ export function badgeOf(job: Job): { text: string; state: string } {
 
 /** Format a relative error as the report does: two digits of the standard error, at least one decimal. */
 export function figureOf(figure: Figure): string {
+  if (figure.se === null && figure.value === 0) return "below the noise";
   if (figure.se === null) return `${(100 * figure.value).toFixed(figure.value >= 0.01 ? 1 : 2)} %`;
   const se = 100 * figure.se;
   const decimals = se > 0 ? Math.min(Math.max(1 - Math.floor(Math.log10(se)), 1), 3) : 2;

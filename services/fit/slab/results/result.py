@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -89,7 +90,7 @@ class SlabFit(Record):
     errors: Errors
     notes: tuple[str, ...] = Field(description="sentences about what was assumed and what the images do not tell")
     converged: bool
-    steps: int = Field(description="of the search")
+    steps: int = Field(description="of the solver, in its search and its last stages")
     paths: int
     core_seconds: float
     dictionary: str = Field(default=DEFAULT_DICTIONARY, description="what the phase function was built from")
@@ -171,6 +172,13 @@ def with_believable_flags(fit: SlabFit) -> SlabFit:
     )
 
 
+COMPARE_SET_UP = (
+    "compare slab.json with the set-up: widths and sizes in mm, angles in degrees with their signs, sides, which file"
+    " is which, and the unit of images or, of exposures, beam.power and exposure_s."
+)
+"""Advice where the description of the cell may be wrong."""
+
+
 class SlabReport(Record):
     """Published by the fit stage of a slab: all its wavelengths."""
 
@@ -179,17 +187,18 @@ class SlabReport(Record):
     def verdict(self) -> Verdict:
         """The verdict on all wavelengths together, where each wavelength takes the place of a channel."""
         held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
-        stopped = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if not fit.converged]
-        unlike = [f"{fit.wavelength_nm:g} nm" for fit in self.fits if is_unlike(fit.errors)]
+        stopped = [fit for fit in self.fits if not fit.converged]
+        unlike = [fit for fit in self.fits if is_unlike(fit.errors)]
         advice = ""
-        if unlike:
+        if any(fit.converged for fit in unlike):
+            advice = f"No material gives such images at {_wavelengths(unlike)}; {COMPARE_SET_UP}"
+        elif unlike:
             advice = (
-                f"No material gives such images at {', '.join(unlike)}; compare slab.json with the set-up: widths and"
-                " sizes in mm, angles in degrees with their signs, sides, which file is which, and the unit of images"
-                " or, of exposures, beam.power and exposure_s."
+                f"The fit at {_wavelengths(unlike)} ended far from its images without converging. Fit again with a"
+                f" greater option effort and another seed. If it ends the same, {COMPARE_SET_UP}"
             )
         elif stopped:
-            advice = f"The fit at {', '.join(stopped)} has not converged; raise option effort."
+            advice = f"The fit at {_wavelengths(stopped)} has not converged; raise option effort."
         summary = FitReport(
             converged=not stopped,
             advice=advice,
@@ -200,3 +209,7 @@ class SlabReport(Record):
             seconds=sum(fit.core_seconds for fit in self.fits),
         )
         return verdict_of(summary)
+
+
+def _wavelengths(fits: Sequence[SlabFit]) -> str:
+    return ", ".join(f"{fit.wavelength_nm:g} nm" for fit in fits)

@@ -42,7 +42,8 @@ class Checkpoint:
     stage: int
     step: int
     """Number of the step within the stage, from 0."""
-    search_steps: int
+    steps: int
+    """Number of steps taken so far, in the search and in the last stages."""
     is_converged: bool
     """Whether the search came as far as the noise of its paths allows."""
     renders: int
@@ -107,7 +108,7 @@ class CheckpointFile:
         (self.folder / FILE).unlink(missing_ok=True)
 
 
-_NUMBERS = ("stage", "step", "search_steps", "is_converged", "renders", "paths")
+_NUMBERS = ("stage", "step", "steps", "is_converged", "renders", "paths")
 
 
 def _material(arrays: dict[str, Array]) -> Material:

@@ -89,6 +89,9 @@ class Coordinates(Protocol):
     def clipped_step(self, change: Array, material: Material) -> Array:
         """A step in which no unknown moves further than a linearisation holds."""
 
+    def linear_change(self, change: Array) -> Array:
+        """The step (U,) in unknowns that agree with these to first order and in which f is linear."""
+
     def similarity_step(self, change: Array, material: Material) -> Array:
         """A step adapted to a thick cell, whose images hardly change with sigma_s at a constant sigma_s' but much with
         sigma_s'.
@@ -171,6 +174,10 @@ class Knots:
     def clipped_step(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - as ln f needs no size
         """The step with each unknown limited by itself."""
         return np.clip(change, -LARGEST_CHANGE, LARGEST_CHANGE)
+
+    def linear_change(self, change: Array) -> Array:
+        """The relative change of f at the knots, and that of sigma_a."""
+        return np.append(np.expm1(change[:KNOTS]), change[-1])
 
     def similarity_step(self, change: Array, material: Material) -> Array:
         """The step, limited to ``MAX_LN_SCATTERING_CHANGE``, with f scaled so that sigma_s' becomes what the step says

@@ -26,6 +26,7 @@ from services.fit.slab.solve.measured_directions import broad_step, noise_ratio,
 from services.fit.slab.solve.normal import Each, NormalEquations, ResidualSums, normal_equations
 from services.fit.slab.solve.prior import Quadratic, is_thick
 from services.fit.slab.solve.smooth import Smoother, smoother_of
+from services.fit.slab.solve.step_length import MAX_HALVINGS, noise_fall, predicted_fall, shortened
 from services.fit.slab.solve.weights import smoothed_covariance, weights_of
 
 Array = NDArray[np.float64]
@@ -37,8 +38,6 @@ TOLERATED_MISFIT_SHARE = 0.5
 """Share of the misfit by which it may rise in a thick cell: weights there come mostly from the paths' noise and are
 estimated anew for each render, and misfits of one medium were seen to differ by a third. Otherwise a low misfit would
 refuse all steps after it."""
-MAX_HALVINGS = 4
-"""Largest number of times that a refused step is halved."""
 PROMISE_RATIO, PROMISE_RATIO_THICK = 2.0, 1.0
 """Ratio of the fall of the objective that a step promises to the fall that noise alone promises. In the search a step
 below the first value waits for more paths; in the last stages a step above it is followed by another. There the second
@@ -77,6 +76,7 @@ class Solution:
     scale: float | Array
     used: int
     steps: int
+    """Number of all steps, in the search and in the last stages."""
     converged: bool
     paths: int
     """Number of all paths, over lights and batches."""
@@ -200,7 +200,7 @@ class GaussNewton:
             scale = self.coordinates.scale(material, quadratic, sharp=not self.is_thick(material))
             prior = self.coordinates.precision(scale)
             change = self.damped_step(quadratic, prior, equations, material, DAMPING)
-            moved = self.coordinates.material_at(x + change)
+            moved = self.coordinates.material_at(x + shortened(change, quadratic, prior, x, self.coordinates))
             gain = predicted_fall(quadratic, prior, x, change) / noise_fall(quadratic, prior, equations.gradient_noise)
             path_variance = 0.0
             if is_last and self.combines(material):
@@ -208,7 +208,7 @@ class GaussNewton:
                 path_variance = noise_fall(quadratic, prior, equations.gradient_noise) / data
             checkpoint = self.next_checkpoint(checkpoint, stage, moved, gain, path_variance)
         return Solution(
-            moved, quadratic, equations.gradient_noise, scale, equations.used, checkpoint.search_steps,
+            moved, quadratic, equations.gradient_noise, scale, equations.used, checkpoint.steps,
             checkpoint.is_converged and gain < UNCONVERGED_RATIO, self.paths,
             self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
             equations.matrix_error @ (self.coordinates.unknowns(moved) - x),
@@ -239,6 +239,7 @@ class GaussNewton:
             material=moved,
             stage=checkpoint.stage + is_over,
             step=0 if is_over else checkpoint.step + 1,
+            steps=checkpoint.steps + 1,
             renders=self.renders,
             paths=self.paths,
             path_noise=self.path_noise,
@@ -370,14 +371,3 @@ def quadratic_at(x: Array, equations: NormalEquations) -> Quadratic:
         equations.noise_gradient - equations.noise @ x,
         equations.matrix_error,
     )
-
-
-def predicted_fall(quadratic: Quadratic, prior: Array, x: Array, change: Array) -> float:
-    """Fall of the objective that the quadratic model promises."""
-    total = quadratic.matrix + prior
-    return -float((quadratic.linear + total @ x) @ change + 0.5 * change @ total @ change)
-
-
-def noise_fall(quadratic: Quadratic, prior: Array, gradient_noise: Array) -> float:
-    """Mean fall of the objective that the gradient's noise alone promises."""
-    return 0.5 * float(np.trace(np.linalg.lstsq(quadratic.matrix + quadratic.noise + prior, gradient_noise)[0]))

@@ -102,6 +102,10 @@ class Mixtures:
         """No directions."""
         return np.zeros(0)
 
+    def linear_change(self, change: Array) -> Array:
+        """The step itself, as f is linear in the weights."""
+        return change
+
     def similarity_step(self, change: Array, material: Material) -> Array:  # noqa: ARG002 - weights are few and seen
         """The step itself, as weights are few."""
         return change

@@ -1,0 +1,23 @@
+"""A fit of few, small images whose noise is twice what they say: much of the phase function follows noise, and the
+coefficients have to stand.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from services.fit.slab.fit import fit_slab
+from services.fit.slab.options import SlabOptions
+from tests.support.small_slab import TRUTHS, write_cell
+
+
+def test_images_noisier_than_stated_do_not_make_a_fit_run_away(tmp_path: Path) -> None:
+    # Steps of its last stage move ln f by 0.5. Taken whole, they ended at 3.4 times the true sigma_s.
+    write_cell(tmp_path, *TRUTHS)
+    _, fit = fit_slab(tmp_path, SlabOptions(effort=0.5))
+    sigma_s, g = TRUTHS[fit.wavelength_nm]
+    assert fit.converged
+    for told, truth in ((fit.parameters.sigma_s, sigma_s), (fit.parameters.sigma_s_reduced, sigma_s * (1 - g))):
+        # The noise is twice what is stated, so 9 of the standard errors are 4.5 of the true ones.
+        assert abs(told.value - truth) <= 9 * told.se <= 0.1 * truth
+    assert any("by 2" in note and "times their noise" in note for note in fit.notes)
