@@ -250,6 +250,16 @@ def test_an_interrupted_stage_has_no_range_and_the_next_one_has(tmp_path: Path) 
     repository.close()
 
 
+def test_a_slab_has_a_reason_and_no_range(tmp_path: Path) -> None:
+    repository = Repository(sqlite_url(tmp_path / DATABASE_FILE))
+    ranges = TimeRanges(repository, lambda spec: spec, lambda _: None, machine_class())
+    told = ranges.of(repository.create(JobSpec(kind="slab", capture=tmp_path), None).job)
+    assert told is not None
+    assert told.low_s is None
+    assert told.reason == "That depends on the sample; a wavelength takes a minute or more on two cores."
+    repository.close()
+
+
 def test_a_long_queue_is_asked_for_at_once(tmp_path: Path) -> None:
     capture = write_capture(tmp_path / "capture")
     repository = Repository(sqlite_url(tmp_path / DATABASE_FILE))
