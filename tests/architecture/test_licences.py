@@ -32,9 +32,8 @@ def licence(of: Distribution) -> str:
     """Licence that the package's metadata state."""
     told = of.metadata
     classified = [one.rpartition(" :: ")[2] for one in told.get_all("Classifier", []) if one.startswith("License ::")]
-    return str(
-        told.get("License-Expression") or "; ".join(classified) or (told.get("License") or "").partition("\n")[0]
-    )
+    expression, plain = (next(iter(told.get_all(name, [])), "") for name in ("License-Expression", "License"))
+    return str(expression or "; ".join(classified) or plain.partition("\n")[0])
 
 
 def dependencies(name: str, extras: tuple[str, ...], seen: set[str]) -> Iterator[Distribution]:

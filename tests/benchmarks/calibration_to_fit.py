@@ -109,7 +109,8 @@ def session(truth: Truth, seed: int) -> Drawn:
         np.mean([PosedCamera(lens, pose).centre_mm for lens, pose in zip(lenses, poses, strict=True)], axis=0)
     )
     places = tilted_places(random, N_PLACES, towards)
-    rig, board_from_world = in_first_frame(tuple(lenses), poses, places), np.linalg.inv(places[0])
+    rig = in_first_frame(tuple(lenses), poses, places)
+    board_from_world: Floats = np.asarray(np.linalg.inv(places[0]), dtype=np.float64)
     teeth = board_from_world[:3, 3]
     fit, views = found_rig(random, rig, names)
     cameras = CamerasStep(tuple(names), fit, {}, tuple(views), ())

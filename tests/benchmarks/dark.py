@@ -35,8 +35,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +157,7 @@ class Bench:
         return self.observer.await_dark() - began_s
 
 
-def strike_by_request(bench: Bench, path: str) -> Iterator[float]:
+def strike_by_request(bench: Bench, path: str) -> Generator[float]:
     """Post to ``path`` (cancel or ALL OFF) in one capture after the other of one server; yields the seconds."""
     with bench.server() as (client, _):
         while True:
@@ -165,7 +166,7 @@ def strike_by_request(bench: Bench, path: str) -> Iterator[float]:
             client.get(f"/v1/jobs/{job}/events")
 
 
-def strike_by_page(bench: Bench) -> Iterator[float]:
+def strike_by_page(bench: Bench) -> Generator[float]:
     """Press ALL OFF in the dome's page while eight pages of the same browser follow the job that captures."""
     from playwright.sync_api import sync_playwright
 
@@ -188,7 +189,7 @@ def strike_by_page(bench: Bench) -> Iterator[float]:
             client.get(f"/v1/jobs/{job}/events")
 
 
-def strike_capture(bench: Bench) -> Iterator[float]:
+def strike_capture(bench: Bench) -> Generator[float]:
     """Send SIGTERM to one ``dentine capture`` after the other."""
     job = bench.folder / "JOB.toml"
     job.write_text("[rig]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in bench.rig.items()))
@@ -198,21 +199,21 @@ def strike_capture(bench: Bench) -> Iterator[float]:
             (bench.folder / "capture.log").open("a") as log,
             subprocess.Popen(command, stdout=log, stderr=log) as process,
         ):
-            yield bench.strike(lambda process=process: process.send_signal(signal.SIGTERM))  # type: ignore[misc]
+            yield bench.strike(partial(process.send_signal, signal.SIGTERM))
 
 
-def strike_server(bench: Bench) -> Iterator[float]:
+def strike_server(bench: Bench) -> Generator[float]:
     """Send SIGTERM to one ``dentine serve`` after the other while a page follows its job."""
     while True:
         with bench.server() as (client, process):
             job = bench.submit(client)
             with client.stream("GET", f"/v1/jobs/{job}/events"):
-                taken_s = bench.strike(lambda process=process: process.send_signal(signal.SIGTERM))  # type: ignore[misc]
+                taken_s = bench.strike(partial(process.send_signal, signal.SIGTERM))
             process.wait(PATIENCE_S)
         yield taken_s
 
 
-WAYS: dict[str, Callable[[Bench], Iterator[float]]] = {
+WAYS: dict[str, Callable[[Bench], Generator[float]]] = {
     "cancel": lambda bench: strike_by_request(bench, "/v1/jobs/{job}/cancel"),
     "all-off": lambda bench: strike_by_request(bench, "/v1/dome/off"),
     "page": strike_by_page,
@@ -255,7 +256,7 @@ def main() -> None:
                         "seconds": seconds,
                     }
                     write_atomic(wanted.json, json.dumps(told, indent=1).encode())
-                strikes.close()  # type: ignore[attr-defined]
+                strikes.close()
                 print(
                     f"{name}: worst of {len(seconds)} {max(seconds):.3f} s, median {statistics.median(seconds):.3f} s",
                     flush=True,

@@ -60,7 +60,7 @@ SENDERS = 8
 RESAMPLES = 500
 
 Row = dict[str, Any]
-Recorded = tuple[str, str, dict[str, str], bytes | str | None]
+Recorded = tuple[str, str, dict[str, str | bytes], bytes | str | None]
 """Method, address, headers and body of a request."""
 
 

@@ -54,7 +54,7 @@ def draw(number: int, places: int) -> dict[str, Any]:
     views = [crop_to_points(view, first.pose.apply(vertices)) for view in mouth.views]
     reach_px = REACH_MM / min(view.camera.pixel_mm(first.pose.apply(centre[None])[0]) for view in views)
     second = pose_from_outlines(views, teeth, [gums], first, centre, reach_px)
-    told = {step.name: _judged(step, mouth, centre) for step in (first, second)}
+    told: dict[str, dict[str, Any]] = {step.name: _judged(step, mouth, centre) for step in (first, second)}
     return {"number": number, **told, "misfit_mm": outline_misfit_mm(views, teeth, [gums], second.pose)}
 
 
@@ -63,7 +63,7 @@ def _scanned(mouth: Mouth, scan: LabelledScan) -> tuple[list[Mesh], Mesh]:
     pose = mouth.rig_from_scan
     vertices = (scan.mesh.vertices_mm - pose.translation_mm) @ pose.rotation
     jaw = jaw_from_scan(LabelledScan(Mesh(vertices, scan.mesh.faces), scan.fdi), "whole")
-    scan_from_arch = np.linalg.inv(jaw.arch_from_scan)
+    scan_from_arch = np.asarray(np.linalg.inv(jaw.arch_from_scan), dtype=np.float64)
     back = RigidPose(scan_from_arch[:3, :3], scan_from_arch[:3, 3])
     solids = [*(tooth.outer for tooth in jaw.teeth), jaw.gums]
     *teeth, gums = (Mesh(back.apply(mesh.vertices_mm), mesh.faces) for mesh in solids)

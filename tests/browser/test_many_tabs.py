@@ -79,7 +79,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
             finally:
                 under_way.remove(asked)
 
-        with serving(counting) as client:  # type: ignore[arg-type]
+        with serving(counting) as client:
             bench.address = str(client.base_url)
             yield bench
             bench.go_on.set()

@@ -108,13 +108,17 @@ def fill_disk(_system: ComposedSystem, disk: StoreDisk) -> None:
         time.sleep(FULL_S)
 
 
+def restart_api(system: ComposedSystem, _disk: StoreDisk) -> None:
+    system.compose("restart", "api")
+
+
 def down_and_up(system: ComposedSystem, _disk: StoreDisk) -> None:
     system.down("--timeout", "30")
     system.up()
 
 
 FAULTS: dict[str, Callable[[ComposedSystem, StoreDisk], None]] = {
-    "API restarted": lambda system, _: system.compose("restart", "api") and None,
+    "API restarted": restart_api,
     "worker killed": kill("worker"),
     "worker cut off": cut_worker,
     "scheduler killed": kill("scheduler"),

@@ -38,7 +38,7 @@ def listening(system: ComposedSystem, service: str) -> set[int]:
 
 def targets(system: ComposedSystem) -> dict[tuple[str, int], str]:
     """Every address and port at which a service listens, with the service's name."""
-    found = {}
+    found: dict[tuple[str, int], str] = {}
     for service in ("api", "scheduler", "worker", "rig", "postgres", "dome"):
         networks = system.inspect(system.container(service))["NetworkSettings"]["Networks"].values()
         found |= {(one["IPAddress"], port): service for one in networks for port in listening(system, service)}

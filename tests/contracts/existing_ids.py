@@ -56,7 +56,7 @@ class ExistingIds:
         self._contents: dict[str, bytes] = {}
         self._source = witnesses.capture["path"]
 
-    def place(self, case: Case, choice: int) -> None:
+    def place(self, case: Case[Any], choice: int) -> None:
         """Make a case name an object that exists, unless the case is meant to have a wrong path."""
         known = self._deleted if case.path.startswith("/v1/deletions") else self._kept + self._made
         there = [one for one in known if set(one) <= set(case.path_parameters)]
@@ -68,21 +68,21 @@ class ExistingIds:
         if there and not _is_wrong(case, ParameterLocation.PATH):
             case.path_parameters = case.path_parameters | there[choice % len(there)]
 
-    def fit(self, case: Case, choice: int) -> None:
+    def fit(self, case: Case[Any], choice: int) -> None:
         """Change a case that is valid by the description so that the server can carry it out."""
         match f"{case.method.upper()} {case.path}":
             case "POST /v1/jobs":
-                case.body = {
+                kept = {
                     name: value
-                    for name, value in case.body.items()
+                    for name, value in _fields(case).items()
                     if name not in {"rig", "held", "samples_per_pixel", "max_samples_per_pixel"}
                 }
-                case.body |= {"capture": self._source if choice % 3 else f"/{case.body.get('capture')}", "workers": 1}
+                case.body = kept | {"capture": self._source if choice % 3 else f"/{kept.get('capture')}", "workers": 1}
                 case.headers.pop("idempotency-key", None)
             case "POST /v1/captures":
                 case.body = manifest_of({_FILE: content_of(choice)})
             case "POST /v1/webhooks" | "PATCH /v1/webhooks/{webhook_id}":
-                case.body = case.body | {"url": NOWHERE}
+                case.body = _fields(case) | {"url": NOWHERE}
             case "PUT /v1/calibrations/{name}":
                 light = {"name": "l0", "position_mm": [0, 0, -50 - choice % 3], "intensity": [1.0]}
                 case.body = _UNITS | {"lights": [light]}
@@ -112,7 +112,7 @@ class ExistingIds:
             case route if "/v1/uploads" in route:
                 case.headers.update(TUS)
 
-    def learn(self, case: Case, response: Response) -> None:
+    def learn(self, case: Case[Any], response: Response) -> None:
         """Remember the objects that a request has made or deleted."""
         if response.status_code not in {200, 201, 202, 204}:
             return
@@ -150,6 +150,12 @@ class ExistingIds:
             (self._jobs / job / flag).touch()
 
 
-def _is_wrong(case: Case, location: ParameterLocation) -> bool:
+def _fields(case: Case[Any]) -> dict[str, Any]:
+    # Body of a case whose description asks for an object.
+    assert isinstance(case.body, dict)
+    return case.body
+
+
+def _is_wrong(case: Case[Any], location: ParameterLocation) -> bool:
     component = case.meta.components.get(location) if case.meta else None
     return component is not None and component.mode.is_negative

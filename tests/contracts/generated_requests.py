@@ -34,6 +34,7 @@ from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
 from schemathesis import Case, GenerationMode, Response
 from schemathesis.core.failures import FailureGroup
+from schemathesis.core.result import Ok
 from schemathesis.specs.openapi import checks
 
 from services.api.auth.tokens import Scope
@@ -153,7 +154,10 @@ class Sender:
         for operation in (one for path in described["paths"].values() for one in path.values()):
             operation.pop("security", None)  # because the cases are sent with the tokens of ``CALLERS``
         self._schema = schemathesis.openapi.from_dict(described, config=schemathesis.Config.from_dict(CONFIG))
-        self._operations = [found.ok() for found in self._schema.get_all_operations()]
+        self._operations: list[Any] = []
+        for found in self._schema.get_all_operations():
+            assert isinstance(found, Ok), found.err()
+            self._operations.append(found.ok())
         self.tally = Tally()
 
     @property
@@ -183,7 +187,7 @@ class Sender:
                 Dressing(dice.choice(CALLERS), dice.randrange(2**16), dice.random() < 0.75, dice.random() < 0.5, {}),
             )
 
-    def _border(self, operation: Any) -> Iterator[Case]:
+    def _border(self, operation: Any) -> Iterator[Case[Any]]:
         modes = list(GenerationMode)
         yield from self._schema.iter_coverage_cases(
             operation, generation_modes=modes, generation_config=self._schema.config.generation
@@ -200,7 +204,7 @@ class Sender:
             suppress_health_check=list(HealthCheck),
         )
         @given(case=operation.as_strategy(generation_mode=mode), dressing=dressings)
-        def send(case: Case, dressing: Dressing) -> None:
+        def send(case: Case[Any], dressing: Dressing) -> None:
             self._send(case, dressing)
 
         with suppress(Unsatisfiable):
@@ -208,7 +212,7 @@ class Sender:
             return True
         return False
 
-    def _send(self, case: Case, dressing: Dressing) -> None:
+    def _send(self, case: Case[Any], dressing: Dressing) -> None:
         if dressing.is_placed:
             self._living.place(case, dressing.choice)
         is_fit = dressing.is_fit and case.meta is not None and case.meta.generation.mode.is_positive
@@ -231,7 +235,7 @@ class Sender:
             self.tally.blame(label, kind, sentence, f"{case.as_curl_command(headers)}\n{response.content[:600]!r}")
         self._living.learn(case, response)
 
-    def _call(self, case: Case, headers: dict[str, str]) -> Response:
+    def _call(self, case: Case[Any], headers: dict[str, str]) -> Response:
         self._session.cookies.clear()
         where: dict[str, Any] = {"base_url": self._address, "session": self._session, "headers": headers}
         if case.path.endswith("/events"):
@@ -245,7 +249,7 @@ def _takes_input(operation: Any) -> bool:
     return any(operation.iter_parameters()) or bool(operation.body)
 
 
-def _faults(case: Case, response: Response, headers: dict[str, str], of: list[Any]) -> Iterator[tuple[str, str]]:
+def _faults(case: Case[Any], response: Response, headers: dict[str, str], of: list[Any]) -> Iterator[tuple[str, str]]:
     if response.status_code >= 500 and response.status_code != HTTPStatus.INSUFFICIENT_STORAGE:
         yield f"failure of the server ({response.status_code})", str(response.headers.get("x-request-id"))
         return

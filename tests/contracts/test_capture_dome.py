@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -77,7 +77,7 @@ class DomeContract:
 
     @pytest.mark.parametrize("problem", [ValueError, KeyboardInterrupt, SystemExit])
     def test_dark_after_any_exception(
-        self, make: type[Dome], observer: DomeObserver, problem: type[BaseException]
+        self, make: Callable[..., Dome], observer: DomeObserver, problem: type[BaseException]
     ) -> None:
         def interrupted() -> None:
             with make() as dome:
@@ -97,7 +97,7 @@ class DomeContract:
         assert not observer.outputs().any()
 
     def test_stays_lit_longer_than_the_watchdog_while_the_driver_lives(
-        self, make: type[Dome], observer: DomeObserver
+        self, make: Callable[..., Dome], observer: DomeObserver
     ) -> None:
         with make(watchdog_s=0.6) as dome:
             dome.light(3, LEVEL, 2.0)
@@ -108,14 +108,14 @@ class DomeContract:
 
 class TestModbusDome(DomeContract):
     @pytest.fixture
-    def make(self, address: tuple[str, int]) -> object:
+    def make(self, address: tuple[str, int]) -> Callable[..., ModbusDome]:
         def open_dome(watchdog_s: float = 2.0) -> ModbusDome:
             return ModbusDome(*address, ExposureBudget(math.inf, math.inf), watchdog_s)
 
         return open_dome
 
     @pytest.fixture
-    def dome(self, make: type[ModbusDome]) -> Iterator[ModbusDome]:
+    def dome(self, make: Callable[..., ModbusDome]) -> Iterator[ModbusDome]:
         with make() as dome:
             yield dome
 
@@ -125,7 +125,9 @@ class TestModbusDome(DomeContract):
         yield observer
         observer.close()
 
-    def test_observing_does_not_feed_the_watchdog(self, make: type[ModbusDome], observer: DomeObserver) -> None:
+    def test_observing_does_not_feed_the_watchdog(
+        self, make: Callable[..., ModbusDome], observer: DomeObserver
+    ) -> None:
         with make(watchdog_s=0.5) as dome:
             dome.light(3, LEVEL, 2.0)
             dome._keepalive.stop()

@@ -95,7 +95,7 @@ def path_of(template: str, ids: Mapping[str, str], receipt: str) -> str:
         "light": "l0",
         "name": "rig",
     }
-    return template.format(**others | ids)
+    return template.format(**others | dict(ids))
 
 
 def told(answer: httpx.Response, ids: Mapping[str, str], receipt: str) -> tuple[int, str, dict[str, str]]:
@@ -151,7 +151,7 @@ def fresh(tmp_path: Path) -> Iterator[House]:
 @pytest.mark.attack("routes × scopes", "lists, event streams, and jobs on what others own")
 def test_lists_show_what_is_ones_own(fresh: House, tmp_path: Path) -> None:
     contents = contents_of(write_capture(tmp_path / "capture"))
-    made = {}
+    made: dict[str, tuple[str, str, str]] = {}
     for whose in GROUPS:
         with httpx.Client(
             base_url=fresh.server.client.base_url,

@@ -34,7 +34,7 @@ def call(
 ) -> tuple[int | None, str]:
     """Exit status and standard error of one call; the status is None if it still ran after ``patience_s``."""
     command = [sys.executable, "-m", "services", *arguments]
-    where = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])} | (environment or {})
+    where = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])} | dict(environment or {})
     with subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=where, cwd=folder
     ) as process:

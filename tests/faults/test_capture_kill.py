@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +37,9 @@ stage.run(JobSpec.model_validate_json(sys.argv[1]), LocalContext(Path(sys.argv[2
 """
 
 
-def wait_for(condition: object, *arguments: object) -> None:
+def wait_for(condition: Callable[..., object], *arguments: object) -> None:
     deadline_s = time.monotonic() + 60
-    while not condition(*arguments):  # type: ignore[operator]
+    while not condition(*arguments):
         assert time.monotonic() < deadline_s, "the capture did not get so far within a minute"
         time.sleep(0.01)
 
@@ -107,6 +108,6 @@ def test_killed_in_mid_exposure(tmp_path: Path) -> None:
         f.model_copy(update=untimed) for f in fresh.frames
     ]
     assert [f.time_s for f in resumed.frames[: len(acknowledged)]] == [line["frame"]["time_s"] for line in acknowledged]
-    arrays = [zarr.open_array(root / "capture" / "capture.zarr", mode="r")[:] for root in (killed, undisturbed)]
-    assert np.array_equal(*arrays)
+    one, other = (zarr.open_array(root / "capture" / "capture.zarr", mode="r")[:] for root in (killed, undisturbed))
+    assert np.array_equal(np.asarray(one), np.asarray(other))
     assert not list(killed.glob(".capture.[0-9]*"))

@@ -134,7 +134,7 @@ def test_a_disk_that_takes_no_byte_is_told(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as failing:
-        failing.setattr(readiness_module.os, "fsync", full)
+        failing.setattr("services.api.health.readiness.os.fsync", full)
         assert bad_checks(client) == {
             "store": (
                 "The jobs' folder cannot be written (No space left on device); check its rights, its mount and the"
@@ -250,7 +250,7 @@ def test_a_store_that_hangs_is_told(client: httpx.Client, monkeypatch: pytest.Mo
     thawed = threading.Event()
     monkeypatch.setattr(readiness_module, "STORE_PROBE_S", 0.2)
     with monkeypatch.context() as frozen:
-        frozen.setattr(readiness_module.os, "fsync", lambda _descriptor: thawed.wait())
+        frozen.setattr("services.api.health.readiness.os.fsync", lambda _descriptor: thawed.wait())
         try:
             assert bad_checks(client) == {
                 "store": "The jobs' folder takes no file within 0.2 s; look at its disk, or at the network to it."

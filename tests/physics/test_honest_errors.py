@@ -9,6 +9,7 @@ because few paths of a pixel at its edge hit the tooth, and a mean of so few is 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,7 +171,7 @@ def test_a_dark_image_is_as_sure_as_it_gets(engine: Engine) -> None:
     ],
 )
 def test_what_cannot_be_reached_is_refused(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch, asked: dict[str, float], named: tuple[str, ...]
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any], named: tuple[str, ...]
 ) -> None:
     from services.fit.transport.paths.walk import Walk
 

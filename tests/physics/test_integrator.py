@@ -308,7 +308,7 @@ def test_impossible_scenes_are_refused(tooth: Path, tmp_path: Path) -> None:
 
     write_mesh(tmp_path / "open.ply", Mesh(OUTER.vertices_mm, OUTER.faces[:-2]))
     write_mesh(tmp_path / "inverted.ply", Mesh(OUTER.vertices_mm, OUTER.faces[:, ::-1]))
-    shapes = {
+    shapes: dict[str, SceneDict] = {
         "open": {"type": "ply", "filename": str(tmp_path / "open.ply")},
         "inverted": {"type": "ply", "filename": str(tmp_path / "inverted.ply")},
         "ball": {"type": "sphere"},

@@ -54,13 +54,15 @@ def test_phase_function_values() -> None:
 
     g, m = G[:, None], deviations()[None, :]
     # The formula has a dozen roundings, one of them to the power 3/2.
-    np.testing.assert_allclose(kernel(phase.density, g, m), density64(np.float64(g), np.float64(m)), rtol=20 * ROUNDING)
+    np.testing.assert_allclose(
+        kernel(phase.density, g, m), density64(g.astype(np.float64), m.astype(np.float64)), rtol=20 * ROUNDING
+    )
 
 
 def test_phase_function_derivatives() -> None:
     from services.fit.optics import phase
 
-    g, m = np.float64(G)[:, None], np.float64(deviations())[None, :]
+    g, m = G.astype(np.float64)[:, None], deviations().astype(np.float64)[None, :]
     a, sign = np.abs(g), np.where(g < 0, -1.0, 1.0)
     d = (1 - a) ** 2 + 2 * a * m
     truth = sign * (-2 * a / (1 - a**2) + 3 * ((1 - a) - m) / d)
@@ -97,7 +99,7 @@ def test_sampled_deviations_invert_the_distribution() -> None:
         np.float32
     )
     ours = kernel(phase.sample_deviation, G[:, None], u[None, :])
-    a, v = np.abs(np.float64(G))[:, None], np.float64(u)[None, :]
+    a, v = np.abs(G.astype(np.float64))[:, None], u.astype(np.float64)[None, :]
     textbook = (1 + a**2 - ((1 - a**2) / (1 - a + 2 * a * v)) ** 2) / (2 * np.maximum(a, 1e-3))
     s = 2 * v - 1
     series = (s + a * (s**2 + 3) / 2 + a**2 * s + a**3 * (s**2 - 1) / 2) / (1 + a * s) ** 2
@@ -137,8 +139,8 @@ def test_nearly_parallel_directions_stay_apart() -> None:
     from services.fit.optics import phase
 
     angle = np.logspace(-6, np.log10(3.1), 300)
-    before = np.float32([0.6, 0.0, 0.8])
-    along, side = np.float64([0.6, 0.0, 0.8]), np.float64([0.8, 0.0, -0.6])
+    along, side = np.array([0.6, 0.0, 0.8]), np.array([0.8, 0.0, -0.6])
+    before = along.astype(np.float32)
     for g in (0.9, -0.9):
         after = (np.cos(angle)[:, None] * along * np.sign(g) + np.sin(angle)[:, None] * side).astype(np.float32)
         ours = direction_deviation(phase.deviation, g, before, after)
@@ -159,11 +161,11 @@ def test_fresnel_reflectance(eta: float) -> None:
     from services.fit.optics import fresnel
 
     cosine = np.concatenate([np.logspace(-4, -1, 200), np.linspace(0.1, 1, 500)]).astype(np.float32)
-    c, n = np.float64(cosine), np.float64(np.float32(eta))
+    c, n = cosine.astype(np.float64), np.float64(np.float32(eta))
     inside = np.sqrt(np.maximum(1 - (1 - c**2) / n**2, 0).astype(complex))
     s, p = (c - n * inside) / (c + n * inside), (n * c - inside) / (n * c + inside)
     truth = np.where(1 - c**2 >= n**2, 1.0, 0.5 * (np.abs(s) ** 2 + np.abs(p) ** 2))
-    ours = kernel(fresnel.reflectance, cosine, np.float32([eta]))
+    ours = kernel(fresnel.reflectance, cosine, np.array([eta], dtype=np.float32))
     # Near the critical angle the transmitted cosine is the root of a rounding error, and enters linearly.
     transmitted_error = np.minimum(
         ROUNDING * 4 / n**2 / np.maximum(inside.real, 1e-12), np.sqrt(ROUNDING * 4) / min(n, 1)
@@ -194,6 +196,6 @@ def test_albedos_near_one_keep_their_absorption() -> None:
     # Compute alpha^k as the walk does, for numbers of scattering events k up to where the absorption shows.
     for absorbed in (1e-7, 1e-6, 1e-4, 0.01, 0.5, 0.9):
         (log_alpha,) = Media([Medium(1, 1 - absorbed)]).log_alpha
-        count = np.float64([1, 10, 1000, 1e5, 1e7])
+        count = np.array([1, 10, 1000, 1e5, 1e7])
         lost = 1 - np.array(dr.exp(log_alpha * type(log_alpha)(count.astype(np.float32))), dtype=np.float64)
         np.testing.assert_allclose(lost, -np.expm1(count * np.log1p(-absorbed)), rtol=2e-6, atol=2 * ROUNDING)

@@ -9,6 +9,7 @@ with forward scattering (``docs/how/shape-gradient.md``); each case allows for i
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,9 +110,9 @@ def test_lights_that_the_view_does_not_list_do_not_count() -> None:
 )
 def test_refusals_are_sentences(change: dict[str, object], words: str) -> None:
     engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 2)
-    arguments: dict[str, object] = {"cotangent": np.zeros((5, 16)), "seed": 0, "samples": 16} | change
+    arguments: dict[str, Any] = {"cotangent": np.zeros((5, 16)), "seed": 0, "samples": 16} | change
     with pytest.raises(InputError, match=words):
-        engine.shape_gradient(CLEAR, view, **arguments)  # type: ignore[arg-type]
+        engine.shape_gradient(CLEAR, view, **arguments)
 
 
 def test_a_known_shape_has_no_gradient() -> None:

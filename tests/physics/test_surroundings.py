@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from services.bench.figures.surroundings import environment_light, read_environment, render_under
 from services.core.errors import InputError
+from services.core.geometry import Mesh
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.transport.platform import prepare_device
 from tests.support.small_tooth import SEMI_AXES_MM, camera_at, ellipsoid
@@ -17,7 +19,7 @@ TISSUE = Tissue(Medium(3.0, 0.999999), Medium(9.0, 0.999999))
 SAMPLES = 256
 
 
-def surfaces() -> dict[str, object]:
+def surfaces() -> dict[str, Mesh]:
     return {"outer": ellipsoid(SEMI_AXES_MM), "dentin": ellipsoid(SEMI_AXES_MM - 0.3)}
 
 
@@ -25,15 +27,15 @@ def test_a_white_tooth_is_lit_from_the_roots_by_the_top_of_an_environment() -> N
     prepare_device()
     sky = np.zeros((16, 32))
     sky[:8] = 2.0
-    common = {"samples": SAMPLES, "boundary": "matched", "ior": 1.631, "roughness": None}
+    common: dict[str, Any] = {"samples": SAMPLES, "boundary": "matched", "ior": 1.631, "roughness": None}
     # The view is from the front with z upwards, so the roots are below.
-    image = render_under(environment_light(sky, 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)  # type: ignore[arg-type]
+    image = render_under(environment_light(sky, 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)
     centre = slice(3, 5)
     roots, crown = image[5:7, centre].mean(), image[1:3, centre].mean()
     assert roots > crown + 0.3
     # What a white tooth sends out under half a sky of 2 and one turned over adds to 2: 4 standard errors of some 6 % of
     # a pixel, sixteen of them.
-    turned = render_under(environment_light(sky[::-1].copy(), 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)  # type: ignore[arg-type]
+    turned = render_under(environment_light(sky[::-1].copy(), 0.0), surfaces(), TISSUE, camera_at((0, 1, 0)), **common)
     middle = (image + turned)[2:6, 2:6]
     assert middle.mean() == pytest.approx(2.0, abs=4 * middle.std() / 4)
     assert middle.std() < 0.4

@@ -170,11 +170,12 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Looped]:
     with serving(app) as client:
         with pytest.MonkeyPatch.context() as patch:
             build = TypeAdapter._init_core_attrs
-            patch.setattr(
-                TypeAdapter,
-                "_init_core_attrs",
-                lambda self, *_, **__: looped.built.append(self) or build(self, *_, **__),
-            )
+
+            def counted_build(self: TypeAdapter[Any], *given: Any, **named: Any) -> Any:
+                looped.built.append(self)
+                return build(self, *given, **named)
+
+            patch.setattr(TypeAdapter, "_init_core_attrs", counted_build)
             looped.client, looped.job = client, client.post("/v1/jobs", json={"capture": "/"}).json()["id"]
         yield looped
 

@@ -25,7 +25,9 @@ from tests.support.live_server import serving
 @contextmanager
 def without(table: str, server: Guarded) -> Iterator[None]:
     """Hide a table from the server for the time of the block."""
-    with closing(sqlite3.connect(sql.make_url(ServerSettings(data=server.data).database_url).database)) as database:
+    file = sql.make_url(ServerSettings(data=server.data).database_url).database
+    assert file is not None
+    with closing(sqlite3.connect(file)) as database:
         database.execute(f"ALTER TABLE {table} RENAME TO away")
         try:
             yield

@@ -109,7 +109,7 @@ def test_a_cancel_ends_the_rendering_in_mid_kernel(tmp_path: Path) -> None:
 
 
 def test_a_rendering_that_fails_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demo_mouth, "OPTIONS", SMALL | {"samples": "1"})
+    monkeypatch.setattr(demo_mouth, "OPTIONS", dict(SMALL) | {"samples": "1"})
     with pytest.raises(
         CrashError, match="could not be rendered: A phantom needs at least one camera, one light, 16 samples"
     ):

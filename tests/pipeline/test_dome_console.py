@@ -48,15 +48,15 @@ def observer(address: Address) -> Iterator[DomeObserver]:
 @pytest.fixture
 def rig(tmp_path: Path) -> Callable[..., RigSpec]:
     write_mouth(tmp_path, LIGHTS)
-    return lambda **options: RigSpec(
-        **{"mouth": tmp_path, "exposure_s": 0.01, "settle_s": 0.0, "watchdog_s": WATCHDOG_S} | options
-    )
+    usual: dict[str, Any] = {"mouth": tmp_path, "exposure_s": 0.01, "settle_s": 0.0, "watchdog_s": WATCHDOG_S}
+    return lambda **options: RigSpec(**usual | options)
 
 
 @contextmanager
-def console(address: Address, **limits: float) -> Iterator[Callable[..., DomeAnswer]]:
+def console(address: Address, **limits: Any) -> Iterator[Callable[..., DomeAnswer]]:
     """Give the console of the dome's process, run inside the test instead of in a process of its own."""
-    worked = Console(*address, DomeSettings(**{"watchdog_s": WATCHDOG_S} | limits))
+    settings: dict[str, Any] = {"watchdog_s": WATCHDOG_S, **limits}
+    worked = Console(*address, DomeSettings(**settings))
     try:
         yield lambda **command: worked.answer(DomeCommand(**{"number": 1} | command))
     finally:

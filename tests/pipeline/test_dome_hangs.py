@@ -45,7 +45,7 @@ def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging
         try:
             with monkeypatch.context() as hurried:
                 hurried.setattr("services.api.dome.dome.ANSWER_S", 0.0)
-                require_end(lambda: [ask(dome) for _ in range(COMMANDS)])
+                require_end(lambda: fill(dome))
             assert observer.status().lit == (3,)
             yield Hanging(dome, observer, process)
         finally:
@@ -58,6 +58,11 @@ def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hanging
 def ask(dome: Dome) -> None:
     with suppress(RigUnreachableError):
         dome.state()
+
+
+def fill(dome: Dome) -> None:
+    for _ in range(COMMANDS):
+        ask(dome)
 
 
 def require_end(work: Callable[[], object]) -> None:

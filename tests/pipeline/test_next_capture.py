@@ -25,6 +25,7 @@ from services.fit.execution.engine_host import InProcessHost
 from services.fit.execution.executors import LocalExecutor
 from services.fit.execution.passes import Passes, StackProblem
 from services.fit.execution.seeds import Seeds
+from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.estimates import estimates
 from services.fit.solve.information import AddedInformation, covariance_with
@@ -46,7 +47,7 @@ def scene(*positions_mm: tuple[float, float, float]) -> SceneRecipe:
     return single_tooth(sphere(4.0), dentin, np.array(positions_mm), np.full(len(positions_mm), 1e6))
 
 
-def problem_of(folder: Path, recipe: SceneRecipe) -> StackProblem:
+def problem_of(folder: Path, recipe: SceneRecipe) -> StackProblem[Tissue]:
     view = View(camera("c0"), PIXELS)
     reference = FakeEngine(recipe)._formula(TRUTH, view)
     block = Block(
@@ -63,7 +64,7 @@ def problem_of(folder: Path, recipe: SceneRecipe) -> StackProblem:
     return StackProblem(passes, DOMAIN, TRUTH, "final", jacobian_g=0.0)
 
 
-def known_of(problem: StackProblem) -> Uncertainty:
+def known_of(problem: StackProblem[Tissue]) -> Uncertainty:
     # Linearise at the truth, where the step to the minimum is only noise, which is not part of a prediction.
     x = DOMAIN.x_of(TRUTH)
     known = uncertainty(DOMAIN, x, problem.linearise(x, samples=SAMPLES, step=0))
@@ -74,7 +75,7 @@ def known_of(problem: StackProblem) -> Uncertainty:
 @pytest.fixture(scope="module")
 def few_lights(
     tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path]:
+) -> tuple[StackProblem[Tissue], Uncertainty, str, tuple[Candidate, ...], Path]:
     folder = tmp_path_factory.mktemp("few")
     problem = problem_of(folder, scene((-300.0, 300.0, -700.0)))
     known = known_of(problem)
@@ -83,7 +84,7 @@ def few_lights(
 
 
 def test_adding_a_light_gives_the_error_that_was_predicted(
-    few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path], tmp_path: Path
+    few_lights: tuple[StackProblem[Tissue], Uncertainty, str, tuple[Candidate, ...], Path], tmp_path: Path
 ) -> None:
     problem, known, _, candidates, folder = few_lights
     assert known.sandwich is not None
@@ -106,7 +107,7 @@ def test_adding_a_light_gives_the_error_that_was_predicted(
 
 
 def test_the_sentence_names_quantity_and_both_errors(
-    few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path],
+    few_lights: tuple[StackProblem[Tissue], Uncertainty, str, tuple[Candidate, ...], Path],
 ) -> None:
     _, _, text, candidates, _ = few_lights
     assert {c.words for c in candidates} == {f"A light {words}" for words in LIGHTS} | {
@@ -117,7 +118,7 @@ def test_the_sentence_names_quantity_and_both_errors(
 
 
 def test_where_nothing_helps_that_is_said(
-    few_lights: tuple[StackProblem, Uncertainty, str, tuple[Candidate, ...], Path],
+    few_lights: tuple[StackProblem[Tissue], Uncertainty, str, tuple[Candidate, ...], Path],
 ) -> None:
     _, known, _, _, _ = few_lights
     nothing = AddedInformation(np.zeros((4, 4)), np.zeros((4, 4)))

@@ -26,7 +26,9 @@ from services.core.errors import FencedError
 from services.core.placement import STAGES, UNLIMITED
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
-from services.core.store import StageWriter
+from services.core.store import StageWriter, write_atomic
+from services.preprocess.quality import write_picture
+from services.preprocess.scratch import write_array
 from services.preprocess.stage import run
 from services.preprocess.tasks import attempt_files, blocks
 from tests.support.folder_captures import write_folder, write_tree
@@ -78,10 +80,10 @@ def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
         return wrapped
 
     with monkeypatch.context() as patch:
-        patch.setattr(attempt_files, "write_atomic", counted(attempt_files.write_atomic, after=False))
-        patch.setattr(attempt_files, "write_array", counted(attempt_files.write_array, after=True))
+        patch.setattr(attempt_files, "write_atomic", counted(write_atomic, after=False))
+        patch.setattr(attempt_files, "write_array", counted(write_array, after=True))
         patch.setattr(attempt_files.AttemptFiles, "array", counted(attempt_files.AttemptFiles.array, after=False))
-        patch.setattr(blocks, "write_picture", counted(blocks.write_picture, after=True))
+        patch.setattr(blocks, "write_picture", counted(write_picture, after=True))
         patch.setattr(StageWriter, "publish", counted(StageWriter.publish, after=False))
         yield
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from services.core.files.meshes import write_mesh
 from services.core.records import MaskBit
 from services.preprocess.masking.shadows import expected_irradiance
+from services.preprocess.masking.valid import valid_bits
 from services.preprocess.projection import project
 from services.preprocess.quality import QualityReport
 from services.preprocess.source import Bits
@@ -35,7 +36,13 @@ def write_capture(root: Path, lights: int) -> NDArray[np.bool_]:
     write_mesh(root / "teeth" / "11" / "outer.ply", ball(BALL_MM))
     view, rng = project(CAMERA, [ball(BALL_MM)]), np.random.default_rng(5)
     points = view.points_mm(CAMERA, slice(None))
-    tree = {"units": "mm", "channels": ["green"], "cameras": [CAMERA.model_dump()], "lights": [], "images": []}
+    tree: dict[str, Any] = {
+        "units": "mm",
+        "channels": ["green"],
+        "cameras": [CAMERA.model_dump()],
+        "lights": [],
+        "images": [],
+    }
     for k, place in enumerate(lights_mm(lights)):
         irradiance = 1e6 * expected_irradiance(points, view.normal, tuple(place.tolist()), None)
         shadow = behind_ball(points.astype(np.float64), place, before_ball(lights_mm(lights)[SHADED], 9.0), RADIUS_MM)
@@ -108,7 +115,7 @@ def test_a_shadow_is_found_among_pixels_that_are_masked_as_highlights(
     """A highlight adds light, so what is dark in spite of it is shadowed."""
     (tmp_path / "capture").mkdir()
     shadow = write_capture(tmp_path / "capture", lights=8)
-    kept = blocks.valid_bits
+    kept = valid_bits
 
     def all_highlights(*args: Any) -> Bits:
         of_light = args[3].name == f"l{SHADED}"

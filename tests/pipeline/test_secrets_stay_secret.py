@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -61,9 +62,11 @@ def test_secrets_are_nowhere_in_what_the_server_writes_and_says(
     client, said = failing_server
     answers: list[str] = []
 
-    def ask(method: str, path: str, token: str | None, **options: object) -> httpx.Response:
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
-        answer = client.request(method, path, headers=headers | dict(options.pop("headers", {})), **options)  # type: ignore[arg-type, call-overload]
+    def ask(
+        method: str, path: str, token: str | None, headers: dict[str, str] | None = None, **options: Any
+    ) -> httpx.Response:
+        signed = {"Authorization": f"Bearer {token}"} if token else {}
+        answer = client.request(method, path, headers=signed | (headers or {}), **options)
         answers.append(f"{answer.headers}{answer.text}")
         return answer
 

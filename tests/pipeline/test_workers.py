@@ -6,6 +6,7 @@ import gc
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import dask
 import pytest
@@ -38,9 +39,8 @@ def cluster() -> Iterator[LocalCluster]:
         "dashboard_address": "127.0.0.1:0",
         "memory_limit": "1 GiB",
     }
-    as_if_alone = unlimited | {
-        "distributed.worker.preload": []
-    }  # settings that every connection of a server changes for its process
+    # Settings that every connection of a server changes for its process.
+    as_if_alone: dict[str, Any] = {**unlimited, "distributed.worker.preload": []}
     with dask.config.set(as_if_alone), LocalCluster(**options, resources={"DOME": 1}) as cluster:
         yield cluster
 

@@ -98,7 +98,7 @@ def photographed(rig: Rig, noise_px: float, random: np.random.Generator) -> list
         for camera in range(len(rig.lenses)):
             blank = View(camera, place, corners, np.zeros((len(corners), 2)), ids, f"camera {camera}, place {place}")
             drawn = project_corners(rig, joined([blank]))
-            inside = ((drawn > 0) & (drawn < np.array(rig.lenses[camera].size))).all(axis=1)
+            inside = np.asarray(((drawn > 0) & (drawn < np.array(rig.lenses[camera].size))).all(axis=1))
             seen = drawn + random.normal(0, noise_px, drawn.shape)
             view = View(camera, place, corners, seen, ids, blank.name).selected(inside)
             if inside.sum() >= 6:

@@ -25,4 +25,4 @@ def outputs(address: Address) -> NDArray[np.float64]:
 
 
 def frames_of(root: Path) -> NDArray[np.uint16]:
-    return zarr.open_array(root / "capture" / "capture.zarr", mode="r")[:]
+    return np.asarray(zarr.open_array(root / "capture" / "capture.zarr", mode="r")[:])

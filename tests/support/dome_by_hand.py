@@ -74,7 +74,7 @@ def rig(tmp_path: Path, **options: Any) -> dict[str, Any]:
 
 
 @contextmanager
-def console(address: Address, **limits: float) -> Iterator[Callable[..., DomeAnswer]]:
+def console(address: Address, **limits: Any) -> Iterator[Callable[..., DomeAnswer]]:
     """Give the console of the dome's process, run inside the test instead of in a process of its own."""
     console = Console(*address, DomeSettings(watchdog_s=WATCHDOG_S, **limits))
     try:

@@ -99,13 +99,9 @@ class FakeEngine:
         image = self.images(tissue, view, samples=samples, seed=seed).mean
         # Find the shares of the scattering orders whose power series in the albedo follows the formula's mean image.
         alphas = 1 - np.logspace(-4, -0.7, 40)
-        whites = [replace(medium, alpha=1.0) for medium in (tissue.enamel, tissue.dentin)]
-        white = self._formula(Tissue(*whites, tissue.shape), view)
+        white = self._formula(_with_albedo(tissue, 1.0), view)
         image = image * white / self._formula(tissue, view)
-        grey = [
-            self._formula(Tissue(*(replace(m, alpha=a) for m in whites), tissue.shape), view).mean() / white.mean()
-            for a in alphas
-        ]
+        grey = [self._formula(_with_albedo(tissue, a), view).mean() / white.mean() for a in alphas]
         powers = bin_powers(alphas, bin_edges)
         share = np.linalg.solve(powers.T @ powers + 1e-6 * np.eye(len(bin_edges) - 1), powers.T @ np.array(grey))
         return share[:, None, None] / share.sum() * image
@@ -149,6 +145,11 @@ class FakeEngine:
         u = _uniform(pixel ^ _mix(np.full_like(pixel, key)))
         v = _uniform(_mix(pixel + np.uint64(0x9E3779B9)) ^ _mix(np.full_like(pixel, key + np.uint64(1))))
         return np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)
+
+
+def _with_albedo(tissue: Tissue, alpha: float) -> Tissue:
+    # The same tissue without stains, and with one albedo in enamel and dentin.
+    return Tissue(replace(tissue.enamel, alpha=alpha), replace(tissue.dentin, alpha=alpha), tissue.shape)
 
 
 def _mix(z: NDArray[np.uint64]) -> NDArray[np.uint64]:

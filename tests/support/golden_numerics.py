@@ -43,7 +43,7 @@ def renders() -> dict[str, NDArray[np.float32]]:
     from tests.support.render_once import Picture, picture
     from tests.support.stained_tooth import stained_recipe
 
-    found = {}
+    found: dict[str, NDArray[np.float32]] = {}
     for boundary in get_args(Boundary):
         result = picture(Engine(stained_recipe(boundary), 2))
         found |= {
@@ -94,7 +94,7 @@ def main() -> None:
     """Store the results of this tree, unless the file already holds results for this value of ``NUMERICS``."""
     if STORED.exists() and int(np.load(STORED)["numerics"]) >= NUMERICS:
         sys.exit(f"{STORED} holds numerics {NUMERICS}; raise services.fit.execution.numerics.NUMERICS first.")
-    np.savez_compressed(STORED, numerics=NUMERICS, **measure())  # type: ignore[arg-type]
+    np.savez_compressed(STORED, numerics=NUMERICS, **measure())  # type: ignore[arg-type]  # none is called allow_pickle
     print(f"{STORED}: {STORED.stat().st_size} bytes")
 
 

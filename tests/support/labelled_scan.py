@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import zlib
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +55,7 @@ def write_vtp(
     """Write VTK PolyData in one of the encodings that programs use; ``joined`` encodes header and data as one base64
     stream.
     """
-    order = "<" if byte_order == "LittleEndian" else ">"
+    order: Literal["<", ">"] = "<" if byte_order == "LittleEndian" else ">"
     width = {"UInt32": "u4", "UInt64": "u8"}[header_type]
     payload = b""
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 import httpx
 import uvicorn
-from fastapi import FastAPI
 
 
 def connect(address: str) -> httpx.Client:
@@ -21,22 +21,25 @@ def connect(address: str) -> httpx.Client:
     return httpx.Client(base_url=address, trust_env=False, timeout=60)
 
 
+class _Telling(uvicorn.Server):
+    # Sets an event once it listens.
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self.listening = threading.Event()
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        self.listening.set()
+
+
 @contextmanager
-def serving(app: FastAPI) -> Iterator[httpx.Client]:
+def serving(app: Callable[..., Any]) -> Iterator[httpx.Client]:
     """Serve an application on a free loopback port for the time of the block."""
-    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="critical", timeout_graceful_shutdown=1))
-    started = threading.Event()
-    startup = server.startup
-
-    async def tell_started(sockets: list[object] | None = None) -> None:
-        await startup(sockets)
-        started.set()
-
-    server.startup = tell_started
+    server = _Telling(uvicorn.Config(app, port=0, log_level="critical", timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
-        assert started.wait(30)
+        assert server.listening.wait(30)
         port = server.servers[0].sockets[0].getsockname()[1]
         with connect(f"http://127.0.0.1:{port}") as client:
             yield client

@@ -27,7 +27,7 @@ def write_raw_folder(root: Path) -> Tree:
     lights = [
         {"name": name, "address": k, "position_mm": [500.0 * k, 0.0, -300.0]} for k, name in enumerate(("L1", "L2"))
     ]
-    frames = []
+    frames: list[Tree] = []
     for k, camera in enumerate(cameras):
         np.save(root / f"{camera['name']}_black.npy", np.full((SIZE[1], SIZE[0], 3), 64, dtype=np.uint16))
         frames.append(

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -65,7 +66,7 @@ def write_raw_mouth(
             counts = (BLACK + FULL_SCALE * np.clip(view.image, 0, 1)).round().astype(np.uint16)
             np.save(root / f"{name}_{kind}.npy", counts)
             frames.append({"camera": name, "file": f"{name}_{kind}.npy", "kind": kind, "exposure_s": 0.1} | lit)
-    known = {"black_counts": BLACK, "radiance_per_count": (1 / FULL_SCALE,) * 3}
+    known: dict[str, Any] = {"black_counts": BLACK, "radiance_per_count": (1 / FULL_SCALE,) * 3}
     calibrated = tuple(CalibratedCamera(**camera.model_dump(), **known) for camera in mouth.cameras.values())
     lights = (CalibratedLight(name="l0", position_mm=(0.0, 900.0, 0.0), intensity=(INTENSITY,) * 3),)
     channels = ("red", "green", "blue")

@@ -150,7 +150,8 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
         mesh.recompute_vertex_normals()
         return mesh
 
-    total, diffuse = [], []
+    total: list[NDArray[np.float32]] = []
+    diffuse: list[NDArray[np.float32]] = []
     for pose in poses:
         # Mitsuba's camera looks along +z with x to the left; OpenCV's has x right, y down
         to_world = np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -207,4 +208,5 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
 
 
 if __name__ == "__main__":
-    np.savez(Path(sys.argv[1]), **render(json.loads(sys.argv[2])))
+    arrays = render(json.loads(sys.argv[2]))
+    np.savez(Path(sys.argv[1]), **arrays)  # type: ignore[arg-type]  # none is called allow_pickle

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,9 @@ def write_capture(
     )
     table = []
     for index, what in enumerate(kinds):
-        kind = "black" if what is None else "tracking" if what[0] < 0 else "light"
+        kind: Literal["black", "tracking", "light"] = (
+            "black" if what is None else "tracking" if what[0] < 0 else "light"
+        )
         level = {"black": 0.0, "tracking": LEVEL / count_of, "light": LEVEL}[kind]
         for camera in range(cameras):
             signal = 0 if what is None else rendered.radiance[camera, index - 2] * (level * EXPOSURE_S / per_count)

@@ -30,7 +30,7 @@ class Role:
 
 
 _COMMANDS = ("services.cli.app:build_app",)
-_WORKER = (
+_WORKER: tuple[str, ...] = (
     *_COMMANDS,
     "services.cli.dask",
     "services.pipeline.stages",

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import obstore
 import pytest
-from moto.server import DomainDispatcherApplication, create_backend_app
+from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from obstore.store import S3Store
 from werkzeug.serving import WSGIRequestHandler, make_server
 
@@ -67,7 +67,7 @@ class S3Server:
 
     def objects(self) -> dict[str, bytes]:
         """Everything that the bucket holds, by key."""
-        from moto.core import DEFAULT_ACCOUNT_ID
+        from moto.core.models import DEFAULT_ACCOUNT_ID
         from moto.s3.models import s3_backends
 
         bucket = s3_backends[DEFAULT_ACCOUNT_ID]["aws"].buckets[BUCKET]

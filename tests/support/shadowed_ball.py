@@ -46,7 +46,7 @@ def before_ball(light_mm: NDArray[np.float64], away_mm: float) -> tuple[float, f
 
 
 def behind_ball(
-    points_mm: NDArray[np.float64],
+    points_mm: NDArray[np.floating],
     light_mm: NDArray[np.float64],
     centre_mm: tuple[float, float, float],
     radius_mm: float,

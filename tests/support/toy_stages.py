@@ -120,6 +120,6 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
 
 def needy(_spec: JobSpec, _context: StageContext) -> AssetManifest:
     """Import a package that does not exist."""
-    import no_such_package
+    import no_such_package  # type: ignore[import-not-found]  # it is missing on purpose
 
     return no_such_package.publish()

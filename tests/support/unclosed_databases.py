@@ -38,4 +38,4 @@ class WatchedConnection(sqlite3.Connection):
 def watch_databases() -> None:
     """Replace ``sqlite3.connect``, so that all further connections of this process are watched."""
     connect = partial(sqlite3.connect, factory=WatchedConnection)
-    sqlite3.connect = sqlite3.dbapi2.connect = connect  # type: ignore[assignment]
+    sqlite3.connect = sqlite3.dbapi2.connect = connect  # type: ignore[assignment]  # a replacement

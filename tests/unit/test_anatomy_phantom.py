@@ -33,6 +33,7 @@ def test_the_folder_is_a_complete_capture(tmp_path: Path) -> None:
     assert tooth.dentin is not None
     width, height = capture.cameras[0].size
     for entry in capture.images:
+        assert entry.variance_file is not None
         image, variance = np.load(tmp_path / entry.file), np.load(tmp_path / entry.variance_file)
         assert image.shape == variance.shape == (height, width, 1)
         assert image.dtype == np.float32

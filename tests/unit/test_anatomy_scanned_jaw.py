@@ -314,8 +314,8 @@ def test_real_teeth_show_their_outside(jaw: ScannedJaw) -> None:
         direction = np.array(towards, dtype=float)
         side = np.linalg.svd(direction[None])[2][1:]
         hits = scene.first_hits(u * side[0] + v * side[1] - 100 * direction, np.repeat(direction[None], len(u), axis=0))
-        seen += np.count_nonzero(hits.hit)
-        inverted += np.count_nonzero(hits.hit & (hits.normals @ direction > 0))
+        seen += int(np.count_nonzero(hits.hit))
+        inverted += int(np.count_nonzero(hits.hit & (hits.normals @ direction > 0)))
     assert seen > 50_000
     # Where the borders of two touching teeth cross each other, the wall of a root may begin with a fold: 7 such rays
     # were measured, and several times as many without the strips at contacts.

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,9 +31,9 @@ def mesh_of(change: Callable[[np.ndarray], np.ndarray]) -> Mesh:
     return Mesh(change(FOUR.mesh.vertices_mm.copy()), FOUR.mesh.faces)
 
 
-def read(folder: Path, mesh: Mesh = FOUR.mesh, labels: np.ndarray | None = None, **options: str) -> LabelledScan:
+def read(folder: Path, mesh: Mesh = FOUR.mesh, labels: np.ndarray | None = None, **options: Any) -> LabelledScan:
     write_labelled_ply(folder / "scan.ply", mesh, FOUR.fdi if labels is None else labels)
-    return read_scan(folder / "scan.ply", "either", **options)  # type: ignore[arg-type]
+    return read_scan(folder / "scan.ply", "either", **options)
 
 
 def relabelled(**new: int) -> np.ndarray:
@@ -71,6 +72,12 @@ def cloud(folder: Path) -> LabelledScan:
     )
     (folder / "scan.ply").write_text(head + rows + "\n")
     return read_scan(folder / "scan.ply")
+
+
+def labels_of_another(folder: Path) -> LabelledScan:
+    np.save(folder / "labels.npy", FOUR.fdi[:-7])
+    read(folder, labels=FOUR.fdi)
+    return read_scan(folder / "scan.ply", labels="labels.npy")
 
 
 def clicks(shift: int = 0, fdi: int = 11) -> list[Click]:
@@ -123,11 +130,7 @@ KINDS: dict[str, tuple[Callable[[Path], object], str]] = {
         "label of tooth 12 is in 2 pieces.*relabel",
     ),
     "labels of another scan": (
-        lambda at: (
-            np.save(at / "labels.npy", FOUR.fdi[:-7]),
-            read(at, labels=FOUR.fdi),
-            read_scan(at / "scan.ply", labels="labels.npy"),
-        ),
+        labels_of_another,
         r"labels of shape \(\d+,\) for \d+ triangles",
     ),
     "a coordinate that is no number": (lambda at: read(at, mesh_of(with_nan)), "non-finite coordinates; repair"),

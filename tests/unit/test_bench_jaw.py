@@ -59,7 +59,7 @@ class FixedErrors:
 def test_rows_are_kept_and_drawn() -> None:
     kept: list[list[dict[str, Any]]] = []
     teeth = SimpleNamespace(teeth=tuple(SimpleNamespace(fdi=fdi) for fdi in (11, 12)))
-    recorder = ErrorRecorder(FixedErrors(teeth), TRUTH, kept.append, samples=16)  # type: ignore[arg-type]
+    recorder = ErrorRecorder(FixedErrors(teeth), TRUTH, kept.append, samples=16)  # type: ignore[arg-type]  # a stand-in
     moved = TRUTH.with_values({"0.enamel.sigma": 5.0})
     for seconds, stage in ((1.0, "start.0"), (2.0, "joint"), (3.0, "joint"), (4.0, "final")):
         recorder.record(seconds, moved, stage, step=int(seconds))

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
 import services.cli.bench as command
@@ -47,7 +48,7 @@ def test_everyone_measured_is_in_the_picture() -> None:
 
 def test_lines_follow_equal_efficiency() -> None:
     race, _ = error_against_time(ROWS).axes
-    dashed = [line.get_xydata() for line in race.get_lines() if line.get_linestyle() == "--"]
+    dashed = [np.asarray(line.get_xydata()) for line in race.get_lines() if line.get_linestyle() == "--"]
     assert len(dashed) == 2
     for line in dashed:
         efficiencies = line[:, 0] * line[:, 1] ** 2

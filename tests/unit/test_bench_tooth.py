@@ -76,7 +76,7 @@ class FixedErrors:
 
 def test_rows_are_kept_as_they_come() -> None:
     kept: list[list[dict[str, Any]]] = []
-    recorder = ErrorRecorder(FixedErrors(), kept.append, samples=16)  # type: ignore[arg-type]
+    recorder = ErrorRecorder(FixedErrors(), kept.append, samples=16)  # type: ignore[arg-type]  # a stand-in
     tissue = Tissue(Medium(4.0, 0.99, g1=0.5), Medium(8.0, 0.98))
     recorder.record("dentine", 1.0, tissue, "start")
     recorder.record("dentine", 2.0, tissue, "final")

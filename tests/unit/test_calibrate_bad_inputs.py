@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from services.calibrate.cameras.boards import detect, opencv_board
 from services.calibrate.lights.listed import align_list
@@ -192,7 +194,13 @@ def relisted(good: ArraySession, lights: LightsStep, listed: np.ndarray) -> Ligh
         (lambda listed: listed + 300 * (np.arange(6) == 4)[:, None], "Light L4 lies .* mm from where the list has it"),
     ],
 )
-def test_a_list_that_is_wrong(good, cameras, lights, spoil, sentence) -> None:  # type: ignore[no-untyped-def]
+def test_a_list_that_is_wrong(
+    good: ArraySession,
+    cameras: CamerasStep,
+    lights: LightsStep,
+    spoil: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    sentence: str,
+) -> None:
     told = told_of(good, cameras, relisted(good, lights, spoil(good.listed_mm)))
     assert any(re.search(sentence, one) for one in told), told
 

@@ -6,6 +6,7 @@ import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,8 @@ def test_derivatives_of_drawn_corners_are_those_of_finite_differences() -> None:
     rig = true_rig(random, n_places=3)
     corners, layout = joined(photographed(rig, 0.0, random)), layout_of(rig)
     values = layout.pack(rig)
-    exact = jacobian(layout, rig, corners, np.ones(3)).toarray()
+    sparse: Any = jacobian(layout, rig, corners, np.ones(3))
+    exact = sparse.toarray()
     for column in range(layout.length):
         step = 1e-6 * max(1.0, abs(values[column]))
         sides = []
@@ -173,7 +175,7 @@ def test_held_out_boards_are_drawn_at_least_as_well_as_by_opencv() -> None:
     board = CHESSBOARD.model_copy(update={"squares": (10, 7), "square_mm": 1.0})
     squares = []
     for side in ("left", "right"):
-        views = []
+        views: list[View] = []
         for path in sorted(STEREO_BOARDS.glob(f"{side}??.jpg")):
             found = detect(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), board)
             views.append(View(0, len(views), found.corners_mm, found.pixels, found.ids, path.name))

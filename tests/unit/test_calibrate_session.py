@@ -27,6 +27,7 @@ from services.core.calibration.record import Calibration, require_consistent
 from services.core.errors import CaptureInputError
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFolder
+from services.core.raw.targets import Board
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.stage import LocalContext, StageEvent
@@ -179,7 +180,7 @@ def test_a_folder_without_boards_is_refused(made: tuple[Path, Calibration]) -> N
 @pytest.mark.parametrize(
     "board", [BOARD, CHESSBOARD, charuco((5, 8), legacy_pattern=True), charuco((4, 3), type="aruco")]
 )
-def test_a_printed_board_is_opencvs(board) -> None:  # type: ignore[no-untyped-def]
+def test_a_printed_board_is_opencvs(board: Board) -> None:
     import cv2
 
     from services.calibrate.cameras.boards import opencv_board
@@ -197,6 +198,7 @@ def test_a_printed_board_is_opencvs(board) -> None:  # type: ignore[no-untyped-d
         return
     made = opencv_board(board)
     if board.type == "aruco":
+        assert board.marker_mm is not None
         width, height = (
             width - round((board.square_mm - board.marker_mm) * scale),
             height - round((board.square_mm - board.marker_mm) * scale),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -43,23 +44,23 @@ OPERATIONS = st.one_of(
 
 
 @given(st.lists(OPERATIONS, max_size=40))
-def test_no_light_without_a_fed_watchdog_and_a_closed_interlock(operations: list[tuple[str, object]]) -> None:
+def test_no_light_without_a_fed_watchdog_and_a_closed_interlock(operations: list[tuple[str, Any]]) -> None:
     model, now_s, fed_at_s = DomeModel(LIGHTS, WATCHDOG_S), 0.0, float("-inf")
     for what, argument in operations:
         if what == "wait":
-            now_s += float(argument)  # type: ignore[arg-type]
+            now_s += float(argument)
         model.advance(now_s)
         if what == "feed":
             model.write("holding", reg.KEEPALIVE.address, [1])
             fed_at_s = now_s
         elif what == "light":
-            set_active(model, int(argument), 1000)  # type: ignore[call-overload]
+            set_active(model, int(argument), 1000)
         elif what == "all":
             set_active(model, reg.ALL_LIGHTS, 1000)
         elif what in {"off", "reset"}:
             model.write("coil", (reg.ALL_OFF if what == "off" else reg.FAULT_RESET).address, [1])
         elif what == "fault":
-            model.write("holding", reg.FAULT_ORDER.address, [int(argument), 3, 1, reg.ANY_SPACE, 0])  # type: ignore[call-overload]
+            model.write("holding", reg.FAULT_ORDER.address, [int(argument), 3, 1, reg.ANY_SPACE, 0])
         model.advance(now_s)
         if (
             now_s >= fed_at_s + WATCHDOG_S

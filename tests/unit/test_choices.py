@@ -22,4 +22,4 @@ def test_what_is_not_known_is_told_with_what_is() -> None:
 def test_an_unknown_loss_is_no_relative_one() -> None:
     ones = np.ones(3)
     with pytest.raises(SettingsError, match="Loss 'cauchy' is not known; known are l1, l2"):
-        weights("cauchy", ones, ones, ones, ones)  # type: ignore[arg-type]
+        weights("cauchy", ones, ones, ones, ones)  # type: ignore[arg-type]  # the loss is unknown on purpose

@@ -133,8 +133,14 @@ def test_one_stream_tells_of_several_jobs_everything_once_and_in_order(
 
 
 def test_streams_that_are_equally_far_share_a_read(repository: Repository, monkeypatch: pytest.MonkeyPatch) -> None:
-    lease, reads, read = start(repository), [], event_stream._read
-    monkeypatch.setattr(event_stream, "_read", lambda *arguments: reads.append(arguments) or read(*arguments))
+    lease, read = start(repository), event_stream._read
+    reads: list[Any] = []
+
+    def counted(*arguments: Any) -> Any:
+        reads.append(arguments)
+        return read(*arguments)
+
+    monkeypatch.setattr(event_stream, "_read", counted)
     work(repository, lease)
 
     async def watch() -> list[str]:

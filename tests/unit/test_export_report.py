@@ -32,7 +32,8 @@ class Page(HTMLParser):
         super().__init__()
         self.addresses: list[str] = []
         self.tags: list[str] = []
-        self.text, self._open = "", []
+        self.text = ""
+        self._open: list[str] = []
         self.feed(source)
         assert self._open == []
 
@@ -60,7 +61,7 @@ def report(**changes: Any) -> FitReport:
         "enamel.sigma_s_reduced": Estimate(value=0.9021, se=0.0243, unit="1/mm", determined=True),
         "shape.1": Estimate(value=0.4, se=0.1, unit="1", determined=True),
     }
-    whole = {
+    whole: dict[str, Any] = {
         "converged": True,
         "advice": "",
         "parameters": {"green": table},
@@ -81,9 +82,8 @@ def pictures(**changes: Any) -> ReportPictures:
 
 def thickness(**changes: Any) -> ThicknessMap:
     mean = Estimate(value=0.7, se=0.06, unit="mm", determined=True)
-    return ThicknessMap(
-        **{"image_mm": np.full((6, 5), 0.7), "errors_mm": np.full((6, 5), 0.08), "mean": mean} | changes
-    )
+    whole: dict[str, Any] = {"image_mm": np.full((6, 5), 0.7), "errors_mm": np.full((6, 5), 0.08), "mean": mean}
+    return ThicknessMap(**whole | changes)
 
 
 def page(path: Path, fit: FitReport, shown: ReportPictures, **context: Any) -> Page:

@@ -31,15 +31,24 @@ def written(tmp_path: Path) -> ET.Element:
     return ET.parse(tmp_path / "scene.xml").getroot()
 
 
+def found(root: ET.Element, path: str) -> ET.Element:
+    element = root.find(path)
+    assert element is not None, path
+    return element
+
+
 def test_parameters_have_defaults_and_are_used(tmp_path: Path) -> None:
     root = written(tmp_path)
     assert {d.get("name"): d.get("value") for d in root.findall("default")} == {
         "light_x": "1.0", "light_y": "2.0", "light_z": "3.0", "intensity": "7.0", "spp": "16",
     }  # fmt: skip
-    light = root.find("emitter[@type='point']")
-    assert light is not None
-    assert light.find("point").attrib == {"name": "position", "x": "$light_x", "y": "$light_y", "z": "$light_z"}  # type: ignore[union-attr]
-    assert root.find("sensor/sampler/integer").get("value") == "$spp"  # type: ignore[union-attr]
+    assert found(found(root, "emitter[@type='point']"), "point").attrib == {
+        "name": "position",
+        "x": "$light_x",
+        "y": "$light_y",
+        "z": "$light_z",
+    }
+    assert found(root, "sensor/sampler/integer").get("value") == "$spp"
 
 
 def test_media_nest_by_reference(tmp_path: Path) -> None:
@@ -59,6 +68,6 @@ def test_media_nest_by_reference(tmp_path: Path) -> None:
 
 
 def test_the_pose_is_turned_to_mitsubas_axes(tmp_path: Path) -> None:
-    matrix = written(tmp_path).find("sensor/transform/matrix").get("value")  # type: ignore[union-attr]
+    matrix = found(written(tmp_path), "sensor/transform/matrix").attrib["value"]
     expected = np.linalg.inv(np.asarray(CAMERA.camera_from_world)) @ np.diag([-1, -1, 1, 1])
     np.testing.assert_allclose(np.array(matrix.split(), dtype=float).reshape(4, 4), expected)

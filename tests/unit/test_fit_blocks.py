@@ -71,11 +71,8 @@ def test_what_a_scene_lacks_stays_absent(tmp_path: Path, missing: str) -> None:
         gums=sphere(5.0),
         cavity=sphere(9.0),
     )
-    scene = (
-        replace(whole, teeth=(ToothSurfaces(sphere(2.0)),))
-        if missing == "dentin"
-        else replace(whole, **{missing: None})
-    )
+    absent: dict[str, Any] = {missing: None}
+    scene = replace(whole, teeth=(ToothSurfaces(sphere(2.0)),)) if missing == "dentin" else replace(whole, **absent)
     stored = read_recipe(write_recipe(tmp_path, scene))
     assert (stored.gums is None, stored.cavity is None, stored.teeth[0].dentin is None) == tuple(
         missing == part for part in ("gums", "cavity", "dentin")

@@ -28,7 +28,10 @@ def sums_of(render: NDArray[np.float64], photos: NDArray[np.float64], seed: int 
     valid = random.random(render.shape) > 0.1
     halves = np.array_split(np.arange(render.shape[1]), 2)
     variance = (0.01 * photos) ** 2
-    parts = [frame_sums(*(a[:, half] for a in (first, second, photos, variance, valid))) for half in halves]
+    parts = [
+        frame_sums(first[:, half], second[:, half], photos[:, half], variance[:, half], valid[:, half])
+        for half in halves
+    ]
     return parts[0] + parts[1]
 
 

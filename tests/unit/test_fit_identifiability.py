@@ -81,4 +81,4 @@ def test_correlation_is_that_of_the_covariance() -> None:
     covariance = np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     found = correlation(Uncertainty(domain, np.zeros(3), covariance, np.zeros((3, 0)), np.eye(3)))
     assert found.names == domain.names
-    np.testing.assert_allclose(found.matrix, [[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]])
+    np.testing.assert_allclose(found.matrix, [[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]])

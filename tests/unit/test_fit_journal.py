@@ -85,7 +85,7 @@ def test_a_line_that_was_cut_short_is_computed_again(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     journal = Journal(path, "a")
     for key in ("x", "y"):
-        journal.get_or_compute(key, lambda key=key: key)  # type: ignore[misc]
+        journal.get_or_compute(key, lambda key=key: key)  # type: ignore[misc]  # a default is not inferred
     whole = path.read_bytes()
     for cut in range(1, len(b'{"key": "y", "value": "y"}\n')):
         path.write_bytes(whole[:-cut])

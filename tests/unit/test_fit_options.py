@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,7 @@ CAPTURE = Path("/captures/anna")
 # names of the two.
 DEFAULTS = "e33e4fc488397004ade7c2cdd7597ecd3f3abfabb456bad41b5432e95fe798e5"
 CHANGED = "b324cf722b393bbd186c58817ac47d75250a935e80cb1d6f3df350ab132599a0"
-OPTIONS = {"max_steps": 4, "loss": "robust", "held": {"enamel.sigma": 4.5}}
+OPTIONS: dict[str, Any] = {"max_steps": 4, "loss": "robust", "held": {"enamel.sigma": 4.5}}
 
 
 @pytest.fixture(autouse=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -52,10 +53,13 @@ def test_a_later_attempt_replaces_the_steps_that_it_repeats(log: EventLog) -> No
 
 
 def test_a_curve_is_read_again_only_after_it_has_grown(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads = []
-    monkeypatch.setattr(
-        "services.api.jobs.history.read_history", lambda *asked: reads.append(asked) or read_history(*asked)
-    )
+    reads: list[Any] = []
+
+    def counted(*asked: Any) -> History:
+        reads.append(asked)
+        return read_history(*asked)
+
+    monkeypatch.setattr("services.api.jobs.history.read_history", counted)
     histories = HistoryCache(max_bytes=2000)
     for number in range(3):
         log.append(1, step(number))

@@ -72,9 +72,9 @@ def test_a_gain_is_not_pulled_by_noise_of_photographs_or_renders() -> None:
     for _ in range(200):
         photograph = image + 0.01 * random.standard_normal(400)
         renders = [image + 0.05 * random.standard_normal(400) for _ in range(2)]
-        rows = [np.stack([random.standard_normal(400), render]) for render in renders]
-        residuals = [render - photograph for render in renders]
-        one = normal_equations(*rows, *residuals, np.full(400, 1e-4), np.full(400, 1e4), exact=1)
+        j1, j2 = (np.stack([random.standard_normal(400), render]) for render in renders)
+        r1, r2 = (render - photograph for render in renders)
+        one = normal_equations(j1, j2, r1, r2, np.full(400, 1e-4), np.full(400, 1e4), exact=1)
         found.append((one.gradient[1], np.sqrt(one.gradient_noise[1, 1] + one.data_noise[1, 1])))
     slopes, errors = np.array(found).T
     # Means and spreads of 200: 4 standard errors.
@@ -129,8 +129,9 @@ def test_a_wrong_uncertainty_is_told_in_one_sentence(
 def equations(random: np.random.Generator, noise: float = 0.0, count: int = 40) -> Any:
     truth = random.standard_normal((2, count))
     known = random.standard_normal((4, count))
-    pair = [np.concatenate([truth + noise * random.standard_normal(truth.shape), known]) for _ in range(2)]
-    return normal_equations(*pair, *np.zeros((2, count)), np.full(count, 1e-2), np.full(count, 1e2), exact=4)
+    j1, j2 = (np.concatenate([truth + noise * random.standard_normal(truth.shape), known]) for _ in range(2))
+    r1, r2 = np.zeros((2, count))
+    return normal_equations(j1, j2, r1, r2, np.full(count, 1e-2), np.full(count, 1e2), exact=4)
 
 
 def test_what_is_left_to_the_tissue_is_the_marginal_of_the_whole() -> None:
@@ -262,7 +263,7 @@ def test_knowing_an_error_better_beforehand_is_worth_what_a_fit_with_that_prior_
     expected = uncertainty(domain, domain.x_of(TISSUE), found).covariance
     np.testing.assert_allclose(covariance_if_known(known, "gain"), expected, rtol=1e-6, atol=1e-15)
     # A better calibration does not shorten the distance to the minimum where a fit ended early.
-    left = replace(known, parts=known.parts | {"unfinished": np.eye(6)})
+    left = replace(known, parts={**known.parts, "unfinished": np.eye(6)})
     np.testing.assert_allclose(covariance_if_known(left, "gain"), expected + np.eye(6), rtol=1e-6, atol=1e-15)
 
 
@@ -297,8 +298,8 @@ def test_parts_of_the_prior_add_up_where_kinds_go_together() -> None:
 def test_a_gain_that_goes_with_a_light_is_known_twice_as_well_when_it_is_said_so() -> None:
     # The photographs have no weight: only the prior determines the gain, and it is divided as stated.
     random, count = np.random.default_rng(9), 6
-    rows = [random.standard_normal((count, 20)) for _ in range(2)]
-    found = normal_equations(*rows, np.zeros(20), np.zeros(20), np.full(20, 1e6), np.full(20, 1e-12), exact=4)
+    j1, j2 = (random.standard_normal((count, 20)) for _ in range(2))
+    found = normal_equations(j1, j2, np.zeros(20), np.zeros(20), np.full(20, 1e6), np.full(20, 1e-12), exact=4)
     known = uncertainty(CORRELATED, CORRELATED.x_of(TISSUE), found)
     gain = CORRELATED.tissue_count
     assert known.covariance[gain, gain] == pytest.approx(1e-4, rel=1e-3)

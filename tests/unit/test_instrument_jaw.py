@@ -60,7 +60,8 @@ def equations_of(teeth: tuple[int, ...], domain: Domain, random: np.random.Gener
         one = normal_equations(rows, rows, residual, residual, 1 / weight, weight, 2, regions, len(ERRORS.names))
         total = one if total is None else total + one
     assert total is not None
-    return total, -np.linalg.solve(total.hessian + domain.precision, total.gradient)
+    step = np.linalg.solve(total.hessian + domain.precision, total.gradient)
+    return total, -np.asarray(step, dtype=np.float64)
 
 
 def solved(teeth: tuple[int, ...]) -> tuple[Uncertainty, Array]:

@@ -56,7 +56,7 @@ def test_a_sensors_noise_is_as_said() -> None:
         read = sensor.read_electrons * sensor.counts_per_electron
         variance = expected * sensor.counts_per_electron + read**2 + 1 / 12
         # 4,800 values: the mean to five of its standard errors, their variance to five times sqrt(2 / n).
-        assert part.mean() - sensor.black == pytest.approx(expected, abs=5 * np.sqrt(variance / part.size))
+        assert part.mean() - sensor.black == pytest.approx(expected, abs=float(5 * np.sqrt(variance / part.size)))
         assert (part - other).var() / 2 == pytest.approx(variance, rel=5 * np.sqrt(2 / part.size))
     assert sensor.photograph(camera, 100 * even, 0.02, np.random.default_rng(1)).max() == 4095
 

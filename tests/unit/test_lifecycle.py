@@ -80,7 +80,7 @@ def test_the_docstring_draws_the_table() -> None:
         line.split("  ") for line in lifecycle.__doc__.splitlines() if line[:1].isupper() and "  " in line
     ] or [[]]
     columns = [Trigger.CANCEL, Trigger.START, Trigger.SUCCEED, Trigger.FAIL, Trigger.LOSE]
-    drawn = {}
+    drawn: dict[tuple[str, Trigger], str] = {}
     for row in [header, *rows]:
         state, *cells = [cell.strip() for cell in row if cell.strip()]
         drawn |= {(state, trigger): cell for trigger, cell in zip(columns, cells, strict=True) if cell != "-"}

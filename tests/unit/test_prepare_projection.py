@@ -29,7 +29,7 @@ def sphere(radius_mm: float, centre_mm: tuple[float, float, float] = (0, 0, 0)) 
 def test_sphere_depth_and_normal() -> None:
     view = project(CAMERA, [sphere(5)])
     y, x = np.nonzero(view.covered)
-    origin, rays = CAMERA.rays(x + 0.5, y + 0.5)
+    origin, rays = CAMERA.rays(x.astype(np.float64) + 0.5, y.astype(np.float64) + 0.5)
     # First intersection of a ray with a sphere about the world's origin
     along = -rays @ origin
     hit = origin + (along - np.sqrt(along**2 - origin @ origin + 25))[:, None] * rays
@@ -90,7 +90,7 @@ def test_incisor_pixels(camera: int, hit: int, whole: int) -> None:
     folder = shared_path("data/tooth-ur1-truth")
     description = read_record(folder / "capture.json", FolderCapture)
     view = project(description.cameras[camera], [read_teeth(folder)[0].outer])
-    assert (np.count_nonzero(view.mesh >= 0), np.count_nonzero(view.covered)) == (hit, whole)
+    assert (int(np.count_nonzero(view.mesh >= 0)), int(np.count_nonzero(view.covered))) == (hit, whole)
     light = np.max(
         [np.load(folder / entry.file)[..., 0] for entry in description.images if entry.camera == f"c{camera}"], axis=0
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.core.geometry import Camera, Light
 from services.core.records import CaptureManifest, FolderCapture, FrameRecord
 from services.preprocess.radiometry import Merge, Radiometry
 
@@ -12,18 +13,18 @@ BLACK, BITS, PER_COUNT = 64, 12, 2e-3
 
 
 def manifest() -> CaptureManifest:
-    camera = {
-        "name": "c",
-        "size": (200, 200),
-        "K": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-        "camera_from_world": np.eye(4).tolist(),
-    }
+    camera = Camera(
+        name="c",
+        size=(200, 200),
+        K=((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        camera_from_world=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+    )
     return CaptureManifest(
         description=FolderCapture(
             units="mm",
             channels=("green",),
             cameras=(camera,),
-            lights=({"name": "l", "position_mm": (0, 0, 1), "intensity": (1.0,)},),
+            lights=(Light(name="l", position_mm=(0, 0, 1), intensity=(1.0,)),),
         ),
         frames=(),
         bits=BITS,

@@ -85,8 +85,8 @@ def test_a_value_without_certainty_is_as_likely_lit_as_shadowed(view: Footprint)
     shape = (6, *view.covered.shape)
     variance = np.full(shape, 1e-4, np.float32)
     variance[0] = 1e38
-    ones = np.ones(shape, np.float32)
-    confidence = shadow_confidence(1e-3 * ones, variance, 1e-3 * ones, ones, view.covered, PIXEL_MM)
+    faint, ones = np.full(shape, 1e-3, np.float32), np.ones(shape, np.float32)
+    confidence = shadow_confidence(faint, variance, faint, ones, view.covered, PIXEL_MM)
     # Its own smallest error, 1e19 / 1e-3 / 1, has no square in float32
     assert np.all(confidence[0, view.covered] == 0.5)
     assert np.all(confidence[1:, view.covered] < 0.5)

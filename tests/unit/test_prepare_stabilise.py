@@ -28,8 +28,12 @@ def footprint(seen: np.ndarray, depth_mm: np.ndarray | None = None) -> Footprint
 
 def view_of(seen: Footprint) -> View:
     height, width = seen.mesh.shape
-    pose = np.eye(4).tolist()
-    camera = Camera(name="front", size=(width, height), K=((1, 0, 0), (0, 1, 0), (0, 0, 1)), camera_from_world=pose)
+    camera = Camera(
+        name="front",
+        size=(width, height),
+        K=((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        camera_from_world=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+    )
     return View(0, camera, Window(0, height, 0, width), camera, seen)
 
 

@@ -4,6 +4,9 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 
 from services.api.http import problems
@@ -19,9 +22,9 @@ KINDS = kinds_below(DentineError)
 
 
 @pytest.mark.parametrize("order", [list, reversed, lambda items: sorted(items, key=lambda item: item[0].__name__)])
-def test_the_order_of_the_table_does_not_matter(order: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_order_of_the_table_does_not_matter(order: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(KINDS) > 50
-    monkeypatch.setattr(problems, "_STATUS", dict(order(list(_STATUS.items()))))  # type: ignore[operator]
+    monkeypatch.setattr(problems, "_STATUS", dict(order(list(_STATUS.items()))))
     for kind in KINDS:
         # No class has two parents, so the nearest one above is the first listed one on the way to the root.
         above = kind

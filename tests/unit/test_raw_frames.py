@@ -149,7 +149,10 @@ def truncate(file: str, write: Write, share: float) -> Callable[[Path], None]:
 
 
 def as_bytes(file: str, content: bytes) -> Callable[[Path], None]:
-    return lambda root: folder_with(root, file, lambda path, _: path.write_bytes(content), KNOWN) and None
+    def damage(root: Path) -> None:
+        folder_with(root, file, lambda path, _: path.write_bytes(content), KNOWN)
+
+    return damage
 
 
 def jpeg() -> bytes:

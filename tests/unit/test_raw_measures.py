@@ -11,6 +11,7 @@ import pytest
 
 from services.core.raw.description import read_calibration
 from services.core.raw.folder import read_raw_folder
+from services.core.raw.frames import read_counts
 from services.core.raw.records import RawFolder, RawFrame
 from services.preprocess.raw import camera as module
 from services.preprocess.raw.camera import CameraFrames
@@ -25,11 +26,11 @@ def test_another_block_takes_what_was_measured(tmp_path: Path, monkeypatch: pyte
     write_raw_capture(root, tmp_path / "mouth", Sensor(), tracking=0, flats=2)
     folder = read_raw_folder(root)
     calibrated = read_calibration(root, folder, None).cameras[0]
-    read, asked = module.read_counts, []
+    asked: list[str] = []
 
     def counted(root: Path, folder: RawFolder, frame: RawFrame) -> np.ndarray:
         asked.append(frame.file)
-        return read(root, folder, frame)
+        return read_counts(root, folder, frame)
 
     monkeypatch.setattr(module, "read_counts", counted)
     first, second, anew = (

@@ -10,6 +10,7 @@ import pytest
 from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.raw.merge import Exposure, merge
 from services.core.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
+from services.core.raw.records import Mosaic
 from services.preprocess.raw.demosaic import demosaic, demosaic_variance
 from services.preprocess.raw.lens import Lens, Sampler, fitted_vignetting
 from services.preprocess.raw.response import Series, measure_linearity
@@ -58,7 +59,7 @@ def test_pairs_of_two_exposures_and_a_flickering_light_tell_the_gain_too() -> No
 def test_frames_without_light_tell_no_gain() -> None:
     sensor = Sensor()
     dark = [signal(sensor, k, 0 * RAMP + 0.5) for k in range(2)]
-    assert shot_noise([LitPair(*dark, 1.0)], 2.0) is None
+    assert shot_noise([LitPair(dark[0], dark[1], 1.0)], 2.0) is None
     assert read_noise(dark[:1], 1.0) is None
 
 
@@ -116,7 +117,7 @@ def test_a_linear_camera_is_left_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("mosaic", ["RGGB", "BGGR", "GRBG", "GBRG"])
-def test_demosaicing_keeps_what_is_linear_in_place(mosaic: str) -> None:
+def test_demosaicing_keeps_what_is_linear_in_place(mosaic: Mosaic) -> None:
     """Away from the border the filters are exact where every channel is a plane, whatever its level."""
     y, x = np.mgrid[0:20, 0:30].astype(float)
     image = np.stack([50 + x, 200 + 2 * y, 100 + x - y], axis=-1)

@@ -71,7 +71,7 @@ def fitted(problem: Linear, *, measured: bool, offset: float) -> tuple[np.ndarra
     photo = problem.photograph(offset)
     start = problem.truth + 0.05
     equations = problem.equations(start, photo)
-    step = -np.linalg.solve(equations.hessian, equations.gradient)
+    step = -np.asarray(np.linalg.solve(equations.hessian, equations.gradient), dtype=np.float64)
     x, equations = start + step, equations.moved(step)
     if not measured:
         return x, uncertainty(DOMAIN, x, equations)
@@ -280,9 +280,9 @@ def test_a_prior_used_in_full_takes_the_tissue_back_along_a_direction_that_image
         exact[0] += 0.01 * rng.standard_normal(count)
         residual = np.array([0.3, 0.05, 0.0, -0.1]) @ exact - sensor * rng.standard_normal(count)
         noise = [np.append(0.15 * rng.standard_normal((3, count)), np.zeros((1, count)), axis=0) for _ in range(2)]
-        residuals = [residual + 0.05 * rng.standard_normal(count) for _ in range(2)]
+        r1, r2 = (residual + 0.05 * rng.standard_normal(count) for _ in range(2))
         weight = np.full(count, sensor**-2)
-        equations = normal_equations(exact + noise[0], exact + noise[1], *residuals, 1 / weight, weight, exact=1)
+        equations = normal_equations(exact + noise[0], exact + noise[1], r1, r2, 1 / weight, weight, exact=1)
         x = np.array([1.0, 2.0, 2.0, -0.1])
         known = uncertainty(domain, x, equations)
         if known.undetermined_directions.shape[1]:

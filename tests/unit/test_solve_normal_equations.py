@@ -20,16 +20,12 @@ def _noisy(rng: np.random.Generator) -> tuple[NormalEquations, ...]:
         shared = np.tile(rng.standard_normal((*shape, MEASUREMENTS // LIGHTS)), LIGHTS)
         return np.sqrt(0.5) * (shared + rng.standard_normal((*shape, MEASUREMENTS)))
 
-    return tuple(
-        normal_equations(
-            *(j + 0.8 * noise(3) for _ in range(2)),
-            *(r + np.sqrt(0.6) * noise() for _ in range(2)),
-            reference,
-            weight,
-            LIGHTS,
-        )
-        for _ in range(ROUNDS)
-    )
+    def draw() -> NormalEquations:
+        j1, j2 = (j + 0.8 * noise(3) for _ in range(2))
+        r1, r2 = (r + np.sqrt(0.6) * noise() for _ in range(2))
+        return normal_equations(j1, j2, r1, r2, reference, weight, LIGHTS)
+
+    return tuple(draw() for _ in range(ROUNDS))
 
 
 def _problem() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -97,8 +93,8 @@ def test_cells_take_away_noise_and_leave_what_is_smooth() -> None:
     cell = (np.arange(pixels) // 16).astype(np.int32)
     old, weight = 0.1 * rng.standard_normal(40)[cell], np.ones(pixels)
     new = old + 0.05
-    o, n = old + rng.standard_normal((2, pixels)), new + rng.standard_normal((2, pixels))
-    alone, together = loss_change(*o, *n, weight, 1), loss_change(*o, *n, weight, 1, cell)
+    (o1, o2), (n1, n2) = old + rng.standard_normal((2, pixels)), new + rng.standard_normal((2, pixels))
+    alone, together = (loss_change(o1, o2, n1, n2, weight, 1, cells) for cells in (None, cell))
     exact = loss_change(old, old, new, new, weight, 1)
     np.testing.assert_allclose(loss_change(old, old, new, new, weight, 1, cell).change, exact.change)
     # Both errors are estimates from 40 cells, good to 20 %; they should differ by a factor of 4, and 2 is required.
@@ -108,9 +104,9 @@ def test_cells_take_away_noise_and_leave_what_is_smooth() -> None:
 
 def test_a_cell_without_weight_counts_for_nothing() -> None:
     rng, cell = np.random.default_rng(9), np.array([0, 0, 2, 2], dtype=np.int32)
-    residuals, weight = rng.standard_normal((4, 4)), np.array([1.0, 2.0, 0.0, 0.0])
-    found = loss_change(*residuals, weight, 1, cell)
-    assert found == loss_change(*residuals[:, :2], weight[:2], 1, cell[:2])
+    (o1, o2, n1, n2), weight = rng.standard_normal((4, 4)), np.array([1.0, 2.0, 0.0, 0.0])
+    found = loss_change(o1, o2, n1, n2, weight, 1, cell)
+    assert found == loss_change(o1[:2], o2[:2], n1[:2], n2[:2], weight[:2], 1, cell[:2])
 
 
 def test_pooling_averages_monte_carlo_noise_but_not_the_data() -> None:

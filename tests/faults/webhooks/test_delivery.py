@@ -69,6 +69,7 @@ def test_a_receiver_that_fails_is_tried_again_under_the_same_id(service: Service
             delivery = service.wait_for_tries(webhook, tries)
             assert delivery.state == "pending"
             assert delivery.next_try_s == pytest.approx(service.now_s + FIRST_RETRY_S * 2 ** (tries - 1), abs=5)
+            assert delivery.next_try_s is not None
             service.now_s = delivery.next_try_s + 1
         (delivery,) = service.wait_for(webhook, "delivered")
     assert [attempt.status for attempt in delivery.attempts] == [500, 503, 404, 204]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi import APIRouter
@@ -48,7 +49,8 @@ def test_changes_refusals_and_artifacts_are_audited_and_reads_are_not(tmp_path: 
 
 def test_the_audit_log_is_paged(server: Guarded) -> None:
     whole = audit(server, limit=500)
-    seen, before = [], None
+    seen: list[dict[str, Any]] = []
+    before = None
     while len(seen) < len(whole):
         page = server.ask(
             "GET", "/v1/audit", Scope.ADMIN, params={"limit": 7} | ({"before": before} if before else {})

@@ -24,7 +24,7 @@ from tests.support.live_server import serving
 )
 @pytest.mark.attack("tokens", "a malformed, unknown or foreign credential")
 def test_a_wrong_credential_is_refused(server: Guarded, header: str) -> None:
-    answer = server.client.get("/v1/jobs", headers={"Authorization": header.encode("latin-1")})
+    answer = server.client.get("/v1/jobs", headers={b"Authorization": header.encode("latin-1")})
     assert (answer.status_code, answer.json()["code"]) == (401, "unauthenticated")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import zarr
 from numpy.typing import NDArray
+from zarr.core.metadata import ArrayV3Metadata
 
 from services.capture import stage
 from services.capture.cameras.motion import SubjectMotion
@@ -46,8 +47,9 @@ def test_counts_turn_back_into_the_radiance_of_the_one_light(
     assert published == manifest
     counts = frames_of(tmp_path / "job")
     array = zarr.open_array(folder / "capture.zarr", mode="r")
+    assert isinstance(array.metadata, ArrayV3Metadata)
     assert array.metadata.dimension_names == ("camera", "frame", "y", "x", "channel")
-    assert (array.shape, array.dtype) == ((2, len(manifest.frames), 18, 24, 3), np.uint16)
+    assert (array.shape, array.dtype) == ((2, len(manifest.frames), 18, 24, 3), np.dtype(np.uint16))
     for camera, description in enumerate(manifest.description.cameras):
         width, height = description.size
         stills = np.stack([smooth_image(width, height, 3, camera, light) for light in range(LIGHTS)])

@@ -122,7 +122,7 @@ def test_a_cancel_in_mid_exposure_ends_the_capture_in_the_dark(
 ) -> None:
     thread, raised = begin(long_job(cameras=cameras), tmp_path / "job")
     try:
-        wait_until(lambda: outputs(address).any())
+        wait_until(lambda: bool(outputs(address).any()))
     finally:
         (tmp_path / "job" / CANCEL_FLAG).touch()
     thread.join(WAIT_S)
@@ -144,7 +144,7 @@ def test_a_cancel_darkens_a_camera_that_is_still_exposing(
     monkeypatch.setattr(SimulatedCameras, "read", read_late)
     thread, raised = begin(long_job(), tmp_path / "job")
     try:
-        wait_until(lambda: outputs(address).any())
+        wait_until(lambda: bool(outputs(address).any()))
         (tmp_path / "job" / CANCEL_FLAG).touch()
         wait_until(lambda: not outputs(address).any())
         assert thread.is_alive(), "the camera has ended, so it is not known what darkened the dome"

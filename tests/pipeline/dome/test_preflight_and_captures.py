@@ -50,7 +50,12 @@ def test_a_capture_has_the_dome_for_itself(
     client: httpx.Client, observer: DomeObserver, jobs: Jobs, tmp_path: Path
 ) -> None:
     begun, go = threading.Event(), threading.Event()
-    jobs.run = lambda *_: (begun.set(), go.wait(60))
+
+    def hold(*_: object) -> None:
+        begun.set()
+        go.wait(60)
+
+    jobs.run = hold
     client.put("/v1/dome/light", json={"light": 2, "on_s": 30}).raise_for_status()
     job = client.post("/v1/jobs", json={"rig": rig(tmp_path)}).json()["id"]
     try:

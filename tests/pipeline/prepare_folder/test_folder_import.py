@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from zarr.core.metadata import ArrayV3Metadata
 
 from services.core.errors import CaptureInputError
 from services.core.records import MaskBit, PreparedManifest
@@ -24,6 +25,7 @@ def test_incisor_imports_whole(tmp_path: Path) -> None:
         zarr.open_array(published / "prepared.zarr" / name, mode="r") for name in ("radiance", "variance", "valid")
     )
     assert radiance.shape == (3, 8, 34, 28, 1)
+    assert isinstance(valid.metadata, ArrayV3Metadata)
     assert valid.metadata.dimension_names == ("camera", "light", "y", "x")
     counts = (np.asarray(valid) == 0).sum(axis=(2, 3))
     np.testing.assert_array_equal(counts, np.repeat([[367], [380], [370]], 8, axis=1))
@@ -44,7 +46,8 @@ def test_noise_model_fills_in_for_missing_variance(tmp_path: Path) -> None:
     prepare(tmp_path, tmp_path / "job", sensor_noise_relative=0.03, sensor_noise_floor=0.01)
     image = np.load(tmp_path / "front_right.npy").astype(np.float64)
     variance = zarr.open_array(tmp_path / "job" / "prepared" / "prepared.zarr" / "variance", mode="r")
-    np.testing.assert_allclose(variance[0, 1, :16, :20], (0.03 * image) ** 2 + (0.01 * image.max()) ** 2, rtol=1e-5)
+    stored = np.asarray(variance[0, 1, :16, :20])
+    np.testing.assert_allclose(stored, (0.03 * image) ** 2 + (0.01 * image.max()) ** 2, rtol=1e-5)
 
 
 def test_padding_and_absent_pairs_are_not_valid(tmp_path: Path) -> None:

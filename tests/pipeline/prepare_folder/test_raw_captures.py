@@ -104,7 +104,8 @@ def test_exposures_that_show_nothing_move_no_subject(
         assert len(motions) == 3
         assert all(image.motion_px is not None for _, image in source.images(view, (0, 1, 2), motions))
         found.append([coefficients[:, 0] for coefficients in motions.values()])
-    assert np.abs(np.subtract(*found)).max() < 0.1
+    one, several = found
+    assert np.abs(np.subtract(one, several)).max() < 0.1
 
 
 def test_a_mosaic_becomes_radiance_of_all_channels(mouth: Path, tmp_path: Path) -> None:
