@@ -8,6 +8,7 @@ irradiance 1 across the beam is the sum over pixels of the beam's image times th
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +19,11 @@ from services.fit.transport.platform import prepare_device
 from tests.support.small_slab import small_rig
 from tests.support.z_scores import require_unbiased, student_to_normal
 
-LIGHTS = [{"name": "l0", "side": "front", "angle_deg": 5.0}, {"name": "l1", "side": "back", "angle_deg": 25.0}]
-CAMERAS = [
+LIGHTS: list[dict[str, Any]] = [
+    {"name": "l0", "side": "front", "angle_deg": 5.0},
+    {"name": "l1", "side": "back", "angle_deg": 25.0},
+]
+CAMERAS: list[dict[str, Any]] = [
     {"name": f"{side}{angle}", "side": side, "angle_deg": float(angle)}
     for side in ("front", "back")
     for angle in (-20, 40)

@@ -54,7 +54,7 @@ def test_all_derivatives_are_unbiased_at_the_error_reached() -> None:
     for number, case in enumerate(cases):
         sums = simulate(case, passes(1), seed=500 + number, border_terms_only=True)
         scores.append(z_scores(sums.mean(), case.values, sums.standard_error()))
-        at_tolerance += np.count_nonzero(sums.standard_error()[1:] <= case.derivative_tolerance() / 3)
+        at_tolerance += int(np.count_nonzero(sums.standard_error()[1:] <= case.derivative_tolerance() / 3))
     assert sum(map(len, scores)) == 320 + 64
     assert at_tolerance >= AT_TOLERANCE
     require_unbiased(np.concatenate(scores), independent=len(cases))

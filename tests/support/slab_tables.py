@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +116,7 @@ def zero_cases() -> list[SlabCase]:
     cases = []
     for row in rows_of("boundary_zero_test.csv"):
         border, depth = float(row["c2_mm"]), float(row["depth_mm_T_below_1e-6"])
-        optics = {
+        optics: dict[str, Any] = {
             "alpha": float(row["alpha"]),
             "beta": float(row["beta"]),
             "g1": float(row["g1"]),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.fit.slab.images import Measurements
-from services.fit.slab.model.dictionary import henyey_greenstein
+from services.fit.slab.model.dictionary import Material, henyey_greenstein
 from services.fit.slab.solve.budget import Budget
 from services.fit.slab.solve.checkpoint import Checkpoint
 from services.fit.slab.solve.coordinates import Knots
@@ -52,7 +52,7 @@ def test_a_stage_ends_where_steps_promise_no_more_than_noise_and_paths_add_littl
 @pytest.mark.parametrize(
     ("moved", "allowed"), [(THIN, Budget().last[1].thin_steps), (THICK, Budget().last[1].thick_steps)]
 )
-def test_a_stage_ends_with_its_steps(moved: object, allowed: int) -> None:
+def test_a_stage_ends_with_its_steps(moved: Material, allowed: int) -> None:
     fit, stage = solver(), Budget().last[1]
     assert fit.next_checkpoint(checkpoint(1, allowed - 2), stage, moved, 9.0, 9.0).stage == 1
     assert fit.next_checkpoint(checkpoint(1, allowed - 1), stage, moved, 9.0, 9.0).stage == 2

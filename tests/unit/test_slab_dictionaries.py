@@ -193,8 +193,8 @@ def test_a_mix_of_a_dictionary_is_found(
         assert abs(got.value - true) <= 4.5 * got.se
         assert got.se <= 0.1 * true
     assert found.dictionary == name
-    phase, true = np.array(found.phase.value_per_sr), truth.phase_per_sr
-    assert np.sqrt(((phase - true) ** 2).sum() / (true**2).sum()) < 0.15
+    phase, true_phase = np.array(found.phase.value_per_sr), truth.phase_per_sr
+    assert np.sqrt(((phase - true_phase) ** 2).sum() / (true_phase**2).sum()) < 0.15
     for k, atom in enumerate(dictionary.names):
         got = found.atoms[f"atoms.{atom}"]
         assert abs(got.value - parts.get(k, 0.0)) <= 4.5 * got.se
@@ -231,7 +231,7 @@ def saved(array: np.ndarray) -> Callable[[Path], None]:
     return lambda path: np.save(path.with_suffix(".npy"), array)
 
 
-def written(text: str) -> Callable[[Path], None]:
+def written(text: str) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(text.encode("latin-1"))
 
 

@@ -15,7 +15,7 @@ from services.fit.slab.solve.prior import Quadratic
 
 BROAD = Knots().broad_directions()
 DEVIATIONS = Knots().broad_standard_deviations(henyey_greenstein(5.0, 0.5, 0.0))
-WEAK = BROAD[:, 0] / np.linalg.norm(BROAD[:, 0])
+WEAK = BROAD[:, 0] / float(np.linalg.norm(BROAD[:, 0]))
 """sigma_s at a constant shape: the direction that holds the only signal here."""
 SPREAD = 0.02
 """Standard deviation of a matrix's entries. Eigenvalues of such noise reach 2 SPREAD sqrt(UNKNOWNS) = 0.57 (Wigner's
@@ -58,7 +58,7 @@ def test_two_steps_go_most_of_the_way_along_a_broad_direction() -> None:
         one = quadratic(seed)
         matrix = step_matrix(one, PRIOR, 1.0)
         assert np.linalg.eigvalsh(matrix)[0] > 0
-        first = np.linalg.solve(matrix, -one.linear)
+        first = np.asarray(np.linalg.solve(matrix, -one.linear), dtype=np.float64)
         alone.append(float(first @ WEAK))
         both.append(float((first + broad_step(one, PRIOR, BROAD, DEVIATIONS, GRADIENT_NOISE, first)) @ WEAK))
     # Chance makes a single way shorter or longer, by about 0.1 in 0.3; ten of them show the mean.
