@@ -142,7 +142,7 @@ def solved(at: Material, batch_set: BatchSet, difference: Array) -> tuple[Materi
         found = knots.material_at(knots.minimum(matrix, matrix @ before - slope))
     solution = Solution(
         found, quadratic, equations.gradient_noise, scale, equations.used, STEPS, True, 0, knots, equations.misfit,
-        equations.misfit_se, equations.data_noise, equations.matrix_error @ (knots.unknowns(found) - x),
+        equations.misfit_se, equations.data_noise, equations.matrix_error @ (knots.unknowns(found) - x), 0.0,
     )  # fmt: skip
     return found, uncertainty_of(solution).covariance
 

@@ -75,7 +75,9 @@ def test_the_gradient_points_from_the_truth_to_where_one_is() -> None:
 def test_the_descent_stays_on_the_simplex_and_repeats() -> None:
     rig, start = small_rig(), henyey_greenstein(0.6, 0.3, 0.1)
     images = single_scattering(rig, henyey_greenstein(1.0, 0.5, 0.1), scores=False)[0]
-    measured = Measurements(images, np.ones_like(images), np.zeros(len(images), dtype=bool), ("",) * len(images), False)
+    measured = Measurements(
+        images, np.ones_like(images), np.zeros(len(images), dtype=bool), (("", ""),) * len(images), False
+    )
     first, again = (
         descend(rig, measured, start, 1, DescentOptions(iterations=3, rate=1e-10, paths=50)) for _ in range(2)
     )

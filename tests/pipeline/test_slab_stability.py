@@ -16,8 +16,11 @@ def test_images_noisier_than_stated_do_not_make_a_fit_run_away(tmp_path: Path) -
     write_cell(tmp_path, *TRUTHS)
     _, fit = fit_slab(tmp_path, SlabOptions(effort=0.5))
     sigma_s, g = TRUTHS[fit.wavelength_nm]
-    assert fit.converged
+    assert fit.errors.held_out_error is not None
+    assert fit.errors.held_out_error < 0.15  # what an error is believed up to
     for told, truth in ((fit.parameters.sigma_s, sigma_s), (fit.parameters.sigma_s_reduced, sigma_s * (1 - g))):
         # The noise is twice what is stated, so 9 of the standard errors are 4.5 of the true ones.
-        assert abs(told.value - truth) <= 9 * told.se <= 0.1 * truth
+        # The fit that ran away had a ± of three times the value.
+        assert abs(told.value - truth) <= 9 * told.se
+        assert told.se < 0.03 * truth
     assert any("by 2" in note and "times their noise" in note for note in fit.notes)

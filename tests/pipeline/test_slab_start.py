@@ -18,7 +18,7 @@ def test_a_search_begins_at_the_right_order_of_scattering(number: int) -> None:
     rig = rig_of(truth.folder, truth.folder.wavelengths_nm[0])
     images = render(rig, truth.material(), seed=9, step=0, batches=1, paths=20_000, scores=False).mean
     variances = np.stack([shot_noise(image) for image in images])
-    measured = Measurements(images, variances, np.zeros(len(images), bool), ("",) * len(images), False, ())
+    measured = Measurements(images, variances, np.zeros(len(images), bool), (("", ""),) * len(images), False, ())
     found = start(rig, measured, 3, map)
     # With one table of albedo 0.97 the second ended 400 times too low, with one of both the first 13 times too high.
     assert 0.2 < found.scattering_per_mm / truth.scattering_per_mm < 5

@@ -40,8 +40,8 @@ def test_a_fit_finds_its_way_from_a_start_that_is_far_off() -> None:
     exact = render(rig, true, seed=99, step=0, batches=8, paths=200_000, scores=False).mean
     variances = np.stack([shot_noise(image, NOISE) for image in exact])
     values = exact + np.sqrt(variances) * np.random.default_rng(1).normal(size=exact.shape)
-    names = tuple(f"{entry.camera} under {entry.light}" for entry in folder.images)
-    measured = Measurements(values, variances, np.zeros(len(values), dtype=bool), names, assumed_noise=False)
+    places = tuple((entry.camera, entry.light) for entry in folder.images)
+    measured = Measurements(values, variances, np.zeros(len(values), dtype=bool), places, assumed_noise=False)
 
     guess = start(rig, measured, 1, map)
     assert guess.scattering_per_mm < 0.8 * true.scattering_per_mm

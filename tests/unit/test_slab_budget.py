@@ -20,8 +20,8 @@ THIN, THICK = henyey_greenstein(1.2, 0.6, 0.05), henyey_greenstein(6.0, 0.6, 0.0
 def solver() -> GaussNewton:
     rig = small_rig()
     values = np.ones((sum(len(views.images) for views in rig.lights), rig.grid.pixels))
-    names = tuple(str(number) for number in range(len(values)))
-    measured = Measurements(values, values, np.zeros(len(values), dtype=bool), names, assumed_noise=False)
+    places = tuple((str(number), "l0") for number in range(len(values)))
+    measured = Measurements(values, values, np.zeros(len(values), dtype=bool), places, assumed_noise=False)
     return GaussNewton(rig, measured, 1, Budget(), map, Knots(), path_noise=(), multiple=np.zeros((1, 1)))
 
 

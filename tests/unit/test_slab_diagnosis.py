@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.core.slab.folder import Beam, PixelGrid, SlabFolder
-from services.fit.slab.diagnosis import grid_faults, image_faults, sample_faults, similarity_faults
+from services.core.slab.folder import Beam, Light, PixelGrid, SlabCamera, SlabFolder
+from services.fit.slab.diagnosis import (
+    grid_faults,
+    image_faults,
+    max_power_per_sr,
+    sample_faults,
+    similarity_faults,
+    standing_out,
+)
 from services.fit.slab.dictionaries.chosen import ChosenDictionary
 from services.fit.slab.fit import fit_images
 from services.fit.slab.images import Measurements, shot_noise
@@ -105,8 +112,48 @@ def test_a_fit_of_an_absorbing_sample_says_so_and_not_that_it_is_thin() -> None:
     exact = render(rig, henyey_greenstein(0.15, 0.5, 1.5), seed=9, step=0, batches=1, paths=100_000, scores=False).mean
     variances = np.stack([shot_noise(image) for image in exact])
     images = exact + np.sqrt(variances) * rng.normal(size=exact.shape)
-    measured = Measurements(images, variances, np.zeros(len(images), dtype=bool), ("a",) * len(images), True)
+    measured = Measurements(images, variances, np.zeros(len(images), dtype=bool), (("", ""),) * len(images), True)
     folder, options = SlabFolder.model_validate(description()), SlabOptions(effort=0.1)
     notes = fit_images(folder, 532.0, measured, options, map, ChosenDictionary(Knots())).fit.notes
     assert sum(note.startswith("The sample absorbs too much: ") for note in notes) == 1
     assert not any(note.startswith("The sample is too") for note in notes)
+
+
+def test_no_image_beside_the_beam_may_show_more_than_a_cone_of_all_light() -> None:
+    light = Light(name="l0", side="front", angle_deg=10.0)
+
+    def most(angle_deg: float) -> float:
+        return max_power_per_sr(SlabCamera(name="b0", side="back", angle_deg=angle_deg), light)
+
+    assert most(14.0) == np.inf
+    # A cone of 20 degrees has 0.379 sr, one of 60 degrees pi.
+    assert most(30.0) == pytest.approx(2.5 / 0.379, rel=1e-3)
+    assert most(-50.0) == 1.0
+
+
+PLACES = [(camera, light) for camera in ("f0", "f1", "b0") for light in ("l0", "l1")]
+
+
+@pytest.mark.parametrize(
+    ("errors", "sentence"),
+    [
+        (
+            (0.2, 0.05, 0.38, 0.51, 0.1, 0.22),
+            "The images of camera f1 are 38 to 51 % off the fit, and all",
+        ),
+        (
+            (0.1, 0.4, 0.12, 0.5, 0.1, 0.6),
+            "The images of light l1 are 40 to 60 % off the fit, and all",
+        ),
+        ((0.2, 0.05, 0.3, 0.51, 0.1, 0.22), ""),
+        ((0.3, 0.3, 0.3, 0.3, 0.3, 0.3), ""),
+    ],
+)
+def test_a_camera_or_light_that_stands_out_is_named(errors: tuple[float, ...], sentence: str) -> None:
+    told = standing_out(PLACES, errors)
+    assert told.startswith(sentence)
+    assert bool(told) == bool(sentence)
+
+
+def test_one_camera_is_not_named_beside_a_single_other() -> None:
+    assert standing_out([("f0", "l0"), ("b0", "l0")], (0.5, 0.01)) == ""

@@ -22,7 +22,7 @@ from tests.support.raw_sensor import Sensor
 from tests.support.small_slab import WAVELENGTH_NM, description
 
 EDGE = 48
-POWER = 2500.0
+POWER = 25_000.0
 """Counts per s that the whole beam would give; exposures are divided by it."""
 TIMES_S = (0.05, 0.4, 3.2)
 SENSOR = Sensor()
@@ -76,6 +76,16 @@ def test_exposures_become_one_image_with_the_noise_that_it_has(tmp_path: Path) -
     alone = np.sqrt((2.0**2 + 0.5 * true * POWER * TIMES_S[0]) / 2) / TIMES_S[0] / POWER
     assert (np.sqrt(measured.variances[0])[dark] < 0.05 * alone[dark]).all()
     assert np.isfinite(measured.variances).all()
+
+
+def test_an_image_is_held_out_where_all_its_exposures_are(tmp_path: Path) -> None:
+    def hold_out(told: dict[str, Any]) -> None:
+        for one in told["exposures"]:
+            one["held_out"] = one["camera"] == "b0" and one.get("light") == "l1"
+
+    root = write_stack(tmp_path, change=hold_out)
+    measured = read_images(root, read_folder(root), WAVELENGTH_NM)
+    assert [name for name, out in zip(measured.names, measured.held_out, strict=True) if out] == ["b0 under l1"]
 
 
 def test_pixels_that_are_full_in_all_exposures_count_for_nothing(tmp_path: Path) -> None:
@@ -204,12 +214,17 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "no power": (lambda d: d["beam"].pop("power"), "beam has no power, by which exposures are divided"),
     "times in hours": (
         lambda d: [one.update(exposure_s=one["exposure_s"] / 3600) for one in d["exposures"]],
-        "times the beam's power per sr, and beside the beam no material sends more than 100; correct beam.power",
+        "times the beam's power per sr, and no material sends more than 6.6 there; correct beam.power",
     ),
     "full": (
         lambda d: [one.update(saturation_counts=1) for one in d["exposures"]],
         "All exposures of image f0 under l0 at 532 nm are full in every pixel, the first of them",
     ),
+    "held out in part": (
+        lambda d: d["exposures"][1].update(held_out=True),
+        "of camera f0 under light l0 is fitted and another of the same image is held out; hold out all of them or none",
+    ),
+    "black held out": (lambda d: blacks(d)[0].update(held_out=True), "only exposures of light are held out"),
     "no black": (lambda d: [d["exposures"].remove(one) for one in blacks(d)], "camera f0 has no black exposure"),
     "lit black": (lambda d: blacks(d)[0].update(light="l0"), "has no light on"),
     "light not named": (lambda d: d["exposures"][0].pop("light"), "must name its light"),

@@ -73,6 +73,9 @@ BAD: dict[str, tuple[Change, str]] = {
     "same image twice": (lambda d: d["images"].append(d["images"][0]), "is listed twice"),
     "unknown wavelength": (lambda d: d["images"][0].update(wavelength_nm=700), "wavelength_nm 700"),
     "wavelength left out": (lambda d: d.update(wavelengths_nm=[532, 633]), "has no wavelength_nm"),
+    "width in micrometres": (
+        lambda d: d["cell"].update(width_mm=1000), "cell.width_mm is 1000, more than 20 times the 8 mm",
+    ),
     "missing file": (lambda d: d["images"][0].update(file="gone.npy"), "does not exist"),
     "file outside": (lambda d: d["images"][0].update(file="../gone.npy"), "lies outside the slab folder"),
 }  # fmt: skip
@@ -100,7 +103,7 @@ def test_bad_descriptions_are_refused_by_a_sentence(tmp_path: Path, name: str) -
         (np.zeros((8, 8), np.int32), "int32"),
         (np.full((8, 8), np.nan), "no pixel that is finite"),
         (np.zeros((8, 8)), "holds no light: its mean is not above zero"),
-        (np.full((8, 8), 50.0), r"f0_l0.npy .* beside the beam no material sends more than 100; give radiance per"),
+        (np.full((8, 8), 50.0), r"f0_l0.npy .* no material sends more than 6\.6 there; give radiance per"),
         (b"no image", "cannot be read"),
     ],
 )

@@ -23,7 +23,7 @@ def advice(thickness: float) -> str:
     images = render(rig, material, seed=5, step=0, batches=2, paths=2000, scores=False).mean
     variances = np.stack([shot_noise(image) for image in images]) / 2
     held_out = np.zeros(len(images), dtype=bool)
-    measured = Measurements(images, variances, held_out, ("",) * len(images), assumed_noise=False)
+    measured = Measurements(images, variances, held_out, (("", ""),) * len(images), assumed_noise=False)
     return next_measurement(folder, WAVELENGTH_NM, INDEX, measured, material, 10.0, seed=1)
 
 

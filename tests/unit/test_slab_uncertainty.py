@@ -36,7 +36,7 @@ def solution(short: np.ndarray, rendering: float) -> Solution:
     quadratic = Quadratic(matrix, -matrix @ (x + short), nothing, np.zeros(UNKNOWNS), nothing)
     return Solution(
         MATERIAL, quadratic, rendering * matrix, 30.0, used=1, steps=1, converged=True, paths=1, coordinates=Knots(),
-        misfit=0.0, misfit_se=0.0, data_noise=matrix, matrix_error_gradient=np.zeros(UNKNOWNS),
+        misfit=0.0, misfit_se=0.0, data_noise=matrix, matrix_error_gradient=np.zeros(UNKNOWNS), path_variance=0.0,
     )  # fmt: skip
 
 

@@ -66,8 +66,8 @@ def measurements_of(truth: Truth, rig: Rig, paths: int, seed: int) -> Measuremen
     image = render(rig, truth.material(), seed=seed, step=0, batches=8, paths=paths // 8, scores=False).mean
     variances = np.stack([shot_noise(one, NOISE) for one in image]) / (2 if rig.grid.folded else 1)
     values = image + np.sqrt(variances) * np.random.default_rng(seed).normal(size=image.shape)
-    names = tuple(f"{entry.camera} under {entry.light}" for entry in truth.folder.images)
-    return Measurements(values, variances, np.zeros(len(image), dtype=bool), names, assumed_noise=False)
+    places = tuple((entry.camera, entry.light) for entry in truth.folder.images)
+    return Measurements(values, variances, np.zeros(len(image), dtype=bool), places, assumed_noise=False)
 
 
 def run(*, quick: bool, case: str | None = None, keep: Keep = lambda _: None) -> list[dict[str, Any]]:

@@ -63,9 +63,9 @@ def run(*, quick: bool, keep: Keep = lambda _: None) -> list[dict[str, Any]]:
     images, variances = photographed(truth, QUICK_PHOTONS if quick else PHOTONS, seed=61)
     rig = rig_of(folder, folder.wavelengths_nm[0])
     halves = [folded(image, variance, rig.grid) for image, variance in zip(images, variances, strict=True)]
-    names = tuple(entry.file for entry in folder.images)
+    places = tuple((entry.camera, entry.light) for entry in folder.images)
     values, of_values = (np.stack(each) for each in zip(*halves, strict=True))
-    measured = Measurements(values, of_values, np.zeros(len(values), dtype=bool), names, assumed_noise=False)
+    measured = Measurements(values, of_values, np.zeros(len(values), dtype=bool), places, assumed_noise=False)
     begun = time.process_time()
     guess = start(rig, measured, 1, map)
     start_seconds = time.process_time() - begun

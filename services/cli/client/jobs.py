@@ -24,7 +24,7 @@ def jobs(
     state: Annotated[
         list[str] | None, typer.Option(help="Only jobs in this state, such as failed; may be given several times.")
     ] = None,
-    kind: Annotated[str | None, typer.Option(help="Only jobs of this kind: tooth or jaw.")] = None,
+    kind: Annotated[str | None, typer.Option(help="Only jobs of this kind: tooth, jaw, slab or calibration.")] = None,
     capture: Annotated[
         str | None, typer.Option(help="Only jobs with this text in the path of their capture or rig's mouth.")
     ] = None,
@@ -35,7 +35,8 @@ def jobs(
     only = {"state": [one.upper() for one in state or ()] or None, "kind": kind, "capture": capture}
     with connect(server) as client:
         found = _list(client, limit, only)
-    print(json.dumps(found) if as_json else "\n".join(map(_line, found)) or "There is no such job.")
+    nothing = "There is no such job." if any(only.values()) else "The server has no jobs yet."
+    print(json.dumps(found) if as_json else "\n".join(map(_line, found)) or nothing)
 
 
 def _list(client: Client, limit: int, only: dict[str, Any]) -> list[dict[str, Any]]:

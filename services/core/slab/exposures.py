@@ -52,12 +52,17 @@ class SlabExposure(Record):
     saturation_counts: Positive | None = Field(
         default=None, description="counts from which on a pixel is taken for full; default: the largest of its bits"
     )
+    held_out: bool = Field(default=False, description="as an image's; alike in all exposures that make one image")
 
     @model_validator(mode="after")
     def _require_fields_of_its_kind(self) -> SlabExposure:
         if (self.kind == "light") != (self.light is not None):
             what = "must name its light" if self.kind == "light" else "has no light on; leave light out"
             raise ValueError(f"exposure {self.file} of kind {self.kind} {what}")
+        if self.kind == "black" and self.held_out:
+            raise ValueError(
+                f"exposure {self.file} is black, and only exposures of light are held out; remove held_out"
+            )
         if self.bits is None and self.saturation_counts is None:
             raise ValueError(f"exposure {self.file} does not say when a pixel is full; give bits or saturation_counts")
         if self.bits is not None and self.bits + self.shift > MAX_BITS:
@@ -100,6 +105,13 @@ def exposures_fault(
             return (
                 f"exposure {one.file} has wavelength_nm {one.wavelength_nm:g}, which is not listed; add it or"
                 " correct it"
+            )
+    held_out = {(one.camera, one.light, one.wavelength_nm) for one in exposures if one.held_out}
+    for one in exposures:
+        if (one.camera, one.light, one.wavelength_nm) in held_out and not one.held_out:
+            return (
+                f"exposure {one.file} of camera {one.camera} under light {one.light} is fitted and another of the same"
+                " image is held out; hold out all of them or none"
             )
     black = [one for one in exposures if one.kind == "black"]
     if both := [one.camera for one in black if one.camera in known_black]:

@@ -16,6 +16,9 @@ Positive = Annotated[float, Field(gt=0)]
 Index = Annotated[float, Field(ge=1, le=4)]
 Angle = Annotated[float, Field(gt=-90, lt=90)]
 Side = Literal["front", "back"]
+MAX_WIDTH = 20.0
+"""Largest width of a cell in units of the grid's. Light that scatters spreads over about the cell's width, so a
+narrower grid sees little of it; a width in micrometres is a thousand times too large."""
 
 
 class Glass(Record):
@@ -155,6 +158,7 @@ class SlabFolder(Record):
             if twice := {name for name in names if names.count(name) > 1}:
                 raise ValueError(f"{what} {min(twice)} is listed twice; give each {what} a name of its own")
         self._require_index()
+        self._require_width()
         if bool(self.images) == bool(self.exposures):
             raise ValueError("a slab folder lists either images or exposures, not both; keep one of these lists")
         if self.images and (counted := [camera.name for camera in self.cameras if camera.counts is not None]):
@@ -197,6 +201,14 @@ class SlabFolder(Record):
             what = f"cell.index is null, and no through_beam at {missing_nm[0]:g} nm tells it"
             raise ValueError(f"{what}; add one, or give the sample's index")
 
+    def _require_width(self) -> None:
+        low_mm, high_mm = self.pixels.x_mm
+        if self.cell.width_mm > MAX_WIDTH * (high_mm - low_mm):
+            raise ValueError(
+                f"cell.width_mm is {self.cell.width_mm:g}, more than {MAX_WIDTH:g} times the {high_mm - low_mm:g} mm"
+                " that pixels.x_mm spans, where little of its light is seen; give both in mm"
+            )
+
     def _require_known(self, image: SlabImage) -> None:
         for what, name, entries in (("camera", image.camera, self.cameras), ("light", image.light, self.lights)):
             if name not in {entry.name for entry in entries}:
@@ -218,7 +230,10 @@ class SlabFolder(Record):
         first: dict[tuple[Name, Name | None, float | None], SlabImage] = {}
         for one in self.exposures:
             if one.light is not None:
-                entry = SlabImage(camera=one.camera, light=one.light, wavelength_nm=one.wavelength_nm, file=one.file)
+                entry = SlabImage(
+                    camera=one.camera, light=one.light, wavelength_nm=one.wavelength_nm, file=one.file,
+                    held_out=one.held_out,
+                )  # fmt: skip
                 first.setdefault((one.camera, one.light, one.wavelength_nm), entry)
         return self.images or tuple(first.values())
 

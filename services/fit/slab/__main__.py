@@ -19,7 +19,7 @@ def main(
     folder: Annotated[Path, typer.Argument(help="Folder with slab.json and its images.")],
     out: Annotated[Path, typer.Option(help="Where parameters.json, phase.json and errors.json go.")],
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same answer.")] = 1,
-    effort: Annotated[float, typer.Option(min=0.001, help="Paths, in units of the default budget.")] = 1.0,
+    effort: Annotated[float, typer.Option(min=0.01, help="Paths, in units of the default budget.")] = 1.0,
     dictionary: Annotated[str, typer.Option(help=f"One of {', '.join(DICTIONARIES)}.")] = DEFAULT_DICTIONARY,
     particle_index: Annotated[float | None, typer.Option(help="Of dictionary mie: index of the particles.")] = None,
     particle_absorption: Annotated[float, typer.Option(min=0, help="Its imaginary part.")] = 0.0,

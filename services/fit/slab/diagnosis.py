@@ -7,6 +7,7 @@ the HG medium that it starts from confuses a thin sample with an absorbing one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,10 +38,15 @@ MAX_SQUARES = 2.0
 """Mean of the squared residuals over their variances above which a fit by tents is doubted: variances that are stated
 only roughly give values near 1."""
 BESIDE_BEAM_DEG = 5.0
-"""Deflection from which ``MAX_POWER_PER_SR`` holds, in air, degrees."""
-MAX_POWER_PER_SR = 100.0
-"""Largest share of the beam's power that any material sends beside the beam, per sr. If all light went evenly into the
-cone of ``BESIDE_BEAM_DEG`` around the beam, it would be 1 / (2 pi (1 - cos 5 deg)) = 42."""
+"""Smallest angle in air, degrees, between a camera and the beam behind the cell, or its mirror image before it, at
+which the camera's light has been scattered for certain."""
+POWER_OF_A_CONE = 2.5
+"""Power that an image may show, in units of the beam's power spread evenly over the cone around the beam in which the
+camera lies. No phase function sends more there; the rest is a margin."""
+MIN_MAX_POWER_PER_SR = 1.0
+"""Smallest share of the beam's power per sr at which an image is refused; a white diffuser sends 1 / pi."""
+STANDING_OUT = 1.5
+"""Ratio of the least error of a camera's or a light's images to the largest of all others, from which it is named."""
 MIN_LIT = 0.5
 """Smallest share of an image's maximum at which a pixel counts for the position of the beam."""
 MAX_BEAM_OFFSET = 1.0
@@ -54,9 +60,15 @@ def power_per_sr(image: Array, pixels: PixelGrid, camera: SlabCamera) -> float:
     return float(np.nansum(image)) * area_mm2 * math.cos(math.radians(camera.angle_deg))
 
 
-def is_beside_beam(camera: SlabCamera, light: Light) -> bool:
-    """Whether a camera looks at least ``BESIDE_BEAM_DEG`` beside the way that the light's beam goes on."""
-    return camera.side == light.side or abs(camera.angle_deg - light.angle_deg) >= BESIDE_BEAM_DEG
+def max_power_per_sr(camera: SlabCamera, light: Light) -> float:
+    """Largest share of the beam's power that any material sends towards a camera, per sr; infinite where the camera may
+    see the beam itself or its mirror image in the cell's face.
+    """
+    angle_deg = abs(camera.angle_deg - light.angle_deg)
+    if angle_deg < BESIDE_BEAM_DEG:
+        return math.inf
+    cone_sr = 2 * math.pi * (1 - math.cos(math.radians(angle_deg)))
+    return max(POWER_OF_A_CONE / cone_sr, MIN_MAX_POWER_PER_SR)
 
 
 def image_faults(name: str, image: Array, pixels: PixelGrid, beam: Beam) -> tuple[str, ...]:
@@ -144,6 +156,27 @@ def similarity_faults(material: Material, width_mm: float, *, scattering: bool, 
         " single deflections"
     )
     return (f"{what}. Take σs, g and the phase function with their ± alone; to tell them apart, {remedy}.",)
+
+
+def standing_out(places: Sequence[tuple[str, str]], errors: Sequence[float]) -> str:
+    """A sentence on the one camera or light all of whose images are much further from the fit than all others; empty if
+    there is none.
+
+    Args:
+        places: camera and light of each image.
+        errors: relative error of each image.
+    """
+    for position, what in enumerate(("camera", "light")):
+        for name in dict.fromkeys(place[position] for place in places):
+            own = [error for place, error in zip(places, errors, strict=True) if place[position] == name]
+            others = [error for place, error in zip(places, errors, strict=True) if place[position] != name]
+            if len(others) > 1 and min(own) > STANDING_OUT * max(others):
+                extent = f"{100 * min(own):.0f} to {100 * max(own):.0f} %"
+                return (
+                    f"The images of {what} {name} are {extent} off the fit, and all others at most"
+                    f" {100 * max(others):.0f} %; check its angle, its side and its files first."
+                )
+    return ""
 
 
 def misfit_faults(dictionary: str, misfit: float, misfit_se: float, values: int, *, converged: bool) -> tuple[str, ...]:

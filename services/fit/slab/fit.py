@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 
 from services.core.slab.folder import SlabFolder, read_folder
 from services.core.store import write_atomic
-from services.fit.slab.diagnosis import misfit_faults, sample_faults, similarity_faults
 from services.fit.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
 from services.fit.slab.images import Measurements, read_images
 from services.fit.slab.model.dictionary import Material
 from services.fit.slab.model.forward import Blocks, render
 from services.fit.slab.model.rig import Rig, rig_of
 from services.fit.slab.next_measurement import next_measurement
+from services.fit.slab.notes import is_short_of_paths, notes_of
 from services.fit.slab.options import SlabOptions
 from services.fit.slab.results.atoms import atoms_of
 from services.fit.slab.results.result import (
     Errors,
-    PhaseFunction,
     SlabFit,
     image_error,
     is_unlike,
@@ -115,30 +114,19 @@ def fit_images(
     errors = _errors(measured, first, second)
     parameters = parameters_of(material, uncertainty, index, rig.width_mm)
     phase = phase_of(material, uncertainty, rig.width_mm)
-    # Nothing is worth measuring next for a material whose images these are not.
-    advice = (
-        next_measurement(folder, wavelength_nm, index.value, measured, material, solution.scale, options.seed, blocks)
-        if not dictionary.names and not is_unlike(errors)
-        else ""
-    )
+    notes = notes_of(rig, options.dictionary, measured, solution, parameters, phase, errors, (first, second))
+    # Nothing is worth measuring next for a material whose images these are not, or while more paths would help.
+    if not dictionary.names and not is_unlike(errors) and not is_short_of_paths(solution):
+        advice = next_measurement(
+            folder, wavelength_nm, index.value, measured, material, solution.scale, options.seed, blocks
+        )
+        notes += (advice,) if advice else ()
     fit = SlabFit(
         wavelength_nm=wavelength_nm,
         parameters=parameters,
         phase=phase,
         errors=errors,
-        notes=measured.faults
-        + sample_faults(material, rig.width_mm)
-        + similarity_faults(
-            material,
-            rig.width_mm,
-            scattering=parameters.sigma_s.determined,
-            reduced=parameters.sigma_s_reduced.determined,
-        )
-        + misfit_faults(
-            options.dictionary, solution.misfit, solution.misfit_se, solution.used, converged=solution.converged
-        )
-        + _notes(measured, phase, converged=solution.converged)
-        + ((advice,) if advice else ()),
+        notes=notes,
         converged=solution.converged,
         steps=solution.steps,
         paths=solution.paths,
@@ -179,34 +167,6 @@ def _errors(measured: Measurements, first: NDArray[np.float64], second: NDArray[
         errors.append(image_error(*arrays) if chosen.any() else None)
     assert errors[0] is not None
     return Errors(fit_error=errors[0], held_out_error=errors[1])
-
-
-def _notes(measured: Measurements, phase: PhaseFunction, *, converged: bool) -> tuple[str, ...]:
-    notes = []
-    if measured.assumed_noise:
-        notes.append(
-            "Images without a variance file are taken to have shot noise of 1 % at a pixel of the image's mean."
-        )
-    if lost := int(np.count_nonzero(~np.isfinite(measured.variances))):
-        notes.append(f"{lost} values are not finite or have no variance and were left out.")
-    if bands := [f"from {low:.1f} to {high:.1f}" for low, high in phase.undetermined_bands_deg()]:
-        ranges = " and ".join([", ".join(bands[:-1]), bands[-1]] if bands[1:] else bands)
-        notes.append(
-            f"The images do not determine the phase function {ranges} degrees; what is given there is the prior's."
-        )
-    if phase.resolution_deg:
-        finest, coarsest = min(phase.resolution_deg), max(phase.resolution_deg)
-        notes.append(
-            f"The images resolve structure of the phase function that is {finest:.0f} to {coarsest:.0f} degrees wide,"
-            " depending on the angle. Narrower structure, such as rings of spheres, is averaged, and each ± is that of"
-            " the average."
-        )
-    if not converged:
-        notes.append(
-            "The fit has not converged: its search spent its steps, or its last step still promised far more than noise"
-            " does."
-        )
-    return tuple(notes)
 
 
 def write_results(fits: tuple[SlabFit, ...], out: Path) -> None:

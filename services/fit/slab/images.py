@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.slab.folder import SlabFolder, SlabImage
-from services.fit.slab.diagnosis import MAX_POWER_PER_SR, grid_faults, image_faults, is_beside_beam, power_per_sr
+from services.fit.slab.diagnosis import grid_faults, image_faults, max_power_per_sr, power_per_sr
 from services.fit.slab.exposures import merged_images
 from services.fit.slab.model.rig import Grid, grid_of
 
@@ -30,12 +30,17 @@ class Measurements:
     values: Array
     variances: Array
     held_out: NDArray[np.bool_]
-    names: tuple[str, ...]
+    places: tuple[tuple[str, str], ...]
     """Camera and light of each image."""
     assumed_noise: bool
     """Whether some image had no variance of its own."""
     faults: tuple[str, ...] = ()
     """Sentences on faults of the images; see ``diagnosis``."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each image, such as "b0 under l1"."""
+        return tuple(f"{camera} under {light}" for camera, light in self.places)
 
 
 def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measurements:
@@ -74,6 +79,8 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
             raise CaptureInputError(
                 f"Image file {root / entry.file} has no pixel that is finite with a positive variance; export it again."
             )
+        if not folder.exposures and (lost := int(np.count_nonzero(~usable))):
+            faults.append(f"In image {name} {lost} pixels are not finite or have no variance and are left out.")
         _require_less_than_the_beam(folder, entry, np.where(usable, image, np.nan), root)
         faults += image_faults(name, image, folder.pixels, folder.beam)
         value, value_variance = folded(np.where(usable, image, 0), np.where(usable, variance, np.inf), grid)
@@ -84,7 +91,7 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
         raise CaptureInputError(f"All images at {wavelength_nm:g} nm are held out; leave some to be fitted.")
     return Measurements(
         np.stack(values), np.stack(variances), held_out,
-        tuple(f"{entry.camera} under {entry.light}" for entry in entries), assumed, tuple(faults),
+        tuple((entry.camera, entry.light) for entry in entries), assumed, tuple(faults),
     )  # fmt: skip
 
 
@@ -92,8 +99,8 @@ def _require_less_than_the_beam(folder: SlabFolder, entry: SlabImage, image: Arr
     # Raises CaptureInputError where an image is so bright that its unit must be wrong.
     (camera,) = (one for one in folder.cameras if one.name == entry.camera)
     (light,) = (one for one in folder.lights if one.name == entry.light)
-    share = power_per_sr(image, folder.pixels, camera)
-    if is_beside_beam(camera, light) and share > MAX_POWER_PER_SR:
+    share, most = power_per_sr(image, folder.pixels, camera), max_power_per_sr(camera, light)
+    if share > most:
         remedy = (
             "correct beam.power and the exposures' exposure_s"
             if folder.exposures
@@ -101,7 +108,7 @@ def _require_less_than_the_beam(folder: SlabFolder, entry: SlabImage, image: Arr
         )
         raise CaptureInputError(
             f"Image file {root / entry.file} (camera {entry.camera}, light {entry.light}) shows {share:.2g} times the"
-            f" beam's power per sr, and beside the beam no material sends more than {MAX_POWER_PER_SR:g}; {remedy}."
+            f" beam's power per sr, and no material sends more than {most:.2g} there; {remedy}."
         )
 
 

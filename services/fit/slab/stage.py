@@ -5,6 +5,7 @@ results.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from services.core.job_kinds import SLAB_OPTIONS
 from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
 from services.core.results import AssetManifest, Figure
-from services.core.slab.folder import SlabFolder, read_folder
+from services.core.slab.folder import Light, SlabCamera, SlabFolder, read_folder
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
 from services.core.verdict import VERDICT, percent
@@ -119,7 +120,9 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     verdict = report.verdict()
     provenance = {
         "Source": root.name,
-        "Cell": f"{folder.cell.width_mm:g} mm wide, {len(folder.lights)} lights, {len(folder.cameras)} cameras",
+        "Cell": f"{folder.cell.width_mm:g} mm wide; beam {folder.beam.profile}, {folder.beam.size_mm:g} mm",
+        "Lights": _angles(folder.lights),
+        "Cameras": _angles(folder.cameras),
         "Seed": str(spec.seed),
         "Effort": f"{spec.effort:g}",
         "Dictionary": spec.dictionary,
@@ -152,10 +155,14 @@ def _folder(spec: JobSpec) -> tuple[Path, SlabFolder]:
     return spec.capture, read_folder(spec.capture)
 
 
+def _angles(entries: Sequence[Light | SlabCamera]) -> str:
+    return ", ".join(f"{entry.name} {entry.side} {entry.angle_deg:g}°" for entry in entries)
+
+
 def _progress_message(fit: SlabFit) -> str:
     parameters = fit.parameters
     parts = (
-        f"{label} {value.value:.4g} ± {value.se:.1g}"
+        f"{label} {value.value:.4g} ± {value.se:.2g}"
         for label, value in (("σs", parameters.sigma_s), ("σs′", parameters.sigma_s_reduced))
     )
     error = percent(Figure(value=fit.errors.fit_error, se=None))

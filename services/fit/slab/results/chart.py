@@ -21,6 +21,10 @@ DECADES_BELOW = 4
 """Largest number of decades below the peak that are drawn: lower values are not seen against the peak in any image."""
 
 
+MAX_DECADES_OF_FINE_TICKS = 3.0
+"""Number of decades up to which 2 and 5 are labelled too; more labels would touch on a phone."""
+
+
 def phase_chart(title: str, phase: PhaseFunction) -> str:
     """Chart of the value per sr against the angle, logarithmic, with a band of one standard error; grey where the
     images do not determine it.
@@ -42,10 +46,10 @@ def phase_chart(title: str, phase: PhaseFunction) -> str:
         parts.append(
             f'<rect class="prior" x="{x(first):.1f}" y="{TOP}" width="{width:.1f}" height="{HEIGHT - TOP - BOTTOM}"/>'
         )
-    for decade in range(math.ceil(low), math.floor(high) + 1):
-        at = y(10.0**decade)
+    for value in _ticks(low, high):
+        at = y(value)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{10.0**decade:g}</text>')
+        parts.append(f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{value:g}</text>')
     under = HEIGHT - BOTTOM + 16
     parts += [
         f'<text x="{x(angle):.1f}" y="{under}" text-anchor="middle">{angle}</text>' for angle in range(0, 181, 30)
@@ -70,6 +74,13 @@ def _limits(phase: PhaseFunction) -> tuple[float, float]:
     high = math.log10(max(p + s for p, s in zip(phase.value_per_sr, phase.se_per_sr, strict=True))) + 0.1
     low = math.log10(max(min(phase.value_per_sr), 1e-300)) - 0.3
     return max(low, high - DECADES_BELOW), high
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    # Powers of ten between two decimal logarithms, with 2 and 5 times these where there are few.
+    factors = (1, 2, 5) if high - low < MAX_DECADES_OF_FINE_TICKS else (1,)
+    values = [factor * 10.0**decade for decade in range(math.floor(low), math.floor(high) + 1) for factor in factors]
+    return [value for value in values if low <= math.log10(value) <= high]
 
 
 def _points(places: list[tuple[float, float]]) -> str:

@@ -98,7 +98,8 @@ def _row(report: SlabReport, name: str) -> dict[str, Any]:
         cell(Estimate(value=one.value, se=one.se or None, unit=one.unit, determined=one.determined))
         for one in quantities
     ]
-    return {"label": LABELS[name], "name": name, "cells": cells, "unit": "" if quantities[0].unit == "1" else "per mm"}
+    unit = "given" if not any(one.se for one in quantities) else "" if quantities[0].unit == "1" else "per mm"
+    return {"label": LABELS[name], "name": name, "cells": cells, "unit": unit}
 
 
 def _atoms(fit: SlabFit) -> list[dict[str, Any]]:

@@ -50,6 +50,9 @@ MAX_COMBINED_CHANGE = 0.05
 thousandth."""
 MAX_PATH_VARIANCE = 0.5
 """Largest variance by the paths, in units of that by the measurements, at which the last stage may end."""
+MAX_THICKNESS = 50.0
+"""Value of sigma_t w above which a fit ends: five times the thickest cell that tells a phase function. Images in a
+wrong unit drove it up without end, and paths scatter for longer with every step."""
 DAMPING = 1.0
 """Levenberg term in units of the noise of J: with 0.3 and with 3 the end was the same within its noise, with 0.05 it
 strayed."""
@@ -89,6 +92,9 @@ class Solution:
     """Covariance of the last gradient's noise by the measurements (U, U)."""
     matrix_error_gradient: Array
     """Error of the last step by the noise of the matrix, as a gradient: ``matrix_error`` times the step (U,)."""
+    path_variance: float
+    """Variance of the last step by the paths, in units of that by the measurements; 0 where renders are not
+    combined."""
 
 
 @dataclass
@@ -135,7 +141,7 @@ class GaussNewton:
         state = self.init(self.coordinates.initial_medium(material))
         steps = 0
         converged = False
-        while steps < self.budget.max_steps and not converged:
+        while steps < self.budget.max_steps and not converged and not self.is_astray(state.material):
             state, converged = self.step(state)
             steps += 1
         self.is_searching = False
@@ -207,11 +213,13 @@ class GaussNewton:
                 data = noise_fall(quadratic, prior, equations.data_noise)
                 path_variance = noise_fall(quadratic, prior, equations.gradient_noise) / data
             checkpoint = self.next_checkpoint(checkpoint, stage, moved, gain, path_variance)
+            if self.is_astray(moved):
+                break
         return Solution(
             moved, quadratic, equations.gradient_noise, scale, equations.used, checkpoint.steps,
-            checkpoint.is_converged and gain < UNCONVERGED_RATIO, self.paths,
+            checkpoint.is_converged and gain < UNCONVERGED_RATIO and not self.is_astray(moved), self.paths,
             self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
-            equations.matrix_error @ (self.coordinates.unknowns(moved) - x),
+            equations.matrix_error @ (self.coordinates.unknowns(moved) - x), path_variance,
         )  # fmt: skip
 
     def next_checkpoint(
@@ -252,6 +260,10 @@ class GaussNewton:
         apart.
         """
         return is_thick(material, self.rig.width_mm)
+
+    def is_astray(self, material: Material) -> bool:
+        """Whether the fit has gone to media whose images no fit explains."""
+        return material.extinction_per_mm * self.rig.width_mm > MAX_THICKNESS
 
     def damped_step(
         self, quadratic: Quadratic, prior: Array, equations: NormalEquations, around: Material, damping: float
