@@ -96,6 +96,8 @@ def test_phase_functions_are_pictures_that_stand_alone(job: Path) -> None:
     assert [part.get("class") for part in picture if part.tag.endswith("}polyline")] == ["series s0"]
     (band,) = (part for part in picture if part.tag.endswith("}polygon"))
     assert len((band.get("points") or "").split()) == 2 * len(ANGLES_RAD)
+    labels = {part.text for part in picture if part.tag.endswith("}text")}
+    assert {"0.05", "0.1", "0.2", "0.5"} <= labels  # of a phase function from 0.01 to 0.8 per sr
     assert "prefers-color-scheme:dark" in (picture[0].text or "")
 
 

@@ -10,7 +10,7 @@ from services.fit.slab.model.dictionary import Material, henyey_greenstein
 from services.fit.slab.solve.budget import Budget
 from services.fit.slab.solve.checkpoint import Checkpoint
 from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import GaussNewton
+from services.fit.slab.solve.gauss_newton import MAX_THICKNESS, GaussNewton
 from services.fit.slab.solve.weights import Weights, weights_of
 from tests.support.small_slab import small_rig
 
@@ -56,6 +56,13 @@ def test_a_stage_ends_with_its_steps(moved: Material, allowed: int) -> None:
     fit, stage = solver(), Budget().last[1]
     assert fit.next_checkpoint(checkpoint(1, allowed - 2), stage, moved, 9.0, 9.0).stage == 1
     assert fit.next_checkpoint(checkpoint(1, allowed - 1), stage, moved, 9.0, 9.0).stage == 2
+
+
+def test_a_search_that_has_gone_astray_takes_no_further_step() -> None:
+    fit = solver()
+    fit.budget, fit.path_noise, fit.multiple = Budget(batches=2, first_paths=5), None, None
+    found = fit.search(henyey_greenstein(1.2 * MAX_THICKNESS, 0.5, 0.0))  # in a cell of 1 mm
+    assert (found.steps, found.is_converged) == (0, False)
 
 
 def given_noise(monkeypatch: pytest.MonkeyPatch, *, combine: bool, share: float = 1.0) -> list[np.ndarray]:

@@ -42,7 +42,7 @@ BESIDE_BEAM_DEG = 5.0
 which the camera's light has been scattered for certain."""
 POWER_OF_A_CONE = 2.5
 """Power that an image may show, in units of the beam's power spread evenly over the cone around the beam in which the
-camera lies. No phase function sends more there; the rest is a margin."""
+camera lies. No phase function that falls with the angle sends more there, and the rest is a margin."""
 MIN_MAX_POWER_PER_SR = 1.0
 """Smallest share of the beam's power per sr at which an image is refused; a white diffuser sends 1 / pi."""
 STANDING_OUT = 1.5
