@@ -58,8 +58,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def spec(folder: Path) -> JobSpec:
-    """A job with a twentieth of the default number of paths."""
-    return JobSpec(kind="slab", capture=folder, effort=0.05, seed=3)
+    """A job with a fiftieth of the default number of paths."""
+    return JobSpec(kind="slab", capture=folder, effort=0.02, seed=4)
 
 
 @pytest.fixture(scope="module")
