@@ -9,9 +9,12 @@ from services.fit.slab.diagnosis import misfit_faults, sample_faults, similarity
 from services.fit.slab.images import Measurements
 from services.fit.slab.model.rig import Rig
 from services.fit.slab.results.result import Errors, Parameters, PhaseFunction, image_error, is_unlike
-from services.fit.slab.solve.gauss_newton import MAX_PATH_VARIANCE, Solution
+from services.fit.slab.solve.gauss_newton import Solution
 
 Array = NDArray[np.float64]
+
+LARGE_PATH_VARIANCE = 1.0
+"""Variance by the paths, in units of that by the images, above which paths are the larger part of the ±."""
 
 
 def notes_of(
@@ -51,8 +54,8 @@ def notes_of(
 
 
 def is_short_of_paths(solution: Solution) -> bool:
-    """Whether the fit ended while its paths still added much to the ±."""
-    return solution.path_variance > MAX_PATH_VARIANCE
+    """Whether more paths would make the ± smaller than any other measurement."""
+    return solution.path_variance > LARGE_PATH_VARIANCE
 
 
 def _on_phase(phase: PhaseFunction) -> list[str]:
