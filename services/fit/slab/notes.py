@@ -54,7 +54,7 @@ def notes_of(
 
 
 def is_short_of_paths(solution: Solution) -> bool:
-    """Whether more paths would make the ± smaller than any other measurement."""
+    """Whether the noise of the paths is the larger part of the ±."""
     return solution.path_variance > LARGE_PATH_VARIANCE
 
 
