@@ -124,7 +124,9 @@ class Figure(Record):
     """A relative image error with what rendering leaves open of it."""
 
     value: float = Field(description="relative image error, 0.05 for 5 %")
-    se: float | None = Field(description="one standard error by the renders' noise; null where it is not known")
+    se: float | None = Field(
+        description="one standard error by the noise of the renders, and of a slab's images; null where it is not known"
+    )
 
 
 class Verdict(Record):

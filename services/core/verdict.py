@@ -31,10 +31,14 @@ def verdict_of(report: FitReport) -> Verdict:
     errors, ses = (
         (report.held_out_error, report.held_out_error_se) if is_tested else (report.fit_error, report.fit_error_se)
     )
-    worst = max([*report.fit_error.values(), *report.held_out_error.values()], default=0.0)
+    fitted, held_out = (max(found.values(), default=0.0) for found in (report.fit_error, report.held_out_error))
+    worst = max(fitted, held_out)
     error, error_of = mean_figure(errors, ses), _HELD_OUT if is_tested else _FITTED
     converged, is_above_limit = report.converged and worst <= MAX_ERROR, worst > MAX_ERROR
     error_text = f"{error_of} error {percent(error)}"
+    if is_above_limit and error.value <= MAX_ERROR:
+        above = f"{_FITTED if fitted > MAX_ERROR else _HELD_OUT} error{' of one channel' if len(errors) > 1 else ''}"
+        error_text += f", {above} {percent(Figure(value=worst, se=None))}"
     convergence_text = f"{'Converged' if converged else 'Not converged'} after {report.steps} steps: {error_text}."
     return Verdict(
         headline=f"Not converged: {error_text}; no fit above {100 * MAX_ERROR:g} % is believed."

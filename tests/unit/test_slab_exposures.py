@@ -140,6 +140,23 @@ def test_counts_that_are_known_need_no_black_frames(tmp_path: Path) -> None:
     assert 0.7 < np.median(known.variances[finite] / by_frames.variances[finite]) < 1.1
 
 
+@pytest.mark.parametrize(
+    ("factor", "is_told"), [(1.0, False), (1.5, False), (1 / 1.5, False), (4.0, True), (1 / 4, True)]
+)
+def test_counts_per_electron_that_frames_contradict_are_told(tmp_path: Path, factor: float, is_told: bool) -> None:
+    """As where electrons per count are stated in place of counts per electron."""
+
+    def misstate(told: dict[str, Any]) -> None:
+        known_counts(told)
+        for camera in told["cameras"]:
+            camera["counts"]["per_electron"] *= factor
+
+    root = write_stack(tmp_path, change=misstate)
+    faults = read_images(root, read_folder(root), WAVELENGTH_NM).faults
+    stated = f"counts.per_electron says {factor * SENSOR.counts_per_electron:g}"
+    assert [stated in fault for fault in faults if "scatter like" in fault] == [True, True] * is_told
+
+
 def folder(parent: Path, name: str) -> Path:
     (parent / name).mkdir()
     return parent / name
@@ -246,6 +263,10 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "half a noise": (lambda d: d["cameras"][0].update(counts={"read_noise": 2}), "give both or neither"),
     "two blacks": (lambda d: d["cameras"][0].update(counts={"black": 64}), "keep one of both"),
     "too far up": (lambda d: d["exposures"][0].update(shift=8), "together more than the 16 bits"),
+    "times exchanged": (
+        lambda d: [one.update(exposure_s=TIMES_S[2 - TIMES_S.index(one["exposure_s"])]) for one in d["exposures"][:3]],
+        "-fold in counts per second and gain; check their exposure_s and gain, and which file is which.",
+    ),
     "another size": (lambda d: d["pixels"].update(columns=EDGE // 2), "export it at the camera's size"),
 }  # fmt: skip
 

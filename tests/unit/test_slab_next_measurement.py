@@ -34,7 +34,10 @@ def test_a_cell_far_from_the_best_thickness_is_told_where_to_go(thickness: float
     told = advice(thickness)
     assert told.startswith("What would help most: ")
     assert any(word in told for word in words), told
-    before, after = told.rpartition("fall from ")[2].removesuffix(" %.").removeprefix("more than ").split(" to ")
+    sentence, _, instead = told.partition(" Nearly as much would come of this: ")
+    if thickness > 1:  # a thinner cell and a diluted sample tell about the same
+        assert any(word in instead for word in words), told
+    before, after = sentence.rpartition("fall from ")[2].removesuffix(" %.").removeprefix("more than ").split(" to ")
     assert float(after.removeprefix("more than ")) < 0.8 * float(before.removesuffix(" %"))
 
 

@@ -48,8 +48,8 @@ def test_a_fit_whose_paths_are_the_larger_part_of_its_error_asks_for_more() -> N
 
 def test_a_camera_that_stands_out_is_named_where_images_do_not_fit() -> None:
     misfit: dict[str, Any] = {"misfit": 5000.0}
-    assert "The images of camera b0 are 50 to 50 % off the fit" in notes(too_bright=(2, 3), **misfit)
-    assert "The images of light l1 are 50 to 50 % off the fit" in notes(too_bright=(1, 3), **misfit)
+    assert "The images of camera b0 are 50 % off the fit" in notes(too_bright=(2, 3), **misfit)
+    assert "The images of light l1 are 50 % off the fit" in notes(too_bright=(1, 3), **misfit)
     assert "off the fit" not in notes(too_bright=(1, 2), **misfit)
     assert "off the fit" not in notes(too_bright=(2, 3))
 

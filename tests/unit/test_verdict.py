@@ -49,6 +49,20 @@ def test_an_error_above_the_limit_leads_whatever_the_solver_says(errors: dict[st
     assert verdict.headline.endswith("; no fit above 15 % is believed.")
 
 
+@pytest.mark.parametrize(
+    ("fitted", "held_out", "told"),
+    [
+        ({"633": 0.3}, {"633": 0.099}, "held-out error 9.9 %, fitted error 30.0 %;"),
+        ({}, {"red": 0.02, "green": 0.2}, "held-out error 11.0 %, held-out error of one channel 20.0 %;"),
+    ],
+)
+def test_the_error_above_the_limit_is_the_one_that_is_told(
+    fitted: dict[str, float], held_out: dict[str, float], told: str
+) -> None:
+    verdict = verdict_of(report(fit_error=fitted, held_out_error=held_out, held_out_error_se={}))
+    assert verdict.headline == f"Not converged: {told} no fit above 15 % is believed."
+
+
 def test_a_fit_that_stopped_early_did_not_converge_however_small_its_error() -> None:
     verdict = verdict_of(report(converged=False, advice="Raise max_steps."))
     assert verdict.headline == "Not converged after 12 steps: held-out error 6.00 ± 0.25 %."

@@ -46,7 +46,7 @@ def main(
         raise typer.Exit(error.exit_status) from error
     write_results(fits, out)
     for fit in fits:
-        fit_error = percent(Figure(value=fit.errors.fit_error, se=None))
+        fit_error = percent(Figure(value=fit.errors.fit_error, se=fit.errors.fit_error_se))
         print(f"{fit.wavelength_nm:g} nm, {fit.core_seconds:.0f} core-seconds, fit error {fit_error}")
         quantities = {name: getattr(fit.parameters, name) for name in type(fit.parameters).model_fields}
         for name, quantity in (quantities | {name: atom for name, atom in fit.atoms.items() if atom.value > 0}).items():

@@ -171,7 +171,8 @@ def standing_out(places: Sequence[tuple[str, str]], errors: Sequence[float]) -> 
             own = [error for place, error in zip(places, errors, strict=True) if place[position] == name]
             others = [error for place, error in zip(places, errors, strict=True) if place[position] != name]
             if len(others) > 1 and min(own) > STANDING_OUT * max(others):
-                extent = f"{100 * min(own):.0f} to {100 * max(own):.0f} %"
+                nearest, farthest = (f"{100 * error:.0f}" for error in (min(own), max(own)))
+                extent = f"{nearest} %" if nearest == farthest else f"{nearest} to {farthest} %"
                 return (
                     f"The images of {what} {name} are {extent} off the fit, and all others at most"
                     f" {100 * max(others):.0f} %; check its angle, its side and its files first."

@@ -24,6 +24,7 @@ from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
 from services.core.robust import robust_sigma
 from services.core.slab.exposures import CameraCounts, SlabExposure
 from services.core.slab.folder import SlabFolder, SlabImage
+from services.fit.slab.exposure_faults import require_consistent, shot_noise_fault
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.float32]
@@ -44,29 +45,33 @@ class Merged:
     values: dict[tuple[str, str], Array]
     variances: dict[tuple[str, str], Array] | None
     """Variances of these images; None where the frames do not determine the noise."""
+    faults: tuple[str, ...]
+    """Sentences on stated noise that the frames contradict."""
 
 
 def merged_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Merged:
     """Merge all exposures of one wavelength.
 
     Raises:
-        CaptureInputError: a frame cannot be read, contradicts its description, or holds no light; names the frame.
+        CaptureInputError: a frame cannot be read, contradicts its description or another frame, or holds no light;
+            names the frame.
     """
     frames = folder.exposures_at(wavelength_nm)
     values: dict[tuple[str, str], Array] = {}
     variances: dict[tuple[str, str], Array] = {}
-    is_known = True
+    faults, is_known = list[str](), True
     for camera in dict.fromkeys(one.camera for one in frames):
         stack = _Stack(root, folder, tuple(one for one in frames if one.camera == camera))
         noise = stack.noise()
         is_known &= noise is not None
+        faults += stack.noise_faults()
         for image in folder.images_at(wavelength_nm):
             if image.camera == camera:
                 rate, variance, lost = merge(stack.exposures_of(image, noise or ASSUMED_NOISE), noise or ASSUMED_NOISE)
                 key = camera, image.light
                 values[key] = np.where(lost, np.nan, rate.astype(np.float64)) / folder.beam.power
                 variances[key] = np.where(lost, np.nan, variance.astype(np.float64)) / folder.beam.power**2
-    return Merged(values, variances if is_known else None)
+    return Merged(values, variances if is_known else None, tuple(faults))
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,8 @@ class _Stack:
         """All exposures of an image's light.
 
         Raises:
-            CaptureInputError: a frame is no brighter than black, and the others do not say that it may be.
+            CaptureInputError: a frame is no brighter than black, and the others do not say that it may be; or two
+                frames contradict each other.
         """
         frames = [one for one in self.frames if one.light == image.light]
         found = [self.exposure(one, noise) for one in frames]
@@ -142,6 +148,7 @@ class _Stack:
                     f"Frame {self.root / frame.file} (camera {frame.camera}, light {frame.light}) is no brighter than"
                     " black; expose it for longer, or leave it out."
                 )
+        require_consistent(self.root, frames, found, noise)
         return found
 
     def noise(self) -> NoiseModel | None:
@@ -151,6 +158,14 @@ class _Stack:
         read = self._read_counts()
         measured = shot_noise(self._pairs(), read)
         return None if measured is None else NoiseModel(measured[1], measured[0])
+
+    def noise_faults(self) -> list[str]:
+        """Sentences on stated counts per electron that the frames contradict."""
+        known = self.known
+        if known.per_electron is None or (measured := shot_noise(self._pairs(), known.read_noise)) is None:
+            return []
+        fault = shot_noise_fault(self.frames[0].camera, known.per_electron, measured[0])
+        return [fault] if fault else []
 
     def _read_counts(self) -> float | None:
         black = sorted((one for one in self.frames if one.kind == "black"), key=_setting)

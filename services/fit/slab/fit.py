@@ -161,12 +161,18 @@ def final_renders(rig: Rig, material: Material, budget: Budget, seed: int, block
 
 def _errors(measured: Measurements, first: NDArray[np.float64], second: NDArray[np.float64]) -> Errors:
     """Errors of the images that were fitted, and of those that were held out."""
-    errors = []
-    for chosen in (~measured.held_out, measured.held_out):
-        arrays = (image[chosen] for image in (first, second, measured.values, measured.variances))
-        errors.append(image_error(*arrays) if chosen.any() else None)
-    assert errors[0] is not None
-    return Errors(fit_error=errors[0], held_out_error=errors[1])
+    fitted, held_out = (
+        image_error(*(image[chosen] for image in (first, second, measured.values, measured.variances)))
+        if chosen.any()
+        else None
+        for chosen in (~measured.held_out, measured.held_out)
+    )
+    assert fitted is not None
+    if held_out is None:
+        return Errors(fit_error=fitted.value, fit_error_se=fitted.se, held_out_error=None)
+    return Errors(
+        fit_error=fitted.value, fit_error_se=fitted.se, held_out_error=held_out.value, held_out_error_se=held_out.se
+    )
 
 
 def write_results(fits: tuple[SlabFit, ...], out: Path) -> None:
@@ -177,4 +183,7 @@ def write_results(fits: tuple[SlabFit, ...], out: Path) -> None:
         if name == "parameters":
             for fit in fits:
                 content[f"{fit.wavelength_nm:g}"] |= {atom: one.model_dump() for atom, one in fit.atoms.items()}
+        if name == "errors":
+            for fit in fits:
+                content[f"{fit.wavelength_nm:g}"] |= {"notes": fit.notes}
         write_atomic(out / f"{name}.json", json.dumps(content, indent=1).encode())

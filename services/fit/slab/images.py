@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.slab.folder import SlabFolder, SlabImage
 from services.fit.slab.diagnosis import grid_faults, image_faults, max_power_per_sr, power_per_sr
-from services.fit.slab.exposures import merged_images
+from services.fit.slab.exposures import Merged, merged_images
 from services.fit.slab.model.rig import Grid, grid_of
 
 Array = NDArray[np.float64]
@@ -56,8 +56,10 @@ def read_images(root: Path, folder: SlabFolder, wavelength_nm: float) -> Measure
         raise CaptureInputError(
             f"{root / 'slab.json'} lists no image at {wavelength_nm:g} nm; add some or remove the wavelength."
         )
+    merged = merged_images(root, folder, wavelength_nm) if folder.exposures else None
     values, variances, faults, assumed = [], [], list(grid_faults(folder.pixels)), False
-    for entry, image, own in _linear(root, folder, wavelength_nm):
+    faults += () if merged is None else merged.faults
+    for entry, image, own in _linear(root, folder, entries, merged):
         name = f"{entry.camera} under {entry.light}"
         if folder.exposures and (full := int(np.isnan(image).sum())):
             if full == image.size:
@@ -112,16 +114,15 @@ def _require_less_than_the_beam(folder: SlabFolder, entry: SlabImage, image: Arr
         )
 
 
-def _linear(root: Path, folder: SlabFolder, wavelength_nm: float) -> Iterator[tuple[SlabImage, Array, Array | None]]:
-    """Each image with its variance, None where the variance has to be assumed; exposures are merged."""
-    entries = folder.images_at(wavelength_nm)
-    if folder.exposures:
-        merged = merged_images(root, folder, wavelength_nm)
-        for entry in entries:
+def _linear(
+    root: Path, folder: SlabFolder, entries: Sequence[SlabImage], merged: Merged | None
+) -> Iterator[tuple[SlabImage, Array, Array | None]]:
+    """Each image with its variance, None where the variance has to be assumed."""
+    for entry in entries:
+        if merged is not None:
             key = entry.camera, entry.light
             yield entry, merged.values[key], None if merged.variances is None else merged.variances[key]
-        return
-    for entry in entries:
+            continue
         variance = None if entry.variance_file is None else _read(root, folder, entry, entry.variance_file)
         yield entry, _read(root, folder, entry, entry.file), variance
 

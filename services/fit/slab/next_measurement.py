@@ -40,6 +40,9 @@ UNKNOWN_LN_F = 10.0
 """Standard deviation of ln f at a knot where images determine nothing."""
 MIN_IMPROVEMENT = 0.2
 """Smallest part by which a measurement must cut the error to be named."""
+SIMILAR = 0.1
+"""Largest share by which the error after another measurement may be above the best one's for it to be named too: a
+sample that cannot be diluted may be put into a thinner cell."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +100,12 @@ def next_measurement(
     best = min(after, key=lambda name: after[name])
     if after[best] > (1 - MIN_IMPROVEMENT) * before[worst]:
         return ""
-    return (
-        f"What would help most: {best}. The error of {worst}, as far as noise and smoothness make it, would fall from "
-        f"{_percent(before[worst])} to {_percent(after[best])}."
+    advice = (
+        f"What would help most: {best}. The error of {worst} that the images' noise and smoothness leave, without the"
+        f" paths' noise that the ± hold too, would fall from {_percent(before[worst])} to {_percent(after[best])}."
     )
+    similar = [name for name, error in after.items() if name != best and error <= (1 + SIMILAR) * after[best]]
+    return f"{advice} Nearly as much would come of this: {similar[0]}." if similar else advice
 
 
 def _inverse(matrix: Array) -> Array:
@@ -142,7 +147,7 @@ def errors_of(material: Material, covariance: Array) -> dict[str, float]:
     }
     chain, phase = phase_chain(material), material.phase_per_sr
     variance = np.einsum("ij,jk,ik->i", chain, covariance, chain, optimize=True) * phase**2
-    found["the phase function"] = float(np.sqrt(variance.sum() / (phase**2).sum()))
+    found["the phase function (rms over its angles)"] = float(np.sqrt(variance.sum() / (phase**2).sum()))
     return found
 
 

@@ -65,8 +65,11 @@ def _on_phase(phase: PhaseFunction) -> list[str]:
         notes.append(
             f"The images do not determine the phase function {ranges} degrees; what is given there is the prior's."
         )
-    if phase.resolution_deg:
-        finest, coarsest = min(phase.resolution_deg), max(phase.resolution_deg)
+    widths_deg = [
+        width for width, determined in zip(phase.resolution_deg, phase.determined, strict=False) if determined
+    ]
+    if widths_deg:
+        finest, coarsest = min(widths_deg), max(widths_deg)
         notes.append(
             f"The images resolve structure of the phase function that is {finest:.0f} to {coarsest:.0f} degrees wide,"
             " depending on the angle. Narrower structure, such as rings of spheres, is averaged, and each ± is that of"
@@ -96,4 +99,4 @@ def _on_solver(solution: Solution) -> list[str]:
 
 def _odd_one_out(measured: Measurements, renders: tuple[Array, Array]) -> str:
     images = zip(*renders, measured.values, measured.variances, strict=True)
-    return standing_out(measured.places, [image_error(*image) for image in images])
+    return standing_out(measured.places, [image_error(*image).value for image in images])

@@ -47,10 +47,12 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     context.raise_if_cancelled()
     root, folder = _folder(spec)
     options = SlabOptions.model_validate(spec.model_dump(include={"seed", *SLAB_OPTIONS}))
+    told = set[str]()
     for wavelength_nm in folder.wavelengths_nm:  # report a fault in the last one before the first has cost its time
         dictionary_of(root, folder, wavelength_nm, options)
         for fault in read_images(root, folder, wavelength_nm).faults:
-            context.report(StageEvent(stage="fit", kind="log", message=f"{wavelength_nm:g} nm: {fault}"))
+            told.add(message := f"{wavelength_nm:g} nm: {fault}")
+            context.report(StageEvent(stage="fit", kind="log", message=message))
     writer = StageWriter(context.root, "fit", context.attempt)
     flag = context.root / CANCEL_FLAG
     result_folders = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
@@ -78,6 +80,9 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
         stored = read_result(result_folder)
         assert stored is not None
         fits.append(stored.fit)
+        for message in (f"{result_folder.name} nm: {note}" for note in stored.fit.notes):
+            if message not in told:
+                context.report(StageEvent(stage="fit", kind="log", message=message))
         write_atomic(writer.folder / f"{result_folder.name}.npz", (result_folder / IMAGES).read_bytes())
     report = SlabReport(fits=tuple(fits))
     writer.publish(report)
@@ -165,5 +170,5 @@ def _progress_message(fit: SlabFit) -> str:
         f"{label} {value.value:.4g} ± {value.se:.2g}"
         for label, value in (("σs", parameters.sigma_s), ("σs′", parameters.sigma_s_reduced))
     )
-    error = percent(Figure(value=fit.errors.fit_error, se=None))
+    error = percent(Figure(value=fit.errors.fit_error, se=fit.errors.fit_error_se))
     return f"{fit.wavelength_nm:g} nm: {', '.join(parts)} per mm; error on fitted images {error}."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from services.core.geometry import Record
-from services.core.results import FitReport, Verdict
+from services.core.results import Figure, FitReport, Verdict
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY
 from services.core.verdict import MAX_ERROR, verdict_of
 from services.fit.slab.model.dictionary import ANGLES_RAD, Material
@@ -79,6 +79,8 @@ class Errors(Record):
 
     fit_error: float
     held_out_error: float | None
+    fit_error_se: float | None = Field(default=None, description="standard error by the noise of images and renders")
+    held_out_error_se: float | None = None
 
 
 class SlabFit(Record):
@@ -144,12 +146,19 @@ def phase_of(material: Material, uncertainty: Uncertainty, width_mm: float) -> P
 
 def image_error(
     first: NDArray[np.float64], second: NDArray[np.float64], values: NDArray[np.float64], variances: NDArray[np.float64]
-) -> float:
-    """Relative error from two independent renders, with the measurements' noise subtracted from both sums."""
+) -> Figure:
+    """Relative error from two independent renders, with the measurements' noise subtracted from both sums.
+
+    Its standard error is that of its square, by the scatter of the pixels' terms, carried through the root: the
+    distance from the error to the root of its square and one standard error more.
+    """
     usable = np.isfinite(variances)
-    y, noise = values[usable], float(variances[usable].sum())
-    square = (float((first[usable] - y) @ (second[usable] - y)) - noise) / max(float(y @ y) - noise, 1e-300)
-    return float(np.sqrt(max(square, 0.0)))
+    y, noise = values[usable], variances[usable]
+    terms = (first[usable] - y) * (second[usable] - y) - noise
+    norm = max(float(y @ y - noise.sum()), 1e-300)
+    square, square_se = max(float(terms.sum()), 0.0) / norm, float(np.sqrt(terms.size) * terms.std()) / norm
+    value = float(np.sqrt(square))
+    return Figure(value=value, se=float(np.sqrt(square + square_se)) - value)
 
 
 def is_unlike(errors: Errors) -> bool:
@@ -186,7 +195,7 @@ class SlabReport(Record):
 
     def verdict(self) -> Verdict:
         """The verdict on all wavelengths together, where each wavelength takes the place of a channel."""
-        held_out = {f"{fit.wavelength_nm:g}": fit.errors.held_out_error for fit in self.fits}
+        errors = {f"{fit.wavelength_nm:g}": fit.errors for fit in self.fits}
         stopped = [fit for fit in self.fits if not fit.converged]
         unlike = [fit for fit in self.fits if is_unlike(fit.errors)]
         advice = ""
@@ -203,12 +212,18 @@ class SlabReport(Record):
             converged=not stopped,
             advice=advice,
             parameters={},
-            fit_error={f"{fit.wavelength_nm:g}": fit.errors.fit_error for fit in self.fits},
-            held_out_error={name: error for name, error in held_out.items() if error is not None},
+            fit_error={name: one.fit_error for name, one in errors.items()},
+            held_out_error=_known({name: one.held_out_error for name, one in errors.items()}),
+            fit_error_se=_known({name: one.fit_error_se for name, one in errors.items()}),
+            held_out_error_se=_known({name: one.held_out_error_se for name, one in errors.items()}),
             steps=sum(fit.steps for fit in self.fits),
             seconds=sum(fit.core_seconds for fit in self.fits),
         )
         return verdict_of(summary)
+
+
+def _known(errors: Mapping[str, float | None]) -> dict[str, float]:
+    return {name: error for name, error in errors.items() if error is not None}
 
 
 def _wavelengths(fits: Sequence[SlabFit]) -> str:
