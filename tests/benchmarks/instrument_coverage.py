@@ -1,0 +1,208 @@
+"""How often a tooth's 95 % intervals contain the truth when the errors of its instrument are drawn; about two
+core-minutes a fit.
+
+python -m tests.benchmarks.instrument_coverage --seeds 5 --json instrument_coverage.json
+
+What gain, lights, flares and moves of scan and dome do to the photographs comes from stock Mitsuba (``render_moves``).
+How a fit's solution responds to them, and the ± that must contain it, come from the fit's own noisy derivatives: its
+closing measurement is made once more with stock's changes of the images in place of its own. In each draw the errors
+are normal with the standard errors that the fit assumes, and the rest of the solution's error is normal with the
+covariance that the fit states for photographs, rendering and what else is not the instrument's. The images are linear
+in all of these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.fit.execution import channel_fit, closing
+from services.fit.execution.blocks import Block, BlockTask, read_block
+from services.fit.instrument.errors import DEFAULT_SE, kind_of_error
+from services.fit.optics.domain import Domain
+from services.fit.solve import covariance
+from services.fit.solve.closing import ClosingSums
+from services.fit.solve.estimates import DERIVED
+from services.fit.solve.recombination import Recombination
+from services.fit.solve.sandwich import CombinedSolution, Sandwich, combine_with_prior
+from services.fit.transport.platform import prepare_device
+from tests.benchmarks.instrument_errors import QUANTITIES, fit
+from tests.benchmarks.render_moves import STORED
+
+Array = NDArray[np.float64]
+
+PIXEL_STEP = 2
+INTERVAL = 1.959964
+INSTRUMENT = ("gain", "light_gain", "flare", "teeth", "dome")
+"""Parts of a ± by the instrument's errors."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Changes of the photographs by one standard error of each error of the instrument, as stock Mitsuba renders
+    them.
+    """
+
+    stored: dict[str, Array]
+
+    @staticmethod
+    def read() -> Changes:
+        """The stored images."""
+        with np.load(STORED) as file:
+            return Changes({name: np.asarray(file[name], dtype=np.float64) for name in file if name[0] == "c"})
+
+    @property
+    def moves(self) -> list[str]:
+        """Names of the twelve moves."""
+        return [name.removeprefix("c0_") for name in self.stored if name.startswith("c0_") and name != "c0_none"]
+
+    def of_block(self, block: Block, errors: Sequence[str]) -> NDArray[np.float32]:
+        """Changes (K, 2, L, N) of a block's images, twice the same: by the errors named, then by the moves."""
+        camera, pixels = block.fitted_view.camera, block.fitted_view.pixels
+        names = block.instrument
+        assert names is not None
+
+        def seen(name: str) -> Array:
+            width, height = camera.size
+            image = self.stored[f"{camera.name}_{name}"][:, : height * PIXEL_STEP, : width * PIXEL_STEP]
+            squares = image.reshape(len(image), height, PIXEL_STEP, width, PIXEL_STEP).mean(axis=(2, 4))
+            return np.asarray(squares[:, pixels[:, 1], pixels[:, 0]])
+
+        image = seen("none")
+        by_name = {names.gain: image, names.flare: np.full_like(image, names.brightest)}
+        for k, light in enumerate(names.lights):
+            by_name[light] = np.where(np.arange(len(image))[:, None] == k, image, 0.0)
+        changes = [
+            DEFAULT_SE[kind_of_error(name)] * by_name[name] if name in by_name else np.zeros_like(image)
+            for name in errors
+        ]
+        return np.repeat(np.array([*changes, *map(seen, self.moves)])[:, None], 2, axis=1).astype(np.float32)
+
+
+@dataclass
+class Recorder:
+    """Stands between a fit and its closing measurement, and keeps what the draws need of the last one."""
+
+    changes: Changes
+    shifts: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """Effect (K, F) of each change on the whitened gradient."""
+    effect: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """Change (F, K) of the solution by each change."""
+    solution: CombinedSolution | None = None
+    slopes: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """Relative derivatives (Q, F) of the reported quantities."""
+
+    def measure(self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any = ()) -> ClosingSums:
+        """The closing measurement with the fit's own changes, which is returned, and with stock's, which is kept."""
+        errors = problem.domain.errors.names
+
+        def by_stock(_: Any, tasks: Sequence[BlockTask], *__: Any) -> list[list[Any]]:
+            return [[self.changes.of_block(read_block(task.block), errors)] for task in tasks]
+
+        with patch.object(closing, "_changes_by_moves", by_stock):
+            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves)
+        self.shifts = stock.shifts[len(held) :]
+        self.slopes = np.array([_slope(problem, x, name) for name in QUANTITIES])
+        return closing.measure_closing(problem, x, whiten, held, samples, moves)
+
+    def combine(
+        self, domain: Domain, x: Array, sandwich: Sandwich, meats: Any, unfinished: Array, parts: int = 1
+    ) -> Any:
+        """The last use of the prior, through which the changes go as well."""
+        found = combine_with_prior(domain, x, sandwich, meats, unfinished, parts)
+        whole = sandwich.product(sandwich.inverse, sandwich.meat) + unfinished
+        before = Recombination(whole, found.sandwich.response(sandwich.inverse), found.sandwich.prior)
+        through = np.eye(len(x))
+        through[:, domain.tissue_count :] += before.change(found.sandwich.rejected)
+        self.effect = through @ sandwich.transform @ sandwich.inverse @ self.shifts.T
+        self.solution = found
+        return found
+
+
+def _slope(problem: Any, x: Array, quantity: str, step: float = 1e-5) -> Array:
+    # Derivative (F,) of the logarithm of a quantity, by central differences.
+    part, leaf = quantity.split(".")
+    _, formula = DERIVED[leaf]
+
+    def value(k: int, change: float) -> float:
+        moved = x + change * np.eye(len(x))[k]
+        return float(np.log(formula(problem.domain.tissue_at(moved, problem.base).medium(part))))
+
+    return np.array([(value(k, step) - value(k, -step)) / (2 * step) for k in range(len(x))])
+
+
+def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:
+    """One fit, and the shares of the draws that its 95 % intervals contain."""
+    recorder = Recorder(changes)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        patch.object(channel_fit, "measure_closing", recorder.measure),
+        patch.object(covariance, "combine_with_prior", recorder.combine),
+    ):
+        found = fit(Path(folder), "none", seed, instrument="on", pixel_step=PIXEL_STEP)
+    assert recorder.solution is not None
+    slopes, rng = recorder.slopes, np.random.default_rng([29, seed])
+    parts = {name: slopes @ part @ slopes.T for name, part in recorder.solution.parts.items()}
+    whole = slopes @ recorder.solution.covariance @ slopes.T
+    own = sum(parts[name] for name in INSTRUMENT if name in parts)
+    instrument = rng.standard_normal((draws, len(recorder.shifts))) @ (slopes @ recorder.effect).T
+    rest = rng.standard_normal((draws, len(QUANTITIES))) @ _root(whole - own).T
+    return {
+        "seed": seed,
+        "converged": found["converged"],
+        "se": np.sqrt(np.diag(whole)).tolist(),
+        "se_by_instrument": np.sqrt(np.diag(np.asarray(own))).tolist(),
+        "by_stock": np.sqrt(((slopes @ recorder.effect) ** 2).sum(axis=1)).tolist(),
+        "covered": _shares(instrument + rest, whole),
+        "covered_by_instrument_alone": _shares(instrument, np.asarray(own)),
+        "seconds": found["seconds"],
+    }
+
+
+def _root(square: Array) -> Array:
+    values, vectors = np.linalg.eigh(square)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _shares(errors: Array, square: Array) -> list[float]:
+    return [float(share) for share in (np.abs(errors) <= INTERVAL * np.sqrt(np.diag(square))).mean(axis=0)]
+
+
+def summary(rows: Iterable[dict[str, Any]]) -> str:
+    """Mean shares over all fits, by quantity and together."""
+    lines = []
+    for key in ("covered", "covered_by_instrument_alone"):
+        shares = 100 * np.mean([row[key] for row in rows], axis=0)
+        told = ", ".join(f"{name} {share:.1f} %" for name, share in zip(QUANTITIES, shares, strict=True))
+        lines.append(f"{key}: {shares.mean():.1f} % ({told})")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the fits and their draws, and write the file after each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5, help="fits, by seeds of the sensor's noise from 1")
+    parser.add_argument("--draws", type=int, default=500, help="of each fit")
+    parser.add_argument("--json", type=Path, required=True, help="where results go; fits in it are not run again")
+    arguments = parser.parse_args()
+    prepare_device(1)
+    rows: list[dict[str, Any]] = json.loads(arguments.json.read_text()) if arguments.json.exists() else []
+    changes = Changes.read()
+    for seed in range(1 + len(rows), 1 + arguments.seeds):
+        rows.append(covered(seed, arguments.draws, changes))
+        print(json.dumps(rows[-1]), flush=True)
+        arguments.json.write_text(json.dumps(rows, indent=1) + "\n")
+    print(summary(rows))
+
+
+if __name__ == "__main__":
+    main()
