@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from services.core.page import page_template
 from services.core.results import Estimate, Figure, Verdict
 from services.core.store import write_atomic
-from services.core.verdict import percent
+from services.core.verdict import mean_figure, percent
 from services.fit.export.pictures import DIVERGING, data_uri, enlarge, signed_map, tone_map, white_level
 from services.fit.export.report import cell, gradient
 from services.fit.slab.results.chart import phase_chart
@@ -82,12 +82,15 @@ def _notes(report: SlabReport) -> list[str]:
 
 
 def _errors(report: SlabReport, name: str) -> dict[str, Any] | None:
-    errors = {f"{fit.wavelength_nm:g} nm": getattr(fit.errors, name) for fit in report.fits}
-    known = {wavelength: error for wavelength, error in errors.items() if error is not None}
-    if not known:
+    errors, ses = (
+        {f"{fit.wavelength_nm:g} nm": found for fit in report.fits if (found := getattr(fit.errors, one)) is not None}
+        for one in (name, f"{name}_se")
+    )
+    if not errors:
         return None
-    mean = Figure(value=sum(known.values()) / len(known), se=None)
-    each = [(wavelength, percent(Figure(value=error, se=None))) for wavelength, error in known.items()]
+    mean = mean_figure(errors, ses)
+    each = [(wavelength, percent(Figure(value=error, se=ses.get(wavelength)))) for wavelength, error in errors.items()]
+    each = each if len(each) > 1 else []
     return {"mean": percent(mean), "each": each}
 
 
