@@ -79,7 +79,10 @@ def test_results_are_written_by_wavelength(small_fit: SlabFit, tmp_path: Path) -
     phase = json.loads((tmp_path / "phase.json").read_text())["532"]
     values, angles = np.array(phase["value_per_sr"]), np.radians(phase["theta_deg"])
     assert 2 * np.pi * np.trapezoid(values * np.sin(angles), angles) == pytest.approx(1, abs=2e-3)
-    assert json.loads((tmp_path / "errors.json").read_text())["532"].keys() == {"fit_error", "held_out_error"}
+    errors = json.loads((tmp_path / "errors.json").read_text())["532"]
+    assert errors.keys() == {"fit_error", "fit_error_se", "held_out_error", "held_out_error_se", "notes"}
+    assert errors["held_out_error_se"] > 0
+    assert tuple(errors["notes"]) == small_fit.notes
 
 
 def test_the_command_refuses_a_folder_that_is_none(tmp_path: Path) -> None:
