@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from services.api.app import STATIC
 from services.api.auth.sessions import COOKIE
@@ -121,6 +122,25 @@ def test_a_reader_is_shown_nothing_that_he_may_not_press(
     page.get_by_role("button", name="Sign out").click()
     sign_in(page, server.tokens[Scope.SUBMIT])
     expect(page.get_by_role("button", name="Retry")).to_be_visible()
+
+
+def test_a_job_that_is_opened_before_the_list_has_come_shows_a_reader_no_buttons(page: Page, server: Guarded) -> None:
+    failed = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": FAILING_SEED}).json()["id"]
+    page.goto("/")
+    expect(page.get_by_label("Token")).to_be_focused()
+    held = list[Route]()
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    page.route(re.compile(r"/v1/jobs(\?|$)"), hold)
+    sign_in(page, server.tokens[Scope.READ])
+    expect(page.get_by_label("Token")).to_have_count(0)
+    page.goto(f"/#/{failed}")
+    expect(page.locator(".job .badge")).to_have_text("failed")
+    assert held
+    expect(page.get_by_role("button", name="Retry")).to_have_count(0)
+    page.unroute_all(behavior="ignoreErrors")
 
 
 def test_a_revoked_token_brings_the_form_back(page: Page, server: Guarded) -> None:

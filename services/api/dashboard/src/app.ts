@@ -93,6 +93,8 @@ async function open(): Promise<void> {
   isViewDue = false;
   const hash = location.hash;
   const turn = ++openings;
+  // An address may be opened while the list, after which the account is asked for, is still on its way.
+  if (isAccountDue) accountShown = showAccount();
   await accountShown;
   if (turn !== openings || isSignedOut) return;
   const lacking = lackingFor(hash);
