@@ -31,11 +31,10 @@ from services.fit.instrument.errors import DEFAULT_SE, kind_of_error
 from services.fit.optics.domain import Domain
 from services.fit.solve import covariance
 from services.fit.solve.closing import ClosingSums
-from services.fit.solve.estimates import DERIVED
 from services.fit.solve.recombination import Recombination
 from services.fit.solve.sandwich import CombinedSolution, Sandwich, combine_with_prior
 from services.fit.transport.platform import prepare_device
-from tests.benchmarks.instrument_errors import QUANTITIES, fit
+from tests.benchmarks.instrument_errors import QUANTITIES, fit, relative_slopes
 from tests.benchmarks.render_moves import STORED
 
 Array = NDArray[np.float64]
@@ -111,7 +110,7 @@ class Recorder:
         with patch.object(closing, "_changes_by_moves", by_stock):
             stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves)
         self.shifts = stock.shifts[len(held) :]
-        self.slopes = np.array([_slope(problem, x, name) for name in QUANTITIES])
+        self.slopes = relative_slopes(problem.domain, problem.base, x)
         return closing.measure_closing(problem, x, whiten, held, samples, moves)
 
     def combine(
@@ -126,18 +125,6 @@ class Recorder:
         self.effect = through @ sandwich.transform @ sandwich.inverse @ self.shifts.T
         self.solution = found
         return found
-
-
-def _slope(problem: Any, x: Array, quantity: str, step: float = 1e-5) -> Array:
-    # Derivative (F,) of the logarithm of a quantity, by central differences.
-    part, leaf = quantity.split(".")
-    _, formula = DERIVED[leaf]
-
-    def value(k: int, change: float) -> float:
-        moved = x + change * np.eye(len(x))[k]
-        return float(np.log(formula(problem.domain.tissue_at(moved, problem.base).medium(part))))
-
-    return np.array([(value(k, step) - value(k, -step)) / (2 * step) for k in range(len(x))])
 
 
 def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:

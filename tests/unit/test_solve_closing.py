@@ -188,6 +188,23 @@ def test_a_response_beyond_noise_is_taken_as_it_is() -> None:
     )
 
 
+def test_a_gain_moves_itself_and_not_the_tissue_although_derivatives_have_changed_on_the_way() -> None:
+    # The solver's equations are those of derivatives of half the size, so the gain that they eliminate is half too
+    # small. With a weak prior, photographs that are all brighter by 1 % move the gain by 1 % and the tissue by nothing.
+    rng, weight = np.random.default_rng(4), np.full(100, 1e4)
+    domain = Domain(DOMAIN.coordinates[:2], InstrumentErrors(("gain.green",), ((1.0,),)))
+    tissue, image = rng.uniform(0.2, 1.0, (2, 100)), rng.uniform(0.5, 1.0, 100)
+    before, exact = (np.stack([scale * tissue[0], tissue[1], image]) for scale in (0.5, 1.0))
+    equations = normal_equations(before, before, 0 * image, 0 * image, 1 / weight, weight, exact=1)
+    transform = whitening(domain, equations).transform
+    brighter = np.broadcast_to(0.01 * image, (1, 2, 100))
+    nothing, flat = (0 * image, 0 * image), np.zeros(3, dtype=bool)
+    sums = closing_sums(transform, (exact, exact), (exact, exact), flat, nothing, brighter, weight, 1, 1)
+    inverse = response(sums, transform.T @ domain.precision @ transform, domain.relation, 1).inverse
+    # The prior of 100 % is not quite nothing: 1 / (1e4 * 58) of the information on the gain alone.
+    np.testing.assert_allclose(transform @ inverse @ sums.shifts[0], [0.0, 0.0, 0.01], atol=1e-6)
+
+
 def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
     # Twelve teeth of two coordinates; each tooth responds differently, only with its own coordinates. The noise is 0.1,
     # and 0.03 between teeth.

@@ -167,9 +167,9 @@ class Response:
 def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
     """Shrink the measured response towards the identity, which is the response that the usable curvature implies.
 
-    Derivatives J~ of the tissue have no component along those of the instrument's errors, which the whitened
-    coordinates eliminate, so M = [1 + E, 0; G, 1]: errors follow the tissue by G, and the tissue's solution is as it
-    would be without them.
+    Images are linear in the instrument's errors, and derivatives by these are exact, so M = [1 + E, F; G, 1]. The
+    whitened coordinates eliminate the errors by the equations that the solver pooled on its way. For the derivatives of
+    these equations F and G are zero, and for those at the solution they are not.
 
     Args:
         sums: the closing measurement.
@@ -180,21 +180,26 @@ def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors
     size = len(prior)
     tissue = size - errors
     excess = sums.response + prior - np.eye(size)
-    excess[:, tissue:] = 0.0
+    excess[tissue:, tissue:] = 0.0
     noise = np.maximum(sums.response_variance, 1e-30)
     between = np.zeros_like(excess)
-    for kind in np.unique(relation[:, :tissue]):
+    for kind in np.unique(relation):
         same_kind = relation == kind
         between[same_kind] = _between_variance(excess[same_kind], noise[same_kind])
     shrunk, remaining = excess * between / (between + noise), noise * between / (between + noise)
 
-    # Singular values are raised to the noise level, because noise alone could have made smaller ones.
-    own = np.eye(tissue) + shrunk[:tissue, :tissue]
-    u, values, v = np.linalg.svd(own)
+    # The inverse by blocks. Singular values of the tissue's block are raised to the noise level, because noise alone
+    # could have made smaller ones.
+    own, across, along = shrunk[:tissue, :tissue], shrunk[:tissue, tissue:], shrunk[tissue:, :tissue]
+    u, values, v = np.linalg.svd(np.eye(tissue) + own - across @ along)
     floor = 2 * np.sqrt(tissue * float(remaining[:tissue, :tissue].mean()))
-    inverse = np.eye(size)
-    inverse[:tissue, :tissue] = v.T @ ((u / np.maximum(values, max(floor, 1e-6))).T)
-    inverse[tissue:, :tissue] = -shrunk[tissue:, :tissue] @ inverse[:tissue, :tissue]
+    of_tissue = v.T @ ((u / np.maximum(values, max(floor, 1e-6))).T)
+    inverse = np.block(
+        [
+            [of_tissue, -of_tissue @ across],
+            [-along @ of_tissue, np.eye(errors) + along @ of_tissue @ across],
+        ]
+    )
     return Response(np.asarray(inverse), remaining, shrunk)
 
 
