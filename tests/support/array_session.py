@@ -14,6 +14,7 @@ from services.calibrate.cameras.models import ModelChoice
 from services.calibrate.cameras.sightings import View
 from services.calibrate.colour.transform import fit_colour
 from services.calibrate.lights.intensity import WhitePhoto, WhiteSphere, fit_intensity, shading
+from services.calibrate.lights.lit_by import seem_lit_by_others
 from services.calibrate.lights.mirror import PosedCamera, highlight_points, nearest_point
 from services.calibrate.lights.problem import SphereView
 from services.calibrate.session.boards import CamerasStep
@@ -82,7 +83,8 @@ class ArraySession:
         where[lights.fit.lights] = lights.fit.positions_mm
         names = [f"L{n}" for n in range(N_LIGHTS)]
         fit = fit_intensity(self.white, lights.fit.cameras, self.white_spheres, where, names)
-        return IntensityStep(fit, self.white, np.zeros(3))
+        others = seem_lit_by_others(self.white, lights.fit.cameras, self.white_spheres, where)
+        return IntensityStep(fit, self.white, np.zeros(3), None, others)
 
     def colours(self) -> ColourStep:
         """Fit the colour transform of one camera."""

@@ -219,10 +219,7 @@ def test_a_list_of_a_left_handed_frame(good: ArraySession, cameras: CamerasStep,
 
 
 def test_a_white_sphere_under_another_light(good: ArraySession, cameras: CamerasStep, lights: LightsStep) -> None:
-    # The two lights nearest to each other: with any others, the side on which the named light shines would be dark.
-    where = lights.fit.positions_mm
-    apart = np.linalg.norm(where[:, None] - where, axis=2) + 1e9 * np.eye(N_LIGHTS)
-    one, two = (int(n) for n in np.unravel_index(int(apart.argmin()), apart.shape))
+    one, two = 0, 3
     white = list(good.white)
     white[one], white[two] = (
         replace(white[one], values=white[two].values),
@@ -230,15 +227,21 @@ def test_a_white_sphere_under_another_light(good: ArraySession, cameras: Cameras
     )
     spoiled = replace(good, white=tuple(white))
     told = told_of(spoiled, cameras, lights, spoiled.intensity(lights))
-    # One of the two may be within the scatter that the other causes.
-    assert told
-    assert {sentence.partition(" is ")[0] for sentence in told} <= {
-        f"The white sphere under light L{n} in camera left" for n in (one, two)
-    }
-    assert all(
-        "another light was on, or its exposure, gain or level is not what raw.toml says" in sentence
-        for sentence in told
-    )
+    assert told == [
+        f"The white sphere under light L{a} in camera left is shaded as by light L{b}; correct the light of this frame."
+        for a, b in sorted(((one, two), (two, one)))
+    ]
+
+
+def test_two_lights_under_each_others_names_on_all_mirror_spheres(good: ArraySession, cameras: CamerasStep) -> None:
+    other = np.arange(N_LIGHTS)
+    other[[0, 3]] = 3, 0
+    mirrors = tuple(replace(view, lights=other[view.lights]) for view in good.mirrors)
+    lights = replace(good, mirrors=mirrors).lights(cameras)
+    told = told_of(good, cameras, replace(lights, aligned=None), good.intensity(lights))
+    assert [one.partition(":")[0] for one in told] == [
+        "White spheres under light L0 are shaded as by L3, and those under L3 as by L0"
+    ]
 
 
 def test_a_white_sphere_of_a_wrong_exposure(good: ArraySession, cameras: CamerasStep, lights: LightsStep) -> None:
@@ -267,6 +270,17 @@ def test_a_chart_in_another_order(good: ArraySession, cameras: CamerasStep, orde
     told = told_of(spoiled, cameras, colours=spoiled.colours())
     assert len(told) == 1
     assert f"patches in camera left fit far better {name}" in told[0]
+
+
+def test_a_chart_with_overexposed_patches(good: ArraySession, cameras: CamerasStep) -> None:
+    rgb = good.rgb.copy()
+    rgb[[5, 18]] = np.nan
+    fitted = good.colours()
+    (told,) = told_of(good, cameras, colours=replace(fitted, rgb={"left": rgb}))
+    assert told.startswith(
+        "2 of 24 patches of the chart in camera left are saturated or outside the image, the first of"
+    )
+    assert "patch 6" in told
 
 
 def test_black_frames_that_are_not_black(good: ArraySession, cameras: CamerasStep) -> None:

@@ -54,6 +54,7 @@ class WhitePhoto:
         light: number of the light.
         pixels: positions (N, 2) of the photograph's pixels, without saturated ones.
         values: counts above black, divided by exposure, gain, level and the lens's vignetting (N, C).
+        file: name of the photograph's file, for messages.
     """
 
     camera: int
@@ -61,6 +62,7 @@ class WhitePhoto:
     light: int
     pixels: Floats
     values: Floats
+    file: str = ""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from services.core.store import write_atomic, write_record
 
 VALID_DAYS = 30.0
 """Default validity of a calibration: a rig in a dental practice is touched within a month."""
-CALIBRATION, RESIDUALS = CALIBRATION_FILE, "residuals.json"
+CALIBRATION, RESIDUALS, PREVIOUS = CALIBRATION_FILE, "residuals.json", "calibration.previous.json"
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,12 @@ def calibrate(
 
 
 def write_session(session: Session, out: Path) -> None:
-    """Write ``calibration.json`` and ``residuals.json`` into a folder."""
+    """Write ``calibration.json`` and ``residuals.json`` into a folder; a record that is there becomes
+    ``calibration.previous.json``.
+    """
     out.mkdir(parents=True, exist_ok=True)
+    if (out / CALIBRATION).is_file():
+        (out / CALIBRATION).replace(out / PREVIOUS)
     write_atomic(out / RESIDUALS, (json.dumps(_residuals(session), indent=1) + "\n").encode())
     write_record(out / CALIBRATION, session.record)
 

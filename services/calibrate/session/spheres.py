@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -14,6 +14,7 @@ from services.calibrate.lights.centres import OutlineView, fit_centres
 from services.calibrate.lights.images import Outline, about_outline, find_highlight, find_outline
 from services.calibrate.lights.intensity import IntensityFit, WhitePhoto, WhiteSphere, fit_intensity
 from services.calibrate.lights.listed import AlignedList, align_list
+from services.calibrate.lights.lit_by import seem_lit_by_others
 from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.lights.positions import LightsFit, fit_lights
 from services.calibrate.lights.problem import SphereView
@@ -66,12 +67,14 @@ class IntensityStep:
         middle_mm: mean of the white spheres' centres (3,), towards which intensities are stated.
         reflectance_se: relative standard error of the white spheres' reflectance; None where raw.toml does not state
             it.
+        lit_by_others: photographs whose shading shows another light than the stated one, by their number in ``photos``.
     """
 
     fit: IntensityFit
     photos: tuple[WhitePhoto, ...]
     middle_mm: Floats
     reflectance_se: float | None = None
+    lit_by_others: Mapping[int, int] = field(default_factory=dict)
 
 
 def find_lights(
@@ -191,7 +194,9 @@ def measure_intensity(
             if (vignetting := vignettings.get(camera_name)) is not None:
                 q = relative_square(pixels, camera.lens.size, camera.lens.values[2:4])
                 values = values / (1 + q * (vignetting[0] + q * (vignetting[1] + q * vignetting[2])))[:, None]
-            found.append(WhitePhoto(camera_names.index(camera_name), places.index(place), number, pixels, values))
+            found.append(
+                WhitePhoto(camera_names.index(camera_name), places.index(place), number, pixels, values, frame.file)
+            )
     centres = fit_centres(outlines, cameras)
     spheres = [
         WhiteSphere(centre, sphere_at[place].radius_mm, np.array(sphere_at[place].reflectance))
@@ -201,7 +206,18 @@ def measure_intensity(
     stated_se = [sphere.reflectance_se for sphere in sphere_at.values()]
     # Among several spheres the largest standard error counts; if one sphere has none, there is none for all.
     se = None if None in stated_se else max(one for one in stated_se if one is not None)
-    return IntensityStep(fit_intensity(found, cameras, spheres, lights_mm, light_names), tuple(found), middle, se)
+    others = seem_lit_by_others(found, cameras, spheres, lights_mm)
+    try:
+        fit = fit_intensity(found, cameras, spheres, lights_mm, light_names)
+    except CaptureInputError as error:
+        if not others:
+            raise
+        number, light = next(iter(others.items()))
+        own = found[number]
+        raise CaptureInputError(
+            f"{error} By its shading {own.file} shows light {light_names[light]} and not {light_names[own.light]}."
+        ) from error
+    return IntensityStep(fit, tuple(found), middle, se, others)
 
 
 def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFrame]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -77,11 +77,8 @@ def suspicions(
         yield from _twins(names, lights)
     if intensity is not None:
         yield from _about_white(names, cameras, intensity)
-    for camera, (order, better, worse) in better_order(colours).items() if colours is not None else ():
-        yield (
-            f"The chart's patches in camera {camera} fit far better {order} (ΔE2000 {better:.1f} against {worse:.1f}): "
-            "give corners_px as the centres of patches 1, 6, 24 and 19 in this order."
-        )
+    if colours is not None:
+        yield from _about_the_chart(colours)
 
 
 def _about_files(folder: RawFolder, black: Mapping[str, Black], inputs: Mapping[str, str]) -> Iterator[str]:
@@ -242,13 +239,54 @@ def _twins(names: list[str], lights: LightsStep) -> Iterator[str]:
 
 
 def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensityStep) -> Iterator[str]:
-    """Yield a sentence for each photograph of a white sphere whose brightness disagrees with the other photographs."""
-    off = intensity.fit.residuals.mean(axis=1)
-    scatter = robust_sigma(off)
-    for number in np.flatnonzero(np.abs(off) > max(MANY_SIGMAS * scatter, MIN_OFF_SHARE)):
-        photo = intensity.photos[intensity.fit.used[number]]
+    """Yield a sentence for each photograph of a white sphere that shows another light, or whose brightness disagrees
+    with the other photographs; one sentence for two lights whose photographs are all interchanged.
+    """
+    others = intensity.lit_by_others
+    interchanged = _interchanged(intensity)
+    for one, two in sorted(interchanged):
         yield (
-            f"The white sphere under light {names[photo.light]} in camera {cameras.names[photo.camera]} is"
-            f" {100 * np.expm1(off[number]):+.0f} % off: another light was on, or its exposure, gain or level is not"
-            " what raw.toml says."
+            f"White spheres under light {names[one]} are shaded as by {names[two]}, and those under {names[two]} as by"
+            f" {names[one]}: the two lights' names are interchanged, in the frames of the mirror sphere or in those of"
+            " the white sphere; correct light in one of them."
         )
+    explained = {light for pair in interchanged for light in pair}
+    off = intensity.fit.residuals.mean(axis=1)
+    limit = max(MANY_SIGMAS * robust_sigma(off), MIN_OFF_SHARE)
+    brightness = dict(zip(intensity.fit.used, off.tolist(), strict=True))
+    for number, photo in enumerate(intensity.photos):
+        if photo.light in explained:
+            continue
+        file = f" ({photo.file})" if photo.file else ""
+        white = f"The white sphere under light {names[photo.light]} in camera {cameras.names[photo.camera]}{file}"
+        if number in others:
+            yield f"{white} is shaded as by light {names[others[number]]}; correct the light of this frame."
+        elif abs(brightness.get(number, 0.0)) > limit:
+            yield (
+                f"{white} is {100 * np.expm1(brightness[number]):+.0f} % off: another light was on, or its exposure,"
+                " gain or level is not what raw.toml says."
+            )
+
+
+def _about_the_chart(colours: ColourStep) -> Iterator[str]:
+    for camera, (order, better, worse) in better_order(colours).items():
+        yield (
+            f"The chart's patches in camera {camera} fit far better {order} (ΔE2000 {better:.1f} against {worse:.1f}): "
+            "give corners_px as the centres of patches 1, 6, 24 and 19 in this order."
+        )
+    for camera, rgb in colours.rgb.items():
+        unusable = np.flatnonzero(~np.isfinite(rgb).all(axis=1)) + 1
+        if len(unusable):
+            yield (
+                f"{len(unusable)} of {len(rgb)} patches of the chart in camera {camera} are saturated or outside the"
+                f" image, the first of them patch {unusable[0]}, and were left out; expose the chart less, or correct"
+                " corners_px."
+            )
+
+
+def _interchanged(intensity: IntensityStep) -> set[tuple[int, int]]:
+    """Return the pairs of lights, smaller number first, whose photographs mostly show the other one."""
+    shown = Counter(photo.light for photo in intensity.photos)
+    seen = Counter((intensity.photos[number].light, other) for number, other in intensity.lit_by_others.items())
+    mostly = {pair for pair, count in seen.items() if 2 * count > shown[pair[0]]}
+    return {(one, two) for one, two in mostly if one < two and (two, one) in mostly}

@@ -11,7 +11,7 @@ import typer
 def board_command(
     out: Annotated[Path, typer.Option(help="The PDF to write; raw.toml's entry for it is printed.")],
     kind: Annotated[str, typer.Option("--type", help="charuco, chessboard or aruco.")] = "charuco",
-    squares: Annotated[tuple[int, int], typer.Option(help="Columns and rows of squares, or of markers.")] = (9, 7),
+    squares: Annotated[tuple[int, int], typer.Option(help="Columns and rows of squares, or of markers: 9 7.")] = (9, 7),
     square_mm: Annotated[float, typer.Option(min=1, help="Edge of a square.")] = 12.0,
     marker_mm: Annotated[float | None, typer.Option(min=0.5, help="Edge of a marker; default 3/4 of a square.")] = None,
     dictionary: Annotated[str, typer.Option(help="Of the markers, by OpenCV's name.")] = "DICT_5X5_100",

@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from services.calibrate.session.run import Session
     from services.core.calibration.record import Calibration
 
+LARGEST_CHANGES = 3
+"""Number of changes that are told where none is significant."""
+
 
 def calibrate_command(
     raw: Annotated[Path, typer.Argument(metavar="RAW", help="Folder with raw.toml and its frames.")],
@@ -46,9 +49,16 @@ def _print_drift(session: Session, earlier: Calibration, against: Path | None) -
 
     found = changes(earlier, session.record)
     clear = [one for one in found if one.is_clear]
-    print(f"against {against}: {len(clear)} of {len(found)} quantities changed beyond their errors")
+    print(
+        f"against {against}: {len(clear)} of {len(found)} quantities changed beyond their errors (lenses, the lights'"
+        " distances from their middle, their intensities)"
+    )
     for one in clear:
         print(f"  {one.sentence}")
+    if not clear:
+        print("  The largest changes over their ±:")
+        for one in found[:LARGEST_CHANGES]:
+            print(f"  {one.sentence}")
 
 
 def _print_limits(session: Session) -> None:
