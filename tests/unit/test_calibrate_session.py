@@ -109,6 +109,10 @@ def test_the_record_is_one_that_jobs_read(made: tuple[Path, Calibration], sessio
     assert not re.search(r"(src|href)=", page)
     assert '"corners"' in (tmp_path / "residuals.json").read_text()
 
+    # A calibration that is written over another keeps that one.
+    write_session(session, tmp_path)
+    assert read_record(tmp_path / "calibration.previous.json", Calibration) == record
+
 
 def with_lights(session: Session, root: Path, folder: RawFolder) -> LightsStep:
     photos = Photos(root, folder)
