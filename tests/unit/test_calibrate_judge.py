@@ -42,7 +42,10 @@ def lights() -> LightsStep:
     return cast("LightsStep", SimpleNamespace(fit=fit, views=(), view_names=(), no_highlight=(), aligned=None))
 
 
-INTENSITY = cast("IntensityStep", SimpleNamespace(fit=SimpleNamespace(residuals=np.zeros((4, 1)), used=range(4))))
+INTENSITY = cast(
+    "IntensityStep",
+    SimpleNamespace(fit=SimpleNamespace(residuals=np.zeros((4, 1)), used=range(4)), photos=(), lit_by_others={}),
+)
 
 
 def test_a_chart_is_advised_for_three_channels_alone(cameras: CamerasStep) -> None:
