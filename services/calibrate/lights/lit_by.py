@@ -15,7 +15,8 @@ MAX_MISFIT = 0.05
 """Largest relative rms misfit of the shading by the stated light at which no other light is tried: noise and a sphere
 that is not quite diffuse leave a few per cent."""
 FAR_BETTER = 3.0
-"""Factor by which another light's misfit must be smaller. Two lights 20° apart differ by ten times the noise."""
+"""Factor by which another light's misfit must be smaller. In simulated sessions the right light leaves 0.5 %, and one
+11° beside it 9 to 12 %."""
 
 
 def seem_lit_by_others(
@@ -47,12 +48,14 @@ def seem_lit_by_others(
 
 def _misfit(photo: WhitePhoto, camera: PosedCamera, sphere: WhiteSphere, light_mm: Floats) -> tuple[float, int]:
     """Return the relative rms difference of a photograph from the shading by a light over the pixels that the light
-    reaches, and the number of these pixels.
+    reaches, infinite where these are few or dark, and their number.
     """
     factor, usable = shading(camera, sphere, light_mm, photo.pixels)
     count = int(np.count_nonzero(usable))
     if count < MIN_PIXELS:
         return float("inf"), count
     values, drawn = photo.values[usable].mean(axis=1), factor[usable]
+    if values.mean() <= 0:
+        return float("inf"), count
     drawn = drawn * (values.sum() / drawn.sum())
     return float(np.sqrt(((values - drawn) ** 2).mean()) / values.mean()), count

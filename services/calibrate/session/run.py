@@ -85,12 +85,12 @@ def calibrate(
 
 
 def write_session(session: Session, out: Path) -> None:
-    """Write ``calibration.json`` and ``residuals.json`` into a folder; a record that is there becomes
+    """Write ``calibration.json`` and ``residuals.json`` into a folder; a record that is there is kept as
     ``calibration.previous.json``.
     """
     out.mkdir(parents=True, exist_ok=True)
     if (out / CALIBRATION).is_file():
-        (out / CALIBRATION).replace(out / PREVIOUS)
+        write_atomic(out / PREVIOUS, (out / CALIBRATION).read_bytes())
     write_atomic(out / RESIDUALS, (json.dumps(_residuals(session), indent=1) + "\n").encode())
     write_record(out / CALIBRATION, session.record)
 

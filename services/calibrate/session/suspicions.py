@@ -248,7 +248,7 @@ def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensitySte
         yield (
             f"White spheres under light {names[one]} are shaded as by {names[two]}, and those under {names[two]} as by"
             f" {names[one]}: the two lights' names are interchanged, in the frames of the mirror sphere or in those of"
-            " the white sphere; correct light in one of them."
+            " the white sphere; correct the key light in one of them."
         )
     explained = {light for pair in interchanged for light in pair}
     off = intensity.fit.residuals.mean(axis=1)
