@@ -118,7 +118,7 @@ class Recorder:
     ) -> Any:
         """The last use of the prior, through which the changes go as well."""
         found = combine_with_prior(domain, x, sandwich, meats, unfinished, parts)
-        whole = sandwich.product(sandwich.inverse, sandwich.meat) + unfinished
+        whole = sandwich.product(sandwich.inverse, sandwich.meat + sandwich.weighing) + unfinished
         before = Recombination(whole, found.sandwich.response(sandwich.inverse), found.sandwich.prior)
         through = np.eye(len(x))
         through[:, domain.tissue_count :] += before.change(found.sandwich.rejected)

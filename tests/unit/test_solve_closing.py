@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from services.fit.instrument.errors import InstrumentErrors
 from services.fit.optics.domain import Coordinate, Domain
@@ -226,31 +227,48 @@ def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
     assert np.abs(told[~own]).max() < 0.03
 
 
-def test_a_shift_within_its_noise_adds_no_error() -> None:
-    shift, zero = np.array([[1.0, 0.5, -0.2]]), np.zeros(3)
-    for noise, expected in ((0.0, np.outer(shift[0], shift[0])), (1.0, np.zeros((3, 3)))):
-        sums = ClosingSums(zero, np.eye(3), np.eye(3), np.eye(3), shift, noise * np.eye(3)[None])
-        for is_combined in (False, True):
-            np.testing.assert_allclose(sums.shift_covariance([0], is_combined=is_combined), expected)
+def shifted(shift: NDArray[np.float64], noise: NDArray[np.float64]) -> ClosingSums:
+    """Sums with one shift (F,) and its noise (F, F)."""
+    none = np.zeros_like(noise)
+    return ClosingSums(np.zeros(len(shift)), none, none, none, shift[None], noise[None])
+
+
+def test_a_shift_without_noise_is_taken_as_it_is_and_one_within_its_noise_is_not() -> None:
+    shift = np.array([1.0, 0.5, -0.2])
+    sums = shifted(shift, np.zeros((3, 3)))
+    for covariance in (sums.shift_covariance([0]), sums.expected_shift_covariance([0])):
+        np.testing.assert_allclose(covariance, np.outer(shift, shift), atol=1e-12)
+    sums = shifted(shift, np.eye(3))
+    np.testing.assert_array_equal(sums.expected_shift_covariance([0]), np.zeros((3, 3)))
+    assert np.trace(sums.shift_covariance([0])) == pytest.approx(shift @ shift - 1)
+
+
+def test_a_shift_that_is_noisy_in_most_directions_is_stated_whole_where_it_is_well_known() -> None:
+    # Along the first coordinate the square is known to 0.4 on average; the other five have noise as large as the shift.
+    # Shortened as a whole by 1 - tr N / |b|^2, the shift would have 0.6 of its square there.
+    rng, true, noise = np.random.default_rng(9), np.array([2.0, 1.0, 1.0, 1.0, 1.0, 1.0]), np.array([0.1, *5 * [1.0]])
+    stated = []
+    for _ in range(2000):
+        sums = shifted(true + noise * rng.standard_normal(6), np.diag(noise**2))
+        stated.append(float(sums.shift_covariance([0])[0, 0]))
+    assert np.mean(stated) == pytest.approx(true[0] ** 2, rel=0.1)
 
 
 def test_noise_of_a_shift_does_not_pass_for_a_direction_that_can_be_avoided() -> None:
     # True shifts of any direction in six coordinates, measured with noise of variance 1 each. Of all combinations with
-    # v_0 = 1, take the one that the stated covariance C takes for the least moved, v = C^-1 e_0 / e_0'C^-1 e_0.
+    # v_0 = 1, take the one that the expected covariance C takes for the least moved, v = C^-1 e_0 / e_0'C^-1 e_0.
     rng, first, noise = np.random.default_rng(8), np.eye(6)[0], np.eye(6)
-    stated, shown = [], []
+    expected, shown = [], []
     for _ in range(4000):
         true = 1.5 * rng.standard_normal(6)
-        shift = true + rng.standard_normal(6)
-        sums = ClosingSums(np.zeros(6), noise, noise, noise, shift[None], noise[None])
-        covariance = sums.shift_covariance([0], is_combined=True)
+        covariance = shifted(true + rng.standard_normal(6), noise).expected_shift_covariance([0])
         best = np.linalg.solve(covariance + 1e-2 * noise, first)
         best /= best[0]
-        stated.append(float(best @ covariance @ best))
+        expected.append(float(best @ covariance @ best))
         shown.append(float(best @ true) ** 2)
     # The prior of the true shifts is estimated from one of them, with an error of (2 / 6)^1/2 in |b|^2. With k b b',
-    # which has the same trace, 0.0001 are stated.
-    assert np.mean(shown) == pytest.approx(np.mean(stated), rel=0.3)
+    # which has the same trace, 0.0001 are expected.
+    assert np.mean(shown) == pytest.approx(np.mean(expected), rel=0.3)
 
 
 def test_the_measurement_survives_the_journal() -> None:

@@ -59,22 +59,32 @@ class ClosingSums:
             sums, shifts=sums.shifts.reshape(-1, count), shift_noise=sums.shift_noise.reshape(-1, count, count)
         )
 
-    def shift_covariance(self, chosen: Iterable[int], *, is_combined: bool) -> Array:
-        """Covariance (F, F) of the gradient by the chosen changes: the sum over them of b b', each shift b shortened to
-        its expected length without noise, k |b|^2 for k b b'.
+    def shift_covariance(self, chosen: Iterable[int]) -> Array:
+        """Covariance (F, F) of the gradient by the chosen changes: the sum over them of b b' - N, for a measured shift
+        b with noise N, each without its negative eigenvalues.
 
-        Args:
-            is_combined: whether the solution is combined with the instrument's prior afterwards. In k b b' noise would
-                pass for a known direction, which the combination would avoid, at an error far below the true one. So
-                each term is then the expectation of the true b b' given b and its noise N, k^2 b b' + k N, which has
-                the same trace (a normal prior of the shift's scale; Efron and Morris 1973).
+        A shift must not be shortened as a whole to its expected length without noise: it would lose as much along
+        directions in which it is well known as along noisy ones.
         """
         total = np.zeros_like(self.response)
         for k in chosen:
-            shift, noise = self.shifts[k], self.shift_noise[k]
-            kept = max(0.0, 1 - float(np.trace(noise)) / max(float(shift @ shift), 1e-300))
-            known = kept if is_combined else 1.0
-            total += kept * (known * np.outer(shift, shift) + is_combined * positive_part(noise))
+            total += positive_part(np.outer(self.shifts[k], self.shifts[k]) - self.shift_noise[k])
+        return total
+
+    def expected_shift_covariance(self, chosen: Iterable[int]) -> Array:
+        """Covariance (F, F) of the gradient by the chosen changes, by which a combination of least variance is chosen.
+
+        Chosen by b b', which is partly noise, the combination would avoid this direction, at an error far above the one
+        it expects. So each term is the expectation of the true square given b and N. For a normal prior of variance
+        tau^2 in every direction that is m m' + K N, m = K b, K = (1 + N / tau^2)^-1, with tau^2 as for the response.
+        """
+        total = np.zeros_like(self.response)
+        for k in chosen:
+            shift, noise = self.shifts[k], positive_part(self.shift_noise[k])
+            between = _between_variance(shift, np.maximum(np.diag(noise), 1e-30))
+            if between > 0:
+                kept = np.linalg.inv(np.eye(len(shift)) + noise / between)
+                total += np.outer(kept @ shift, kept @ shift) + kept @ noise
         return total
 
 

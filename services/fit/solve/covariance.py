@@ -281,7 +281,7 @@ def uncertainty(
     t, count = whitened.transform, len(x)
     prior = t.T @ domain.precision @ t
     parts = {"photographs": misfit * positive_part(t.T @ equations.data_noise @ t)} | _prior_parts(domain, t)
-    meat = parts["photographs"] + prior
+    meat, weighing = parts["photographs"] + prior, np.zeros_like(prior)
     if sums is None:
         inverse = np.eye(count)
         parts["rendering"] = positive_part(t.T @ equations.gradient_noise @ t)
@@ -297,13 +297,13 @@ def uncertainty(
         kinds = ["mean_cosine"] * (len(sums.shifts) - len(moved)) + list(moved)
         parts |= {"rendering": rendered + response_noise}
         shifts = {
-            kind: sums.shift_covariance(
-                (k for k, own in enumerate(kinds) if own == kind), is_combined=bool(domain.errors.names)
-            )
+            kind: sums.shift_covariance(k for k, own in enumerate(kinds) if own == kind)
             for kind in dict.fromkeys(kinds)
         }
         parts |= shifts
-        meat = meat + rendered + sum(shifts.values()) + response_noise
+        stated = sum(shifts.values(), np.zeros_like(prior))
+        meat = meat + rendered + stated + response_noise
+        weighing = sums.expected_shift_covariance(range(len(kinds))) - stated
         remaining_gradient = (
             pooled.gradient + t.T @ domain.prior_slope(x) + np.linalg.solve(inverse, taken) - prior @ taken
         )
@@ -311,7 +311,7 @@ def uncertainty(
     # Count the remaining step along the determined directions as error.
     remaining = ClosingModel(domain, x, whitened, inverse, remaining_gradient, parts["rendering"]).remaining_step()
     combined = combine_with_prior(
-        domain, x, Sandwich(t, inverse, meat, misfit), parts, np.outer(remaining, remaining), part_count
+        domain, x, Sandwich(t, inverse, meat, misfit, weighing), parts, np.outer(remaining, remaining), part_count
     )
     covariance = 0.5 * (combined.covariance + combined.covariance.T)
     return Uncertainty(

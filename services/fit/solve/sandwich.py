@@ -26,6 +26,9 @@ class Sandwich:
     meat: Array
     misfit: float
     """Factor s by which residuals exceed the measurements' noise."""
+    weighing: Array
+    """Difference (F, F) between the meat by which the combination with the prior is chosen and the meat that is stated
+    (``ClosingSums.expected_shift_covariance``)."""
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Covariance V (K, K) of the prior of the instrument's errors."""
     rejected: tuple[int, ...] = ()
@@ -41,8 +44,9 @@ class Sandwich:
         before = self.product(inverse, meat)
         if not len(self.prior):
             return before
-        found = Recombination(before, self.response(inverse), self.prior)
-        return found.updated(found.change(self.rejected)).covariance
+        response = self.response(inverse)
+        weighed = Recombination(self.product(inverse, meat + self.weighing), response, self.prior)
+        return Recombination(before, response, self.prior).updated(weighed.change(self.rejected)).covariance
 
     def product(self, inverse: Array, meat: Array) -> Array:
         """Covariance T M^-1 meat M^-T T' (F, F) before the prior is used in full."""
@@ -97,11 +101,13 @@ def combine_with_prior(
     if not domain.errors.names:
         return CombinedSolution(x, whole, parts_before, sandwich, ())
     sandwich = replace(sandwich, prior=domain.errors.matrix)
-    found = Recombination(whole, sandwich.response(sandwich.inverse), sandwich.prior)
+    response = sandwich.response(sandwich.inverse)
+    found = Recombination(whole, response, sandwich.prior)
+    weighed = Recombination(whole + sandwich.product(sandwich.inverse, sandwich.weighing), response, sandwich.prior)
     tested = (k for k, name in enumerate(domain.errors.names) if kind_of_error(name) in CHECKED_BY_IMAGES)
     detected = faults(x[count:], found, tested)
     rejected = tuple(fault.index for fault in detected)
-    change = found.change(rejected)
+    change = weighed.change(rejected)
     updated = found.updated(change)
 
     # Transform every part but the prior's by 1 + Q; the prior's parts follow from the new solution's response.
