@@ -9,6 +9,10 @@ closing measurement is made once more with stock's changes of the images in plac
 are normal with the standard errors that the fit assumes, and the rest of the solution's error is normal with the
 covariance that the fit states for photographs, rendering and what else is not the instrument's. The images are linear
 in all of these.
+
+``bound`` is the Cramér–Rao bound of each quantity: photographs' noise, instrument errors with their priors, moves too
+as unknowns that photographs determine (with stock's changes), and the held mean cosines, of which photographs are
+taken to know nothing. It has no noise of rendering.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -94,6 +98,8 @@ class Recorder:
     changes: Changes
     shifts: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Effect (K, F) of each change on the whitened gradient."""
+    information: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """What photographs know of the moves, (12, 12), by stock's changes."""
     effect: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Change (F, K) of the solution by each change."""
     solution: CombinedSolution | None = None
@@ -103,9 +109,15 @@ class Recorder:
     def measure(self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any = ()) -> ClosingSums:
         """The closing measurement with the fit's own changes, which is returned, and with stock's, which is kept."""
         errors = problem.domain.errors.names
+        self.information = np.zeros((len(moves), len(moves)))
 
         def by_stock(_: Any, tasks: Sequence[BlockTask], *__: Any) -> list[list[Any]]:
-            return [[self.changes.of_block(read_block(task.block), errors)] for task in tasks]
+            found = []
+            for block in (read_block(task.block) for task in tasks):
+                found.append([self.changes.of_block(block, errors)])
+                moved = found[-1][0][len(errors) :, 0].reshape(len(moves), -1).astype(np.float64)
+                self.information += (moved * block.fit_weight.reshape(-1)) @ moved.T
+            return found
 
         with patch.object(closing, "_changes_by_moves", by_stock):
             stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves)
@@ -125,6 +137,15 @@ class Recorder:
         self.effect = through @ sandwich.transform @ sandwich.inverse @ self.shifts.T
         self.solution = found
         return found
+
+    def bound(self) -> Array:
+        """Cramér–Rao covariance (Q, Q) of the reported quantities without the noise of rendering."""
+        assert self.solution is not None
+        known = self.shifts[-len(self.information) :].T
+        whole = np.block([[np.eye(len(known)), known], [known.T, np.eye(len(self.information)) + self.information]])
+        own = self.slopes @ self.solution.sandwich.transform
+        held = self.slopes @ self.solution.parts.get("mean_cosine", np.zeros_like(known @ known.T)) @ self.slopes.T
+        return np.asarray(own @ np.linalg.inv(whole)[: len(known), : len(known)] @ own.T + held)
 
 
 def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:
@@ -147,6 +168,7 @@ def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:
         "seed": seed,
         "converged": found["converged"],
         "se": np.sqrt(np.diag(whole)).tolist(),
+        "bound": np.sqrt(np.diag(recorder.bound())).tolist(),
         "se_by_instrument": np.sqrt(np.diag(np.asarray(own))).tolist(),
         "by_stock": np.sqrt(((slopes @ recorder.effect) ** 2).sum(axis=1)).tolist(),
         "covered": _shares(instrument + rest, whole),
@@ -164,13 +186,16 @@ def _shares(errors: Array, square: Array) -> list[float]:
     return [float(share) for share in (np.abs(errors) <= INTERVAL * np.sqrt(np.diag(square))).mean(axis=0)]
 
 
-def summary(rows: Iterable[dict[str, Any]]) -> str:
-    """Mean shares over all fits, by quantity and together."""
+def summary(rows: Sequence[dict[str, Any]]) -> str:
+    """Mean shares over all fits, by quantity and together, and the median ± over the bound."""
     lines = []
     for key in ("covered", "covered_by_instrument_alone"):
         shares = 100 * np.mean([row[key] for row in rows], axis=0)
         told = ", ".join(f"{name} {share:.1f} %" for name, share in zip(QUANTITIES, shares, strict=True))
         lines.append(f"{key}: {shares.mean():.1f} % ({told})")
+    sharpness = np.median([np.array(row["se"]) / row["bound"] for row in rows], axis=0)
+    told = ", ".join(f"{name} {ratio:.2f}" for name, ratio in zip(QUANTITIES, sharpness, strict=True))
+    lines.append(f"± over bound, median: {told}")
     return "\n".join(lines)
 
 

@@ -58,11 +58,25 @@ class ArraySession:
             "RawFolder",
             SimpleNamespace(
                 light=lights,
-                frame=[SimpleNamespace(file=view.name) for view in self.boards],
+                frame=[SimpleNamespace(file=view.name, kind="board") for view in self.boards] + self._mirror_frames(),
                 camera_named=lambda _: camera,
                 channels=("red", "green", "blue"),
             ),
         )
+
+    def _mirror_frames(self) -> list[SimpleNamespace]:
+        return [
+            SimpleNamespace(
+                file=f"{NAMES[view.camera]}_s{view.place}_L{light}",
+                kind="mirror-sphere",
+                camera=NAMES[view.camera],
+                sphere="ball",
+                place=f"s{view.place}",
+                light=f"L{light}",
+            )
+            for view in self.mirrors
+            for light in view.lights
+        ]
 
     def cameras(self) -> CamerasStep:
         """Fit the bundle of the board photographs, starting at the true rig."""
@@ -71,7 +85,7 @@ class ArraySession:
 
     def lights(self, cameras: CamerasStep) -> LightsStep:
         """Fit the lights' positions with the cameras that the boards gave."""
-        names = [f"camera {NAMES[view.camera]}, s{view.place}" for view in self.mirrors]
+        names = [f"camera {NAMES[view.camera]}, ball, s{view.place}" for view in self.mirrors]
         lights = [f"L{n}" for n in range(N_LIGHTS)]
         return place_lights(
             self.mirrors, names, cameras.posed_cameras, lights, cameras.camera_covariance, self.listed_mm

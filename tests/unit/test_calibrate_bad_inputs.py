@@ -18,7 +18,7 @@ from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep
 from services.calibrate.session.suspicions import suspicions
 from services.core.raw.targets import Board
-from tests.support.array_session import N_LIGHTS, ArraySession, array_session, exchanged, told_of
+from tests.support.array_session import N_LIGHTS, NAMES, ArraySession, array_session, exchanged, told_of
 from tests.support.board_sessions import charuco
 from tests.support.sphere_sessions import dome_lights
 
@@ -146,6 +146,36 @@ def test_a_sphere_that_moved_between_cameras(good: ArraySession, cameras: Camera
     assert any("does not fit those of the other cameras: it moved" in one and "s1" in one for one in told)
 
 
+def under_other_lights(good: ArraySession, cameras: tuple[int, ...], names: dict[int, int]) -> ArraySession:
+    """The session with the mirror sphere's photographs at place 1 under other lights' names, in some cameras."""
+    mirrors = [
+        replace(view, lights=np.array([names.get(light, light) for light in view.lights.tolist()]))
+        if view.place == 1 and view.camera in cameras
+        else view
+        for view in good.mirrors
+    ]
+    return replace(good, mirrors=tuple(mirrors))
+
+
+def test_two_lights_under_each_others_names_at_one_place(good: ArraySession, cameras: CamerasStep) -> None:
+    spoiled = under_other_lights(good, (0, 1, 2), {1: 4, 4: 1})
+    told = [one for one in told_of(spoiled, cameras, spoiled.lights(cameras)) if "key light" in one]
+    files = ", ".join(f"{camera}_s1_L{light}" for camera in NAMES for light in (4, 1))
+    assert told == [
+        f"At place ball, s1 the frames of lights L1 and L4 are interchanged; correct the key light of {files}."
+    ]
+
+
+def test_a_frame_of_a_mirror_sphere_under_another_lights_name(good: ArraySession, cameras: CamerasStep) -> None:
+    mirrors = []
+    for view in under_other_lights(good, (2,), {1: 4, 4: 9}).mirrors:
+        kept = view.lights != 9
+        mirrors.append(replace(view, lights=view.lights[kept], highlights_px=view.highlights_px[kept]))
+    spoiled = replace(good, mirrors=tuple(mirrors))
+    told = told_of(spoiled, cameras, spoiled.lights(cameras))
+    assert told == ["Frame right_s1_L4 shows the highlight of light L1; correct its key light."]
+
+
 def test_one_light_under_two_names(good: ArraySession, cameras: CamerasStep) -> None:
     mirrors = []
     for view in good.mirrors:
@@ -169,7 +199,7 @@ def test_a_reflection_of_something_else(good: ArraySession, cameras: CamerasStep
     spoiled = replace(good, mirrors=(replace(view, highlights_px=pixels), *good.mirrors[1:]))
     told = told_of(spoiled, cameras, spoiled.lights(cameras))
     assert len(told) == 1
-    assert f"The highlight of light L{view.lights[2]} in camera left is" in told[0]
+    assert f"The highlight of light L{view.lights[2]} in left_s0_L{view.lights[2]} is" in told[0]
 
 
 def test_a_light_that_was_off(good: ArraySession, cameras: CamerasStep, lights: LightsStep) -> None:
@@ -295,6 +325,12 @@ def test_a_chart_in_another_order(good: ArraySession, cameras: CamerasStep, orde
     told = told_of(spoiled, cameras, colours=spoiled.colours())
     assert len(told) == 1
     assert f"patches in camera left fit far better {name}" in told[0]
+
+
+def test_a_mosaic_with_red_for_blue(good: ArraySession, cameras: CamerasStep) -> None:
+    spoiled = replace(good, rgb=good.rgb[:, ::-1])
+    (told,) = told_of(spoiled, cameras, colours=spoiled.colours())
+    assert "colours in camera left are right with red and blue interchanged; correct mosaic, or the order of" in told
 
 
 def test_a_chart_with_overexposed_patches(good: ArraySession, cameras: CamerasStep) -> None:

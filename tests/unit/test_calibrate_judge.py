@@ -34,12 +34,16 @@ def folder(*channels: str) -> RawFolder:
     return cast("RawFolder", SimpleNamespace(channels=channels, light=(), frame=()))
 
 
-def lights() -> LightsStep:
-    """One light that is well known; nothing else of the fit is used."""
+def lights(variance: float = 0.01, views: tuple[SimpleNamespace, ...] = ()) -> LightsStep:
+    """One light, well known by default; nothing else of the fit is used."""
     fit = SimpleNamespace(
-        lights=np.array([0]), covariance=0.01 * np.eye(3), positions_mm=np.zeros((1, 3)), edge_shifts_px=(), outliers=()
+        lights=np.array([0]),
+        covariance=variance * np.eye(3),
+        positions_mm=np.zeros((1, 3)),
+        edge_shifts_px=(),
+        outliers=(),
     )
-    return cast("LightsStep", SimpleNamespace(fit=fit, views=(), view_names=(), no_highlight=(), aligned=None))
+    return cast("LightsStep", SimpleNamespace(fit=fit, views=views, view_names=(), no_highlight=(), aligned=None))
 
 
 INTENSITY = cast(
@@ -63,6 +67,24 @@ def test_boards_are_advised_for_a_camera_whatever_its_name(cameras: CamerasStep)
     # Corners scatter by 0.1 px in each coordinate, so their rms is 15 × 0.141 = 2.1 px, and 2.1² asks for five times as
     # many.
     assert "; 5 times as many photographs would meet it" in told.advice
+
+
+def test_what_looks_wrong_is_mended_before_photographs_are_counted(cameras: CamerasStep) -> None:
+    shaken = replace(cameras, fit=replace(cameras.fit, residuals_px=cameras.fit.residuals_px * 15, converged=False))
+    told = judge(folder("red"), shaken, lights(), INTENSITY, None, None)
+    assert told.advice.startswith("First mend what looks wrong in the report: scatter of corners, camera")
+
+
+@pytest.mark.parametrize(("places", "remedy"), [(9, "in ten places that lie far apart"), (10, "4 times as many")])
+def test_places_far_apart_are_advised_before_more_photographs(
+    cameras: CamerasStep, places: int, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.calibrate.session.judge.suspicions", lambda *_: ())
+    unsure = lights(variance=5.3, views=tuple(SimpleNamespace(place=place) for place in range(places)))
+    told = judge(folder("red"), cameras, unsure, INTENSITY, None, None)
+    # The light's ± is (3 · 5.3)^1/2 = 4.0 mm, twice the limit.
+    assert "position of the lights, rms ± is 4 mm against 2 mm; " in told.advice
+    assert remedy in told.advice
 
 
 def test_a_figure_that_is_not_known_is_told(cameras: CamerasStep, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,6 +100,21 @@ def better_order(step: ColourStep) -> dict[str, tuple[str, float, float]]:
     return better_orders
 
 
+def with_red_for_blue(step: ColourStep) -> list[str]:
+    """Return the cameras whose red channel measures Z, and whose blue one does not: the two are interchanged.
+
+    A linear transform fits a chart as well with interchanged channels, but every sensor's blue channel has the largest
+    coefficient of Z.
+    """
+    found = []
+    for camera, rgb in step.rgb.items():
+        usable = np.isfinite(rgb).all(axis=1)
+        z_by_channel = least_squares_matrix(rgb[usable], step.xyz[usable])[2]
+        if z_by_channel[0] > z_by_channel[2]:
+            found.append(camera)
+    return found
+
+
 def _patches(photos: Photos, frame: RawFrame) -> Patches:
     channels = photos.channels(frame)
     corners = np.array(frame.corners_px, dtype=np.float64) if frame.corners_px is not None else _search(channels)

@@ -225,8 +225,13 @@ def _groups(photos: Photos, kind: FrameKind) -> dict[tuple[str, str], list[RawFr
     groups: dict[tuple[str, str], list[RawFrame]] = defaultdict(list)
     for frame in photos.folder.frame:
         if frame.kind == kind:
-            groups[frame.camera, f"{frame.sphere}, {frame.place or 'its place'}"].append(frame)
+            groups[frame.camera, place_of(frame)].append(frame)
     return groups
+
+
+def place_of(frame: RawFrame) -> str:
+    """Return the sphere of a frame and its place, in words."""
+    return f"{frame.sphere}, {frame.place or 'its place'}"
 
 
 def _outline(

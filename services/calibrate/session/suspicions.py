@@ -12,7 +12,8 @@ from services.calibrate.cameras.bundle import project_corners
 from services.calibrate.lights.listed import swapped_names
 from services.calibrate.lights.mirror import outline_errors
 from services.calibrate.session.boards import CamerasStep
-from services.calibrate.session.charts import ColourStep, better_order
+from services.calibrate.session.charts import ColourStep, better_order, with_red_for_blue
+from services.calibrate.session.highlights import about_highlights
 from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep
 from services.core.raw.records import RawFolder
@@ -72,7 +73,7 @@ def suspicions(
     yield from _about_boards(cameras)
     if lights is not None:
         yield from _about_spheres(cameras, lights)
-        yield from _about_highlights(names, cameras, lights)
+        yield from about_highlights(folder, cameras, lights)
         yield from _about_the_list(names, lights)
         yield from _twins(names, lights)
     if intensity is not None:
@@ -182,19 +183,6 @@ def _about_spheres(cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
         )
 
 
-def _about_highlights(names: list[str], cameras: CamerasStep, lights: LightsStep) -> Iterator[str]:
-    for outlier in lights.fit.outliers:
-        yield (
-            f"The highlight of light {names[outlier.light]} in camera {cameras.names[outlier.camera]} is"
-            f" {outlier.residual_px:.1f} px off: something else may shine there, so it was left out."
-        )
-    if lights.no_highlight:
-        yield (
-            f"{len(lights.no_highlight)} frames show no highlight, among them {lights.no_highlight[0]}: was the"
-            " light on?"
-        )
-
-
 def _about_the_list(names: list[str], lights: LightsStep) -> Iterator[str]:
     aligned = lights.aligned
     if aligned is None:
@@ -269,11 +257,18 @@ def _about_white(names: list[str], cameras: CamerasStep, intensity: IntensitySte
 
 
 def _about_the_chart(colours: ColourStep) -> Iterator[str]:
-    for camera, (order, better, worse) in better_order(colours).items():
+    in_other_order = better_order(colours)
+    for camera, (order, better, worse) in in_other_order.items():
         yield (
             f"The chart's patches in camera {camera} fit far better {order} (ΔE2000 {better:.1f} against {worse:.1f}): "
             "give corners_px as the centres of patches 1, 6, 24 and 19 in this order."
         )
+    for camera in with_red_for_blue(colours):
+        if camera not in in_other_order:
+            yield (
+                f"The chart's colours in camera {camera} are right with red and blue interchanged; correct mosaic, or"
+                " the order of the channels in its files."
+            )
     for camera, rgb in colours.rgb.items():
         unusable = np.flatnonzero(~np.isfinite(rgb).all(axis=1)) + 1
         if len(unusable):

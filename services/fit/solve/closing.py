@@ -61,15 +61,15 @@ class ClosingSums:
 
     def shift_covariance(self, chosen: Iterable[int]) -> Array:
         """Covariance (F, F) of the gradient by the chosen changes: the sum over them of b b' - N, for a measured shift
-        b with noise N, each without its negative eigenvalues.
+        b with noise N, without its negative eigenvalues.
 
         A shift must not be shortened as a whole to its expected length without noise: it would lose as much along
         directions in which it is well known as along noisy ones.
         """
         total = np.zeros_like(self.response)
         for k in chosen:
-            total += positive_part(np.outer(self.shifts[k], self.shifts[k]) - self.shift_noise[k])
-        return total
+            total += np.outer(self.shifts[k], self.shifts[k]) - self.shift_noise[k]
+        return positive_part(total)
 
     def expected_shift_covariance(self, chosen: Iterable[int]) -> Array:
         """Covariance (F, F) of the gradient by the chosen changes, by which a combination of least variance is chosen.
