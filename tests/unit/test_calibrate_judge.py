@@ -72,7 +72,7 @@ def test_boards_are_advised_for_a_camera_whatever_its_name(cameras: CamerasStep)
 def test_what_looks_wrong_is_mended_before_photographs_are_counted(cameras: CamerasStep) -> None:
     shaken = replace(cameras, fit=replace(cameras.fit, residuals_px=cameras.fit.residuals_px * 15, converged=False))
     told = judge(folder("red"), shaken, lights(), INTENSITY, None, None)
-    assert told.advice.startswith("First mend what looks wrong in the report: scatter of corners, camera")
+    assert told.advice.startswith("First mend what looks wrong: scatter of corners, camera")
 
 
 @pytest.mark.parametrize(("places", "remedy"), [(9, "in ten places that lie far apart"), (10, "4 times as many")])

@@ -220,7 +220,7 @@ def _retake_advice(worst: Limit, sphere_places: int, *, has_suspicions: bool) ->
         return f"Photograph {what} again: {worst.what} is not known at all, and {worst.limit:g} {worst.unit} are asked."
     off = f"{worst.what} is {worst.value:.2g} {worst.unit} against {worst.limit:g} {worst.unit}"
     if has_suspicions:
-        return f"First mend what looks wrong in the report: {off}."
+        return f"First mend what looks wrong: {off}."
     times = math.ceil((worst.value / worst.limit) ** 2)
     if times > MAX_TIMES or (worst.improved_by == "spheres" and sphere_places < ENOUGH_SPHERE_PLACES):
         return f"Photograph {what} again: {off}; {RETAKE_PLANS[worst.improved_by]}."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from services.calibrate.session.drawings import (
 )
 from services.calibrate.session.record import REFLECTANCE_SE
 from services.calibrate.session.run import Session
+from services.core.calibration.record import Calibration
 from services.core.page import page_template
 from services.core.store import write_atomic
 
@@ -61,6 +62,8 @@ def _camera(session: Session, number: int) -> dict[str, Any]:
     errors = np.sqrt(np.diag(fit.covariance)[fit.layout.lens_columns(number)])
     mine = fit.corners.camera == number
     drawing, largest = uncertainty_drawing(fit, number, session.cameras.distance_mm)
+    posed = session.cameras.posed_cameras[number]
+    se = _standard_errors(session.record)
     intrinsics = {
         key: f"{values[place]:.2f} ± {errors[place]:.2f}" for place, key in enumerate(("fx", "fy", "cx", "cy"))
     }
@@ -68,6 +71,9 @@ def _camera(session: Session, number: int) -> dict[str, Any]:
         **intrinsics,
         "name": name,
         "model": describe_model(session.cameras.choices[name]),
+        "centre": ", ".join(f"{x:.1f}" for x in posed.centre_mm),
+        "turned": _rms(se, f"camera.{name}", ("rx", "ry", "rz"), np.degrees(1), "°"),
+        "moved": _rms(se, f"camera.{name}", ("tx", "ty", "tz"), 1.0, " mm"),
         "corners": int(mine.sum()),
         "left_out": int((mine & ~fit.inliers).sum()),
         "sigma": f"{fit.sigma_px[number]:.3f}",
@@ -77,17 +83,27 @@ def _camera(session: Session, number: int) -> dict[str, Any]:
     }
 
 
+def _standard_errors(record: Calibration) -> dict[str, float]:
+    """Return the standard errors that a record states, by name."""
+    stated = record.uncertainty
+    return {} if stated is None else dict(zip(stated.names, np.sqrt(np.diag(stated.matrix)).tolist(), strict=True))
+
+
+def _rms(se: Mapping[str, float], of: str, parts: tuple[str, ...], factor: float, unit: str) -> str:
+    """Return the rms of three standard errors with its unit."""
+    values = [se.get(f"{of}.{part}", np.nan) for part in parts]
+    rms = factor * float(np.sqrt(np.mean(np.square(values))))
+    return f"{rms:.2g}{unit}" if np.isfinite(rms) else "not known"
+
+
 def _lights(session: Session) -> dict[str, Any] | None:
     record = session.record
     if not record.lights:
         return None
-    errors = np.full(len(record.lights), np.nan)
-    if record.uncertainty is not None:
-        place = {name: n for n, name in enumerate(record.uncertainty.names)}
-        variances = np.diag(record.uncertainty.matrix)
-        for number, light in enumerate(record.lights):
-            mine = [place[f"light.{light.name}.{axis}"] for axis in "xyz" if f"light.{light.name}.{axis}" in place]
-            errors[number] = np.sqrt(variances[mine].sum()) if mine else np.nan
+    se = _standard_errors(record)
+    errors = np.array(
+        [np.linalg.norm([se.get(f"light.{light.name}.{x}", np.nan) for x in "xyz"]) for light in record.lights]
+    )
     where = np.array([light.position_mm for light in record.lights])
     cameras = np.array([camera.centre_mm for camera in session.cameras.posed_cameras])
     names = [light.name for light in record.lights]
@@ -96,7 +112,11 @@ def _lights(session: Session) -> dict[str, Any] | None:
             "name": light.name,
             "where": ", ".join(f"{x:.1f}" for x in light.position_mm),
             "error": f"{error:.2f} mm" if np.isfinite(error) else "not known",
-            "intensity": ", ".join(f"{x:.4f}" for x in light.intensity),
+            "intensity": ", ".join(
+                f"{x:.4f}"
+                + (f" ± {100 * gain:.2f} %" if (gain := se.get(f"light_gain.{light.name}.{channel}")) else "")
+                for x, channel in zip(light.intensity, record.channels, strict=True)
+            ),
         }
         for light, error in zip(record.lights, errors, strict=True)
     ]
