@@ -42,6 +42,7 @@ def build_app() -> typer.Typer:
     """Assemble the commands into one application."""
     from services.cli.bench import bench
     from services.cli.capture import capture
+    from services.cli.client.calibrations import calibrations
     from services.cli.client.cancel import cancel
     from services.cli.client.delete import delete
     from services.cli.client.demo import demo
@@ -80,7 +81,8 @@ def build_app() -> typer.Typer:
     )
     app.callback()(_root)
     local = serve, dome_sim, capture, run, options, export, landmarks, register, phantom, bench
-    for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo, keep_calibration):
+    kept = keep_calibration, calibrations
+    for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo, *kept):
         app.command()(command)
     add_dask_commands(app, lambda: read_settings(os.environ).server.tls)
     app.command("sphere")(sphere_command)

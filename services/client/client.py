@@ -72,6 +72,10 @@ class Client:
                     stream.write(piece)
         return out.stat().st_size
 
+    def calibrations(self) -> list[dict[str, Any]]:
+        """All stored calibrations with their states, newest first, without their content."""
+        return self.run(self._requests.calibrations())
+
     def calibration(self, name: str) -> dict[str, Any]:
         """A stored calibration; its 'option' is what a job takes."""
         return self.run(self._requests.calibration(name))
@@ -198,6 +202,10 @@ class AsyncClient:
                     async for piece in response.aiter_bytes():
                         stream.write(piece)
         return out.stat().st_size
+
+    async def calibrations(self) -> list[dict[str, Any]]:
+        """See ``Client``."""
+        return await self.run(self._requests.calibrations())
 
     async def calibration(self, name: str) -> dict[str, Any]:
         """See ``Client``."""

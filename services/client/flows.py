@@ -48,7 +48,7 @@ class BlockingCall:
 Flow = Generator[HttpRequest | Pause | BlockingCall, Any, R]
 
 
-def answer(server: str, request: HttpRequest) -> Flow[dict[str, Any]]:
+def answer(server: str, request: HttpRequest) -> Flow[Any]:
     """Make a request and return the JSON of the answer.
 
     A GET request is repeated once if its connection breaks, because servers close idle connections.

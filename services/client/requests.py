@@ -54,6 +54,10 @@ class Requests:
         """The request for a job's files as one zip; the client streams its answer."""
         return HttpRequest("GET", f"/jobs/{quote(job_id, safe='')}/artifacts.zip")
 
+    def calibrations(self) -> Flow[list[dict[str, Any]]]:
+        """All stored calibrations, newest first, without their content."""
+        return answer(self.server, HttpRequest("GET", "/calibrations", {}))
+
     def calibration(self, name: str) -> Flow[dict[str, Any]]:
         """A stored calibration; its 'option' is what a job takes."""
         return self._answer("GET", f"/calibrations/{quote(name, safe='')}")

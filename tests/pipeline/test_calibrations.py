@@ -259,6 +259,9 @@ def test_what_a_calibration_job_made_is_put_under_a_name(
     command = [sys.executable, "-m", "services", "keep-calibration", made, "by-job", "--server", str(client.base_url)]
     told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert told == "calibrations/by-job: beyond its limits\n"
+    command = [sys.executable, "-m", "services", "calibrations", "--server", str(client.base_url)]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert told.startswith("calibrations/by-job  beyond its limits: ")
     assert client.put(f"/v1/jobs/{made}/calibration/by-job").status_code == 200
     assert client.put("/v1/calibrations/by-hand", json=calibration | BEYOND).json()["id"] == kept.json()["id"]
     # Jobs can use the calibration by its name after the job that made it is deleted.
