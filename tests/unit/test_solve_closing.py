@@ -236,11 +236,12 @@ def shifted(shift: NDArray[np.float64], noise: NDArray[np.float64]) -> ClosingSu
 def test_a_shift_without_noise_is_taken_as_it_is_and_one_within_its_noise_is_not() -> None:
     shift = np.array([1.0, 0.5, -0.2])
     sums = shifted(shift, np.zeros((3, 3)))
-    for covariance in (sums.shift_covariance([0]), sums.expected_shift_covariance([0])):
+    stated = [sums.shift_covariance([0], is_combined=is_combined) for is_combined in (False, True)]
+    for covariance in (*stated, sums.expected_shift_covariance([0])):
         np.testing.assert_allclose(covariance, np.outer(shift, shift), atol=1e-12)
     sums = shifted(shift, np.eye(3))
     np.testing.assert_array_equal(sums.expected_shift_covariance([0]), np.zeros((3, 3)))
-    assert np.trace(sums.shift_covariance([0])) == pytest.approx(shift @ shift - 1)
+    assert np.trace(sums.shift_covariance([0], is_combined=False)) == pytest.approx(shift @ shift - 1)
 
 
 def test_a_shift_that_is_noisy_in_most_directions_is_stated_whole_where_it_is_well_known() -> None:
@@ -250,7 +251,7 @@ def test_a_shift_that_is_noisy_in_most_directions_is_stated_whole_where_it_is_we
     stated = []
     for _ in range(2000):
         sums = shifted(true + noise * rng.standard_normal(6), np.diag(noise**2))
-        stated.append(float(sums.shift_covariance([0])[0, 0]))
+        stated.append(float(sums.shift_covariance([0], is_combined=False)[0, 0]))
     assert np.mean(stated) == pytest.approx(true[0] ** 2, rel=0.1)
 
 
@@ -258,17 +259,23 @@ def test_noise_of_a_shift_does_not_pass_for_a_direction_that_can_be_avoided() ->
     # True shifts of any direction in six coordinates, measured with noise of variance 1 each. Of all combinations with
     # v_0 = 1, take the one that the expected covariance C takes for the least moved, v = C^-1 e_0 / e_0'C^-1 e_0.
     rng, first, noise = np.random.default_rng(8), np.eye(6)[0], np.eye(6)
-    expected, shown = [], []
+    expected, stated, unbiased, shown = [], [], [], []
     for _ in range(4000):
         true = 1.5 * rng.standard_normal(6)
-        covariance = shifted(true + rng.standard_normal(6), noise).expected_shift_covariance([0])
+        sums = shifted(true + rng.standard_normal(6), noise)
+        covariance = sums.expected_shift_covariance([0])
         best = np.linalg.solve(covariance + 1e-2 * noise, first)
         best /= best[0]
         expected.append(float(best @ covariance @ best))
+        stated.append(float(best @ sums.shift_covariance([0], is_combined=True) @ best))
+        unbiased.append(float(best @ sums.shift_covariance([0], is_combined=False) @ best))
         shown.append(float(best @ true) ** 2)
     # The prior of the true shifts is estimated from one of them, with an error of (2 / 6)^1/2 in |b|^2. With k b b',
     # which has the same trace, 0.0001 are expected.
     assert np.mean(shown) == pytest.approx(np.mean(expected), rel=0.3)
+    # The combination avoids b, so what is stated without regard to it is far below what is shown.
+    assert np.mean(stated) == pytest.approx(np.mean(shown), rel=0.3)
+    assert np.mean(unbiased) < 0.3 * np.mean(shown)
 
 
 def test_the_measurement_survives_the_journal() -> None:

@@ -14,7 +14,7 @@ with tau^2 such that sum E^2 / (tau^2 + v) equals its expectation (Paule and Man
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -59,17 +59,23 @@ class ClosingSums:
             sums, shifts=sums.shifts.reshape(-1, count), shift_noise=sums.shift_noise.reshape(-1, count, count)
         )
 
-    def shift_covariance(self, chosen: Iterable[int]) -> Array:
+    def shift_covariance(self, chosen: Sequence[int], *, is_combined: bool) -> Array:
         """Covariance (F, F) of the gradient by the chosen changes: the sum over them of b b' - N, for a measured shift
         b with noise N, without its negative eigenvalues.
 
         A shift must not be shortened as a whole to its expected length without noise: it would lose as much along
         directions in which it is well known as along noisy ones.
+
+        Args:
+            is_combined: whether the solution is combined with the instrument's prior afterwards. The combination goes
+                where measured effects are small, partly by chance, so in each direction the larger of the sum and of
+                its expectation counts.
         """
-        total = np.zeros_like(self.response)
+        least = self.expected_shift_covariance(chosen) if is_combined else np.zeros_like(self.response)
+        excess = -least
         for k in chosen:
-            total += np.outer(self.shifts[k], self.shifts[k]) - self.shift_noise[k]
-        return positive_part(total)
+            excess += np.outer(self.shifts[k], self.shifts[k]) - self.shift_noise[k]
+        return np.asarray(least + positive_part(excess))
 
     def expected_shift_covariance(self, chosen: Iterable[int]) -> Array:
         """Covariance (F, F) of the gradient by the chosen changes, by which a combination of least variance is chosen.

@@ -297,7 +297,9 @@ def uncertainty(
         kinds = ["mean_cosine"] * (len(sums.shifts) - len(moved)) + list(moved)
         parts |= {"rendering": rendered + response_noise}
         shifts = {
-            kind: sums.shift_covariance(k for k, own in enumerate(kinds) if own == kind)
+            kind: sums.shift_covariance(
+                [k for k, own in enumerate(kinds) if own == kind], is_combined=bool(domain.errors.names)
+            )
             for kind in dict.fromkeys(kinds)
         }
         parts |= shifts
