@@ -58,14 +58,13 @@ def _markup(drawing: str) -> Any:
 
 def _camera(session: Session, number: int) -> dict[str, Any]:
     fit, name = session.cameras.fit, session.cameras.names[number]
-    values = fit.rig.lenses[number].values
-    errors = np.sqrt(np.diag(fit.covariance)[fit.layout.lens_columns(number)])
     mine = fit.corners.camera == number
     drawing, largest = uncertainty_drawing(fit, number, session.cameras.distance_mm)
-    posed = session.cameras.posed_cameras[number]
-    se = _standard_errors(session.record)
+    posed, se = session.posed_cameras[number], _standard_errors(session.record)
+    values = posed.lens.values[:4].tolist()
     intrinsics = {
-        key: f"{values[place]:.2f} ± {errors[place]:.2f}" for place, key in enumerate(("fx", "fy", "cx", "cy"))
+        key: f"{value:.2f} ± {unit * se.get(f'camera.{name}.{key}', np.nan):.2f}"
+        for key, value, unit in zip(("fx", "fy", "cx", "cy"), values, (values[0], values[1], 1.0, 1.0), strict=True)
     }
     return {
         **intrinsics,
@@ -105,7 +104,7 @@ def _lights(session: Session) -> dict[str, Any] | None:
         [np.linalg.norm([se.get(f"light.{light.name}.{x}", np.nan) for x in "xyz"]) for light in record.lights]
     )
     where = np.array([light.position_mm for light in record.lights])
-    cameras = np.array([camera.centre_mm for camera in session.cameras.posed_cameras])
+    cameras = np.array([camera.centre_mm for camera in session.posed_cameras])
     names = [light.name for light in record.lights]
     rows = [
         {

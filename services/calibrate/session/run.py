@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.session.boards import CamerasStep, calibrate_cameras
 from services.calibrate.session.charts import ColourStep, calibrate_colours
 from services.calibrate.session.flats import measure_vignetting
@@ -38,6 +39,11 @@ class Session:
     intensity: IntensityStep | None
     colours: ColourStep | None
     judgement: Judgement
+
+    @property
+    def posed_cameras(self) -> Sequence[PosedCamera]:
+        """The cameras of the record: as boards have them, or as boards and mirror spheres together."""
+        return self.cameras.posed_cameras if self.lights is None else self.lights.fit.cameras
 
 
 def calibrate(
