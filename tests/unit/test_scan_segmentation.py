@@ -68,6 +68,16 @@ def test_a_file_without_labels_is_parted_by_points(tmp_path: Path) -> None:
     assert (scan.fdi == FOUR.fdi).mean() > 0.85
 
 
+def test_points_at_the_gums_do_not_change_a_tooth() -> None:
+    low = FOUR.mesh.vertices_mm[np.abs(FOUR.mesh.vertices_mm[:, 2] - 1.0) < 0.5]
+    with_low = {
+        fdi: np.concatenate([top, low[[np.linalg.norm(low[:, :2] - top[0, :2], axis=1).argmin()]]])
+        for fdi, top in TOPS.items()
+    }
+    found = segment_by_landmarks(FOUR.mesh, with_low, "the scan")
+    np.testing.assert_array_equal(found, segment_by_landmarks(FOUR.mesh, TOPS, "the scan"))
+
+
 def turned(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices_mm, mesh.faces[:, ::-1].copy())
 

@@ -40,6 +40,9 @@ FARTHEST_MM = 2.0
 a millimetre apart."""
 NEAREST_MM = 2.0
 """Smallest distance between the points of two teeth, mm: the narrowest teeth are 5 mm wide."""
+TOP_MM = 3.0
+"""Height below a tooth's highest point, mm, within which points are on its edge or chewing surface: cusps differ by 2
+mm at most, and the gums are 5 mm below them and more."""
 PATCH_MM, PATCH_DEPTH_MM = 8.0, 6.0
 """Radius around a point and depth below it of the patch to which a crown is fitted, mm: half a molar's width with some
 margin, and the smallest height of a crown."""
@@ -102,8 +105,8 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
 
     Args:
         mesh: open surface of one jaw, counter-clockwise seen from outside.
-        points_mm: by FDI number, points (N, 3) in the middle of the tooth's edge or chewing surface, or on a cusp. A
-            tooth without points is treated as gums.
+        points_mm: by FDI number, points (N, 3) in the middle of the tooth's edge or chewing surface, or on a cusp.
+            Points farther down, as at the gums, are left out. A tooth without points is treated as gums.
         what: the scan's name for messages.
 
     Raises:
@@ -111,7 +114,7 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
             the teeth point into the gums, or no crown is found at a tooth's points.
     """
     teeth = tuple(sorted(points_mm))
-    tops = np.array([points_mm[fdi].mean(axis=0) for fdi in teeth]).reshape(-1, 3)
+    tops = np.array([_top(points_mm[fdi], vector_area_mm2(mesh)) for fdi in teeth]).reshape(-1, 3)
     _require_points(mesh, points_mm, teeth, tops, what)
     is_kept = manifold_piece(mesh)
     surface = compact(Mesh(mesh.vertices_mm, mesh.faces[is_kept]))
@@ -131,6 +134,12 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
                 " chewing surface."
             )
     return labels
+
+
+def _top(points_mm: Array, opening_mm2: Array) -> Array:
+    # Mean (3,) of a tooth's highest points, away from the gums.
+    heights_mm = points_mm @ opening_mm2 / np.linalg.norm(opening_mm2)
+    return np.asarray(points_mm[heights_mm > heights_mm.max() - TOP_MM].mean(axis=0))
 
 
 def _require_points(mesh: Mesh, points_mm: Mapping[int, Array], teeth: tuple[int, ...], tops: Array, what: str) -> None:
