@@ -116,6 +116,15 @@ def test_what_is_held_stays_and_only_the_shape_is_asked_for_where_all_media_are(
     assert all(table[f"shape.{k}"].se for k in range(3))
 
 
+def test_a_channel_that_takes_the_shape_from_another_has_its_error(tmp_path: Path) -> None:
+    write_prepared(tmp_path, channels=("red", "green"))
+    tables = fit(tmp_path, dentin="fit", max_steps=3, advise=False).parameters
+    # Both channels have the same photographs, and the first one of those with equal signals fits the shape.
+    parts = {channel: table["dentin.sigma_a"].se_parts for channel, table in tables.items()}
+    assert "shape" not in parts["red"]
+    assert parts["green"]["shape"] > 0
+
+
 def test_a_held_albedo_is_not_moved_by_the_cosine(tmp_path: Path) -> None:
     write_prepared(tmp_path)
     table = fit(tmp_path, held={"enamel.alpha": 0.99}).parameters["green"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from services.core.records import JobSpec
 from services.fit.checks.evaluate import Evaluation, Shown, evaluate
-from services.fit.execution.closing import HeldCosines, measure_closing
+from services.fit.execution.closing import HeldCosines, HeldShapes, measure_closing
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, StackProblem
 from services.fit.inputs.observations import ChannelFiles, Level
@@ -164,6 +164,10 @@ class Stages(ABC, Generic[Optics]):
     @abstractmethod
     def _held_cosines(self, domain: Domain) -> HeldCosines:
         """Mean cosines that this domain holds, as input of the closing measurement."""
+
+    def _held_shapes(self) -> HeldShapes:
+        """Shapes of the dentin that this fit holds though they have an error."""
+        return ()
 
     @property
     def part_count(self) -> int:
@@ -318,14 +322,13 @@ class Stages(ABC, Generic[Optics]):
         # Measure the response of the exact images where Jacobians came from similar media. Make one more step with it
         # where the predicted gain exceeds noise, and prediction and comparison combined are better.
         domain = problem.domain
-        whitened, moves = whitening(domain, equations), self.files.moves
+        whitened, moves, shapes = whitening(domain, equations), self.files.moves, self._held_shapes()
 
         def compute() -> dict[str, Any]:
             prefix = message_prefix(self.files.channel, self.tooth)
             self.log(f"{prefix}: renders around the answer tell its ±, which may take as long as all steps.")
-            sums = measure_closing(
-                problem, x, whitened.transform, self._held_cosines(domain), max(samples // CLOSING_DIVISOR, 1), moves
-            )
+            held, fewer = self._held_cosines(domain), max(samples // CLOSING_DIVISOR, 1)
+            sums = measure_closing(problem, x, whitened.transform, held, fewer, moves, shapes)
             return {
                 "sums": sums.record(),
                 "step": last_step(
@@ -337,8 +340,8 @@ class Stages(ABC, Generic[Optics]):
         entry, _ = self.journal.get_or_compute(key, compute)
         step = np.array(entry["step"])
         sums = ClosingSums.of(entry["sums"])
-        bodies = [move.body for move in moves]
-        return uncertainty(domain, x + step, equations, sums, step, bodies, self.part_count)
+        sources = ["shape"] * len(shapes) + [move.body for move in moves]
+        return uncertainty(domain, x + step, equations, sums, step, sources, self.part_count)
 
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float

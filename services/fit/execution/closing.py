@@ -27,6 +27,9 @@ HeldCosines = Mapping[tuple[str, ...], tuple[float, float]]
 """Media whose mean cosine was held, and the mean and standard deviation of its prior in the unbounded domain; the error
 of one entry's media is common to them."""
 
+HeldShapes = Sequence[tuple[dict[str, float], dict[str, float]]]
+"""Blend weights by name at both ends of each independent error of a held shape, one standard deviation on either
+side."""
 MOVE_DIVISOR = 4
 """Divisor of the paths for images of moved scans and domes, because there are thirteen of them."""
 SHIFT_DIVISOR = 2
@@ -34,7 +37,13 @@ SHIFT_DIVISOR = 2
 
 
 def measure_closing(
-    problem: StackProblem[Optics], x: Array, whiten: Array, held: HeldCosines, samples: int, moves: Sequence[Move] = ()
+    problem: StackProblem[Optics],
+    x: Array,
+    whiten: Array,
+    held: HeldCosines,
+    samples: int,
+    moves: Sequence[Move] = (),
+    shapes: HeldShapes = (),
 ) -> ClosingSums:
     """Closing sums of all blocks at x (F,), added in block order.
 
@@ -44,7 +53,8 @@ def measure_closing(
         whiten: T (F, F), x = T y.
         held: held mean cosines; each entry costs four images.
         samples: paths per pixel and seed.
-        moves: moves of scan and dome; each costs two images, and their changes follow those of ``held`` in the sums.
+        moves: moves of scan and dome; each costs two images, and their changes come last in the sums.
+        shapes: held shapes of the dentin; each costs four images, and their changes follow those of ``held``.
     """
     run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
     tissue, similar, differentiation = problem.jacobian_media(x)
@@ -54,7 +64,7 @@ def measure_closing(
     ends = tuple(
         (_with_cosine(tissue, parts, mean - sd), _with_cosine(tissue, parts, mean + sd))
         for parts, (mean, sd) in held.items()
-    )
+    ) + tuple((tissue.with_values(low), tissue.with_values(high)) for low, high in shapes)
     tasks = problem.passes_at(x).tasks(label, tissue, samples)
     changes = _changes_by_moves(problem, tasks, moves, label)
     common = (similar, differentiation, first, whiten, slopes, copied, second, images, ends)

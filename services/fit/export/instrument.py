@@ -17,6 +17,7 @@ SOURCES = {
     "dome": "dome",
     "prior": "prior",
     "mean_cosine": "mean cosine",
+    "shape": "dentin's shape",
     "unfinished": "unfinished",
 }
 """Sources of a standard error, with their headings in the report."""

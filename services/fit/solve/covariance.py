@@ -272,8 +272,8 @@ def uncertainty(
         sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where
             Jacobians are the images' own.
         step: the step (F,) that the fit made after the closing measurement.
-        moved: kind, ``teeth`` or ``dome``, of each of the last changes of the closing measurement; the earlier changes
-            are those of held mean cosines.
+        moved: kind, ``shape``, ``teeth`` or ``dome``, of each of the last changes of the closing measurement; the
+            earlier changes are those of held mean cosines.
         part_count: number of objects that the fit treats as separate in the images, such as the teeth of a jaw.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0

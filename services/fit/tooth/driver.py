@@ -83,7 +83,7 @@ class FitDriver:
         modes = len(dentin.modes_mm) if dentin is not None else 0
         order = sorted(channels, key=lambda c: -files[c].quality)
         fits: dict[str, ChannelFit[Tissue]] = {}
-        shape, next_capture = tuple[float, ...](), ""
+        shape, covariance, next_capture = tuple[float, ...](), tuple[tuple[float, ...], ...](), ""
         with attempt.workers() as run_on:
             for number, channel in enumerate(order):
                 attempt.log(f"{channel}: renderers start, then the table is searched.")
@@ -91,9 +91,11 @@ class FitDriver:
                     observations, files[channel], views[channel], journal, run_on, (number, len(order))
                 )
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
+                schedule.shape_covariance = covariance
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
-                shape = fits[channel].tissue.shape
+                if not shape:
+                    shape, covariance = fits[channel].tissue.shape, shape_covariance(fits[channel].uncertainty)
                 if spec.advise and number == 0 and fits[channel].solution.result.converged:
                     next_capture = schedule.next_capture(fits[channel], attempt.inputs)
                     measured = calibration_advice(fits[channel].tissue, schedule.media, fits[channel].uncertainty)

@@ -31,16 +31,19 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from services.core.errors import SettingsError
 from services.fit.checks.next_capture import Sensor, capture_advice
 from services.fit.execution.channel_fit import ChannelFit, Stages
-from services.fit.execution.closing import HeldCosines
+from services.fit.execution.closing import HeldCosines, HeldShapes
 from services.fit.execution.passes import StackProblem, orders_task
 from services.fit.execution.stain_passes import StainStage
 from services.fit.inputs.observations import COARSE_PIXELS
 from services.fit.inputs.reweighting import reweighted
 from services.fit.inputs.stain_uv import StainLayout
-from services.fit.optics.domain import HELD_G, Coordinate, Domain, similar_medium
+from services.fit.optics.domain import BOUNDS, HELD_G, Coordinate, Domain, similar_medium
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import COSINE, SHAPE, WEAK, Priors, priors_of
 from services.fit.solve import adam, table_search
@@ -87,6 +90,8 @@ class ChannelSchedule(Stages[Tissue]):
     """Blend weights to fit; 0 where the dentin's shape is known."""
     shape: tuple[float, ...] = ()
     """Known blend weights."""
+    shape_covariance: tuple[tuple[float, ...], ...] = ()
+    """Covariance of the known blend weights, which another channel's fit found; empty where they are exact."""
     stain_layout: StainLayout | None = None
     """Texels to fit; None where the surface is taken as clean."""
 
@@ -119,6 +124,19 @@ class ChannelSchedule(Stages[Tissue]):
             if name.endswith((".g1", ".cosine"))
         }
         return {(part,): WEAK[f"{part}.g1"] for part in self.media if part not in fixed}
+
+    def _held_shapes(self) -> HeldShapes:
+        # One standard deviation to either side along each principal axis of the covariance, inside the bounds.
+        if not self.shape_covariance:
+            return ()
+        variances, axes = np.linalg.eigh(np.array(self.shape_covariance))
+        steps = (axes * np.sqrt(np.maximum(variances, 0.0))).T
+
+        def weights(step: NDArray[np.float64]) -> dict[str, float]:
+            inside = np.clip(np.array(self.shape) + step, *BOUNDS["shape"])
+            return {f"shape.{k}": float(weight) for k, weight in enumerate(inside)}
+
+        return [(weights(-step), weights(step)) for step in steps]
 
     def _other_values(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}

@@ -23,7 +23,7 @@ export function valueOf(estimate: Estimate): string {
   return `${estimate.value.toFixed(decimals)} ± ${estimate.se.toFixed(decimals)}`;
 }
 
-const SOURCES: Record<string, string> = { light_gain: "lights", mean_cosine: "mean cosine" };
+const SOURCES: Record<string, string> = { light_gain: "lights", mean_cosine: "mean cosine", shape: "dentin's shape" };
 
 /**
  * Return the sources that make up most of a standard error, as shares of its square; empty where they are not known.
