@@ -58,7 +58,8 @@ class ArraySession:
             "RawFolder",
             SimpleNamespace(
                 light=lights,
-                frame=[SimpleNamespace(file=view.name, kind="board") for view in self.boards] + self._mirror_frames(),
+                frame=[SimpleNamespace(file=view.name, kind="board", exposure_s=0.02) for view in self.boards]
+                + self._mirror_frames(),
                 camera_named=lambda _: camera,
                 channels=("red", "green", "blue"),
             ),
@@ -69,6 +70,7 @@ class ArraySession:
             SimpleNamespace(
                 file=f"{NAMES[view.camera]}_s{view.place}_L{light}",
                 kind="mirror-sphere",
+                exposure_s=0.02,
                 camera=NAMES[view.camera],
                 sphere="ball",
                 place=f"s{view.place}",

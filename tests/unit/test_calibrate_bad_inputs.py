@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from services.calibrate.session.missed import why_missed
 from services.calibrate.session.photos import Black
 from services.calibrate.session.spheres import IntensityStep, LightsStep
 from services.calibrate.session.suspicions import suspicions
+from services.core.raw.records import RawFolder
 from services.core.raw.targets import Board
 from tests.support.array_session import N_LIGHTS, NAMES, ArraySession, array_session, exchanged, told_of
 from tests.support.board_sessions import charuco
@@ -342,6 +345,14 @@ def test_a_chart_with_overexposed_patches(good: ArraySession, cameras: CamerasSt
         "2 of 24 patches of the chart in camera left are saturated or outside the image, the first of"
     )
     assert "patch 6" in told
+
+
+def test_exposures_in_milliseconds(good: ArraySession, cameras: CamerasStep) -> None:
+    frames = [SimpleNamespace(**(vars(frame) | {"exposure_s": 20.0})) for frame in good.folder.frame]
+    folder = SimpleNamespace(**(vars(good.folder) | {"frame": frames}))
+    (told,) = suspicions(cast("RawFolder", folder), cameras, None)
+    assert told.startswith(f"{len(frames)} frames are said to be exposed for 10 s and longer, among them")
+    assert "give exposure_s in seconds" in told
 
 
 def test_black_frames_that_are_not_black(good: ArraySession, cameras: CamerasStep) -> None:

@@ -11,7 +11,7 @@ from services.anatomy.scans.patches import middle_mm, vector_area_mm2
 from services.anatomy.scans.scan import LabelledScan, read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.anatomy.scans.segmentation import segment_by_landmarks
-from services.core.errors import CaptureInputError
+from services.core.errors import CaptureInputError, MeshError
 from services.core.geometry import Mesh
 from tests.support.labelled_scan import CROWN_MM, bumps, write_vtp
 from tests.support.shared_data import shared_path
@@ -76,6 +76,15 @@ def test_points_at_the_gums_do_not_change_a_tooth() -> None:
     }
     found = segment_by_landmarks(FOUR.mesh, with_low, "the scan")
     np.testing.assert_array_equal(found, segment_by_landmarks(FOUR.mesh, TOPS, "the scan"))
+
+
+@pytest.mark.parametrize("pair", [(11, 21), (12, 11), (21, 22)])
+def test_exchanged_numbers_are_named(tmp_path: Path, pair: tuple[int, int]) -> None:
+    write_vtp(tmp_path / "scan.vtp", FOUR.mesh, None)
+    one, other = pair
+    exchanged = TOPS | {one: TOPS[other], other: TOPS[one]}
+    with pytest.raises(MeshError, match=f"Teeth {min(pair)} and {max(pair)} of scan .* order of their numbers"):
+        read_scan(tmp_path / "scan.vtp", labels=None, points_mm=exchanged)
 
 
 def turned(mesh: Mesh) -> Mesh:

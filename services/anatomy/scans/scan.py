@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.scans.order import require_order
 from services.anatomy.scans.patches import middle_mm
 from services.anatomy.scans.segmentation import GINGIVA, segment_by_landmarks
 from services.anatomy.scans.units import MM_PER_UNIT, Unit, require_anatomical_scale
@@ -88,7 +89,8 @@ def read_scan(
     Raises:
         CaptureInputError: the scan is unreadable, lacks labels or gingiva, has labels that name no tooth, or is not of
             one jaw or of the expected one.
-        MeshError: the scan has a size that no jaw has in this unit.
+        MeshError: the scan has a size that no jaw has in this unit, or its teeth stand in another order than their
+            numbers.
     """
     file = read_scan_file(path)
     is_labelled = labels is not None or _array(file, LABEL) is not None
@@ -104,6 +106,7 @@ def read_scan(
     _require_one_jaw(scan, path, jaw)
     if np.isfinite(mesh.vertices_mm).all():
         middles = [middle_mm(Mesh(mesh.vertices_mm, mesh.faces[scan.fdi == number])) for number in scan.teeth]
+        require_order(scan.teeth, np.array(middles), f"scan {path}")
         require_anatomical_scale(scan.teeth, np.array(middles), units, f"scan {path}")
     mesh.require_surface(f"of scan {path}", EXTENT_MM)
     return scan

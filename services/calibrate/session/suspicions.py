@@ -43,6 +43,8 @@ MOVED_TIMES = 4.0
 photographs, its outlines disagree by pixels."""
 MAX_BLACK_SHARE = 0.1
 """Largest black level as a fraction of the range: cameras set it to a few per cent."""
+LONG_EXPOSURE_S = 10.0
+"""Exposure in s that is taken for one in ms: lamps near teeth need some hundredths of a second."""
 MAX_SCALE_ERROR = 0.03
 """Largest relative error of a list's scale: a list measured by hand is right to 10 mm in a metre, and 3 % mean another
 unit or another board."""
@@ -90,6 +92,11 @@ def _about_files(folder: RawFolder, black: Mapping[str, Black], inputs: Mapping[
             same[digest].append(file)
     for first, second, *_ in (files for files in same.values() if files[1:]):
         yield f"Files {first} and {second} hold the same photograph; export the second again, or list it once."
+    if long := [frame for frame in folder.frame if frame.exposure_s >= LONG_EXPOSURE_S]:
+        yield (
+            f"{len(long)} frames are said to be exposed for {LONG_EXPOSURE_S:g} s and longer, among them"
+            f" {long[0].file}; give exposure_s in seconds, 0.02 for 20 ms."
+        )
     for name, level in black.items():
         camera = folder.camera_named(name)
         full = camera.full_counts
