@@ -106,7 +106,9 @@ class Recorder:
     slopes: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Relative derivatives (Q, F) of the reported quantities."""
 
-    def measure(self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any = ()) -> ClosingSums:
+    def measure(
+        self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any, shapes: Any
+    ) -> ClosingSums:
         """The closing measurement with the fit's own changes, which is returned, and with stock's, which is kept."""
         errors = problem.domain.errors.names
         self.information = np.zeros((len(moves), len(moves)))
@@ -120,10 +122,10 @@ class Recorder:
             return found
 
         with patch.object(closing, "_changes_by_moves", by_stock):
-            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves)
+            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves, shapes)
         self.shifts = stock.shifts[len(held) :]
         self.slopes = relative_slopes(problem.domain, problem.base, x)
-        return closing.measure_closing(problem, x, whiten, held, samples, moves)
+        return closing.measure_closing(problem, x, whiten, held, samples, moves, shapes)
 
     def combine(
         self, domain: Domain, x: Array, sandwich: Sandwich, meats: Any, unfinished: Array, parts: int = 1
