@@ -14,6 +14,7 @@ from services.calibrate.cameras.models import ModelChoice
 from services.calibrate.session.boards import CamerasStep
 from services.calibrate.session.judge import judge
 from services.calibrate.session.spheres import IntensityStep, LightsStep
+from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.raw.records import RawFolder
 from tests.support.board_sessions import photographed, true_rig
 
@@ -85,6 +86,14 @@ def test_places_far_apart_are_advised_before_more_photographs(
     # The light's ± is (3 · 5.3)^1/2 = 4.0 mm, twice the limit.
     assert "position of the lights, rms ± is 4 mm against 2 mm; " in told.advice
     assert remedy in told.advice
+
+
+def test_the_white_sphere_is_advised_where_intensities_are_worst(cameras: CamerasStep) -> None:
+    stated = CalibrationUncertainty(names=("light_gain.L0.red",), covariance=((0.025**2,),))
+    told = judge(folder("red"), cameras, lights(), INTENSITY, None, stated)
+    assert (
+        "white sphere again: intensity of the lights, rms ± is 2.5 % against 0.5 %; measure its radius" in told.advice
+    )
 
 
 def test_a_figure_that_is_not_known_is_told(cameras: CamerasStep, monkeypatch: pytest.MonkeyPatch) -> None:

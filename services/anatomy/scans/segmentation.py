@@ -114,7 +114,8 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
             the teeth point into the gums, or no crown is found at a tooth's points.
     """
     teeth = tuple(sorted(points_mm))
-    tops = np.array([_top(points_mm[fdi], vector_area_mm2(mesh)) for fdi in teeth]).reshape(-1, 3)
+    opening = vector_area_mm2(mesh)
+    tops = np.array([_top(points_mm[fdi], opening) for fdi in teeth]).reshape(-1, 3)
     _require_points(mesh, points_mm, teeth, tops, what)
     is_kept = manifold_piece(mesh)
     surface = compact(Mesh(mesh.vertices_mm, mesh.faces[is_kept]))
@@ -136,9 +137,9 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
     return labels
 
 
-def _top(points_mm: Array, opening_mm2: Array) -> Array:
-    # Mean (3,) of a tooth's highest points, away from the gums.
-    heights_mm = points_mm @ opening_mm2 / np.linalg.norm(opening_mm2)
+def _top(points_mm: Array, opening: Array) -> Array:
+    # Mean (3,) of a tooth's highest points, in the direction of a vector (3,) away from the gums.
+    heights_mm = points_mm @ opening / max(float(np.linalg.norm(opening)), np.finfo(float).tiny)
     return np.asarray(points_mm[heights_mm > heights_mm.max() - TOP_MM].mean(axis=0))
 
 

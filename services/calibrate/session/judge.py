@@ -31,7 +31,7 @@ MAX_EMPTY = 0.3
 empty."""
 CHANNELS_OF_COLOUR = 3
 """Number of channels for which XYZ is fitted to a chart."""
-SUBJECTS = {"boards": "boards", "spheres": "spheres", "chart": "the chart"}
+SUBJECTS = {"boards": "boards", "spheres": "spheres", "white": "the white sphere", "chart": "the chart"}
 RETAKE_PLANS = {
     "boards": (
         "take boards in ten places and more, tilted by 20° to 40° in several directions, and fill the image with them"
@@ -39,6 +39,7 @@ RETAKE_PLANS = {
     "spheres": (
         "take the mirror sphere in ten places that lie far apart, sharp and as large as the teeth's surroundings allow"
     ),
+    "white": "measure its radius again, and take it in three places, whole and not overexposed",
     "chart": "take the chart sharp, evenly lit and not overexposed",
 }
 ENOUGH_SPHERE_PLACES = 10
@@ -64,7 +65,7 @@ class Limit:
     value: float
     limit: float
     unit: str
-    improved_by: Literal["boards", "spheres", "chart"]
+    improved_by: Literal["boards", "spheres", "white", "chart"]
 
     @property
     def is_kept(self) -> bool:
@@ -137,7 +138,7 @@ def _limits(
         if gains:
             variances = np.diag(uncertainty.matrix)[gains]
             rms = 100 * float(np.sqrt(np.mean(variances)))
-            yield Limit("intensity of the lights, rms ±", rms, 0.5, "%", "spheres")
+            yield Limit("intensity of the lights, rms ±", rms, 0.5, "%", "white")
     if colours is not None:
         for name, fit in colours.fits.items():
             median = float(np.median(fit.held_out))
@@ -222,7 +223,8 @@ def _retake_advice(worst: Limit, sphere_places: int, *, has_suspicions: bool) ->
     if has_suspicions:
         return f"First mend what looks wrong: {off}."
     times = math.ceil((worst.value / worst.limit) ** 2)
-    if times > MAX_TIMES or (worst.improved_by == "spheres" and sphere_places < ENOUGH_SPHERE_PLACES):
+    is_short_of_places = worst.improved_by == "spheres" and sphere_places < ENOUGH_SPHERE_PLACES
+    if times > MAX_TIMES or is_short_of_places or worst.improved_by == "white":
         return f"Photograph {what} again: {off}; {RETAKE_PLANS[worst.improved_by]}."
     return (
         f"Photograph {what} again: {off}; {times} times as many photographs would meet it, if chance alone is the"

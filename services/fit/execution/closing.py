@@ -26,10 +26,10 @@ Array = NDArray[np.float64]
 HeldCosines = Mapping[tuple[str, ...], tuple[float, float]]
 """Media whose mean cosine was held, and the mean and standard deviation of its prior in the unbounded domain; the error
 of one entry's media is common to them."""
-
 HeldShapes = Sequence[tuple[dict[str, float], dict[str, float]]]
 """Blend weights by name at both ends of each independent error of a held shape, one standard deviation on either
 side."""
+
 MOVE_DIVISOR = 4
 """Divisor of the paths for images of moved scans and domes, because there are thirteen of them."""
 SHIFT_DIVISOR = 2
