@@ -23,7 +23,7 @@ def half_angle_deg(
         (reflected_of + NOISE * random.standard_normal(len(angle_deg))).astype(np.float32),
         np.full(len(angle_deg), 1 / NOISE**2, dtype=np.float32),
     )
-    return float(np.degrees(profile.half_angle(tolerated, WIDEST_DEG)))
+    return 0.0 if (lobe := profile.lobe(tolerated, WIDEST_DEG)) is None else float(np.degrees(lobe.half_angle))
 
 
 def ggx(angle_deg: np.ndarray, roughness: float) -> np.ndarray:
@@ -78,7 +78,7 @@ def test_pixels_without_an_estimate_tell_nothing() -> None:
     profile, angle = LobeProfile(), angles().astype(np.float32)
     none = np.zeros_like(angle)
     profile.add(np.cos(np.radians(angle)), none + np.float32(1e-10), none, none)
-    assert profile.half_angle(0.02, WIDEST_DEG) == 0
+    assert profile.lobe(0.02, WIDEST_DEG) is None
 
 
 def test_light_far_from_the_mirror_direction_tells_nothing() -> None:

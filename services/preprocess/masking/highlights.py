@@ -8,22 +8,19 @@ direction.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
 from services.preprocess.masking.lobe import PROFILE_DEG, LobeProfile
+from services.preprocess.masking.shading import Shading, fit_shading, lit_pixels, lobe_explains_light
 from services.preprocess.projection import Footprint
 from services.preprocess.window import bands
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
-FITTED_PIXELS = 100_000
-"""Largest number of pixels to which shading is fitted."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +133,8 @@ def highlight_mask(
     axis /= np.linalg.norm(axis)
     brightness = along_axis(radiance, axis)
     far = usable & (cosines < np.float32(np.cos(np.radians(o.lobe_deg)))) & (brightness > 0)
-    shading = _fit_shading(brightness, far, normal, o)
-    colour = _fit_colour(radiance, brightness, usable, far, axis) if radiance.shape[-1] >= 3 else None
+    shading = fit_shading(brightness, far, normal, o.shading_error)
+    colour = _fit_colour(radiance, variance, brightness, usable, far, axis, o) if radiance.shape[-1] >= 3 else None
 
     # Estimate the reflected part of each pixel and test it against the thresholds, a few rows at a time
     weak, strong = saturated_near.astype(np.uint8), saturated_near
@@ -147,7 +144,7 @@ def highlight_mask(
         if not own.any():
             continue
         estimate, weight = _reflected(
-            radiance[rows], variance[rows], brightness[rows], normal[rows], rows, axis, shading, colour, o
+            radiance[rows], variance[rows], brightness[rows], normal[rows], rows, axis, shading, colour
         )
         bright = brightness[rows]
         fraction = estimate / np.maximum(bright, np.float32(1e-30))
@@ -156,8 +153,10 @@ def highlight_mask(
         weak[rows] |= is_weak
         strong[rows] |= is_weak & (fraction > np.float32(o.strong)) & (significance > np.float32(o.strong_sigma))
         profile.add(cosines[rows][own], bright[own], estimate[own], weight[own])
-    half_angle = profile.half_angle(o.tolerated, o.cone_deg)
-    if half_angle == 0 and not strong.any():
+    found = profile.lobe(o.tolerated, o.cone_deg)
+    if found is not None and not lobe_explains_light(found, brightness, usable, normal, cosines):
+        found = None
+    if found is None and not strong.any():
         return mask
 
     # Apply hysteresis: keep connected weak pixels that contain a strong one, and add one pixel of bloom around them
@@ -167,8 +166,8 @@ def highlight_mask(
     of_core[0] = 0
     core = of_core[labels]
     bloom = cv2.dilate(core, np.ones((3, 3), np.uint8)) > 0
-    lobe = cosines > np.float32(np.cos(half_angle))
-    return np.asarray((usable | saturated) & (bloom | lobe))
+    masked = bloom if found is None else bloom | (cosines > np.float32(np.cos(found.half_angle)))
+    return np.asarray((usable | saturated) & masked)
 
 
 def along_axis(image: Image, axis: NDArray[np.float64]) -> Image:
@@ -179,41 +178,18 @@ def along_axis(image: Image, axis: NDArray[np.float64]) -> Image:
 
 
 @dataclass(frozen=True)
-class _Shading:
-    """Diffuse shading as a quadratic in the normal.
-
-    Attributes:
-        quadratic: (3, 3) symmetric matrix of the quadratic part.
-        linear: (3,) coefficients of the linear part.
-        constant: constant part.
-        misfit: relative standard deviation of the residual, at least ``shading_error``.
-    """
-
-    quadratic: NDArray[np.float32]
-    linear: NDArray[np.float32]
-    constant: np.float32
-    misfit: float
-
-    def at(self, normal: Image) -> Image:
-        """Shading (h, w) of surfaces with unit normals (h, w, 3)."""
-        flat = normal.reshape(-1, 3)
-        product = flat @ self.quadratic
-        product += self.linear
-        product *= flat
-        return np.asarray(product @ np.ones(3, dtype=np.float32) + self.constant).reshape(normal.shape[:2])
-
-
-@dataclass(frozen=True)
 class _Colour:
     """Diffuse chroma of an image.
 
     Attributes:
         direction: (C,) unit vector of the chroma, perpendicular to the light's colour.
         inverse_ratio: (H, W) brightness over chroma of diffuse light in each pixel's neighbourhood.
+        misfit: relative standard deviation of the residual beyond the sensor's noise, at least ``colour_error``.
     """
 
     direction: NDArray[np.float64]
     inverse_ratio: Image
+    misfit: float
 
 
 def _reflected(
@@ -223,9 +199,8 @@ def _reflected(
     normal: Image,
     rows: slice,
     axis: NDArray[np.float64],
-    shading: _Shading | None,
+    shading: Shading | None,
     colour: _Colour | None,
-    o: HighlightOptions,
 ) -> tuple[Image, Image]:
     """Estimate the reflected part of the brightness (h, w) and its inverse variance (h, w), 0 where unknown.
 
@@ -242,63 +217,42 @@ def _reflected(
         total += own * (brightness - expected)
         weight += own
     if colour is not None:
-        inverse = colour.inverse_ratio[rows]
-        estimate = brightness - along_axis(radiance, colour.direction) * inverse
-        spread = np.zeros_like(brightness)
-        for c in range(radiance.shape[-1]):
-            factor = np.float32(axis[c]) - np.float32(colour.direction[c]) * inverse
-            factor *= factor
-            factor *= variance[..., c]
-            spread += factor
-        own = 1 / np.maximum(spread + (np.float32(o.colour_error) * brightness) ** 2, tiny)
+        estimate, spread = _by_colour(
+            radiance, variance, brightness, axis, colour.direction, colour.inverse_ratio[rows]
+        )
+        own = 1 / np.maximum(spread + (np.float32(colour.misfit) * brightness) ** 2, tiny)
         total += own * estimate
         weight += own
     return np.divide(total, np.maximum(weight, tiny), out=total), weight
 
 
-def _fit_shading(brightness: Image, far: BoolArray, normal: Image, o: HighlightOptions) -> _Shading | None:
-    """Fit the shading (nine coefficients) of the diffuse pixels ``far``; None if too few of them are lit."""
-    chosen = _strided(far, FITTED_PIXELS)
-    if not len(chosen):
-        return None
-    # Use only lit pixels; evenly strided ones are enough for nine coefficients
-    level = brightness.ravel()[chosen]
-    lit = level > 0.1 * np.quantile(level, 0.95)
-    chosen, level = chosen[lit], level[lit].astype(np.float64)
-    if len(chosen) < 90:
-        return None
-    terms = np.stack(tuple(_quadratic(normal.reshape(-1, 3)[chosen].astype(np.float64))), axis=-1)
-    # Solve with a small ridge, which keeps coefficients near zero that the visible normals do not determine
-    matrix = terms.T @ terms
-    c = np.linalg.solve(matrix + 1e-4 * np.trace(matrix) / 9 * np.eye(9), terms.T @ level)
-    # Take the relative residual as the model's error
-    misfit = max(o.shading_error, float(np.sqrt(np.mean((level - terms @ c) ** 2)) / level.mean()))
-    quadratic = np.array(
-        [[c[7], c[4] / 2, c[6] / 2], [c[4] / 2, -c[7], c[5] / 2], [c[6] / 2, c[5] / 2, 3 * c[8]]], dtype=np.float32
-    )
-    return _Shading(quadratic, c[1:4].astype(np.float32), np.float32(c[0] - c[8]), misfit)
-
-
-def _strided(mask: BoolArray, most: int) -> NDArray[np.intp]:
-    """Flat indices of at most ``most`` of a mask's pixels, evenly strided."""
-    inside = np.flatnonzero(mask)
-    return inside[:: max(1, -(-len(inside) // most))]
-
-
-def _quadratic(normal: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    """Yield nine polynomials of a normal (..., 3) up to degree two: the spherical harmonics up to scale."""
-    x, y, z = (normal[..., k] for k in range(3))
-    yield np.ones_like(x)
-    yield from (x, y, z)
-    yield x * y
-    yield y * z
-    yield z * x
-    yield x * x - y * y
-    yield 3 * z * z - 1
+def _by_colour(
+    radiance: Image,
+    variance: Image,
+    brightness: Image,
+    axis: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    inverse_ratio: Image,
+) -> tuple[Image, Image]:
+    """Reflected part S − v/ρ (...) of pixels (..., C) by their colour, and its variance (...) from the noise alone."""
+    estimate = brightness - radiance @ direction.astype(np.float32) * inverse_ratio
+    spread = np.zeros_like(brightness)
+    for c in range(radiance.shape[-1]):
+        factor = np.float32(axis[c]) - np.float32(direction[c]) * inverse_ratio
+        factor *= factor
+        factor *= variance[..., c]
+        spread += factor
+    return estimate, spread
 
 
 def _fit_colour(
-    radiance: Image, brightness: Image, usable: BoolArray, far: BoolArray, axis: NDArray[np.float64]
+    radiance: Image,
+    variance: Image,
+    brightness: Image,
+    usable: BoolArray,
+    far: BoolArray,
+    axis: NDArray[np.float64],
+    o: HighlightOptions,
 ) -> _Colour | None:
     """Estimate the diffuse chroma from the pixels ``far``; None if they are too few or have none."""
     import cv2
@@ -330,7 +284,14 @@ def _fit_colour(
     inverse = (1 / ratio).astype(np.float32)
     if factor > 1:
         inverse = np.asarray(cv2.resize(inverse, usable.shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
-    return _Colour(direction, inverse)
+    # Take the residual of diffuse pixels, less their noise, as the model's error: light that has travelled far through
+    # a tooth is more yellow than light that has not
+    chosen = lit_pixels(brightness, far)
+    level = brightness.ravel()[chosen]
+    pixels = (one.reshape(-1, len(axis))[chosen] for one in (radiance, variance))
+    residual, spread = _by_colour(*pixels, level, axis, direction, inverse.ravel()[chosen])
+    excess = max(float(np.mean(residual**2) - np.mean(spread)), 0.0)
+    return _Colour(direction, inverse, max(o.colour_error, float(np.sqrt(excess) / level.mean())))
 
 
 def _wide_blur(image: Image, sigma_px: float, factor: int) -> Image:

@@ -33,11 +33,39 @@ SHAPE_ERROR = 0.1
 
 
 @dataclass(frozen=True)
+class Distribution:
+    """Microfacet distribution, up to scale."""
+
+    roughness: float
+    is_beckmann: bool
+
+    def at(self, cosines_squared: Array) -> Array:
+        """Values (N,) at squared cosines (N,) between normal and half vector, all above zero."""
+        squared = self.roughness**2
+        if self.is_beckmann:
+            return np.asarray(np.exp((1 - 1 / cosines_squared) / squared) / (squared * cosines_squared**2))
+        return np.asarray(squared / (cosines_squared * (squared - 1) + 1) ** 2)
+
+
+@dataclass(frozen=True)
+class FoundLobe:
+    """A reflection found in a profile.
+
+    Attributes:
+        distribution: its distribution.
+        half_angle: angle, rad, within which it exceeds the tolerated fraction of the diffuse light.
+    """
+
+    distribution: Distribution
+    half_angle: float
+
+
+@dataclass(frozen=True)
 class _Lobe:
     """Distribution fitted to the profile.
 
     Attributes:
-        roughness: roughness of the distribution.
+        distribution: the distribution.
         by_angle: amplitude times distribution, at the profile's angles.
         error: relative standard error of the amplitude; negative if the amplitude is negative.
         bias: fraction of all light by which the reflection is underestimated, because diffuse light was learned from
@@ -45,7 +73,7 @@ class _Lobe:
         misfit: weighted sum of squared residuals.
     """
 
-    roughness: float
+    distribution: Distribution
     by_angle: Array
     error: float
     bias: float
@@ -88,16 +116,16 @@ class LobeProfile:
     def _by_degree(degrees: NDArray[np.int64], values: NDArray[np.float32]) -> Array:
         return np.asarray(np.bincount(degrees, values, minlength=PROFILE_DEG)[:PROFILE_DEG], dtype=np.float64)
 
-    def half_angle(self, tolerated: float, widest_deg: float) -> float:
-        """Half-angle in rad within which the reflection exceeds a fraction of the diffuse light; 0 if no lobe is found.
+    def lobe(self, tolerated: float, widest_deg: float) -> FoundLobe | None:
+        """The lobe within whose half-angle the reflection exceeds a fraction of the diffuse light, or None.
 
         Args:
-            tolerated: the fraction. widest_deg: upper limit of the result.
+            tolerated: the fraction. widest_deg: upper limit of the half-angle.
         """
         used = np.flatnonzero(self._total > 0)
         # Require clearly more angles than the unknowns roughness, amplitude and bias
         if len(used) < 10:
-            return 0.0
+            return None
         total, reflected, count = self._total[used], self._reflected[used], self._count[used]
         level = np.maximum(total, count * total.sum() / count.sum())
         spread = self._variance[used] + (DIFFUSE_ERROR * level) ** 2 + (SHAPE_ERROR * reflected) ** 2
@@ -107,12 +135,13 @@ class LobeProfile:
         # Reject a lobe whose amplitude is noise, that is as broad as shading, or whose core reflects too little
         core = lobe.by_angle > lobe.by_angle.max() / 2
         core_share = reflected[core].sum() / total[core].sum() + lobe.bias if core.any() else 0.0
-        if not 0 < lobe.error < 1 / SIGMA or lobe.roughness == ROUGHNESS[-1] or core_share < CORE_SHARE:
-            return 0.0
+        if not 0 < lobe.error < 1 / SIGMA or lobe.distribution.roughness == ROUGHNESS[-1] or core_share < CORE_SHARE:
+            return None
         own = lobe.by_angle * count / (1 + max(lobe.bias, 0.0))
         share = own / np.maximum(total - own, 1e-9 * total.max())
         beyond = used[share < tolerated]
-        return float(np.radians(min(beyond[0], widest_deg) if len(beyond) else widest_deg))
+        half_angle_deg = min(beyond[0], widest_deg) if len(beyond) else widest_deg
+        return FoundLobe(lobe.distribution, float(np.radians(half_angle_deg)))
 
 
 def _lobes(degrees: Array, total: Array, reflected: Array, count: Array, weight: Array) -> Iterator[_Lobe]:
@@ -123,12 +152,10 @@ def _lobes(degrees: Array, total: Array, reflected: Array, count: Array, weight:
     """
     cosines_squared = np.cos(np.radians(degrees)) ** 2
     for roughness in ROUGHNESS:
-        squared = roughness**2
-        ggx = squared / (cosines_squared * (squared - 1) + 1) ** 2
-        beckmann = np.exp((1 - 1 / cosines_squared) / squared) / (squared * cosines_squared**2)
-        for facets in (ggx, beckmann):
+        for distribution in (Distribution(float(roughness), False), Distribution(float(roughness), True)):
+            facets = distribution.at(cosines_squared)
             # Skip a distribution that is almost zero at all these angles
-            if facets.max() * squared < 1e-9:
+            if facets.max() * roughness**2 < 1e-9:
                 continue
             # Solve the normal equations for amplitude and bias; skip a distribution that is proportional to all light
             own, other = facets * count, -total
@@ -143,4 +170,4 @@ def _lobes(degrees: Array, total: Array, reflected: Array, count: Array, weight:
             bias = (square * by_other - mixed * by_own) / determinant
             misfit = float((weight * (reflected - amplitude * own - bias * other) ** 2).sum())
             error = float(np.sqrt(other_square / determinant) / amplitude) if amplitude else np.inf
-            yield _Lobe(float(roughness), amplitude * facets, error, float(bias), misfit)
+            yield _Lobe(distribution, amplitude * facets, error, float(bias), misfit)
