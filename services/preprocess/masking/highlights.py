@@ -288,8 +288,8 @@ def _fit_colour(
     # a tooth is more yellow than light that has not
     chosen = lit_pixels(brightness, far)
     level = brightness.ravel()[chosen]
-    pixels = (one.reshape(-1, len(axis))[chosen] for one in (radiance, variance))
-    residual, spread = _by_colour(*pixels, level, axis, direction, inverse.ravel()[chosen])
+    values, noise = (image.reshape(-1, len(axis))[chosen] for image in (radiance, variance))
+    residual, spread = _by_colour(values, noise, level, axis, direction, inverse.ravel()[chosen])
     excess = max(float(np.mean(residual**2) - np.mean(spread)), 0.0)
     return _Colour(direction, inverse, max(o.colour_error, float(np.sqrt(excess) / level.mean())))
 
