@@ -12,7 +12,8 @@ in all of these.
 
 ``bound`` is the Cramér–Rao bound of each quantity: photographs' noise, instrument errors with their priors, moves too
 as unknowns that photographs determine (with stock's changes), and the held mean cosines, of which photographs are
-taken to know nothing. It has no noise of rendering.
+taken to know nothing. It has no noise of rendering. What photographs tell of moves is the product of stock's changes in
+two halves of the pixels, whose noise is independent.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from services.fit.execution.blocks import Block, BlockTask, read_block
 from services.fit.instrument.errors import DEFAULT_SE, kind_of_error
 from services.fit.optics.domain import Domain
 from services.fit.solve import covariance
-from services.fit.solve.closing import ClosingSums
+from services.fit.solve.closing import ClosingSums, positive_part
 from services.fit.solve.recombination import Recombination
 from services.fit.solve.sandwich import CombinedSolution, Sandwich, combine_with_prior
 from services.fit.transport.platform import prepare_device
@@ -70,17 +71,9 @@ class Changes:
 
     def of_block(self, block: Block, errors: Sequence[str]) -> NDArray[np.float32]:
         """Changes (K, 2, L, N) of a block's images, twice the same: by the errors named, then by the moves."""
-        camera, pixels = block.fitted_view.camera, block.fitted_view.pixels
         names = block.instrument
         assert names is not None
-
-        def seen(name: str) -> Array:
-            width, height = camera.size
-            image = self.stored[f"{camera.name}_{name}"][:, : height * PIXEL_STEP, : width * PIXEL_STEP]
-            squares = image.reshape(len(image), height, PIXEL_STEP, width, PIXEL_STEP).mean(axis=(2, 4))
-            return np.asarray(squares[:, pixels[:, 1], pixels[:, 0]])
-
-        image = seen("none")
+        image = self._squares(block, "none").mean(axis=(0, 1))
         by_name = {names.gain: image, names.flare: np.full_like(image, names.brightest)}
         for k, light in enumerate(names.lights):
             by_name[light] = np.where(np.arange(len(image))[:, None] == k, image, 0.0)
@@ -88,7 +81,28 @@ class Changes:
             DEFAULT_SE[kind_of_error(name)] * by_name[name] if name in by_name else np.zeros_like(image)
             for name in errors
         ]
-        return np.repeat(np.array([*changes, *map(seen, self.moves)])[:, None], 2, axis=1).astype(np.float32)
+        moved = [self._squares(block, name).mean(axis=(0, 1)) for name in self.moves]
+        return np.repeat(np.array([*changes, *moved])[:, None], 2, axis=1).astype(np.float32)
+
+    def information(self, block: Block) -> Array:
+        """What a block's photographs tell of the moves, (12, 12): products of the changes of the pixels on one diagonal
+        of each square with those on the other.
+        """
+        squares = [self._squares(block, name) for name in self.moves]
+        one, other = (
+            np.array([0.5 * (each[0, k] + each[1, 1 - k]) for each in squares]).reshape(len(squares), -1)
+            for k in (0, 1)
+        )
+        product = (one * block.fit_weight.reshape(-1)) @ other.T
+        return np.asarray(0.5 * (product + product.T))
+
+    def _squares(self, block: Block, name: str) -> Array:
+        # Stored images at the pixels of each of the block's pixels, (rows, columns, L, N).
+        camera, pixels = block.fitted_view.camera, block.fitted_view.pixels
+        width, height = camera.size
+        image = self.stored[f"{camera.name}_{name}"][:, : height * PIXEL_STEP, : width * PIXEL_STEP]
+        squares = image.reshape(len(image), height, PIXEL_STEP, width, PIXEL_STEP).transpose(2, 4, 0, 1, 3)
+        return np.asarray(squares[..., pixels[:, 1], pixels[:, 0]])
 
 
 @dataclass
@@ -117,8 +131,7 @@ class Recorder:
             found = []
             for block in (read_block(task.block) for task in tasks):
                 found.append([self.changes.of_block(block, errors)])
-                moved = found[-1][0][len(errors) :, 0].reshape(len(moves), -1).astype(np.float64)
-                self.information += (moved * block.fit_weight.reshape(-1)) @ moved.T
+                self.information += self.changes.information(block)
             return found
 
         with patch.object(closing, "_changes_by_moves", by_stock):
@@ -144,7 +157,8 @@ class Recorder:
         """Cramér–Rao covariance (Q, Q) of the reported quantities without the noise of rendering."""
         assert self.solution is not None
         known = self.shifts[-len(self.information) :].T
-        whole = np.block([[np.eye(len(known)), known], [known.T, np.eye(len(self.information)) + self.information]])
+        told = positive_part(self.information)
+        whole = np.block([[np.eye(len(known)), known], [known.T, np.eye(len(told)) + told]])
         own = self.slopes @ self.solution.sandwich.transform
         held = self.slopes @ self.solution.parts.get("mean_cosine", np.zeros_like(known @ known.T)) @ self.slopes.T
         return np.asarray(own @ np.linalg.inv(whole)[: len(known), : len(known)] @ own.T + held)

@@ -39,6 +39,11 @@ CHECKED_BY_IMAGES = frozenset({"light_gain", "flare"})
 can hardly tell it from absorption: freed of its prior it follows other errors, such as the model's own.
 Of 36 good captures 4 put it 11 to 15 % too low, with absorption 35 to 65 % too low, and of 7 with a gain 10 % too high
 none showed it."""
+MANY_FAULTS = 3
+"""Least number of checked errors far from their prior that may show what the model leaves out."""
+FAULT_SHARE = 1 / 4
+"""Least share of them. In a fit of one tooth of a virtual mouth, without its neighbours and gums, three to five of
+twelve were; of captures with one fault of the calibration at most two of eight."""
 MAX_ERROR = 10.0
 """Largest absolute value of an error, in its unit."""
 
@@ -79,6 +84,16 @@ class InstrumentErrors:
 
 
 NO_ERRORS = InstrumentErrors()
+
+
+def is_of_model(faults: int, names: Sequence[str]) -> bool:
+    """Whether so many errors lie far from their prior that the model is at fault, and not the calibration.
+
+    Args:
+        faults: number of errors that do. names: names of all errors.
+    """
+    checked = sum(kind_of_error(name) in CHECKED_BY_IMAGES for name in names)
+    return faults >= max(MANY_FAULTS, FAULT_SHARE * checked)
 
 
 def gain_name(channel: str) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec
-from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, kind_of_error
+from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, is_of_model, kind_of_error
 from services.fit.solve.recombination import Fault
 
 SIZES = {
@@ -68,7 +68,13 @@ def instrument_sentences(
         if spec.lobes == 2
         else ()
     )
-    return (*_assumed(assumed, errors), *_unused(stated), *_exact_lights(errors), *unmoved, *_faults(errors, faults))
+    return (
+        *_assumed(assumed, errors),
+        *_unused(stated),
+        *_exact_lights(errors),
+        *unmoved,
+        *_faults(spec, errors, faults),
+    )
 
 
 def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
@@ -115,8 +121,20 @@ def _exact_lights(errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
         )
 
 
-def _faults(errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]]) -> Iterator[str]:
+def _faults(
+    spec: JobSpec, errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]]
+) -> Iterator[str]:
+    alone = "" if spec.kind == "jaw" else ' Light from neighbours and gums is in a fit of kind = "jaw".'
     for channel, own in faults.items():
+        if is_of_model(len(own), names := errors[channel].names):
+            worst = max(own, key=lambda fault: abs(fault.z))
+            yield (
+                f"In {channel} the images put {len(own)} gains of lights and flares off, most of all"
+                f" {names[worst.index]} by {100 * worst.size:+.1f} %, {abs(worst.z):.1f} times what it may be: so many"
+                f" show what the model leaves out, and not a fault of the calibration. The ± do not contain it.{alone}"
+                " Look also at the option boundary and at the place of the scan."
+            )
+            continue
         for fault in own:
             name, before = errors[channel].names[fault.index], errors[channel].se[fault.index]
             yield (

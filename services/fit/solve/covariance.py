@@ -56,7 +56,8 @@ class Uncertainty:
     parts: Mapping[str, Array] = field(default_factory=dict)
     """Covariances (F, F) that add up to the whole, by their source (``results.Estimate``)."""
     faults: tuple[Fault, ...] = ()
-    """Instrument errors that the images show to be faults of the calibration."""
+    """Instrument errors that lie too far from their prior: faults of the calibration, or of the model where they are
+    many (``is_of_model``)."""
     is_full_step: bool = True
     """Whether the full use of the prior of the instrument's errors moved x no farther than one linear model
     is valid."""
