@@ -20,7 +20,7 @@ from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
 from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
-from services.fit.instrument.errors import CHECKED_BY_IMAGES, DEFAULT_SE, InstrumentErrors, errors_of, is_of_model
+from services.fit.instrument.errors import CHECKED_BY_IMAGES, DEFAULT_SE, InstrumentErrors, errors_of, have_common_cause
 from services.fit.instrument.moves import by_scene, move_covariance, rigid, write_moves
 from services.fit.instrument.photographs import error_derivatives, photographed
 from services.fit.instrument.sentences import REMEDY, assumed_names, instrument_sentences
@@ -212,7 +212,7 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     )
 
 
-def test_many_lights_off_at_once_are_told_as_what_the_model_leaves_out() -> None:
+def test_many_lights_off_at_once_are_told_as_one_cause() -> None:
     spec, lights = JobSpec.model_validate({"capture": "c"}), tuple("abcdefgh")
     errors = {"green": errors_of("green", lights, ("c0",), None)}
     two, three = (tuple(Fault(k, -0.01 * k, -3.0 - k) for k in range(1, count)) for count in (3, 4))
@@ -225,10 +225,10 @@ def test_many_lights_off_at_once_are_told_as_what_the_model_leaves_out() -> None
     assert 'kind = "jaw"' in told
     (told,) = instrument_sentences(spec.model_copy(update={"kind": "jaw"}), errors, {"green": three}, ())
     assert "jaw" not in told
-    assert is_of_model(3, errors["green"].names)
-    assert not is_of_model(2, errors["green"].names)
+    assert have_common_cause(3, errors["green"].names)
+    assert not have_common_cause(2, errors["green"].names)
     # A jaw under many lights has flares alone, of which one may be a fault.
-    assert not is_of_model(1, ("gain.green", "flare.c0.green"))
+    assert not have_common_cause(1, ("gain.green", "flare.c0.green"))
 
 
 def test_an_error_that_the_calibration_states_is_not_told_as_assumed() -> None:

@@ -40,10 +40,11 @@ can hardly tell it from absorption: freed of its prior it follows other errors, 
 Of 36 good captures 4 put it 11 to 15 % too low, with absorption 35 to 65 % too low, and of 7 with a gain 10 % too high
 none showed it."""
 MANY_FAULTS = 3
-"""Least number of checked errors far from their prior that may show what the model leaves out."""
+"""Least number of checked errors far from their prior that show a cause common to them."""
 FAULT_SHARE = 1 / 4
 """Least share of them. In a fit of one tooth of a virtual mouth, without its neighbours and gums, three to five of
-twelve were; of captures with one fault of the calibration at most two of eight."""
+twelve were far off; with one light 30 mm off, or with errors drawn from their prior, at most one of eight. Exchanged
+photographs (four or five of eight) and a scan 1 mm off (two to four) have such a common cause too."""
 MAX_ERROR = 10.0
 """Largest absolute value of an error, in its unit."""
 
@@ -86,8 +87,9 @@ class InstrumentErrors:
 NO_ERRORS = InstrumentErrors()
 
 
-def is_of_model(faults: int, names: Sequence[str]) -> bool:
-    """Whether so many errors lie far from their prior that the model is at fault, and not the calibration.
+def have_common_cause(faults: int, names: Sequence[str]) -> bool:
+    """Whether so many errors lie far from their prior that they have one cause, in the model or the photographs, and
+    are no faults of the calibration.
 
     Args:
         faults: number of errors that do. names: names of all errors.

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from services.core.records import JobSpec, PreparedManifest
-from services.fit.instrument.errors import is_of_model
+from services.fit.instrument.errors import have_common_cause
 from services.fit.instrument.moves import move_covariance
 from services.fit.instrument.sentences import assumed_names, instrument_sentences
 from services.fit.solve.covariance import Uncertainty
@@ -30,7 +30,7 @@ def instrument_report(
         errors, [body for body in moves if any(body in one.parts for one in uncertainties.values())]
     )
     faults = {channel: one.faults for channel, one in uncertainties.items() if one.faults}
-    named = {c: own for c, own in faults.items() if not is_of_model(len(own), errors[c].names)}
+    named = {c: own for c, own in faults.items() if not have_common_cause(len(own), errors[c].names)}
     return {
         "instrument": found,
         "instrument_prior": {c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in found},

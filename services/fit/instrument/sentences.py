@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec
-from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, is_of_model, kind_of_error
+from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, have_common_cause, kind_of_error
 from services.fit.solve.recombination import Fault
 
 SIZES = {
@@ -126,13 +126,13 @@ def _faults(
 ) -> Iterator[str]:
     alone = "" if spec.kind == "jaw" else ' Light from neighbours and gums is in a fit of kind = "jaw".'
     for channel, own in faults.items():
-        if is_of_model(len(own), names := errors[channel].names):
+        if have_common_cause(len(own), names := errors[channel].names):
             worst = max(own, key=lambda fault: abs(fault.z))
             yield (
                 f"In {channel} the images put {len(own)} gains of lights and flares off, most of all"
                 f" {names[worst.index]} by {100 * worst.size:+.1f} %, {abs(worst.z):.1f} times what it may be: so many"
-                f" show what the model leaves out, and not a fault of the calibration. The ± do not contain it.{alone}"
-                " Look also at the option boundary and at the place of the scan."
+                " have one cause: what the model leaves out, photographs under wrong names, or a scan in another"
+                f" place. The ± do not contain it.{alone} Look also at the option boundary."
             )
             continue
         for fault in own:

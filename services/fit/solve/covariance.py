@@ -56,8 +56,8 @@ class Uncertainty:
     parts: Mapping[str, Array] = field(default_factory=dict)
     """Covariances (F, F) that add up to the whole, by their source (``results.Estimate``)."""
     faults: tuple[Fault, ...] = ()
-    """Instrument errors that lie too far from their prior: faults of the calibration, or of the model where they are
-    many (``is_of_model``)."""
+    """Instrument errors that lie too far from their prior: faults of the calibration, or where they are many the signs
+    of another cause (``have_common_cause``)."""
     is_full_step: bool = True
     """Whether the full use of the prior of the instrument's errors moved x no farther than one linear model
     is valid."""

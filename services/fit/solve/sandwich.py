@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.instrument.errors import CHECKED_BY_IMAGES, is_of_model, kind_of_error
+from services.fit.instrument.errors import CHECKED_BY_IMAGES, have_common_cause, kind_of_error
 from services.fit.optics.domain import Domain
 from services.fit.solve.recombination import Fault, Recombination, faults
 
@@ -106,8 +106,8 @@ def combine_with_prior(
     weighed = Recombination(whole + sandwich.product(sandwich.inverse, sandwich.weighing), response, sandwich.prior)
     tested = (k for k, name in enumerate(domain.errors.names) if kind_of_error(name) in CHECKED_BY_IMAGES)
     detected = faults(x[count:], found, tested)
-    of_model = is_of_model(len(detected), domain.errors.names)
-    rejected = () if of_model else tuple(fault.index for fault in detected)
+    is_common = have_common_cause(len(detected), domain.errors.names)
+    rejected = () if is_common else tuple(fault.index for fault in detected)
     change = weighed.change(rejected)
     updated = found.updated(change)
 
