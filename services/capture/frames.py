@@ -27,7 +27,7 @@ from pydantic import ValidationError
 
 from services.core.errors import StoreError
 from services.core.geometry import Record
-from services.core.records import FrameRecord
+from services.core.results import FrameRecord
 from services.core.store import StageWriter, create_array, image_pieces, write_atomic
 
 ARRAY = "capture.zarr"

@@ -12,7 +12,7 @@ from services.capture.cameras.protocol import Cameras
 from services.capture.dome.protocol import Dome, Rgb
 from services.capture.frames import FrameStore
 from services.capture.plan import PlannedFrame
-from services.core.records import FrameRecord
+from services.core.results import FrameRecord
 from services.core.stage import StageContext, StageEvent
 
 CLIPPED_FRACTION = 0.01

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from services.core.errors import SettingsError
 from services.core.installed import require_packages
-from services.core.records import LIMITS_OF_A_RIG, CaptureManifest, JobSpec
+from services.core.records import LIMITS_OF_A_RIG, JobSpec
+from services.core.results import CaptureManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter
 

@@ -56,6 +56,7 @@ SLAB_OPTIONS = frozenset({"effort", "dictionary", "particle_index", "particle_ab
 """Options that only a slab has."""
 _OF_A_JAW: Mapping[str, Any] = {
     "fdi": None,
+    "surroundings": "auto",
     "lobes": 1,
     "held": {},
     "stains": False,

@@ -1,4 +1,4 @@
-"""Records that cross a process boundary: a job's options, and the manifests that stages publish."""
+"""Records that cross a process boundary: a job's options, and the description of a folder capture."""
 
 from __future__ import annotations
 
@@ -188,6 +188,13 @@ class JobSpec(Record):
             " the way"
         ),
     )
+    surroundings: Literal["auto", "on", "off"] = Field(
+        default="auto",
+        description=(
+            "of kind tooth: render light that passes between the tooth, gums and other teeth, which are taken to have"
+            " the tooth's media; auto: where they come from a registered scan"
+        ),
+    )
     boundary: Boundary = Field(default="thin", description="model of the enamel surface")
     ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
     dentin: Literal["known", "fit", "none"] = Field(
@@ -341,60 +348,3 @@ class JobSpec(Record):
             if not low < value < high:
                 raise ValueError(f"held {name} = {value:g} must lie between {low:g} and {high:g}")
         return self
-
-
-class FrameRecord(Record):
-    """One acknowledged frame of a capture; wherever this row is on disk, the frame's image is too."""
-
-    index: int
-    kind: Literal["black", "tracking", "light"]
-    light: str | None
-    exposure_s: Positive
-    level: Unit
-    time_s: float = Field(description="since the capture began")
-    readback: tuple[int, int, int] = Field(
-        description="R, G, B register levels read back from the controller; all-on frames give the first light's"
-    )
-
-
-class CaptureManifest(Record):
-    """Published by the capture stage: ``capture.zarr`` plus the rig's calibration and meshes."""
-
-    description: FolderCapture = Field(description="cameras, lights, channels; images empty")
-    frames: tuple[FrameRecord, ...]
-    bits: int
-    black_level: int
-    radiance_per_count: float = Field(description="scene radiance of one count above black at level 1 and 1 s exposure")
-    sensor_noise_relative: float
-    sensor_noise_floor: float
-    fdi: tuple[int, ...]
-
-
-class PreparedManifest(Record):
-    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid, surface; and ``teeth/``."""
-
-    channels: tuple[str, ...]
-    cameras: tuple[Camera, ...]
-    lights: tuple[Light, ...]
-    held_out: tuple[tuple[str, str], ...] = Field(description="(camera, light) pairs the source marks as held out")
-    fdi: tuple[int, ...]
-    dentin_known: tuple[int, ...] = Field(description="FDI numbers whose dentin surface is given")
-    gums: bool = Field(
-        default=False,
-        description="whether gums are to be fitted: pixels that show them are valid, and gums.ply is there",
-    )
-    cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
-    tooth_pixels: tuple[int, ...] = Field(
-        default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth"
-    )
-    median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
-    uncertainty: CalibrationUncertainty | None = Field(
-        default=None, description="how wrong the calibration may be; null where the capture does not say"
-    )
-    masks: str = Field(
-        default="", description="digest of the masks by hand that it was prepared with; empty without any"
-    )
-    notes: tuple[str, ...] = Field(
-        default=(), description="what to know of the capture before trusting a fit of it, one sentence each"
-    )
-    valid_fraction: float

@@ -1,4 +1,6 @@
-"""Records of a fit's results: estimates with their standard errors, the report, the verdict and the exported asset."""
+"""Records that stages publish: the manifests of capture and preparation, and a fit's results: estimates with their
+standard errors, the report, the verdict and the exported asset.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from services.core.geometry import Record, Vector3
+from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.geometry import Camera, Light, Record, Vector3
+from services.core.records import FolderCapture, Positive, Unit
 
 
 class Estimate(Record):
@@ -168,3 +172,64 @@ class AssetManifest(Record):
         default=None, description="how well the fit went; null where an earlier version exported it"
     )
     centre_mm: Vector3 = (0.0, 0.0, 0.0)
+
+
+class FrameRecord(Record):
+    """One acknowledged frame of a capture; wherever this row is on disk, the frame's image is too."""
+
+    index: int
+    kind: Literal["black", "tracking", "light"]
+    light: str | None
+    exposure_s: Positive
+    level: Unit
+    time_s: float = Field(description="since the capture began")
+    readback: tuple[int, int, int] = Field(
+        description="R, G, B register levels read back from the controller; all-on frames give the first light's"
+    )
+
+
+class CaptureManifest(Record):
+    """Published by the capture stage: ``capture.zarr`` plus the rig's calibration and meshes."""
+
+    description: FolderCapture = Field(description="cameras, lights, channels; images empty")
+    frames: tuple[FrameRecord, ...]
+    bits: int
+    black_level: int
+    radiance_per_count: float = Field(description="scene radiance of one count above black at level 1 and 1 s exposure")
+    sensor_noise_relative: float
+    sensor_noise_floor: float
+    fdi: tuple[int, ...]
+
+
+class PreparedManifest(Record):
+    """Published by the prepare stage: ``prepared.zarr`` with radiance, variance, valid, surface; and ``teeth/``."""
+
+    channels: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    held_out: tuple[tuple[str, str], ...] = Field(description="(camera, light) pairs the source marks as held out")
+    fdi: tuple[int, ...]
+    dentin_known: tuple[int, ...] = Field(description="FDI numbers whose dentin surface is given")
+    gums: bool = Field(
+        default=False,
+        description="whether gums are to be fitted: pixels that show them are valid, and gums.ply is there",
+    )
+    cavity: bool = Field(default=False, description="the same for the wall of the mouth, cavity.ply")
+    surroundings: bool = Field(
+        default=False,
+        description="whether a tooth is to be rendered with gums.ply and the other teeth below teeth/",
+    )
+    tooth_pixels: tuple[int, ...] = Field(
+        default=(), description="valid pixels that show each tooth of fdi, over all images; 0 for a hidden tooth"
+    )
+    median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
+    uncertainty: CalibrationUncertainty | None = Field(
+        default=None, description="how wrong the calibration may be; null where the capture does not say"
+    )
+    masks: str = Field(
+        default="", description="digest of the masks by hand that it was prepared with; empty without any"
+    )
+    notes: tuple[str, ...] = Field(
+        default=(), description="what to know of the capture before trusting a fit of it, one sentence each"
+    )
+    valid_fraction: float

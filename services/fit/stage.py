@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from services.core.choices import chosen
 from services.core.geometry import Mesh
 from services.core.installed import require_packages
-from services.core.records import JobSpec, PreparedManifest
-from services.core.results import AssetManifest, FitReport, ToothReport
+from services.core.records import JobSpec
+from services.core.results import AssetManifest, FitReport, PreparedManifest, ToothReport
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage, write_atomic, write_record
 from services.core.verdict import VERDICT, verdict_of
@@ -183,8 +183,7 @@ def fitted_teeth(
 ) -> tuple[Tooth, ...]:
     """The teeth with the fitted dentin surfaces."""
     from services.core.files.meshes import read_teeth
-    from services.fit.jaw.driver import jaw_dentins
-    from services.fit.tooth.driver import dentin_shape
+    from services.fit.inputs.dentin import dentin_shape, jaw_dentins
 
     teeth = read_teeth(prepared_folder, prepared.fdi)
     if spec.kind == "jaw":

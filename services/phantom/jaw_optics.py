@@ -50,6 +50,22 @@ def jaw_mouth(fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
     )
 
 
+def mouth_around(tissue: Tissue, fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
+    """Media of teeth that vary about those of the first, and of gums, without a wall.
+
+    Args:
+        tissue: media of the first tooth in this channel.
+        fdi: FDI numbers of the teeth, the first one's first.
+        channel: name of the channel.
+        subject: seed of the deviations, which are the same in all channels; None for none.
+    """
+    teeth = [tissue]
+    for number in fdi[1:]:
+        enamel, dentin = _draws(subject, number, 2)
+        teeth.append(Tissue(_varied(tissue.enamel, enamel), _varied(tissue.dentin, dentin)))
+    return Mouth(tuple(teeth), _varied(gums_medium(channel), _draws(subject, _GUMS, 1)[0]))
+
+
 def gums_medium(channel: str) -> Medium:
     """Medium of average gums in one channel."""
     reduced, absorption = GUMS_PER_MM[channel]

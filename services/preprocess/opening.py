@@ -12,7 +12,8 @@ from services.core.calibration.state import broken_limits, require_within_limits
 from services.core.files.meshes import read_teeth
 from services.core.raw.folder import is_raw_folder
 from services.core.raw.registration import teeth_root
-from services.core.records import CaptureManifest, JobSpec
+from services.core.records import JobSpec
+from services.core.results import CaptureManifest
 from services.core.store import open_stage, read_record
 from services.preprocess.folder import FolderSource
 from services.preprocess.raw.memory_budget import GIB

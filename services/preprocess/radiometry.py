@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.records import CaptureManifest, FrameRecord
+from services.core.results import CaptureManifest, FrameRecord
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from services.core.calibration.record import require_consistent
 from services.core.errors import CaptureInputError
-from services.core.records import CaptureManifest, FrameRecord, MaskBit
+from services.core.records import MaskBit
+from services.core.results import CaptureManifest, FrameRecord
 from services.core.store import MANIFEST, StoredArray
 from services.preprocess.radiometry import Merge, Radiometry
 from services.preprocess.scratch import cached_array

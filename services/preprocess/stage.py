@@ -6,7 +6,8 @@ import importlib
 
 from services.core.errors import SettingsError
 from services.core.installed import require_packages
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.core.stage import StageContext
 from services.core.store import StageWriter
 
@@ -59,7 +60,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
             f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it."
         )
     masks = HandMasks(context.root, source.description)
-    subject = read_subject(source.root, whole=spec.kind == "jaw", fdi=spec.fdi)
+    subject = read_subject(source.root, spec.kind == "jaw", spec.fdi, spec.surroundings)
     require_plausible_scale(cameras, source.description.lights, subject.teeth)
 
     files = AttemptFiles(StageWriter(context.root, STAGE, context.attempt))

@@ -1,11 +1,12 @@
 """Surfaces that a capture shows: teeth, gums and the wall of the mouth. A jaw's fit models all of them, a single
-tooth's fit only teeth.
+tooth's fit the tooth and, where asked, gums and other teeth as its surroundings.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
+from services.core.raw.registration import REGISTRATION
 from services.preprocess.projection import Footprint, project
 from services.preprocess.source import View
 from services.preprocess.window import window_of
@@ -33,8 +35,10 @@ class Subject:
     """Wall of the mouth, an open surface that is visible from both sides."""
     whole: bool
     """Whether gums and wall are fitted too; otherwise gums are occluders."""
-    others: tuple[Mesh, ...] = ()
-    """Outer surfaces of teeth that are not fitted and therefore are occluders."""
+    others: tuple[Tooth, ...] = ()
+    """Teeth that are not fitted and therefore are occluders."""
+    surroundings: bool = False
+    """Whether the fit renders the occluders, with light that passes between them and the tooth."""
 
     @property
     def gums_number(self) -> int:
@@ -49,12 +53,17 @@ class Subject:
     @property
     def occluders(self) -> tuple[Mesh, ...]:
         """Occluders: surfaces that hide and shade others and are not fitted."""
-        return self.others if self.gums is None or self.whole else (*self.others, self.gums)
+        others = tuple(tooth.outer for tooth in self.others)
+        return others if self.gums is None or self.whole else (*others, self.gums)
 
     def fitted_meshes(self) -> list[Mesh]:
         """Surfaces that are fitted, and that a camera's window must contain."""
         around = [mesh for mesh in (self.gums, self.cavity) if mesh is not None and self.whole]
         return [tooth.outer for tooth in self.teeth] + around
+
+    def rendered_meshes(self) -> list[Mesh]:
+        """Surfaces whose shadows the fit renders."""
+        return self.fitted_meshes() + (list(self.occluders) if self.surroundings else [])
 
     def view_of(self, number: int, camera: Camera) -> View:
         """Window and footprint of the subject in one camera's images."""
@@ -87,13 +96,16 @@ class Subject:
         return np.bincount(labels, minlength=len(self.teeth))[: len(self.teeth)]
 
 
-def read_subject(root: Path, whole: bool, fdi: int | None = None) -> Subject:
+def read_subject(
+    root: Path, whole: bool, fdi: int | None = None, surroundings: Literal["auto", "on", "off"] = "off"
+) -> Subject:
     """Read ``teeth/``, ``gums.ply`` and, if everything is fitted, ``cavity.ply`` of a capture.
 
     Args:
         root: folder of the capture.
         whole: whether gums and wall are fitted too.
         fdi: number of the only tooth to fit; None for all.
+        surroundings: whether the fit of a tooth renders gums and other teeth; auto for where they were registered.
 
     Raises:
         CaptureInputError: there is no tooth, or not the one asked for, or a file cannot be read. MeshError: a surface
@@ -107,12 +119,14 @@ def read_subject(root: Path, whole: bool, fdi: int | None = None) -> Subject:
             " one of these."
         )
     cavity = _optional(root / "cavity.ply") if whole else None
-    if whole and gums is not None:
+    others = tuple(tooth for tooth in teeth if fdi not in {None, tooth.fdi})
+    asked = surroundings == "on" or (surroundings == "auto" and (root / REGISTRATION).is_file())
+    are_rendered = asked and not whole and (gums is not None or bool(others))
+    if (whole or are_rendered) and gums is not None:
         gums.require_solid("gums.ply")
     if cavity is not None:
         cavity.require_surface("cavity.ply")
-    others = tuple(tooth.outer for tooth in teeth if fdi not in {None, tooth.fdi})
-    return Subject(chosen, gums, cavity, whole, others)
+    return Subject(chosen, gums, cavity, whole, others, are_rendered)
 
 
 def _optional(path: Path) -> Mesh | None:

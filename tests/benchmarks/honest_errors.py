@@ -29,7 +29,8 @@ from typing import Protocol
 import numpy as np
 
 from services.core.files.meshes import read_teeth
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.optics.domain import to_natural

@@ -30,8 +30,8 @@ from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import build_jaw
 from services.bench.fits.jaw import prepared_jaw, reported_mouth
 from services.bench.fits.tooth_capture import PreparedTooth
-from services.core.records import JobSpec, PreparedManifest
-from services.core.results import FitReport
+from services.core.records import JobSpec
+from services.core.results import FitReport, PreparedManifest
 from services.core.store import open_stage
 from services.fit.checks.thickness import enamel_thickness_mm
 from services.fit.jaw.views import views_of_parts

@@ -25,7 +25,8 @@ import cv2
 import numpy as np
 
 from services.bench.fits.tooth_capture import prepared_tooth, tissue_of
-from services.core.records import FolderCapture, JobSpec, PreparedManifest
+from services.core.records import FolderCapture, JobSpec
+from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import StoredArray, is_published, open_stage, read_record, write_atomic, write_record
 from services.fit.checks.evaluate import ErrorSums

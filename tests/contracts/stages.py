@@ -8,8 +8,8 @@ from services.api.masks.images import picture_of
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light
 from services.core.masks import digest_of, read_masks
-from services.core.records import JobSpec, PreparedManifest
-from services.core.results import AssetManifest
+from services.core.records import JobSpec
+from services.core.results import AssetManifest, PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, create_array
 from tests.support import toy_stages

@@ -18,7 +18,8 @@ from services.client.client import Client
 from services.client.errors import UnknownCalibrationError
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import read_teeth
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.stage import LocalContext
 from services.core.store import open_stage

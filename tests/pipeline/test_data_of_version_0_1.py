@@ -14,8 +14,8 @@ import pytest
 
 from services.api.app import create_app
 from services.api.auth.tokens import Scope
-from services.core.records import JobSpec, PreparedManifest
-from services.core.results import AssetManifest, FitReport
+from services.core.records import JobSpec
+from services.core.results import AssetManifest, FitReport, PreparedManifest
 from services.core.settings import ServerSettings
 from services.core.store import open_stage, read_record
 from tests.support.guarded_server import make_token

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from services.core.calibration.uncertainty import TWIST
-from services.core.records import JobSpec, PreparedManifest
-from services.core.results import Estimate, FitReport
+from services.core.records import JobSpec
+from services.core.results import Estimate, FitReport, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import MANIFEST, open_stage
 from services.fit.inputs.observations import Observations, ViewStack, read_channel

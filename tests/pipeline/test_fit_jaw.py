@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from services.core.errors import CaptureInputError, DentineError, InputError, SettingsError
-from services.core.records import JobSpec, PreparedManifest
-from services.core.results import FitReport
+from services.core.records import JobSpec
+from services.core.results import FitReport, PreparedManifest
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.fit.checks.thickness import enamel_thickness_mm

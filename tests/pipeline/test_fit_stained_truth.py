@@ -16,11 +16,11 @@ from services.core.files.meshes import read_mesh
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.fit.export.stains import read_stains
+from services.fit.inputs.dentin import dentin_shape
 from services.fit.inputs.observations import channel_scene
 from services.fit.inputs.stain_uv import stain_layout, texel_edge_mm
 from services.fit.optics.domain import similar_tissue
 from services.fit.stage import export, run
-from services.fit.tooth.driver import dentin_shape
 from services.fit.tooth.schedule import SIMILAR_G
 from services.fit.transport.engine import Engine
 from services.phantom.stain_paint import TEXEL_MM, painted_depth

@@ -20,7 +20,8 @@ from services.cli.app import build_app
 from services.core.errors import CaptureInputError, MeshError
 from services.core.files.meshes import read_mesh, read_teeth, write_mesh
 from services.core.geometry import Camera, Mesh
-from services.core.records import FolderCapture, JobSpec, MaskBit, PreparedManifest
+from services.core.records import FolderCapture, JobSpec, MaskBit
+from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import read_record
 from services.fit.transport.rays import RayScene, pixel_rays

@@ -16,7 +16,8 @@ import pytest
 
 from services.core.errors import CorruptStoreError, PlatformError, StoreError
 from services.core.files import object_store
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import StoredArray, open_stage, require_intact, withdraw
 from services.fit.inputs.levels import LevelReader

@@ -16,7 +16,8 @@ import zarr
 
 from services.core.errors import CorruptStoreError, JobCancelledError
 from services.core.geometry import Camera, Light, Mesh
-from services.core.records import JobSpec, MaskBit, PreparedManifest
+from services.core.records import JobSpec, MaskBit
+from services.core.results import PreparedManifest
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage, read_record
 from services.preprocess.projection import Footprint, project

@@ -12,7 +12,8 @@ import pytest
 from services.core.errors import CaptureInputError
 from services.core.events import JobEvent
 from services.core.raw.registration import REGISTERED, Registration, lacks_pose
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.core.store import open_stage, read_record
 from services.pipeline.stages import run_job, stages_of
 from tests.support.raw_folders import write_toml

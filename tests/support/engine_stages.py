@@ -9,8 +9,8 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from services.core.records import CaptureManifest, JobSpec
-from services.core.results import AssetManifest
+from services.core.records import JobSpec
+from services.core.results import AssetManifest, CaptureManifest
 from services.core.stage import CANCEL_FLAG, StageContext
 from services.core.store import read_record
 from services.fit.execution.blocks import StoredFile, write_recipe

@@ -11,7 +11,8 @@ import trimesh
 
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.preprocess.stage import run
 

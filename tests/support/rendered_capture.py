@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light
-from services.core.records import MaskBit, PreparedManifest
+from services.core.records import MaskBit
+from services.core.results import PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Tissue
 from services.fit.transport.engine import Engine

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, teeth_folder
-from services.core.records import CaptureManifest, FolderCapture, FrameRecord
+from services.core.records import FolderCapture
+from services.core.results import CaptureManifest, FrameRecord
 from services.core.store import StageWriter, create_array
 
 LEVEL, EXPOSURE_S = 0.5, 0.05

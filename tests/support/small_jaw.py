@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh
-from services.core.records import JobSpec, MaskBit, PreparedManifest
+from services.core.records import JobSpec, MaskBit
+from services.core.results import PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.fit.transport.rays import RayScene, pixel_rays
@@ -78,8 +79,8 @@ def true_mouth(fdi: tuple[int, ...]) -> Mouth:
 def seen(camera: Camera, scene: SceneRecipe) -> NDArray[np.int64]:
     """Labels (H, W) of the surface at each pixel's centre: the tooth's index, then gums, then wall; -1 for none."""
     assert scene.gums is not None
-    assert scene.cavity is not None
-    rays = RayScene(*(tooth.outer for tooth in scene.teeth), scene.gums, scene.cavity)
+    walls = () if scene.cavity is None else (scene.cavity,)
+    rays = RayScene(*(tooth.outer for tooth in scene.teeth), scene.gums, *walls)
     return rays.first_hits(*pixel_rays(camera)).mesh.reshape(SIZE, SIZE)
 
 
@@ -92,6 +93,7 @@ def write_prepared_jaw(
     shape: tuple[float, ...] = (),
     hidden: tuple[int, ...] = (),
     dark: tuple[int, ...] = (),
+    only: int | None = None,
     samples: int = 1024,
     noise: float = 0.01,
     seed: int = 7,
@@ -104,10 +106,13 @@ def write_prepared_jaw(
         shape: blend weights of every tooth, for an engine whose formula uses them.
         hidden: FDI numbers of teeth that are masked in all images.
         dark: FDI numbers of teeth that are black in all photographs.
+        only: FDI number of the only tooth to fit; there is then no wall, and the rest are its surroundings.
         noise: relative standard deviation of the sensor's noise.
     """
     scene, rng = recipe(fdi, dentin=dentin), np.random.default_rng(seed)
     mouth = true_mouth(fdi)
+    if only is not None:
+        scene, mouth = replace(scene, cavity=None), replace(mouth, reflectance=None)
     truth = replace(mouth, teeth=tuple(replace(tooth, shape=shape) for tooth in mouth.teeth))
     writer = StageWriter(root, "prepared", 1)
     shape = (2, len(LIGHTS_MM), SIZE, SIZE)
@@ -122,6 +127,7 @@ def write_prepared_jaw(
     for c, camera in enumerate(cameras()):
         shown = seen(camera, scene)
         black, masked = (np.isin(shown, [fdi.index(number) for number in numbers]) for numbers in (dark, hidden))
+        masked |= only is not None and shown != fdi.index(only)
         pixels = np.argwhere(shown >= 0)[:, ::-1].astype(np.int32)
         estimate = renderer.images(truth, View(camera, pixels), samples=samples, seed=seed + c)
         images = np.zeros(shape[1:])
@@ -138,13 +144,13 @@ def write_prepared_jaw(
         if tooth.dentin is not None:
             write_mesh(writer.folder / "teeth" / str(number) / "dentin.ply", tooth.dentin.base)
     for part, mesh in (("gums", scene.gums), ("cavity", scene.cavity)):
-        assert mesh is not None
-        write_mesh(writer.folder / f"{part}.ply", mesh)
+        if mesh is not None:
+            write_mesh(writer.folder / f"{part}.ply", mesh)
     lights = tuple(Light(name=f"l{k}", position_mm=place, intensity=(1e6,)) for k, place in enumerate(LIGHTS_MM))
     manifest = PreparedManifest(
         channels=("green",), cameras=cameras(), lights=lights,
-        held_out=tuple((f"c{c}", f"l{HELD_OUT_LIGHT}") for c in range(2)), fdi=fdi, dentin_known=fdi if dentin else (),
-        median_motion_px=None, valid_fraction=0.9,
+        held_out=tuple((f"c{c}", f"l{HELD_OUT_LIGHT}") for c in range(2)), fdi=fdi if only is None else (only,),
+        dentin_known=fdi if dentin else (), median_motion_px=None, valid_fraction=0.9, surroundings=only is not None,
     )  # fmt: skip
     writer.publish(manifest)
 

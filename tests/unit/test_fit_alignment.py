@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Tooth
-from services.core.records import MaskBit, PreparedManifest
+from services.core.records import MaskBit
+from services.core.results import PreparedManifest
 from services.core.store import create_array
 from services.fit.checks.alignment import Offset, clearest_offset, offset_sentences
 from services.fit.checks.evaluate import ErrorSums, Evaluation

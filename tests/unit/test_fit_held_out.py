@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from services.core.geometry import Light
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.fit.inputs.held_out import held_out_images
 from tests.support.prepared import camera
 

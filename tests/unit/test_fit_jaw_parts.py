@@ -17,7 +17,7 @@ from services.core.errors import CaptureInputError, InputError, JobCancelledErro
 from services.core.geometry import Mesh, Tooth
 from services.core.records import JobSpec
 from services.fit.execution.closing import _with_cosine
-from services.fit.jaw.driver import jaw_dentins
+from services.fit.inputs.dentin import jaw_dentins
 from services.fit.jaw.neighbours import Neighbours, arch_position
 from services.fit.jaw.schedule import JawSchedule
 from services.fit.jaw.starts import MIN_TOOTH_PIXELS, ToothStart, median_tissue, start_mouth, start_tooth

@@ -8,7 +8,8 @@ import numpy as np
 import zarr
 
 from services.core.geometry import Camera
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.core.store import create_array, open_stage
 from services.fit.inputs.levels import LevelReader, averaged, reduced_camera, whole_squares
 from services.fit.inputs.observations import read_channel, read_observations

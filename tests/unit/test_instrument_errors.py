@@ -222,9 +222,9 @@ def test_many_lights_off_at_once_are_told_as_one_cause() -> None:
     assert told.startswith(
         "In green the images put 3 gains of lights and flares off, most of all light_gain.c by -3.0 %"
     )
-    assert 'kind = "jaw"' in told
-    (told,) = instrument_sentences(spec.model_copy(update={"kind": "jaw"}), errors, {"green": three}, ())
-    assert "jaw" not in told
+    assert "rendered with surroundings = 'on'" in told
+    (told,) = instrument_sentences(spec, errors, {"green": three}, (), is_alone=False)
+    assert "surroundings" not in told
     assert have_common_cause(3, errors["green"].names)
     assert not have_common_cause(2, errors["green"].names)
     # A jaw under many lights has flares alone, of which one may be a fault.

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Light
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.fit.execution.blocks import Block, BlockInstrument
 from services.fit.instrument.capture import MAX_JAW_LIGHTS, instrument_of
 from services.fit.instrument.errors import errors_of

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.geometry import Light
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.fit.execution.blocks import read_recipe
 from services.fit.instrument.capture import instrument_of
 from services.fit.instrument.errors import DEFAULT_MOVE_SE

@@ -6,7 +6,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from services.core.records import CaptureManifest, FolderCapture, FrameRecord, MaskBit
+from services.core.records import FolderCapture, MaskBit
+from services.core.results import CaptureManifest, FrameRecord
 from services.preprocess.radiometry import Radiometry
 from services.preprocess.rig import _image
 from services.preprocess.stabilisation.motion import Displacement

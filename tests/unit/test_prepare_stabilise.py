@@ -10,7 +10,7 @@ import pytest
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
-from services.core.records import FrameRecord
+from services.core.results import FrameRecord
 from services.preprocess.projection import Footprint
 from services.preprocess.source import View
 from services.preprocess.stabilisation.motion import ViewMotion, jaws, stored_step

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.core.errors import CaptureInputError
+from services.core.errors import CaptureInputError, MeshError
 from services.core.files.meshes import read_mesh, write_mesh
 from services.core.geometry import Camera, Mesh
+from services.core.raw.registration import REGISTRATION
+from services.core.records import JobSpec
+from services.fit.inputs.observations import read_observations
 from services.preprocess.subject import read_subject
 from tests.support.folder_captures import prepare, write_folder
 
@@ -64,3 +67,39 @@ def test_a_preparation_holds_the_named_tooth_alone(tmp_path: Path) -> None:
     manifest = prepare(tmp_path / "capture", tmp_path / "job", fdi=11)
     assert manifest.fdi == (11,)
     assert not (tmp_path / "job" / "prepared" / "teeth" / "21").exists()
+
+
+def test_surroundings_are_rendered_where_asked_or_registered(two_teeth: Path) -> None:
+    write_ball(two_teeth / "gums.ply", (0, 6, 0))
+    alone, around = (read_subject(two_teeth, False, 11, surroundings) for surroundings in ("auto", "on"))
+    assert (alone.surroundings, len(alone.rendered_meshes())) == (False, 1)
+    assert (around.surroundings, len(around.rendered_meshes())) == (True, 3)
+    np.testing.assert_array_equal(alone.footprint_in(CAMERA).mesh, around.footprint_in(CAMERA).mesh)
+    (two_teeth / REGISTRATION).write_text("{}")
+    assert read_subject(two_teeth, False, 11, "auto").surroundings
+    assert not read_subject(two_teeth, False, 11, surroundings="off").surroundings
+    # A jaw is fitted whole, and a tooth that has nothing around it is alone.
+    assert not read_subject(two_teeth, True, None, "on").surroundings
+    (two_teeth / "gums.ply").unlink()
+    assert not read_subject(two_teeth, False, None, surroundings="on").surroundings
+
+
+def test_a_preparation_with_surroundings_holds_their_surfaces(tmp_path: Path) -> None:
+    write_folder(tmp_path / "capture")
+    write_ball(tmp_path / "capture" / "teeth" / "21" / "outer.ply", (9, 0, 0))
+    write_ball(tmp_path / "capture" / "gums.ply", (4, 8, 0))
+    manifest = prepare(tmp_path / "capture", tmp_path / "job", fdi=11, surroundings="on")
+    assert (manifest.fdi, manifest.surroundings) == ((11,), True)
+    assert "Rendered around tooth 11, with light passing between them: gums, 21." in manifest.notes
+    observations = read_observations(tmp_path / "job", JobSpec(capture=tmp_path / "capture", fdi=11))
+    assert [tooth.fdi for tooth in observations.neighbours] == [21]
+    assert observations.gums is not None
+
+
+def test_gums_that_are_rendered_must_be_closed(two_teeth: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=4)
+    faces = np.asarray(ball.faces[5:], dtype=np.int32)
+    write_mesh(two_teeth / "gums.ply", Mesh(np.asarray(ball.vertices) + np.array([0, 6, 0]), faces))
+    assert read_subject(two_teeth, False, 11).gums is not None
+    with pytest.raises(MeshError, match=r"gums\.ply"):
+        read_subject(two_teeth, False, 11, surroundings="on")

@@ -15,7 +15,8 @@ from services.core.files.image_metadata import metadata_fault
 from services.core.files.validation import fault_of, first_error, parse_record
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
 from services.core.raw.records import RawFolder
-from services.core.records import CaptureManifest, FolderCapture
+from services.core.records import FolderCapture
+from services.core.results import CaptureManifest
 from services.core.settings import UploadLimits
 from services.core.slab.folder import SlabFolder
 

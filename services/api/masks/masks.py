@@ -18,7 +18,7 @@ from services.core.calibration.record import Calibration
 from services.core.files.image_metadata import plain_png
 from services.core.geometry import Camera, Record
 from services.core.masks import ALL_LIGHTS, LONGEST_NAME, is_stale, mask_path, read_masks
-from services.core.records import PreparedManifest
+from services.core.results import PreparedManifest
 from services.core.store import StoredArray, is_published, open_stage, write_atomic
 
 MAX_PREPARED_PX = 2**26

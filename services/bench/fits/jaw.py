@@ -159,8 +159,8 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     """Prepare a jaw's capture below ``job`` if it is not prepared, and build its scene; its views are labelled with
     what each pixel shows.
     """
+    from services.fit.inputs.dentin import jaw_dentins
     from services.fit.inputs.observations import channel_scene, read_channel, read_observations
-    from services.fit.jaw.driver import jaw_dentins
     from services.fit.jaw.views import label_views
     from services.fit.transport.engine import Engine
 

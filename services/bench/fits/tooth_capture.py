@@ -131,7 +131,7 @@ def prepare(job: Path, spec: JobSpec) -> None:
 
 def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> PreparedTooth:
     """Prepare a capture below ``job`` if it is not prepared, and build its scene."""
-    from services.fit.tooth.driver import dentin_shape
+    from services.fit.inputs.dentin import dentin_shape
     from services.fit.transport.platform import prepare_device
 
     prepare_device()

@@ -82,6 +82,7 @@ def job_of(capture: Path, pixel_mm: float, options: Mapping[str, Any]) -> JobSpe
         "fdi": FITTED,
         "boundary": "matched",
         "dentin": "fit",
+        "surroundings": "on",
         "channels": ("green",),
         "pixel_step": max(round(PIXELS_MM / pixel_mm), 1),
         "advise": False,

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, teeth_folder
-from services.core.records import CaptureManifest, FolderCapture, FrameRecord
+from services.core.records import FolderCapture
+from services.core.results import CaptureManifest, FrameRecord
 from services.core.store import StageWriter, create_array, image_pieces
 
 DISTANCE_MM = 300.0

@@ -12,7 +12,8 @@ from services.core.calibration.cameras_and_lights import CalibratedCamera, Calib
 from services.core.calibration.uncertainty import CalibrationUncertainty, require_known_names
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Record, Vector3
-from services.core.records import CaptureManifest, FolderCapture
+from services.core.records import FolderCapture
+from services.core.results import CaptureManifest
 from services.core.store import MANIFEST, open_stage, read_record
 
 CALIBRATION_FILE = "calibration.json"

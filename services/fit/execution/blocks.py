@@ -206,7 +206,7 @@ def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
         if mesh is not None:
             arrays.update({f"{name}_vertices": mesh.vertices_mm, f"{name}_faces": mesh.faces})
 
-    for k, tooth in enumerate(recipe.teeth):
+    for k, tooth in enumerate(recipe.all_teeth):
         add(f"outer{k}", tooth.outer)
         if tooth.dentin is not None:
             add(f"dentin{k}", tooth.dentin.base)
@@ -219,6 +219,7 @@ def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
         folder,
         "scene",
         teeth=np.array(len(recipe.teeth)),
+        neighbours=np.array(len(recipe.neighbours)),
         light_positions=recipe.light_positions_mm,
         light_intensities=recipe.light_intensities,
         boundary=np.array(recipe.boundary),
@@ -247,8 +248,10 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
         dentin = None if base is None else DentinShape(base, a[f"dentin{k}_modes"].astype(float))
         return ToothSurfaces(outer, dentin, a[f"stain{k}_uv"].astype(float) if f"stain{k}_uv" in a else None)
 
+    own, others = (int(np.asarray(a[name], dtype=int)) for name in ("teeth", "neighbours"))
     return SceneRecipe(
-        teeth=tuple(tooth(k) for k in range(int(np.asarray(a["teeth"], dtype=int)))),
+        teeth=tuple(tooth(k) for k in range(own)),
+        neighbours=tuple(tooth(k) for k in range(own, own + others)),
         light_positions_mm=a["light_positions"].astype(float),
         light_intensities=a["light_intensities"].astype(float),
         boundary=chosen("Boundary", str(a["boundary"]), {name: name for name in get_args(Boundary)}),

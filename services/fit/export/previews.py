@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Tooth
-from services.core.records import PreparedManifest
+from services.core.results import PreparedManifest
 from services.core.store import write_atomic
 from services.fit.checks.evaluate import Evaluation
 from services.fit.checks.thickness import ThicknessMap
@@ -33,6 +33,8 @@ PREVIEWS = "previews"
 """Folder of the previews, in the job's folder."""
 PICTURES = "pictures.npz"
 """File of the final pictures, in the fit's folder."""
+MARGIN = 0.1
+"""Width of the frame around the pixels that a fit reads, as a share of their extent."""
 
 
 def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
@@ -53,12 +55,19 @@ def shown_images(views: tuple[ViewStack, ...]) -> tuple[tuple[str, int], ...]:
 def pictures_of(
     evaluations: Mapping[str, Evaluation], manifest: PreparedManifest, views: Mapping[str, tuple[ViewStack, ...]]
 ) -> tuple[Picture, ...]:
-    """Pictures from lists of pixels; the last axis is the channel, in the order of ``evaluations``."""
+    """Pictures from lists of pixels, cropped about these; the last axis is the channel, in the order of
+    ``evaluations``.
+    """
     # Show a fit of every n-th pixel as a smaller picture and not as separate dots.
     every = min(
         (spacing(pixels) for evaluation in evaluations.values() for pixels, _ in evaluation.renders.values()), default=1
     )
     channels = list(evaluations)
+    every_view = [view for own in views.values() for view in own]
+    corners = {
+        name: _corners([view for view in every_view if view.camera.name == name], every)
+        for name in {view.camera.name for view in every_view}
+    }
     images: dict[tuple[str, str], Picture] = {}
     for index, channel in enumerate(channels):
         valid_lights = np.flatnonzero(np.any([v.valid.any(axis=1) for v in views[channel]], axis=0))
@@ -67,17 +76,27 @@ def pictures_of(
             view, number = by_camera[camera], int(valid_lights[light])
             key = (camera, manifest.lights[number].name)
             if key not in images:
-                width, height = (-(-size // every) for size in view.camera.size)
+                width, height = np.ptp(corners[camera], axis=0)
                 blank = np.zeros((height, width, len(channels)))
                 images[key] = Picture(
                     *key, bool(view.held_out[number]), blank, blank.copy(), np.zeros((height, width), dtype=bool)
                 )
             shown = (view.pixels % every == 0).all(axis=1)
-            x, y = view.pixels[shown].T // every
+            left, top = corners[camera][0]
+            x, y = (view.pixels[shown] // every - (left, top)).T
             images[key].photo[y, x, index] = view.reference[number, shown]
             images[key].valid[y, x] |= view.valid[number, shown]
-            images[key].render[pixels[:, 1] // every, pixels[:, 0] // every, index] = values
+            images[key].render[pixels[:, 1] // every - top, pixels[:, 0] // every - left, index] = values
     return tuple(images[key] for key in sorted(images))
+
+
+def _corners(views: Sequence[ViewStack], every: int) -> NDArray[np.int64]:
+    # Upper left and lower right corner (2, 2) of one camera's pictures, x and y, in pictures' pixels.
+    pixels = np.concatenate([view.pixels for view in views]) // every
+    low, high = pixels.min(axis=0), pixels.max(axis=0) + 1
+    margin = np.ceil(MARGIN * (high - low)).astype(int)
+    size = -(-np.array(views[0].camera.size) // every)
+    return np.stack([np.maximum(low - margin, 0), np.minimum(high + margin, size)])
 
 
 def spacing(pixels: NDArray[np.int32]) -> int:

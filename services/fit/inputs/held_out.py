@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, SettingsError
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 
 
 def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:

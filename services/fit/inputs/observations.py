@@ -13,9 +13,11 @@ from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
-from services.core.records import JobSpec, Loss, PreparedManifest
+from services.core.records import JobSpec, Loss
+from services.core.results import PreparedManifest
 from services.core.store import open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
+from services.fit.inputs.dentin import read_neighbours
 from services.fit.inputs.held_out import held_out_images
 from services.fit.inputs.levels import LevelReader, reduced_camera, whole_squares
 from services.fit.instrument.capture import Instrument
@@ -78,6 +80,8 @@ class Observations:
     """Mask (camera, light) of the held-out images."""
     gums: Mesh | None = None
     cavity: Mesh | None = None
+    neighbours: tuple[Tooth, ...] = ()
+    """Teeth that are rendered around a single one, the nearest first."""
 
     @property
     def light_positions_mm(self) -> Array:
@@ -166,11 +170,13 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
                 f" {', '.join(manifest.channels)}."
             )
     held_out = held_out_images(manifest, spec)
-    if spec.kind == "tooth":
+    if spec.kind == "tooth" and not manifest.surroundings:
         return Observations(folder, manifest, teeth, held_out)
     gums, cavity = (
         read_mesh(path) if path.is_file() else None for path in (folder / "gums.ply", folder / "cavity.ply")
     )
+    if spec.kind == "tooth":
+        return Observations(folder, manifest, teeth, held_out, gums, neighbours=read_neighbours(folder, teeth[0]))
     return Observations(folder, manifest, teeth, held_out, gums, cavity)
 
 
@@ -244,6 +250,7 @@ def channel_scene(
     dentins: Sequence[DentinShape | None],
     spec: JobSpec,
     stain_uv: Array | None = None,
+    neighbours: tuple[ToothSurfaces, ...] = (),
 ) -> SceneRecipe:
     """Scene recipe of the capture, with the dentin of each tooth, under all lights of a channel."""
     return SceneRecipe(
@@ -258,6 +265,7 @@ def channel_scene(
         spec.device,
         gums=observations.gums,
         cavity=observations.cavity,
+        neighbours=neighbours,
     )
 
 

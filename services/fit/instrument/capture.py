@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Light
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.fit.execution.blocks import BlockInstrument
 from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names
 from services.fit.instrument.irradiance import uncertainty_at_teeth

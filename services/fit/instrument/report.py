@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from services.core.records import JobSpec, PreparedManifest
+from services.core.records import JobSpec
+from services.core.results import PreparedManifest
 from services.fit.instrument.errors import have_common_cause
 from services.fit.instrument.moves import move_covariance
 from services.fit.instrument.sentences import assumed_names, instrument_sentences
@@ -36,5 +37,12 @@ def instrument_report(
         "instrument_prior": {c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in found},
         "assumed": assumed,
         "instrument_faults": {c: tuple(errors[c].names[fault.index] for fault in own) for c, own in named.items()},
-        "instrument_told": instrument_sentences(spec, errors, faults, assumed, manifest.uncertainty),
+        "instrument_told": instrument_sentences(
+            spec,
+            errors,
+            faults,
+            assumed,
+            manifest.uncertainty,
+            is_alone=spec.kind == "tooth" and not manifest.surroundings,
+        ),
     }

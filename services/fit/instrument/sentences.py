@@ -42,6 +42,8 @@ def instrument_sentences(
     faults: Mapping[str, Sequence[Fault]],
     assumed: tuple[str, ...],
     stated: CalibrationUncertainty | None = None,
+    *,
+    is_alone: bool = True,
 ) -> tuple[str, ...]:
     """Sentences for the report, the assumptions first.
 
@@ -51,6 +53,7 @@ def instrument_sentences(
         assumed: names, as ``assumed_names`` gives them.
         errors: by channel, the errors before the fit.
         faults: by channel, the errors that the images show to be faults of the calibration.
+        is_alone: whether the fit renders a tooth without gums and other teeth.
     """
     if spec.instrument == "off":
         return (
@@ -73,7 +76,7 @@ def instrument_sentences(
         *_unused(stated),
         *_exact_lights(errors),
         *unmoved,
-        *_faults(spec, errors, faults),
+        *_faults(spec, errors, faults, is_alone=is_alone),
     )
 
 
@@ -122,9 +125,11 @@ def _exact_lights(errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
 
 
 def _faults(
-    spec: JobSpec, errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]]
+    spec: JobSpec, errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]], *, is_alone: bool
 ) -> Iterator[str]:
-    alone = "" if spec.kind == "jaw" else ' Light from neighbours and gums is in a fit of kind = "jaw".'
+    alone = " Light from gums and other teeth is rendered with surroundings = 'on'." if is_alone else ""
+    has_one_lobe = spec.kind == "tooth" and spec.lobes == 1
+    options = f"Look also at the option{'s boundary and lobes' if has_one_lobe else ' boundary'}."
     for channel, own in faults.items():
         if have_common_cause(len(own), names := errors[channel].names):
             worst = max(own, key=lambda fault: abs(fault.z))
@@ -132,7 +137,7 @@ def _faults(
                 f"In {channel} the images put {len(own)} gains of lights and flares off, most of all"
                 f" {names[worst.index]} by {100 * worst.size:+.1f} %, {abs(worst.z):.1f} times what it may be: so many"
                 " have one cause: what the model leaves out, photographs under wrong names, or a scan in another"
-                f" place. The ± do not contain it.{alone} Look also at the option boundary."
+                f" place. The ± do not contain it.{alone} {options}"
             )
             continue
         for fault in own:

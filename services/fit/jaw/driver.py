@@ -10,9 +10,8 @@ from functools import partial
 import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
-from services.anatomy.frame import ToothFrame
 from services.core.errors import SettingsError
-from services.core.geometry import Camera, Tooth
+from services.core.geometry import Tooth
 from services.core.job_kinds import job_kinds
 from services.core.records import JobSpec
 from services.core.results import FitReport
@@ -21,6 +20,7 @@ from services.fit.execution.blocks import GUMS
 from services.fit.execution.executors import Executor
 from services.fit.execution.journal import Journal
 from services.fit.export.previews import shown_images
+from services.fit.inputs.dentin import jaw_dentins
 from services.fit.inputs.observations import (
     ChannelFiles,
     Observations,
@@ -34,11 +34,10 @@ from services.fit.inputs.observations import (
 from services.fit.instrument.capture import Instrument, instrument_of
 from services.fit.jaw.report import JawFit, report
 from services.fit.jaw.schedule import JawSchedule
-from services.fit.jaw.starts import GUMS_START, MIN_TOOTH_PIXELS, TOOTH_ERRORS, start_mouth, start_tooth
+from services.fit.jaw.starts import MIN_TOOTH_PIXELS, TOOTH_ERRORS, start_mouth, start_tooth
 from services.fit.jaw.views import fitted_pixels, label_views, views_of_parts, views_without_teeth
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.priors import SHAPE
-from services.fit.tooth.driver import blend_shape, viewpoints_mm
+from services.fit.optics.priors import GUMS_START, SHAPE
 from services.fit.tooth.schedule import ChannelSchedule
 
 START_STEPS = 4
@@ -129,33 +128,6 @@ def require_jaw_options(spec: JobSpec) -> None:
                 f"A jaw is fitted with {option} = {usual!r}, not {value!r}; leave it out, or fit its teeth one by one"
                 " with kind 'tooth'."
             )
-
-
-def jaw_dentins(teeth: Sequence[Tooth], cameras: tuple[Camera, ...], spec: JobSpec) -> list[DentinShape | None]:
-    """Dentin of each tooth that the job asks for: the given surface, a blend shape made from the enamel, or none.
-
-    A tooth without dentin, or whose mesh allows no blend shape, is homogeneous.
-    """
-    if spec.dentin == "known":
-        return known_dentins(teeth)
-    if spec.dentin == "none":
-        return [None for _ in teeth]
-    from services.anatomy.jaw_frames import jaw_frames
-
-    def blended(tooth: Tooth, frame: ToothFrame) -> DentinShape | None:
-        try:
-            return blend_shape(tooth, frame)
-        except TOOTH_ERRORS:
-            return None
-
-    return [
-        blended(tooth, frame) for tooth, frame in zip(teeth, jaw_frames(teeth, viewpoints_mm(cameras)), strict=True)
-    ]
-
-
-def known_dentins(teeth: Sequence[Tooth]) -> list[DentinShape | None]:
-    """Dentin of each tooth as a fixed surface."""
-    return [None if tooth.dentin is None else DentinShape.known(tooth.dentin) for tooth in teeth]
 
 
 @dataclass

@@ -40,15 +40,12 @@ from services.fit.jaw.neighbours import Neighbours
 from services.fit.jaw.starts import ToothStart, median_tissue
 from services.fit.optics.domain import Coordinate, Domain, similar_medium, similar_tissue, to_dual
 from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.optics.priors import COSINE, SHAPE, WEAK, priors_of
+from services.fit.optics.priors import COSINE, GUMS_SD, SHAPE, WEAK, priors_of
 from services.fit.tooth.schedule import EXACT_SAMPLES, SIMILAR_G, START_RATIOS, START_STEPS
 
 TIED_SD = {"sigma": 0.2, "alpha": 0.15}
 """Standard deviations of the teeth of one mouth about their median, in the unbounded domain: 20 % of sigma, 35 % of 1 -
 alpha."""
-GUMS_SD = {"sigma": 1.0, "alpha": 0.7}
-"""Prior standard deviations of the gums' parameters about their start, in the unbounded domain; wide, because gums were
-never measured alone."""
 WALL_SD = 1.5
 """Prior standard deviation of the logit of the wall's reflectance about its start."""
 

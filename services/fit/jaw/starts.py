@@ -13,6 +13,7 @@ from services.core.errors import InputError, MeshError, NonFiniteError
 from services.fit.optics.domain import HELD_G, similar_tissue, to_dual, to_natural
 from services.fit.optics.half_space import half_space_reflectance
 from services.fit.optics.parameters import Medium, Mouth, Tissue
+from services.fit.optics.priors import GUMS_START
 
 MIN_TOOTH_PIXELS = 16
 """Least number of fitted pixels of a tooth over all views. A tooth with fewer is tied to the others, because so few do
@@ -22,9 +23,6 @@ FRONT_DIGITS = (1, 2, 3)
 TOOTH_ERRORS = (InputError, NonFiniteError)
 """Errors that the data or meshes of one tooth can cause. Any other error has its cause in the machine or in its
 operation and ends the job."""
-GUMS_START = Medium(8.5, 0.97, g1=HELD_G)
-"""Generic soft tissue at the start: reduced scattering 1.65 per mm at 540 nm (Jacques 2013), absorption between that of
-red and green."""
 
 
 @dataclass(frozen=True)

@@ -319,7 +319,8 @@ def similar_tissue(tissue: Optics, g: float) -> Optics:
     """The tissue with all media replaced by similar ones of mean cosine g; shapes, stains and the wall's reflectance
     stay.
     """
-    if isinstance(tissue, Tissue):
-        return replace(tissue, enamel=similar_medium(tissue.enamel, g), dentin=similar_medium(tissue.dentin, g))
     gums = None if tissue.gums is None else similar_medium(tissue.gums, g)
+    if isinstance(tissue, Tissue):
+        enamel, dentin = similar_medium(tissue.enamel, g), similar_medium(tissue.dentin, g)
+        return replace(tissue, enamel=enamel, dentin=dentin, gums=gums)
     return Mouth(tuple(similar_tissue(tooth, g) for tooth in tissue.teeth), gums, tissue.reflectance)

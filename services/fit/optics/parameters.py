@@ -72,9 +72,9 @@ class Stain:
 
 @dataclass(frozen=True)
 class Tissue:
-    """All parameters that a fit may change, for one colour channel.
+    """All parameters that a fit of one tooth may change, for one colour channel.
 
-    Names: ``enamel.sigma`` ... ``dentin.g2``, ``shape.0`` ... ``shape.2``.
+    Names: ``enamel.sigma`` ... ``dentin.g2``, ``shape.0`` ... ``shape.2``, ``gums.sigma`` ....
     """
 
     enamel: Medium
@@ -83,29 +83,33 @@ class Tissue:
     """Dentin blend weights c, 0 to 1, in the order of the anatomy's modes."""
     stain: Stain | None = None
     """None for a surface without stains."""
+    gums: Medium | None = None
+    """Gums around the tooth, where the scene has any; None for a tooth of a ``Mouth``, which has its own."""
 
     def medium(self, part: str) -> Medium:
-        """The medium of ``enamel`` or ``dentin``."""
+        """The medium of ``enamel``, ``dentin`` or ``gums``."""
+        if part == "gums":
+            assert self.gums is not None
+            return self.gums
         return self.enamel if part == "enamel" else self.dentin
 
     def value(self, name: str) -> float:
         """The parameter called ``name``."""
         part, leaf = name.split(".")
-        return self.shape[int(leaf)] if part == "shape" else float(getattr(getattr(self, part), leaf))
+        return self.shape[int(leaf)] if part == "shape" else float(getattr(self.medium(part), leaf))
 
     def with_values(self, values: dict[str, float]) -> Tissue:
         """A copy with some parameters replaced."""
-        enamel, dentin, shape = self.enamel, self.dentin, list(self.shape)
+        changed, shape = self, list(self.shape)
         for name, value in values.items():
             part, leaf = name.split(".")
-            change: dict[str, Any] = {leaf: value}
             if part == "shape":
                 shape[int(leaf)] = value
-            elif part == "enamel":
-                enamel = replace(enamel, **change)
             else:
-                dentin = replace(dentin, **change)
-        return Tissue(enamel, dentin, tuple(shape), self.stain)
+                medium: dict[str, Any] = {leaf: value}
+                part_changed: dict[str, Any] = {part: replace(changed.medium(part), **medium)}
+                changed = replace(changed, **part_changed)
+        return replace(changed, shape=tuple(shape))
 
 
 @dataclass(frozen=True)

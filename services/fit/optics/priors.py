@@ -37,6 +37,12 @@ WEAK: Priors = MappingProxyType(
 COSINE = (to_dual("cosine", 0.7), 0.35)
 """Prior of the mean cosine of a single lobe that replaces two: 0.48 to 0.84 (one sigma). Similarity of second order
 gives 0.5 to 0.7 for the lobes of teeth."""
+GUMS_START = Medium(8.5, 0.97, g1=HELD_G)
+"""Generic soft tissue at the start: reduced scattering 1.65 per mm at 540 nm (Jacques 2013), absorption between that of
+red and green."""
+GUMS_SD = {"sigma": 1.0, "alpha": 0.7}
+"""Prior standard deviations of the gums' parameters about their start, in the unbounded domain; wide, because gums were
+never measured alone."""
 SHAPE = (0.6, 0.3)
 """Prior of a blend weight: the weights nearest to the dentin of a micro-CT incisor and of procedural teeth lie at 0.3
 to 1."""

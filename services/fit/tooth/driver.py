@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from services.anatomy.dentin_shape import DentinShape
-from services.anatomy.frame import ToothFrame
 from services.core.geometry import Camera, Tooth
 from services.core.records import JobSpec
 from services.core.results import FitReport
@@ -26,6 +23,7 @@ from services.fit.execution.executors import Executor
 from services.fit.execution.journal import Journal
 from services.fit.export.previews import shown_images
 from services.fit.export.stains import store_stains
+from services.fit.inputs.dentin import dentin_shape, neighbour_surfaces
 from services.fit.inputs.observations import (
     ChannelFiles,
     Observations,
@@ -39,6 +37,7 @@ from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_m
 from services.fit.instrument.capture import instrument_of
 from services.fit.instrument.report import instrument_report
 from services.fit.optics.parameters import Tissue
+from services.fit.optics.priors import GUMS_START
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import estimates
 from services.fit.tooth.schedule import ChannelSchedule
@@ -56,6 +55,7 @@ class FitDriver:
         observations = read_observations(attempt.context.root, spec)
         (tooth,) = observations.teeth
         dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
+        neighbours = neighbour_surfaces(tooth, observations.neighbours, observations.manifest.cameras, spec)
         if numbering_fault := _numbering_fault(tooth, spec):
             attempt.log(numbering_fault)
         channels = spec.channels or observations.manifest.channels
@@ -67,7 +67,7 @@ class FitDriver:
         )
         scenes = {
             channel: channel_scene(
-                observations, channel, (dentin,), spec, None if layout is None else layout.corners_uv
+                observations, channel, (dentin,), spec, None if layout is None else layout.corners_uv, neighbours
             )
             for channel in channels
         }
@@ -91,6 +91,7 @@ class FitDriver:
                     observations, files[channel], views[channel], journal, run_on, (number, len(order))
                 )
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
+                schedule.gums = None if observations.gums is None else GUMS_START
                 schedule.shape_covariance = covariance
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
@@ -196,7 +197,8 @@ class FitDriver:
     def _table(
         self, fit: ChannelFit[Tissue], uncertainty: Uncertainty, shape_uncertainty: Uncertainty
     ) -> dict[str, Any]:
-        parts = ("enamel",) if self.attempt.spec.dentin == "none" else ("enamel", "dentin", "shape")
+        tooth = ("enamel",) if self.attempt.spec.dentin == "none" else ("enamel", "dentin", "shape")
+        parts = tooth if fit.tissue.gums is None else (*tooth, "gums")
         fitted_shape = (
             shape_uncertainty
             if any(name.startswith("shape.") for name in shape_uncertainty.domain.parameters)
@@ -205,43 +207,10 @@ class FitDriver:
         return estimates(fit.tissue, parts, uncertainty, fitted_shape)
 
 
-def dentin_shape(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> DentinShape | None:
-    """Dentin surface that the job asks for: the given one, a blend shape made from the enamel, or none.
-
-    The axes of the blend modes follow from the mesh and from its FDI number and, where these leave them open, from the
-    places of the cameras.
-    """
-    if spec.dentin == "known":
-        assert tooth.dentin is not None
-        return DentinShape.known(tooth.dentin)
-    if spec.dentin == "fit":
-        from services.anatomy.jaw_frames import tooth_frame
-
-        return blend_shape(tooth, tooth_frame(tooth, viewpoints_mm(cameras)))
-    return None
-
-
 def _numbering_fault(tooth: Tooth, spec: JobSpec) -> str:
     from services.anatomy.jaw_frames import fdi_mismatch_note
 
     return fdi_mismatch_note(tooth) if spec.dentin == "fit" else ""
-
-
-def blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
-    """Blend shape of a tooth's dentin, with the tooth's canonical frame.
-
-    Raises:
-        MeshError: the mesh allows no blend shape.
-    """
-    from services.anatomy.blend import dentin_blend_shape
-    from services.anatomy.templates.dimensions import upper_tooth
-
-    return dentin_blend_shape(tooth.outer, frame, crown=upper_tooth(tooth.fdi % 10))
-
-
-def viewpoints_mm(cameras: tuple[Camera, ...]) -> NDArray[np.float64]:
-    """Centres (N, 3) of the cameras, in mm."""
-    return np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
 
 
 def shape_covariance(uncertainty: Uncertainty, tooth: int | None = None) -> tuple[tuple[float, ...], ...]:

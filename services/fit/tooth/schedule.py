@@ -43,9 +43,9 @@ from services.fit.execution.stain_passes import StainStage
 from services.fit.inputs.observations import COARSE_PIXELS
 from services.fit.inputs.reweighting import reweighted
 from services.fit.inputs.stain_uv import StainLayout
-from services.fit.optics.domain import BOUNDS, HELD_G, Coordinate, Domain, similar_medium
+from services.fit.optics.domain import BOUNDS, HELD_G, Coordinate, Domain, similar_medium, to_dual
 from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.priors import COSINE, SHAPE, WEAK, Priors, priors_of
+from services.fit.optics.priors import COSINE, GUMS_SD, SHAPE, WEAK, Priors, priors_of
 from services.fit.solve import adam, table_search
 from services.fit.solve.gauss_newton import Options, Solution
 from services.fit.solve.losses import is_reweighted
@@ -94,6 +94,8 @@ class ChannelSchedule(Stages[Tissue]):
     """Covariance of the known blend weights, which another channel's fit found; empty where they are exact."""
     stain_layout: StainLayout | None = None
     """Texels to fit; None where the surface is taken as clean."""
+    gums: Medium | None = None
+    """Start of the gums around the tooth, whose albedo is fitted in exact images; None for a scene without gums."""
 
     def run(self) -> ChannelFit[Tissue]:
         """Fit the channel."""
@@ -158,7 +160,7 @@ class ChannelSchedule(Stages[Tissue]):
         tissue, samples_reached = (
             self._fit_similar_media(domain, options) if domain.coordinates else (self._held_tissue(), 2 * samples)
         )
-        domain = self._with_shape(self._with_cosines(domain) if spec.lobes == 1 else domain)
+        domain = self._with_shape(self._with_gums(self._with_cosines(domain) if spec.lobes == 1 else domain))
         domain = replace(domain, errors=self.files.errors)
         previous: Solution | None = None
         if self.modes:
@@ -181,7 +183,7 @@ class ChannelSchedule(Stages[Tissue]):
             problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
             tissue, solution = self._iterate(problem, options, solution.samples)
         if spec.lobes == 2:
-            domain = replace(self._with_shape(self._domain(ALL_LEAVES)), errors=self.files.errors)
+            domain = replace(self._with_shape(self._with_gums(self._domain(ALL_LEAVES))), errors=self.files.errors)
             problem = StackProblem(self.passes, domain, self._with_lobes(tissue), "phase")
             tissue, solution = self._iterate(problem, options, min(solution.samples, exact_samples))
         return problem, tissue, solution
@@ -202,7 +204,7 @@ class ChannelSchedule(Stages[Tissue]):
         return self._uniform(Medium(1.0, 0.5, g1=HELD_G)).with_values(self.spec.held)
 
     def _uniform(self, medium: Medium) -> Tissue:
-        return Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape)
+        return Tissue(medium, medium, (SHAPE[0],) * self.modes if self.modes else self.shape, gums=self.gums)
 
     def _adam_stages(self) -> Fitted:
         # Fit as in teeth 2018: a homogeneous tooth, then both media and the dentin's shape together, by Adam.
@@ -212,7 +214,8 @@ class ChannelSchedule(Stages[Tissue]):
                 "homogeneous", shared_domain(self._priors), tissue, self.spec.samples_per_pixel
             )
         tissue = (self._with_lobes(tissue) if self.spec.lobes == 2 else tissue).with_values(self.spec.held)
-        domain = self._with_shape(self._domain(ALL_LEAVES if self.spec.lobes == 2 else ("sigma", "alpha")))
+        domain = self._domain(ALL_LEAVES if self.spec.lobes == 2 else ("sigma", "alpha"))
+        domain = self._with_shape(self._with_gums(domain))
         self.switch_to_full_resolution()
         return self._descend(
             "layered" if self.has_dentin else "homogeneous",
@@ -278,6 +281,13 @@ class ChannelSchedule(Stages[Tissue]):
         # The dentin's is left out, because light that reaches it has scattered often.
         fitted = [part for part in self.media[:1] if not any(name.startswith(f"{part}.") for name in self.spec.held)]
         return Domain(domain.coordinates + tuple(Coordinate((f"{part}.cosine",), *COSINE) for part in fitted))
+
+    def _with_gums(self, domain: Domain) -> Domain:
+        # Add the gums' albedo, which decides how much light they return to the tooth, under the prior of a jaw's gums.
+        if self.gums is None:
+            return domain
+        prior = to_dual("alpha", self.gums.alpha), GUMS_SD["alpha"]
+        return Domain((*domain.coordinates, Coordinate(("gums.alpha",), *prior)))
 
     def _with_shape(self, domain: Domain) -> Domain:
         return Domain(domain.coordinates + tuple(Coordinate((f"shape.{k}",), *SHAPE) for k in range(self.modes)))

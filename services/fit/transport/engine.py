@@ -320,10 +320,11 @@ class Engine:
         from services.fit.transport.scene.media import Media
 
         require_view(view, self.recipe)
-        mouth = tissue if isinstance(tissue, Mouth) else Mouth((tissue,))
+        mouth = tissue if isinstance(tissue, Mouth) else Mouth((tissue,), tissue.gums)
         media = media_of(mouth, self.recipe)
-        reshaped = self._geometry.reshape(tuple(tuple(tooth.shape) for tooth in mouth.teeth))
-        if self._geometry.restain(tuple(tooth.stain for tooth in mouth.teeth)) or reshaped:
+        others = len(self.recipe.neighbours)
+        reshaped = self._geometry.reshape((*(tuple(tooth.shape) for tooth in mouth.teeth), *[()] * others))
+        if self._geometry.restain((*(tooth.stain for tooth in mouth.teeth), *[None] * others)) or reshaped:
             self._lights.maps.trace(self._geometry, self._ior)
             self._lights_by_selection.clear()
         return Media(media), self._lights_of(view)

@@ -17,6 +17,7 @@ from services.core.files.meshes import write_mesh
 from services.core.geometry import Matrix4, Record, teeth_folder
 from services.core.store import read_record, write_record
 from services.phantom.files import medium_truth
+from services.phantom.jaw_optics import mouth_around
 from services.phantom.lab.capture import PinholeImages, write_capture
 from services.phantom.lab.light import MouthLight
 from services.phantom.lab.mouth import FITTED, true_mouth
@@ -53,6 +54,10 @@ COARSE_SIZE = LabSize(RigSize((480, 352), 0.19, 3, 6), boards=7, mirror=4, white
 """Smallest size, which only shows that all steps work together."""
 
 
+VERSION = 2
+"""Counts up whenever the same options make other files, so that an older laboratory is made anew."""
+
+
 class LabRecord(Record):
     """Content of ``truth/lab.json``, which is written last, so a folder that has it is complete."""
 
@@ -75,7 +80,7 @@ def make_lab(root: Path, size: LabSize, subject: int, seed: int, report: Callabl
         seed: seed of all other random numbers.
         report: called with the name of each step as it begins.
     """
-    recipe = repr((size, subject, seed))
+    recipe = repr((VERSION, size, subject, seed))
     record_path = root / TRUTH / LAB_RECORD
     if record_path.is_file() and read_record(record_path, LabRecord).recipe == recipe:
         return False
@@ -90,7 +95,9 @@ def make_lab(root: Path, size: LabSize, subject: int, seed: int, report: Callabl
     report("calibration session: boards, spheres, flat field and chart")
     numbers = {"n_boards": size.boards, "n_mirror": size.mirror, "n_white": size.white}
     first_board = write_session(root / SESSION, rig, sensor, seed, **numbers)
-    light = MouthLight(mouth, rig.lights, tissues)
+    fdi = tuple(tooth.fdi for tooth in mouth.teeth)
+    media = {channel: mouth_around(tissue, fdi, channel, subject) for channel, tissue in tissues.items()}
+    light = MouthLight(mouth, rig.lights, media)
     pinhole_images = []
     for number, camera in enumerate(rig.cameras):
         report(f"mouth: camera {camera.name} is rendered under {len(rig.lights)} lights")
@@ -102,7 +109,7 @@ def make_lab(root: Path, size: LabSize, subject: int, seed: int, report: Callabl
     for name, mesh in (("outer.ply", tooth.outer), ("dentin.ply", tooth.dentin)):
         if mesh is not None:
             write_mesh(teeth_folder(root / TRUTH, FITTED) / name, mesh)
-    media = {
+    truth = {
         channel: {"enamel": medium_truth(tissue.enamel), "dentin": medium_truth(tissue.dentin)}
         for channel, tissue in tissues.items()
     }
@@ -111,7 +118,7 @@ def make_lab(root: Path, size: LabSize, subject: int, seed: int, report: Callabl
             "recipe": recipe,
             "world_from_scan": mouth.world_from_scan.tolist(),
             "world_from_session": first_board.tolist(),
-            "media": media,
+            "media": truth,
         }
     )
     write_record(record_path, record)

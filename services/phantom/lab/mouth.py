@@ -1,5 +1,5 @@
-"""The mouth of a virtual laboratory: the six upper front teeth of a subject, their gums, lips and a retractor, and a
-scan of them.
+"""The mouth of a virtual laboratory: the six upper front teeth of a subject, the gums, lips and a retractor, and a scan
+of them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from services.anatomy.scans.scan import LabelledScan
 from services.anatomy.templates.jaw import build_jaw
 from services.core.geometry import Mesh, Tooth
-from services.phantom.lab.root import with_whole_root
 from services.phantom.lab.scan import scan_of, write_labelled_ply
 from services.phantom.lips import lips_and_retractor
 
@@ -33,19 +32,26 @@ class LabMouth:
     """True surfaces in the world of the rig, whose origin is the middle of the crowns.
 
     Attributes:
-        teeth: teeth from the patient's right to the left, with root stubs that end in the gums.
-        fitted: the tooth that is measured, with its dentin and its whole root.
-        gums, lips: surfaces around the teeth.
+        teeth: the tooth that is measured, then the others from the patient's right to the left, with their dentin and
+            with root stubs that end in the gums.
+        gums: the solid that holds the roots of the whole jaw.
+        shown_gums: the part of its surface that lips and cheeks do not hide.
+        lips: lips and retractor.
         scan: scan of the teeth in a frame of its own.
         world_from_scan: rigid transform (4, 4).
     """
 
     teeth: tuple[Tooth, ...]
-    fitted: Tooth
     gums: Mesh
+    shown_gums: Mesh
     lips: Mesh
     scan: LabelledScan
     world_from_scan: Floats
+
+    @property
+    def fitted(self) -> Tooth:
+        """The tooth that is measured."""
+        return self.teeth[0]
 
 
 def true_mouth(subject: int | None, seed: int) -> LabMouth:
@@ -58,14 +64,14 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
     from scipy.spatial.transform import Rotation
 
     jaw = build_jaw(subject)
-    own = [tooth for tooth in jaw.teeth if tooth.fdi % 10 <= TEETH_A_SIDE]
+    own = sorted(
+        (tooth for tooth in jaw.teeth if tooth.fdi % 10 <= TEETH_A_SIDE), key=lambda tooth: tooth.fdi != FITTED
+    )
     crowns = np.concatenate([tooth.outer.vertices_mm for tooth in own])
     shift = -(crowns.min(axis=0) + crowns.max(axis=0)) / 2
     shift[1] = -np.quantile(crowns[:, 1], 0.9)
-    teeth = tuple(Tooth(one.fdi, _moved(one.outer, shift)) for one in own)
-    rooted = with_whole_root(jaw.tooth(FITTED))
-    assert rooted.dentin is not None
-    fitted = Tooth(FITTED, _moved(rooted.outer, shift), _moved(rooted.dentin, shift))
+    teeth = tuple(Tooth(one.fdi, _moved(one.outer, shift), _moved(one.dentin, shift)) for one in own)
+    gums = _moved(jaw.gums, shift)
 
     random = np.random.default_rng([seed, 0x5CA])
     scan = scan_of(jaw, SCAN_NOISE_MM, seed, TEETH_A_SIDE)
@@ -76,8 +82,8 @@ def true_mouth(subject: int | None, seed: int) -> LabMouth:
     world_from_scan[:3, :3], world_from_scan[:3, 3] = rotation.T, -rotation.T @ translation
     return LabMouth(
         teeth,
-        fitted,
-        _near(_moved(jaw.gums, shift), float(min(tooth.outer.vertices_mm[:, 1].min() for tooth in teeth))),
+        gums,
+        _near(gums, float(min(tooth.outer.vertices_mm[:, 1].min() for tooth in teeth))),
         lips_and_retractor([tooth.outer for tooth in teeth]),
         LabelledScan(Mesh(vertices, scan.mesh.faces), scan.fdi),
         world_from_scan,

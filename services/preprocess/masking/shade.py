@@ -58,8 +58,8 @@ class _Coarse:
 def shade(files: AttemptFiles, source: Source, subject: Subject, view: View, context: StageContext) -> None:
     """Flag SHADOW in all images of a camera and store the confidence in per cent.
 
-    The fit itself renders the shadows of fitted surfaces. Here, shadows of gums and teeth that are not fitted are found
-    from their geometry, and shadows of objects without a scan by comparing the camera's lights.
+    The fit itself renders the shadows of surfaces in its scene. Here, shadows of gums and teeth that it leaves out are
+    found from their geometry, and shadows of objects without a scan by comparing the camera's lights.
 
     Raises:
         JobCancelledError: the job was cancelled. FencedError: another attempt has begun.
@@ -69,14 +69,14 @@ def shade(files: AttemptFiles, source: Source, subject: Subject, view: View, con
     stacks = [np.zeros((len(lights), *coarse.visible.shape), dtype=np.float32) for _ in range(4)]
     radiance, variance, irradiance, facing = stacks
     by_geometry = np.zeros(radiance.shape, dtype=bool)
-    rendered = subject.fitted_meshes()
+    rendered, left_out = subject.rendered_meshes(), [] if subject.surroundings else list(subject.occluders)
     for index, j in enumerate(lights):
         context.raise_if_cancelled()
         lamp = source.description.lights[j]
         radiance[index], variance[index] = _brightness(files, view, j, coarse)
         irradiance[index], facing[index] = _light_on(coarse, lamp, rendered)
-        if subject.occluders:
-            unoccluded = is_unoccluded(coarse.points_mm, coarse.normal, lamp.position_mm, list(subject.occluders))
+        if left_out:
+            unoccluded = is_unoccluded(coarse.points_mm, coarse.normal, lamp.position_mm, left_out)
             by_geometry[index] = coarse.visible & (irradiance[index] > 0) & ~unoccluded
             irradiance[index][by_geometry[index]] = 0
     confidence = by_geometry.astype(np.float32)

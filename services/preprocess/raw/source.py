@@ -12,7 +12,7 @@ from services.core.files.meshes import fdi_numbers
 from services.core.raw.description import described, read_calibration
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFrame
-from services.core.records import FrameRecord
+from services.core.results import FrameRecord
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import missing_exposures
 from services.preprocess.raw.view import RawView

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.core.records import FrameRecord
+from services.core.results import FrameRecord
 from services.preprocess.projection import Footprint
 from services.preprocess.source import Motions, View
 from services.preprocess.stabilisation.flow_comparison import FlowComparison, compare_flow

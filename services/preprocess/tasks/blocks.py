@@ -73,7 +73,7 @@ class Block:
         context.raise_if_cancelled()
         self.files.writer.require_lease()
         source = open_source(self.spec, context.root, verify=False)
-        subject = read_subject(source.root, whole=self.spec.kind == "jaw", fdi=self.spec.fdi)
+        subject = read_subject(source.root, self.spec.kind == "jaw", self.spec.fdi, self.spec.surroundings)
         if self.step == "locate":
             _locate(self.files, source, subject, self.camera)
             return

@@ -9,7 +9,7 @@ import numpy as np
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import teeth_folder
-from services.core.records import PreparedManifest
+from services.core.results import PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import write_record
 from services.preprocess.brightness import Brightness
@@ -79,6 +79,9 @@ def summarise(
     notes = [*source_notes, *brightness.notes(), *unusable_note(reports)]
     if hidden := [str(number) for number, count in zip(fdi, tooth_pixels, strict=True) if count == 0]:
         notes.append(f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
+    if subject.surroundings:
+        around = [*(["gums"] if subject.gums is not None else []), *(str(tooth.fdi) for tooth in subject.others)]
+        notes.append(f"Rendered around tooth {fdi[0]}, with light passing between them: {', '.join(around)}.")
     for note in notes:
         context.report(StageEvent(stage="prepare", kind="log", message=note))
     covered = tuple(
@@ -89,7 +92,7 @@ def summarise(
     flows = tuple(done.flow for done in flow_records if done is not None and done.flow is not None)
     write_record(files.folder / "quality.json", QualityReport(images=covered, flows=flows))
     write_page(files.folder, covered, flows, notes)
-    _copy_meshes(source.root, files.folder, fdi)
+    _copy_meshes(source.root, files.folder, fdi + tuple(tooth.fdi for tooth in subject.others if subject.surroundings))
     # Remove partly written files that a killed process left
     for partial in files.folder.rglob("*.partial"):
         partial.unlink()
@@ -104,6 +107,7 @@ def summarise(
         dentin_known=tuple(tooth.fdi for tooth in subject.teeth if tooth.dentin is not None),
         gums=subject.whole and subject.gums is not None,
         cavity=subject.whole and subject.cavity is not None,
+        surroundings=subject.surroundings,
         tooth_pixels=tuple(tooth_pixels.tolist()),
         median_motion_px=float(np.median(motions)) if motions else None,
         uncertainty=source.description.uncertainty,

@@ -22,7 +22,8 @@ from services.capture.dome.simulator import order_fault
 from services.core.errors import (
     RigError,
 )
-from services.core.records import CaptureManifest, FolderCapture, FrameRecord, JobSpec, RigSpec, SimulatedCameraSpec
+from services.core.records import FolderCapture, JobSpec, RigSpec, SimulatedCameraSpec
+from services.core.results import CaptureManifest, FrameRecord
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage, read_record
 from tests.support.captured_frames import LIGHTS, NOISELESS, Address, frames_of

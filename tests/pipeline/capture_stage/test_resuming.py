@@ -24,7 +24,8 @@ from services.core.errors import (
     ReadbackError,
     StoreError,
 )
-from services.core.records import FrameRecord, JobSpec, RigSpec, SimulatedCameraSpec
+from services.core.records import JobSpec, RigSpec, SimulatedCameraSpec
+from services.core.results import FrameRecord
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import StageWriter, is_published
 from tests.support.captured_frames import LIGHTS, Address, frames_of, outputs

@@ -10,7 +10,8 @@ import zarr
 from zarr.core.metadata import ArrayV3Metadata
 
 from services.core.errors import CaptureInputError
-from services.core.records import MaskBit, PreparedManifest
+from services.core.records import MaskBit
+from services.core.results import PreparedManifest
 from services.core.store import open_stage
 from tests.support.folder_captures import prepare, rename_camera, write_folder, write_tree
 from tests.support.shared_data import shared_path

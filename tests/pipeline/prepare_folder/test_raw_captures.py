@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import zarr
 
-from services.core.records import PreparedManifest
+from services.core.results import PreparedManifest
 from services.core.store import read_record
 from services.preprocess.quality import QualityReport
 from services.preprocess.raw.source import RawSource

@@ -24,7 +24,7 @@ const SOURCES = new Set(["capture", "rig"]);
  * missing.
  */
 const GROUPS: [string, string[]][] = [
-  ["What is fitted", ["kind", "fdi", "boundary", "ior", "dentin", "stains", "lobes"]],
+  ["What is fitted", ["kind", "fdi", "surroundings", "boundary", "ior", "dentin", "stains", "lobes"]],
   [
     "Images",
     [

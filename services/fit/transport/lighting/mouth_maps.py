@@ -88,7 +88,7 @@ class MouthMaps(LightMaps):
         enamel_mm = dr.maximum(cell.depth - entry - dentin_mm, 0)
         lengths_mm = [dr.select(outside, 0, enamel_mm), dr.select(outside, 0, dentin_mm)]
         numbers = self._geometry.numbers
-        medium = dr.select(outside, mi.UInt32(1), solid * (1 + numbers.dentin) + 1)
+        medium = dr.select(outside, mi.UInt32(1), self._geometry.outer_medium(solid))
         media = [medium, dr.select(solid < self._geometry.teeth, medium + 1, mi.UInt32(1))]
         surface = dr.select(outside, 1, cell.interpolated(1, 16) * (1 / 65535))
         certain = cell.inside & (followed | free)

@@ -57,12 +57,17 @@ def require_surfaces(recipe: SceneRecipe) -> None:
 
     Raises:
         MeshError: names the surface.
-        InputError: no tooth, or too many.
+        InputError: no tooth, or too many, or neighbours of several.
     """
-    if not 0 < len(recipe.teeth) <= MAX_TEETH:
-        raise InputError(f"The scene has {len(recipe.teeth)} teeth; give 1 to {MAX_TEETH}.")
-    for number, tooth in enumerate(recipe.teeth):
-        which = "" if len(recipe.teeth) == 1 else f" of tooth {number}"
+    if not 0 < len(recipe.all_teeth) <= MAX_TEETH:
+        raise InputError(f"The scene has {len(recipe.all_teeth)} teeth; give 1 to {MAX_TEETH}.")
+    if recipe.neighbours and len(recipe.teeth) > 1:
+        raise InputError(
+            f"The scene has neighbours of {len(recipe.teeth)} teeth, and only those of one can have its media; list"
+            " them among the teeth."
+        )
+    for number, tooth in enumerate(recipe.all_teeth):
+        which = "" if len(recipe.all_teeth) == 1 else f" of tooth {number}"
         tooth.outer.require_solid(f"outer surface{which}")
         if tooth.dentin is not None:
             tooth.dentin.base.require_solid(f"dentin surface{which}")
@@ -84,7 +89,7 @@ def require_view(view: View, recipe: SceneRecipe) -> None:
     if any(
         (camera_centre_mm >= tooth.outer.vertices_mm.min(axis=0)).all()
         and (camera_centre_mm <= tooth.outer.vertices_mm.max(axis=0)).all()
-        for tooth in recipe.teeth
+        for tooth in recipe.all_teeth
     ):
         where = ", ".join(f"{c:.4g}" for c in camera_centre_mm)
         raise InputError(

@@ -134,7 +134,7 @@ class Clearance:
         """Lower bound in mm at ``point``; not positive where the distance is not known."""
         cell = mi.Point3f(point - self._low) * (1 / self._cell_mm)
         index = dr.floor(cell)
-        inside = active
+        inside = mi.Bool(active)  # a copy: &= changes an array in its place
         for k in range(3):
             inside &= (index[k] >= 0) & (index[k] < int(self._shape[k]))
         x, y, z = (mi.UInt32(dr.maximum(index[k], 0)) for k in range(3))

@@ -1,8 +1,8 @@
 """Teeth, gums and the wall of the mouth as triangles, and the media between them.
 
-All surfaces are one mesh. A surface's number is k for the outer surface of tooth k of T, T + k for its dentin, 2T for
-gums and 2T + 1 for the wall. A lane's *place* holds bit n while it is inside the solid that surface n bounds, so solids
-may overlap. Code for features that a scene lacks is absent from its kernels.
+All surfaces are one mesh. A surface's number is k for the outer surface of tooth k of T, neighbours included, T + k for
+its dentin, 2T for gums and 2T + 1 for the wall. A lane's *place* holds bit n while it is inside the solid that surface
+n bounds, so solids may overlap. Code for features that a scene lacks is absent from its kernels.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ class MeshGeometry:
 
     def __init__(self, recipe: SceneRecipe) -> None:
         self.recipe = recipe
-        self.teeth = len(recipe.teeth)
-        dentins = [tooth.dentin for tooth in recipe.teeth]
+        self.teeth = len(recipe.all_teeth)
+        dentins = [tooth.dentin for tooth in recipe.all_teeth]
         self.numbers = media_numbers(recipe)
         self.single = self.teeth == 1 and recipe.gums is None and recipe.cavity is None
         self.opaque = recipe.cavity is not None
         self.modes_of = tuple(0 if dentin is None else len(dentin.modes_mm) for dentin in dentins)
         self.epsilon = RAY_EPSILON * (1 + float(np.abs(recipe.vertices_mm()).max()))
-        for tooth in recipe.teeth:
+        for tooth in recipe.all_teeth:
             if tooth.dentin is not None:
                 require_nested(tooth.outer, tooth.dentin.base, 2 * self.epsilon)
 
         # Surfaces that never move come first.
-        fixed = {k: tooth.outer for k, tooth in enumerate(recipe.teeth)}
+        fixed = {k: tooth.outer for k, tooth in enumerate(recipe.all_teeth)}
         fixed |= {2 * self.teeth + k: mesh for k, mesh in enumerate((recipe.gums, recipe.cavity)) if mesh is not None}
         self._dentins: dict[int, DentinShape] = {k: dentin for k, dentin in enumerate(dentins) if dentin is not None}
         meshes = [*fixed.values(), *(dentin.base for dentin in self._dentins.values())]
@@ -62,7 +62,7 @@ class MeshGeometry:
         solids_mm = np.concatenate(
             [
                 mesh.vertices_mm
-                for mesh in (*(tooth.outer for tooth in recipe.teeth), *([recipe.gums] if recipe.gums else []))
+                for mesh in (*(tooth.outer for tooth in recipe.all_teeth), *([recipe.gums] if recipe.gums else []))
             ]
         )
         self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32), solids_mm)
@@ -130,7 +130,7 @@ class MeshGeometry:
         assert self._border is not None
         medium, tooth = self.medium(place), self.inside(place)
         in_tooth = tooth < self.teeth
-        enamel = tooth * 2 + 1
+        enamel = self.outer_medium(tooth)
         share, slope = self._border.share(point, active & in_tooth)
         pure = mi.Float(1)
         return Mixed(
@@ -156,7 +156,7 @@ class MeshGeometry:
             return False
         self._stains, self.textures = stains, None
         if any(stain is not None for stain in stains):
-            teeth = self.recipe.teeth
+            teeth = self.recipe.all_teeth
             corners = [
                 np.zeros((len(tooth.outer.faces), 3, 2)) if tooth.stain_uv is None else tooth.stain_uv
                 for tooth in teeth
@@ -235,12 +235,20 @@ class MeshGeometry:
             inside_outer = place & 1
             return dr.select((place & 2) != 0, mi.UInt32(2), inside_outer) if self._dentins else inside_outer
         tooth, numbers = self.inside(place), self.numbers
-        enamel = tooth * (1 + numbers.dentin) + 1
+        enamel = self.outer_medium(tooth)
         in_dentin = ((place >> self.teeth) & (2**self.teeth - 1)) != 0
         of_tooth = dr.select(in_dentin, enamel + 1, enamel) if self._dentins else enamel
         return dr.select(
             tooth < self.teeth, of_tooth, dr.select(tooth == self.teeth, mi.UInt32(numbers.of_gums), mi.UInt32(0))
         )
+
+    def outer_medium(self, solid: mi.UInt32) -> mi.UInt32:
+        """Medium of a tooth's enamel, or of the gums, by the number that ``inside`` gives. That of the dentin, if the
+        scene has any, is one more than the enamel's.
+        """
+        if self.recipe.neighbours:
+            return dr.select(solid < self.teeth, mi.UInt32(1), mi.UInt32(self.numbers.of_gums))
+        return solid * (1 + self.numbers.dentin) + 1
 
     def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
         """Place after a hit. Entering sets the surface's bit and leaving clears it, so the next hit corrects a missed

@@ -14,7 +14,7 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 @dataclass(frozen=True)
 class MediaNumbers:
     """Numbers of the media of a scene: enamel and dentin of each tooth in turn, gums, and the wall's reflectance as an
-    albedo. 0 is empty space.
+    albedo. 0 is empty space. Neighbours of a single tooth have its numbers.
     """
 
     teeth: int
@@ -52,7 +52,7 @@ def media_numbers(recipe: SceneRecipe) -> MediaNumbers:
     """Numbers of the scene's media."""
     return MediaNumbers(
         len(recipe.teeth),
-        any(tooth.dentin is not None for tooth in recipe.teeth),
+        any(tooth.dentin is not None for tooth in recipe.all_teeth),
         recipe.gums is not None,
         recipe.cavity is not None,
     )
@@ -163,9 +163,15 @@ def whitened(tissue: Tissue | Mouth) -> Tissue | Mouth:
     """The same tissue without absorption."""
     if isinstance(tissue, Tissue):
         return _white(tissue)
-    gums = None if tissue.gums is None else replace(tissue.gums, alpha=1.0)
-    return Mouth(tuple(map(_white, tissue.teeth)), gums, None if tissue.reflectance is None else 1.0)
+    return Mouth(
+        tuple(map(_white, tissue.teeth)), _white_gums(tissue.gums), None if tissue.reflectance is None else 1.0
+    )
 
 
 def _white(tissue: Tissue) -> Tissue:
-    return replace(tissue, enamel=replace(tissue.enamel, alpha=1.0), dentin=replace(tissue.dentin, alpha=1.0))
+    enamel, dentin = (replace(medium, alpha=1.0) for medium in (tissue.enamel, tissue.dentin))
+    return replace(tissue, enamel=enamel, dentin=dentin, gums=_white_gums(tissue.gums))
+
+
+def _white_gums(gums: Medium | None) -> Medium | None:
+    return None if gums is None else replace(gums, alpha=1.0)

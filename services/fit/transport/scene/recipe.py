@@ -28,7 +28,8 @@ class ToothSurfaces:
 class SceneRecipe:
     """Teeth with their surroundings, their lights and their boundary model, for one colour channel.
 
-    Where solids overlap, dentin counts over enamel over gums, and of two teeth the one listed first.
+    Where solids overlap, dentin counts over enamel over gums, and of two teeth the one listed first, of ``teeth``
+    before ``neighbours``.
     """
 
     teeth: tuple[ToothSurfaces, ...]
@@ -48,11 +49,18 @@ class SceneRecipe:
     border_width_mm: float = 0.0
     """Width in mm of the border over which albedo and phase function change from enamel's to dentin's, half of it on
     either side; 0 for a sharp border."""
+    neighbours: tuple[ToothSurfaces, ...] = ()
+    """Further teeth around a single one, of the same media; their dentin does not move."""
+
+    @property
+    def all_teeth(self) -> tuple[ToothSurfaces, ...]:
+        """All teeth, in the order in which they count where they overlap."""
+        return self.teeth + self.neighbours
 
     def vertices_mm(self) -> NDArray[np.float64]:
         """Vertices of all outer surfaces, (V, 3)."""
         meshes = [
-            *(tooth.outer for tooth in self.teeth),
+            *(tooth.outer for tooth in self.all_teeth),
             *(mesh for mesh in (self.gums, self.cavity) if mesh is not None),
         ]
         return np.concatenate([mesh.vertices_mm for mesh in meshes])

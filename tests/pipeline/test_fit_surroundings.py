@@ -1,0 +1,53 @@
+"""The fit of one tooth in its gums among other teeth, of photographs that light from all of them reached."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from services.core.results import FitReport
+from services.core.stage import LocalContext
+from services.core.store import MANIFEST
+from services.fit.stage import export, run
+from tests.support.small_jaw import jaw_spec, write_prepared_jaw
+
+FITTED = 11
+ENGINE = "services.fit.transport.engine:Engine"
+
+
+def fit(root: Path, *, surroundings: bool) -> FitReport:
+    write_prepared_jaw(root, ENGINE, only=FITTED)
+    if not surroundings:
+        manifest = json.loads((root / "prepared" / MANIFEST).read_text())
+        manifest["record"]["surroundings"] = False
+        (root / "prepared" / MANIFEST).write_text(json.dumps(manifest))
+    spec = jaw_spec(root, kind="tooth", instrument="off", advise=False, max_steps=6)
+    report = run(spec, LocalContext(root, 1))
+    export(spec, LocalContext(root, 1))
+    return report
+
+
+@pytest.fixture(scope="module")
+def around(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FitReport]:
+    root = tmp_path_factory.mktemp("around")
+    return root, fit(root, surroundings=True)
+
+
+def test_light_from_gums_and_other_teeth_is_explained(around: tuple[Path, FitReport], tmp_path: Path) -> None:
+    _, with_them = around
+    # These few coarse pixels hardly determine the media; tests.benchmarks.surroundings compares them with the truth.
+    alone = fit(tmp_path, surroundings=False)
+    assert with_them.converged
+    assert alone.held_out_error["green"] > 3 * with_them.held_out_error["green"]
+
+
+def test_the_gums_are_reported_beside_the_tooth(around: tuple[Path, FitReport]) -> None:
+    root, report = around
+    table = report.parameters["green"]
+    assert table["gums.alpha"].se is not None
+    assert table["gums.sigma"].se is None
+    assert ">Gums<" in (root / "report.html").read_text()
+    told = json.loads((root / "parameters.json").read_text())["green"]
+    assert told["gums.sigma_a"]["value"] > 0
