@@ -86,6 +86,16 @@ def test_a_photograph_that_no_light_makes_is_odd_only_where_the_others_are_well_
     assert not named(sums_of(render, poor))
 
 
+def test_the_faint_rest_of_a_light_behind_the_gums_is_not_odd_but_a_dead_light_is() -> None:
+    render, photos = scene(5)
+    render[3], photos[3] = 1e-3 * render[3], 2e-3 * photos[3, ::-1]
+    assert not named(sums_of(render, photos))
+    render, photos = scene(5)
+    photos[3] *= 0.01
+    (frame,) = named(sums_of(render, photos))
+    assert (frame.light, frame.other) == ("l3", "")
+
+
 def test_single_photographs_are_not_blamed_for_a_misplaced_mesh() -> None:
     render, photos = scene(4)
     photos[2] = 1.01 * photos[5]

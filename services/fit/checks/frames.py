@@ -34,6 +34,9 @@ MIN_ODD_ERROR = 0.3
 ODD_RATIO = 5.0
 """Factor by which the error of an odd photograph must exceed the median of its camera's: where all are poorly
 explained, no single one is odd."""
+MIN_ODD_SHARE = 0.05
+"""Least misfit of an odd photograph, as a share of the median photograph of its camera (roots of sums of squares). What
+passes through gums that hide a tooth from a light is a thousandth of that, and a fit hardly knows it."""
 MIN_FRAMES = 3
 """Least number of photographs of a camera for one of them to be odd."""
 
@@ -83,7 +86,9 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
         reported.add(photo)
         yield WrongFrame(camera, lights[photo], float(own[photo]), lights[light])
     limit = max(MIN_ODD_ERROR, ODD_RATIO * float(np.median(shown)))
-    odd = np.flatnonzero(np.isfinite(own) & (own > limit)).tolist() if len(shown) >= MIN_FRAMES else []
+    misfit, signal = np.diag(sums.product), np.diag(sums.signal)
+    matters = misfit > MIN_ODD_SHARE**2 * np.median(signal[np.isfinite(own)])
+    odd = np.flatnonzero(np.isfinite(own) & (own > limit) & matters).tolist() if len(shown) >= MIN_FRAMES else []
     for photo in odd:
         if photo not in reported:
             yield WrongFrame(camera, lights[photo], float(own[photo]))
