@@ -68,7 +68,7 @@ ENTRY_POINTS = "dentine.job_kinds"
 """Name of the group of entry points by which installed packages add kinds."""
 JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
     {
-        "tooth": JobKind("one tooth alone", ("prepare", "fit", "export"), _TEETH, None),
+        "tooth": JobKind("one tooth", ("prepare", "fit", "export"), _TEETH, None),
         "jaw": JobKind(
             "all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None, _OF_A_JAW
         ),

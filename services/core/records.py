@@ -183,10 +183,7 @@ class JobSpec(Record):
         default=None,
         ge=11,
         le=85,
-        description=(
-            "of kind tooth: the tooth to fit, by its FDI number, where the capture has several; the others are in"
-            " the way"
-        ),
+        description=("of kind tooth: the tooth to fit, by its FDI number, where the capture has several"),
     )
     surroundings: Literal["auto", "on", "off"] = Field(
         default="auto",

@@ -39,15 +39,8 @@ def jaw_mouth(fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
         channel: name of the channel.
         subject: seed of the subject; None for the average in every tooth.
     """
-    average = TRUE_TISSUE[channel]
-    teeth = []
-    for number in fdi:
-        enamel, dentin = _draws(subject, number, 2)
-        teeth.append(Tissue(_varied(average.enamel, enamel), _varied(average.dentin, dentin)))
-    gums = _varied(gums_medium(channel), _draws(subject, _GUMS, 1)[0])
-    return Mouth(
-        tuple(teeth), gums, GUM_REFLECTANCE[channel] * (1 + REFLECTANCE_SPREAD * _draws(subject, _CAVITY, 1)[0][0])
-    )
+    reflectance = GUM_REFLECTANCE[channel] * (1 + REFLECTANCE_SPREAD * _draws(subject, _CAVITY, 1)[0][0])
+    return Mouth(_teeth_about(TRUE_TISSUE[channel], fdi, subject), _gums_of(channel, subject), reflectance)
 
 
 def mouth_around(tissue: Tissue, fdi: Sequence[int], channel: str, subject: int | None) -> Mouth:
@@ -59,11 +52,7 @@ def mouth_around(tissue: Tissue, fdi: Sequence[int], channel: str, subject: int 
         channel: name of the channel.
         subject: seed of the deviations, which are the same in all channels; None for none.
     """
-    teeth = [tissue]
-    for number in fdi[1:]:
-        enamel, dentin = _draws(subject, number, 2)
-        teeth.append(Tissue(_varied(tissue.enamel, enamel), _varied(tissue.dentin, dentin)))
-    return Mouth(tuple(teeth), _varied(gums_medium(channel), _draws(subject, _GUMS, 1)[0]))
+    return Mouth((tissue, *_teeth_about(tissue, fdi[1:], subject)), _gums_of(channel, subject))
 
 
 def gums_medium(channel: str) -> Medium:
@@ -71,6 +60,18 @@ def gums_medium(channel: str) -> Medium:
     reduced, absorption = GUMS_PER_MM[channel]
     scattering = reduced / (1 - GUMS_MEAN_COSINE)
     return Medium(scattering + absorption, scattering / (scattering + absorption), g1=GUMS_MEAN_COSINE)
+
+
+def _teeth_about(tissue: Tissue, fdi: Sequence[int], subject: int | None) -> tuple[Tissue, ...]:
+    teeth = []
+    for number in fdi:
+        enamel, dentin = _draws(subject, number, 2)
+        teeth.append(Tissue(_varied(tissue.enamel, enamel), _varied(tissue.dentin, dentin)))
+    return tuple(teeth)
+
+
+def _gums_of(channel: str, subject: int | None) -> Medium:
+    return _varied(gums_medium(channel), _draws(subject, _GUMS, 1)[0])
 
 
 def _draws(subject: int | None, stream: int, media: int) -> list[list[float]]:

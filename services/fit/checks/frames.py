@@ -35,8 +35,8 @@ ODD_RATIO = 5.0
 """Factor by which the error of an odd photograph must exceed the median of its camera's: where all are poorly
 explained, no single one is odd."""
 MIN_ODD_SHARE = 0.05
-"""Least misfit of an odd photograph, as a share of the median photograph of its camera (roots of sums of squares). What
-passes through gums that hide a tooth from a light is a thousandth of that, and a fit hardly knows it."""
+"""Least misfit of an odd photograph, as a share of the median photograph of its camera (roots of sums of squares).
+Where gums hide a tooth from a light, a hundredth or a thousandth of that reaches it, which a fit hardly knows."""
 MIN_FRAMES = 3
 """Least number of photographs of a camera for one of them to be odd."""
 

@@ -22,7 +22,8 @@ only the Jacobian from similar ones: where J'W r = 0 the exact image fits, whate
 sigma and g are nearly one parameter in a thick medium. With one lobe the enamel's mean cosine is a coordinate at
 constant reduced scattering and absorption, from the first exact stage on, under a weak prior: it decides how much light
 turns back after few scatterings. With two lobes g1, beta and g2 are free under weak Gaussian priors. The instrument's
-errors become coordinates in the first exact stage: in similar media they would only compensate the bias of these.
+errors become coordinates in the first exact stage: in similar media they would only compensate the bias of these. So
+does the albedo of the gums around the tooth, where the scene has them.
 Absorption of a thin enamel cap is nearly invisible, so its exponent has a prior that is two decades wide.
 """
 

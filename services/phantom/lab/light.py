@@ -1,7 +1,7 @@
 """Radiance from the mouth of a virtual laboratory to a camera, under each of its lights.
 
-The tooth that is measured is rendered by the engine with path tracing, among gums and other teeth with which it
-exchanges light. Pixels that show these or the lips only have to look like them, so they are shaded locally.
+The teeth are rendered by the engine with path tracing, with light passing between them and their gums. Pixels that show
+gums, lips or the retractor only have to look like them, so they are shaded locally.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
 from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight
+from services.core.geometry import Tooth
 from services.fit.optics.parameters import Mouth
 from services.fit.transport.engine import Engine
 from services.fit.transport.rays import RayScene, pixel_rays
@@ -41,12 +42,8 @@ class MouthLight:
         self._surfaces = RayScene(*(tooth.outer for tooth in mouth.teeth), mouth.shown_gums, mouth.lips)
         # Use one scene of unit intensities for all channels, because images are linear in each light's intensity.
         positions_mm, unit = np.array([light.position_mm for light in lights]), np.ones(len(lights))
-        teeth = tuple(
-            ToothSurfaces(tooth.outer, DentinShape.known(tooth.dentin))
-            for tooth in mouth.teeth
-            if tooth.dentin is not None
-        )
-        self._engine = Engine(SceneRecipe(teeth, positions_mm, unit, gums=mouth.gums, gums_ior=GUMS_IOR))
+        teeth = map(_surfaces, mouth.teeth)
+        self._engine = Engine(SceneRecipe(tuple(teeth), positions_mm, unit, gums=mouth.gums, gums_ior=GUMS_IOR))
 
     def images(self, camera: CalibratedCamera, samples: int, seed: int) -> Floats:
         """Radiance (L, H, W, 3) under each light, averaged over the pixels.
@@ -91,6 +88,11 @@ class MouthLight:
                 drawn[n] += np.where(is_tooth, 0.0, lit)[:, None] * colour * np.array(light.intensity)
         shape = (len(self._lights), height, width, 3)
         return drawn.reshape(shape), visible.reshape(self._teeth, height, width)
+
+
+def _surfaces(tooth: Tooth) -> ToothSurfaces:
+    assert tooth.dentin is not None, "all teeth of the mouth have dentin"
+    return ToothSurfaces(tooth.outer, DentinShape.known(tooth.dentin))
 
 
 def _smoothed(images: Floats, whole: NDArray[np.bool_]) -> Floats:
