@@ -84,7 +84,7 @@ def dentin_blend_shape(
     base = _base(outer, grid, surface, faces)
     inward = _unit(_smooth(base, grid.inward(base.vertices_mm), 6))
 
-    height = _height(base.vertices_mm @ axes.T, crown)
+    height = crown_height(base.vertices_mm @ axes.T, crown)
     buccal = _smooth(base, _free_depth_mm(base.vertices_mm, inward, grid), 6) * np.sqrt(height)
     proximal = _side(base.vertices_mm @ axes.T) * np.sqrt(height)
     drop = (FULL_DROP_MM - BASE_DEPTH_MM) * height**2
@@ -115,9 +115,10 @@ def _kept_inside(points_mm: NDArray[np.float64], grid: SignedDistanceGrid) -> ND
     return points_mm
 
 
-def _height(points_mm: NDArray[np.float64], crown: ToothDimensions | None) -> NDArray[np.float64]:
-    # Relative height (N,) of points in the canonical frame's axes: 0 at the cervical line and on the root, 1 at the
-    # edge. The line rises on the proximal sides.
+def crown_height(points_mm: NDArray[np.float64], crown: ToothDimensions | None) -> NDArray[np.float64]:
+    """Relative height (N,) of points (N, 3) in the canonical frame's axes: 0 at the cervical line, which rises on the
+    proximal sides, and on the root, 1 at the edge.
+    """
     across, up = points_mm[:, 0], points_mm[:, 2]
     top, bottom = up.max(), np.full(len(up), up.min())
     if crown is not None:

@@ -234,6 +234,11 @@ class JobSpec(Record):
         fail_fast=True,
         description="cameras kept from the fit, under all lights; the others then lose those of held_out_lights alone",
     )
+    left_out_lights: tuple[str, ...] = Field(
+        default=(),
+        fail_fast=True,
+        description="lights whose images are not used at all, such as one that a report calls far off",
+    )
     channels: tuple[str, ...] | None = Field(default=None, fail_fast=True, description="channels to fit; default: all")
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
     shadows: bool = Field(

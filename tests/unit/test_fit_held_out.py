@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from services.core.geometry import Light
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
-from services.fit.inputs.held_out import held_out_images
-from tests.support.prepared import camera
+from services.fit.inputs.held_out import held_out_images, left_out_lights
+from services.fit.inputs.observations import read_channel, read_observations
+from tests.support.prepared import camera, write_prepared
 
 
 def manifest() -> PreparedManifest:
@@ -38,3 +41,16 @@ def test_lights_that_are_named_too_are_kept_from_all_cameras() -> None:
 
 def test_without_cameras_the_captures_own_choice_stays() -> None:
     assert np.argwhere(chosen()).tolist() == [[0, 1]]
+
+
+def test_lights_that_are_left_out_are_named_by_the_job() -> None:
+    found = left_out_lights(manifest(), JobSpec.model_validate({"capture": "c", "left_out_lights": ("l0", "l4")}))
+    assert found.tolist() == [True, False, False, False, True]
+    assert not left_out_lights(manifest(), JobSpec.model_validate({"capture": "c"})).any()
+
+
+def test_no_image_of_a_light_that_is_left_out_counts(tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    spec = JobSpec.model_validate({"capture": tmp_path, "left_out_lights": ("l2",)})
+    for view in read_channel(read_observations(tmp_path, spec), "green", spec):
+        assert view.valid.any(axis=1).tolist() == [True, True, False, True, True, True]

@@ -170,5 +170,5 @@ def _sentence(frame: WrongFrame, cameras: Sequence[str]) -> str:
         )
     return (
         f"The photograph of {where} under light {frame.light} is {100 * frame.error:.0f} % off, far more than its"
-        " camera's others; look at it, and leave that light out or take it again."
+        " camera's others; look at it, and take it again or leave that light out (left_out_lights)."
     )

@@ -20,12 +20,13 @@ from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter, write_atomic
 from services.core.verdict import MAX_ERROR
 from services.fit.checks.evaluate import ErrorSums, Evaluation
-from services.fit.execution.channel_fit import ChannelFit, StepReport, history_key, message_prefix
+from services.fit.execution.channel_fit import ChannelFit
 from services.fit.execution.executors import Executor, executor
 from services.fit.execution.journal import Journal
 from services.fit.execution.numerics import numerics_name
 from services.fit.execution.passes import Passes, TraceRow
 from services.fit.execution.seeds import Seeds
+from services.fit.execution.step_report import StepReport, history_key, message_prefix
 from services.fit.export.previews import write_pictures, write_preview
 from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack
 

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from services.core.records import JobSpec
 from services.fit.checks.evaluate import Evaluation, Shown, evaluate
-from services.fit.execution.closing import HeldCosines, HeldShapes, measure_closing
+from services.fit.execution.closing import DisplacedScene, HeldCosines, HeldShapes, measure_closing
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, StackProblem
+from services.fit.execution.step_report import StepReport, history_key, message_prefix
 from services.fit.inputs.observations import ChannelFiles, Level
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
@@ -48,38 +49,6 @@ REPEAT_STAGE = "again"
 solution far."""
 MIN_SAMPLES = 4
 """Least number of paths per pixel, however many pixels there are."""
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """Report of one step."""
-
-    channel: str
-    stage: str
-    step: int
-    stage_step: int
-    loss: float
-    """Relative squared error on fitted images, sensor noise included; dimensionless. The loss and the errors are not
-    reported below the precision of the step's samples."""
-    fit_error: float | None
-    held_out_error: float | None
-    held_out_se: float | None
-    """Monte Carlo standard error of ``held_out_error``."""
-    parameters: dict[str, float]
-    samples: int
-    verdict: str
-    tooth: int | None = None
-    """FDI number of the tooth, while a jaw's fit treats one tooth alone."""
-
-
-def message_prefix(channel: str, tooth: int | None) -> str:
-    """Start of a fit's messages: the channel, and the tooth while a jaw's fit treats one tooth alone."""
-    return channel if tooth is None else f"{channel}, tooth {tooth}"
-
-
-def history_key(channel: str, step: int) -> str:
-    """Key of a step's report in the journal."""
-    return f"{channel}/history/{step}"
 
 
 def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_count: int, samples: int) -> Array:
@@ -168,6 +137,10 @@ class Stages(ABC, Generic[Optics]):
     def _held_shapes(self) -> HeldShapes:
         """Shapes of the dentin that this fit holds though they have an error."""
         return ()
+
+    def _displaced_scene(self, tissue: Optics) -> DisplacedScene | None:  # noqa: ARG002 - for those that have one
+        """Scene whose dentin also moves as no fitted shape can, as input of the closing measurement."""
+        return None
 
     @property
     def part_count(self) -> int:
@@ -325,22 +298,24 @@ class Stages(ABC, Generic[Optics]):
         whitened, moves, shapes = whitening(domain, equations), self.files.moves, self._held_shapes()
 
         def compute() -> dict[str, Any]:
+            displaced = self._displaced_scene(domain.tissue_at(x, problem.base))
             prefix = message_prefix(self.files.channel, self.tooth)
             self.log(f"{prefix}: renders around the answer tell its ±, which may take as long as all steps.")
             held, fewer = self._held_cosines(domain), max(samples // CLOSING_DIVISOR, 1)
-            sums = measure_closing(problem, x, whitened.transform, held, fewer, moves, shapes)
+            sums = measure_closing(problem, x, whitened.transform, held, fewer, moves, shapes, displaced)
             return {
                 "sums": sums.record(),
                 "step": last_step(
                     problem, x, closing_model(domain, x, equations, sums), self.part_count, samples
                 ).tolist(),
+                "displacements": 0 if displaced is None else displaced.count,
             }
 
         self.raise_if_cancelled()
         entry, _ = self.journal.get_or_compute(key, compute)
         step = np.array(entry["step"])
         sums = ClosingSums.of(entry["sums"])
-        sources = ["shape"] * len(shapes) + [move.body for move in moves]
+        sources = ["shape"] * (len(shapes) + entry["displacements"]) + [move.body for move in moves]
         return uncertainty(domain, x + step, equations, sums, step, sources, self.part_count)
 
     def _solve(

@@ -5,14 +5,14 @@ on any worker.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.execution.blocks import BlockTask, read_block
+from services.fit.execution.blocks import BlockTask, StoredFile, read_block
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
@@ -31,9 +31,20 @@ HeldShapes = Sequence[tuple[dict[str, float], dict[str, float]]]
 side."""
 
 MOVE_DIVISOR = 4
-"""Divisor of the paths for images of moved scans and domes, because there are thirteen of them."""
+"""Divisor of the paths for images of displaced dentin and of moved scans and domes, because there are many."""
 SHIFT_DIVISOR = 2
 """Divisor of the paths for images of changed media, because they enter a variance only and not the solution."""
+
+
+@dataclass(frozen=True)
+class DisplacedScene:
+    """Scene whose dentin has further blend modes after those of the fit: displacements of one standard deviation that
+    no fitted shape can make, outwards, and then the same inwards, because weights of modes are positive.
+    """
+
+    recipe: StoredFile
+    count: int
+    """Number of the displacements, without their opposites."""
 
 
 def measure_closing(
@@ -44,6 +55,7 @@ def measure_closing(
     samples: int,
     moves: Sequence[Move] = (),
     shapes: HeldShapes = (),
+    displaced: DisplacedScene | None = None,
 ) -> ClosingSums:
     """Closing sums of all blocks at x (F,), added in block order.
 
@@ -55,6 +67,7 @@ def measure_closing(
         samples: paths per pixel and seed.
         moves: moves of scan and dome; each costs two images, and their changes come last in the sums.
         shapes: held shapes of the dentin; each costs four images, and their changes follow those of ``held``.
+        displaced: displacements of the dentin; each costs four images, and their changes follow those of ``shapes``.
     """
     run, label = problem.passes.executor, f"{problem.passes.seeds.channel}-{problem.stage}-closing"
     tissue, similar, differentiation = problem.jacobian_media(x)
@@ -66,7 +79,8 @@ def measure_closing(
         for parts, (mean, sd) in held.items()
     ) + tuple((tissue.with_values(low), tissue.with_values(high)) for low, high in shapes)
     tasks = problem.passes_at(x).tasks(label, tissue, samples)
-    changes = _changes_by_moves(problem, tasks, moves, label)
+    few = [replace(task, samples=max(task.samples // MOVE_DIVISOR, 1)) for task in tasks]
+    changes = _changes_by_scene(problem, few, displaced, moves, label)
     common = (similar, differentiation, first, whiten, slopes, copied, second, images, ends)
     pending = [
         run.submit(f"{label}-{task.index}", closing_task, task, *common, *own)
@@ -80,23 +94,47 @@ def measure_closing(
     return total
 
 
-def _changes_by_moves(
-    problem: StackProblem[Optics], tasks: Sequence[BlockTask], moves: Sequence[Move], label: str
+def _changes_by_scene(
+    problem: StackProblem[Optics],
+    tasks: Sequence[BlockTask],
+    displaced: DisplacedScene | None,
+    moves: Sequence[Move],
+    label: str,
 ) -> list[list[Any]]:
-    # Results of ``moves_task`` by block and scene. All blocks of one scene come before the next scene, because a worker
-    # keeps few scenes.
-    seeds = problem.seed(0, "closing-moves-1"), problem.seed(0, "closing-moves-2")
-    few = [replace(task, samples=max(task.samples // MOVE_DIVISOR, 1)) for task in tasks]
-    by_moves = [
-        [
-            problem.passes.executor.submit(
-                f"{label}-moves-{number}-{one.index}", moves_task, one, one.tissue, scene, seeds
-            )
-            for one in few
-        ]
-        for number, scene in enumerate(by_scene(moves))
-    ]
-    return [[scene[k] for scene in by_moves] for k in range(len(few))]
+    # Results by block and scene, of ``displacements_task`` and then of ``moves_task``. All blocks of one scene come
+    # before the next scene, because a worker keeps few scenes.
+    scenes: list[tuple[str, Callable[..., Any], Any]] = [("moves", moves_task, scene) for scene in by_scene(moves)]
+    if displaced is not None:
+        scenes.insert(0, ("displacements", displacements_task, displaced))
+    results = []
+    for number, (name, task, scene) in enumerate(scenes):
+        seeds = problem.seed(0, f"closing-{name}-1"), problem.seed(0, f"closing-{name}-2")
+        results.append(
+            [
+                problem.passes.executor.submit(
+                    f"{label}-{name}-{number}-{one.index}", task, one, one.tissue, scene, seeds
+                )
+                for one in tasks
+            ]
+        )
+    return [[of_scene[k] for of_scene in results] for k in range(len(tasks))]
+
+
+def displacements_task(
+    host: EngineHost, task: BlockTask, tissue: Tissue, scene: DisplacedScene, seeds: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Changes of a block's images by the displacements of a scene's dentin: (K, 2, L, N) by displacement and seed."""
+    view = read_block(task.block).fitted_view
+
+    def images(mode: int) -> Array:
+        weights = np.zeros(2 * scene.count)
+        weights[mode] = 1.0
+        moved = replace(tissue, shape=(*tissue.shape, *weights.tolist()))
+        stacks = [host.call("images", scene.recipe, moved, view, samples=task.samples, seed=seed) for seed in seeds]
+        return np.stack([np.asarray(stack.mean, dtype=np.float64) for stack in stacks])
+
+    changes = [0.5 * (images(k) - images(scene.count + k)) for k in range(scene.count)]
+    return np.array(changes).astype(np.float32)
 
 
 def closing_task(
@@ -113,7 +151,7 @@ def closing_task(
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
     *changes: NDArray[np.float32],
 ) -> tuple[ClosingSums, TraceRow]:
-    """One block's closing sums and trace, with the changes by moves (K, 2, L, N) of each scene.
+    """One block's closing sums and trace, with the changes (K, 2, L, N) by the displacements or moves of each scene.
 
     Rows of ``slopes`` that are ``copied`` are taken from the similar media's Jacobian.
     """

@@ -13,7 +13,7 @@ from services.core.results import PreparedManifest
 from services.core.store import write_atomic
 from services.fit.checks.evaluate import Evaluation
 from services.fit.checks.thickness import ThicknessMap
-from services.fit.execution.channel_fit import StepReport
+from services.fit.execution.step_report import StepReport
 from services.fit.export.pictures import (
     RESIDUAL_OF_WHITE,
     Picture,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.frame import ToothFrame
+from services.anatomy.templates.dimensions import upper_tooth
 from services.core.errors import InputError, NonFiniteError
 from services.core.files.meshes import read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
@@ -88,6 +90,22 @@ def neighbour_surfaces(
     return tuple(ToothSurfaces(other.outer, at_rest(dentin)) for other, dentin in zip(neighbours, dentins, strict=True))
 
 
+def with_shape_errors(
+    surfaces: ToothSurfaces, shape: tuple[float, ...], tooth: Tooth, cameras: tuple[Camera, ...]
+) -> ToothSurfaces:
+    """The tooth with further blend modes: the errors of its dentin's shape at the blend weights ``shape``, and their
+    opposites.
+    """
+    from services.anatomy.jaw_frames import tooth_frame
+    from services.anatomy.shape_errors import shape_errors
+
+    assert surfaces.dentin is not None
+    frame, crown = tooth_frame(tooth, viewpoints_mm(cameras)), upper_tooth(tooth.fdi % 10)
+    errors = shape_errors(surfaces.outer, surfaces.dentin, shape, frame, crown)
+    modes = np.concatenate([surfaces.dentin.modes_mm, errors, -errors])
+    return replace(surfaces, dentin=replace(surfaces.dentin, modes_mm=modes))
+
+
 def viewpoints_mm(cameras: tuple[Camera, ...]) -> NDArray[np.float64]:
     """Centres (N, 3) of the cameras, in mm."""
     return np.array([camera.rays(np.zeros(1), np.zeros(1))[0] for camera in cameras])
@@ -95,6 +113,5 @@ def viewpoints_mm(cameras: tuple[Camera, ...]) -> NDArray[np.float64]:
 
 def _blend_shape(tooth: Tooth, frame: ToothFrame) -> DentinShape:
     from services.anatomy.blend import dentin_blend_shape
-    from services.anatomy.templates.dimensions import upper_tooth
 
     return dentin_blend_shape(tooth.outer, frame, crown=upper_tooth(tooth.fdi % 10))

@@ -1,6 +1,8 @@
-"""Images that are held out of a fit to test it."""
+"""Images that are held out of a fit to test it, and lights that the job leaves out altogether."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +28,7 @@ def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
         )
     chosen = np.zeros((len(cameras), len(lights)), dtype=bool)
     if spec.held_out_lights is not None:
-        for name in spec.held_out_lights:
-            if name not in lights:
-                raise SettingsError(
-                    f"Option held_out_lights names '{name}', which the capture does not have; it has"
-                    f" {', '.join(lights)}."
-                )
-            chosen[:, lights.index(name)] = True
+        chosen |= _named("held_out_lights", spec.held_out_lights, lights)
     elif spec.held_out_cameras:
         pass
     elif manifest.held_out:
@@ -41,14 +37,27 @@ def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
     else:
         chosen[:, 3::4] = True
         chosen[:, -1] |= not chosen.any()
-    for name in spec.held_out_cameras:
-        if name not in cameras:
-            raise SettingsError(
-                f"Option held_out_cameras names '{name}', which the capture does not have; it has {', '.join(cameras)}."
-            )
-        chosen[cameras.index(name)] = True
+    chosen |= _named("held_out_cameras", spec.held_out_cameras, cameras)[:, None]
     if chosen.all():
         raise SettingsError(
             "Every image is held out and none is left to fit; name fewer in held_out_lights or held_out_cameras."
         )
     return chosen
+
+
+def left_out_lights(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:
+    """Mask (L,) of the lights whose images are neither fitted nor used as a test.
+
+    Raises:
+        SettingsError: a light is unknown.
+    """
+    return _named("left_out_lights", spec.left_out_lights, [light.name for light in manifest.lights])
+
+
+def _named(option: str, chosen: Sequence[str], names: Sequence[str]) -> NDArray[np.bool_]:
+    for name in chosen:
+        if name not in names:
+            raise SettingsError(
+                f"Option {option} names '{name}', which the capture does not have; it has {', '.join(names)}."
+            )
+    return np.isin(names, chosen)

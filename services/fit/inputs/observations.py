@@ -18,7 +18,7 @@ from services.core.results import PreparedManifest
 from services.core.store import open_stage
 from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
 from services.fit.inputs.dentin import read_neighbours
-from services.fit.inputs.held_out import held_out_images
+from services.fit.inputs.held_out import held_out_images, left_out_lights
 from services.fit.inputs.levels import LevelReader, reduced_camera, whole_squares
 from services.fit.instrument.capture import Instrument
 from services.fit.instrument.errors import NO_ERRORS, InstrumentErrors
@@ -188,9 +188,9 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
     """
     manifest, index = observations.manifest, observations.manifest.channels.index(channel)
     level = LevelReader(observations.folder / "prepared.zarr", index, spec.pixel_step)
-    lights, views = range(len(manifest.lights)), []
+    lights, views, used = range(len(manifest.lights)), [], ~left_out_lights(manifest, spec)[:, None, None]
     for c, camera in enumerate(manifest.cameras):
-        valid = np.stack([whole_squares(level.bits(c, light, camera) == 0, spec.pixel_step) for light in lights])
+        valid = np.stack([whole_squares(level.bits(c, light, camera) == 0, spec.pixel_step) for light in lights]) & used
         y, x = np.nonzero(valid.any(axis=0))
         if len(x) == 0:
             continue

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +20,14 @@ from services.fit.checks.identifiability import NOT_EXPLAINED, correlation, dete
 from services.fit.checks.next_calibration import calibration_advice
 from services.fit.checks.thickness import ThicknessMap, thickness_map
 from services.fit.execution.attempt import Attempt, assess_convergence, standard_errors, worst_error
+from services.fit.execution.blocks import StoredFile, read_recipe, write_recipe
 from services.fit.execution.channel_fit import ChannelFit
+from services.fit.execution.closing import DisplacedScene
 from services.fit.execution.executors import Executor
 from services.fit.execution.journal import Journal
 from services.fit.export.previews import shown_images
 from services.fit.export.stains import store_stains
-from services.fit.inputs.dentin import dentin_shape, neighbour_surfaces
+from services.fit.inputs.dentin import dentin_shape, neighbour_surfaces, with_shape_errors
 from services.fit.inputs.observations import (
     ChannelFiles,
     Observations,
@@ -93,6 +97,9 @@ class FitDriver:
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
                 schedule.gums = None if observations.gums is None else GUMS_START
                 schedule.shape_covariance = covariance
+                if modes:
+                    given = files[channel].recipe, tooth, observations.manifest.cameras
+                    schedule.make_displaced_scene = partial(_displaced_scene, attempt.inputs, *given)
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
                 if not shape:
@@ -211,6 +218,16 @@ def _numbering_fault(tooth: Tooth, spec: JobSpec) -> str:
     from services.anatomy.jaw_frames import fdi_mismatch_note
 
     return fdi_mismatch_note(tooth) if spec.dentin == "fit" else ""
+
+
+def _displaced_scene(
+    folder: Path, recipe: StoredFile, tooth: Tooth, cameras: tuple[Camera, ...], tissue: Tissue
+) -> DisplacedScene:
+    scene = read_recipe(recipe)
+    surfaces = with_shape_errors(scene.teeth[0], tissue.shape, tooth, cameras)
+    assert surfaces.dentin is not None
+    count = (len(surfaces.dentin.modes_mm) - len(tissue.shape)) // 2
+    return DisplacedScene(write_recipe(folder, replace(scene, teeth=(surfaces,))), count)
 
 
 def shape_covariance(uncertainty: Uncertainty, tooth: int | None = None) -> tuple[tuple[float, ...], ...]:

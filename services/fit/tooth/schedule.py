@@ -29,6 +29,7 @@ Absorption of a thin enamel cap is nearly invisible, so its exponent has a prior
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -38,7 +39,7 @@ from numpy.typing import NDArray
 from services.core.errors import SettingsError
 from services.fit.checks.next_capture import Sensor, capture_advice
 from services.fit.execution.channel_fit import ChannelFit, Stages
-from services.fit.execution.closing import HeldCosines, HeldShapes
+from services.fit.execution.closing import DisplacedScene, HeldCosines, HeldShapes
 from services.fit.execution.passes import StackProblem, orders_task
 from services.fit.execution.stain_passes import StainStage
 from services.fit.inputs.observations import COARSE_PIXELS
@@ -95,6 +96,8 @@ class ChannelSchedule(Stages[Tissue]):
     """Covariance of the known blend weights, which another channel's fit found; empty where they are exact."""
     stain_layout: StainLayout | None = None
     """Texels to fit; None where the surface is taken as clean."""
+    make_displaced_scene: Callable[[Tissue], DisplacedScene] | None = None
+    """Makes the scene whose dentin also moves as its blend modes cannot; None where the dentin is known or absent."""
     gums: Medium | None = None
     """Start of the gums around the tooth, whose albedo is fitted in exact images; None for a scene without gums."""
 
@@ -140,6 +143,9 @@ class ChannelSchedule(Stages[Tissue]):
             return {f"shape.{k}": float(weight) for k, weight in enumerate(inside)}
 
         return [(weights(-step), weights(step)) for step in steps]
+
+    def _displaced_scene(self, tissue: Tissue) -> DisplacedScene | None:
+        return None if self.make_displaced_scene is None else self.make_displaced_scene(tissue)
 
     def _other_values(self, tissue: Tissue) -> dict[str, float]:
         return {f"shape.{k}": c for k, c in enumerate(tissue.shape)}

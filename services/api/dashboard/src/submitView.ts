@@ -30,6 +30,7 @@ const GROUPS: [string, string[]][] = [
     [
       "channels",
       "held_out_lights",
+      "left_out_lights",
       "calibration",
       "accept_calibration",
       "instrument",
