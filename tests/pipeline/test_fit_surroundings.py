@@ -17,13 +17,13 @@ FITTED = 11
 ENGINE = "services.fit.transport.engine:Engine"
 
 
-def fit(root: Path, *, surroundings: bool) -> FitReport:
+def fit(root: Path, *, surroundings: bool, max_steps: int) -> FitReport:
     write_prepared_jaw(root, ENGINE, only=FITTED)
     if not surroundings:
         manifest = json.loads((root / "prepared" / MANIFEST).read_text())
         manifest["record"]["surroundings"] = False
         (root / "prepared" / MANIFEST).write_text(json.dumps(manifest))
-    spec = jaw_spec(root, kind="tooth", instrument="off", advise=False, max_steps=6)
+    spec = jaw_spec(root, kind="tooth", instrument="off", advise=False, max_steps=max_steps)
     report = run(spec, LocalContext(root, 1))
     export(spec, LocalContext(root, 1))
     return report
@@ -32,13 +32,13 @@ def fit(root: Path, *, surroundings: bool) -> FitReport:
 @pytest.fixture(scope="module")
 def around(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FitReport]:
     root = tmp_path_factory.mktemp("around")
-    return root, fit(root, surroundings=True)
+    return root, fit(root, surroundings=True, max_steps=6)
 
 
 def test_light_from_gums_and_other_teeth_is_explained(around: tuple[Path, FitReport], tmp_path: Path) -> None:
     _, with_them = around
     # These few coarse pixels hardly determine the media; tests.benchmarks.surroundings compares them with the truth.
-    alone = fit(tmp_path, surroundings=False)
+    alone = fit(tmp_path, surroundings=False, max_steps=2)
     assert with_them.converged
     assert alone.held_out_error["green"] > 3 * with_them.held_out_error["green"]
 

@@ -20,6 +20,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.blend import MODES
 from services.core.errors import NonFiniteError
 from services.fit.inputs.stain_uv import bilinear_texels
 from services.fit.optics.parameters import Stain, Tissue
@@ -111,7 +112,8 @@ class FakeEngine:
         thickness = 0.3 + 0.9 * y / 34.0
         if self.recipe.teeth[0].dentin is None:
             thickness = thickness + 50.0
-        for m, c in enumerate(tissue.shape):
+        # Displacements of the dentin, which follow the weights of the blend shape, change nothing here.
+        for m, c in enumerate(tissue.shape[: len(MODES)]):
             thickness = thickness * (1 + 0.3 * c * np.cos((m + 1) * x / 9.0))
         lights = np.arange(len(self.recipe.light_positions_mm))[:, None]
         direction = np.abs(self.recipe.light_positions_mm[:, :1]).astype(float) / 1000
