@@ -71,4 +71,4 @@ dashboard: ## bundle the dashboard's TypeScript into services/api/dashboard/stat
 
 setup:
 	@deploy/setup.sh
-	@echo 'dentine is set up; $(BIN)/dentine --help lists its commands, make demo tries it'
+	@$(if $(filter setup,$(MAKECMDGOALS)),echo 'dentine is set up: $(BIN)/dentine --help lists its commands and make demo tries it',:)

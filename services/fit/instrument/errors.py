@@ -42,10 +42,10 @@ none showed it."""
 MANY_FAULTS = 3
 """Least number of checked errors far from their prior that show a cause common to them."""
 FAULT_SHARE = 1 / 4
-"""Least share of them. In fits of a virtual mouth's tooth with another root than the photographed one, or with one lobe
-for an enamel of two, three to six of twelve were far off; with one light 30 mm off, or with errors drawn from their
-prior, at most one of eight. Exchanged photographs (four or five of eight) and a scan 1 mm off (two to four) have such a
-common cause too."""
+"""Least share of them. In fits of a virtual mouth's tooth with another root than the photographed one, or with a dentin
+that no blend shape follows, three to six of twelve were far off; with one light 30 mm off, or with errors drawn from
+their prior, at most one of eight. Exchanged photographs (four or five of eight) and a scan 1 mm off (two to four) have
+such a common cause too."""
 MAX_ERROR = 10.0
 """Largest absolute value of an error, in its unit."""
 
