@@ -20,7 +20,7 @@ from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
 from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
-from services.fit.instrument.errors import CHECKED_BY_IMAGES, DEFAULT_SE, InstrumentErrors, errors_of, have_common_cause
+from services.fit.instrument.errors import DEFAULT_SE, FAULT_Z, InstrumentErrors, errors_of, have_common_cause
 from services.fit.instrument.moves import by_scene, move_covariance, rigid, write_moves
 from services.fit.instrument.photographs import error_derivatives, photographed
 from services.fit.instrument.sentences import REMEDY, assumed_names, instrument_sentences
@@ -204,7 +204,7 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
         "In green the images put light_gain.b off by -5.0 %, 4.2 times what their own error and its ± of 1 %"
     )
     assert "check that light, its cable and its name" in fault
-    assert set(REMEDY) == CHECKED_BY_IMAGES
+    assert set(REMEDY) == set(FAULT_Z)
     assert "Images hardly show a gain that is farther off" in assumed
     off = spec.model_copy(update={"instrument": "off"})
     assert instrument_sentences(off, {"green": InstrumentErrors()}, {}, ())[0].startswith(

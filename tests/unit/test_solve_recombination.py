@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.solve.recombination import FAULT_Z, Recombination, faults
+from services.fit.solve.recombination import Recombination, faults
 
 Array = NDArray[np.float64]
 
 PRIOR = np.diag([0.01, 0.01, 0.003]) ** 2
 TISSUE, ERRORS, COUNT = 2, 3, 60
+LIMITS = dict.fromkeys(range(ERRORS), 3.0)
+"""Number of standard errors beyond which an error is a fault, by its index."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def test_what_it_states_is_what_repeated_fits_show() -> None:
 
 def test_a_fault_is_named_with_its_size_and_does_not_draw_others_along() -> None:
     one, random, size = crude(4, misfit=0.3, moved=0.5), np.random.default_rng(5), np.array([-0.1, 0.0, 0.0])
-    named = [faults(one.draw(random, fault=size)[TISSUE + ERRORS :], one.found, range(ERRORS)) for _ in range(200)]
+    named = [faults(one.draw(random, fault=size)[TISSUE + ERRORS :], one.found, LIMITS) for _ in range(200)]
     assert all(told and told[0].index == 0 for told in named)
     sizes = np.array([told[0].size for told in named])
     # The prior's mean is off by -0.1, so the error is 0.1 above it: mean of 200.
@@ -112,15 +114,23 @@ def test_a_fault_is_named_with_its_size_and_does_not_draw_others_along() -> None
 def test_an_error_that_images_cannot_check_is_believed_and_not_named() -> None:
     one, random, size = crude(4, misfit=0.3, moved=0.5), np.random.default_rng(5), np.array([-0.1, 0.0, 0.0])
     deviations = one.draw(random, fault=size)[TISSUE + ERRORS :]
-    assert 0 in {fault.index for fault in faults(deviations, one.found, range(ERRORS))}
-    assert 0 not in {fault.index for fault in faults(deviations, one.found, range(1, ERRORS))}
+    assert 0 in {fault.index for fault in faults(deviations, one.found, LIMITS)}
+    assert 0 not in {fault.index for fault in faults(deviations, one.found, {1: 3.0, 2: 3.0})}
+
+
+def test_each_error_is_a_fault_beyond_its_own_limit() -> None:
+    one, random, size = crude(4, misfit=0.3, moved=0.5), np.random.default_rng(5), np.array([-0.1, -0.1, 0.0])
+    deviations = one.draw(random, fault=size)[TISSUE + ERRORS :]
+    named = {fault.index: abs(fault.z) for fault in faults(deviations, one.found, LIMITS)}
+    assert named.keys() >= {0, 1}, "both faults are clear"
+    raised = LIMITS | {0: named[0] + 1.0}
+    assert {fault.index for fault in faults(deviations, one.found, raised)} == named.keys() - {0}
 
 
 def test_good_calibrations_are_told_as_wrong_as_rarely_as_their_errors_say() -> None:
     one, random = crude(2, misfit=1.0, moved=2.0), np.random.default_rng(6)
-    false = sum(bool(faults(one.draw(random)[TISSUE + ERRORS :], one.found, range(ERRORS))) for _ in range(2000))
+    false = sum(bool(faults(one.draw(random)[TISSUE + ERRORS :], one.found, LIMITS)) for _ in range(2000))
     # Three errors at z = 3: at most 3 / 370 of 2,000, which is 16; the bound is 4 Poisson errors above that.
-    assert FAULT_Z == 3.0
     assert false < 16 + 4 * np.sqrt(16)
 
 

@@ -34,11 +34,13 @@ the best that registration reaches, and the precision of a tape measure."""
 LINEAR_REACH = 0.1
 """Length scale of an error for the lengths of steps; images are exactly linear in an error."""
 
-CHECKED_BY_IMAGES = frozenset({"light_gain", "flare"})
-"""Kinds of errors that images show to be faults of the calibration. The gain of all is not among them, because images
-can hardly tell it from absorption: freed of its prior it follows other errors, such as the model's own.
-Of 36 good captures 4 put it 11 to 15 % too low, with absorption 35 to 65 % too low, and of 7 with a gain 10 % too high
-none showed it."""
+FAULT_Z: Mapping[str, float] = MappingProxyType({"light_gain": 3.0, "flare": 4.0})
+"""Kinds of errors that images show to be faults of the calibration, and the number of standard errors from its prior
+beyond which such an error is one. One sound light in 370 lies beyond 3 by chance. A flare also takes up light that the
+model leaves out, so sound flares lie beyond 3 more often; one of 2 % lies 6.7 from its prior. The gain of all is not
+among them, because images can hardly tell it from absorption: freed of its prior it follows other errors, such as the
+model's own. Of 36 good captures 4 put it 11 to 15 % too low, with absorption 35 to 65 % too low, and of 7 with a gain
+10 % too high none showed it."""
 MANY_FAULTS = 3
 """Least number of checked errors far from their prior that show a cause common to them."""
 FAULT_SHARE = 1 / 4
@@ -95,7 +97,7 @@ def have_common_cause(faults: int, names: Sequence[str]) -> bool:
     Args:
         faults: number of errors that do. names: names of all errors.
     """
-    checked = sum(kind_of_error(name) in CHECKED_BY_IMAGES for name in names)
+    checked = sum(kind_of_error(name) in FAULT_Z for name in names)
     return faults >= max(MANY_FAULTS, FAULT_SHARE * checked)
 
 

@@ -16,7 +16,7 @@ of the prior.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,11 +96,6 @@ def _inverse(covariance: Array, unit: Array) -> Array:
     return np.asarray(whitened @ whitened.T)
 
 
-FAULT_Z = 3.0
-"""An error that lies more than this many standard errors from its prior is a fault of the calibration: 1 sound error in
-370 is taken for one."""
-
-
 @dataclass(frozen=True)
 class Fault:
     """A calibration error that lies farther from its prior than the standard errors of both allow."""
@@ -113,8 +108,8 @@ class Fault:
     """``size`` over its standard error, which covers the images' errors and the prior's."""
 
 
-def faults(deviations: Array, found: Recombination, tested: Iterable[int]) -> tuple[Fault, ...]:
-    """Tested errors that lie more than ``FAULT_Z`` standard errors from their prior, the most significant first.
+def faults(deviations: Array, found: Recombination, limits: Mapping[int, float]) -> tuple[Fault, ...]:
+    """Errors that lie more than their limit from their prior, the most significant first.
 
     A prior that is off by f moves d by f h, with h the error's own column of 1 - B[e], so f = h'D^-1 d / h'D^-1 h is
     the estimate of f from all errors together. The faults are removed one by one before the others are tested, because
@@ -123,21 +118,22 @@ def faults(deviations: Array, found: Recombination, tested: Iterable[int]) -> tu
     Args:
         deviations: d (K,), errors of the first solution less their prior's mean.
         found: the first solution and its prior.
-        tested: indices of the errors that may be faults; the prior of all others is believed.
+        limits: number of standard errors beyond which an error is a fault, by its index; the prior of all others is
+            believed.
     """
     moves, weight = (
         np.eye(len(deviations)) - found.error_response,
         _inverse(found.difference_covariance, np.sqrt(np.diag(found.prior))),
     )
-    remaining, detected = set(tested), list[Fault]()
+    remaining, detected = set(limits), list[Fault]()
     while remaining:
         information = {k: float(moves[:, k] @ weight @ moves[:, k]) for k in remaining}
         sizes = {k: float(moves[:, k] @ weight @ deviations) / max(information[k], 1e-300) for k in remaining}
-        worst = max(remaining, key=lambda k: abs(sizes[k]) * np.sqrt(information[k]))
-        z = sizes[worst] * float(np.sqrt(information[worst]))
-        if abs(z) <= FAULT_Z:
+        z = {k: sizes[k] * float(np.sqrt(information[k])) for k in remaining}
+        worst = max(remaining, key=lambda k: abs(z[k]) / limits[k])
+        if abs(z[worst]) <= limits[worst]:
             break
-        detected.append(Fault(worst, sizes[worst], z))
+        detected.append(Fault(worst, sizes[worst], z[worst]))
         along = weight @ moves[:, worst]
         weight = weight - np.outer(along, along) / information[worst]
         remaining.remove(worst)
