@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from services.core.errors import SettingsError
 from services.core.geometry import Light
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
@@ -47,6 +49,13 @@ def test_lights_that_are_left_out_are_named_by_the_job() -> None:
     found = left_out_lights(manifest(), JobSpec.model_validate({"capture": "c", "left_out_lights": ("l0", "l4")}))
     assert found.tolist() == [True, False, False, False, True]
     assert not left_out_lights(manifest(), JobSpec.model_validate({"capture": "c"})).any()
+
+
+@pytest.mark.parametrize("left_out", [("l0", "l1", "l2", "l4"), ("l0", "l1", "l2", "l3", "l4")])
+def test_some_light_is_left_to_fit(left_out: tuple[str, ...]) -> None:
+    spec = JobSpec.model_validate({"capture": "c", "held_out_lights": ("l3",), "left_out_lights": left_out})
+    with pytest.raises(SettingsError, match="No light is left to fit; name fewer in left_out_lights"):
+        left_out_lights(manifest(), spec)
 
 
 def test_no_image_of_a_light_that_is_left_out_counts(tmp_path: Path) -> None:

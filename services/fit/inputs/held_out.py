@@ -49,9 +49,12 @@ def left_out_lights(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
     """Mask (L,) of the lights whose images are neither fitted nor used as a test.
 
     Raises:
-        SettingsError: a light is unknown.
+        SettingsError: a light is unknown, or no light is left to fit.
     """
-    return _named("left_out_lights", spec.left_out_lights, [light.name for light in manifest.lights])
+    chosen = _named("left_out_lights", spec.left_out_lights, [light.name for light in manifest.lights])
+    if (chosen | held_out_images(manifest, spec).all(axis=0)).all():
+        raise SettingsError("No light is left to fit; name fewer in left_out_lights.")
+    return chosen
 
 
 def _named(option: str, chosen: Sequence[str], names: Sequence[str]) -> NDArray[np.bool_]:

@@ -91,7 +91,8 @@ def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> 
         )
         yield (
             f"Assumed, as the calibration does not state how wrong it may be: {listed}. "
-            f"The ± depend on these; give uncertainty in capture.json.{gain}"
+            "The ± depend on these; state them as uncertainty in capture.json, or in a raw folder's calibration.json."
+            f"{gain}"
         )
 
 
