@@ -152,6 +152,14 @@ def test_tracking_frames_in_one_block_are_told(tmp_path: Path) -> None:
     assert any("Tracking frames of camera left all stand before or after its lights" in one for one in told)
 
 
+def test_lights_that_stand_before_cameras_are_told(tmp_path: Path) -> None:
+    for light in ("L1", "L2", "L3"):
+        for camera in ("left", "right"):
+            np.save(tmp_path / f"{light}_{camera}_10ms.npy", counts(1, 1))
+    told = import_folder(tmp_path, None, "RGGB", None).missing
+    assert told[0].startswith("Names are read as those of 3 cameras and 2 lights, with the camera first; rename")
+
+
 def test_a_scan_is_offered_to_be_filled_in(tmp_path: Path) -> None:
     np.save(tmp_path / "left_L1_10ms.npy", counts(1, 1))
     (tmp_path / "upper.stl").write_bytes(b"")

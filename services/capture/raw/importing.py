@@ -197,6 +197,11 @@ def _bits(images: Iterable[np.ndarray]) -> Entry:
 
 def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[str]:
     lit = {frame.light for frame in folder.frame if frame.kind == "light"}
+    if len(folder.camera) > len(lit) > 0:
+        yield (
+            f"Names are read as those of {len(folder.camera)} cameras and {len(lit)} lights, with the camera first;"
+            " rename the files, such as left_L07_0.05s.tif, where lights stand first."
+        )
     for camera in folder.camera:
         name = camera.name
         if camera.bits is not None:
