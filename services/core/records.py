@@ -241,6 +241,12 @@ class JobSpec(Record):
     )
     channels: tuple[str, ...] | None = Field(default=None, fail_fast=True, description="channels to fit; default: all")
     seed: Whole = Field(default=1, ge=0, le=2**31 - 1, description="random seed; the same job gives the same answer")
+    highlights: bool = Field(
+        default=True,
+        description=(
+            "leave out pixels where the surface reflects a light; false for photographs through crossed polarisers"
+        ),
+    )
     shadows: bool = Field(
         default=False,
         description=(

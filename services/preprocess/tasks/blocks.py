@@ -93,7 +93,9 @@ class Block:
             _compare(self.files, source, view, motions)
             return
         lights = [light for light in self.items if self.files.image(self.camera, light) is None]
-        writer = ImageWriter(self.files, source, subject, HandMasks(context.root, source.description), view)
+        writer = ImageWriter(
+            self.files, source, subject, HandMasks(context.root, source.description), view, self.spec.highlights
+        )
         began_s = time.monotonic()
         for light, image in source.images(view, lights, motions):
             self.files.put_image(self.camera, light, writer.store(light, image, began_s))
@@ -160,6 +162,8 @@ class ImageWriter:
     subject: Subject
     masks: HandMasks
     view: View
+    with_highlights: bool = True
+    """Whether highlights are masked."""
 
     def store(self, light: int, image: LightImage, began_s: float) -> ImageDone:
         """Mask one image, store it and return its record.
@@ -171,7 +175,8 @@ class ImageWriter:
         """
         camera, lamp = self.view.whole, self.source.description.lights[light]
         footprint, window = self.view.footprint, self.view.window
-        bits = valid_bits(image, footprint, self.view.camera, lamp, self.subject.glossy(footprint))
+        glossy = self.subject.glossy(footprint) if self.with_highlights else ()
+        bits = valid_bits(image, footprint, self.view.camera, lamp, glossy)
         bits |= self.masks.bits(camera.name, lamp.name, camera.size)[window.rows, window.columns]
         image_light = measure_light(image, self.view, lamp, (bits == 0) & (footprint.mesh < len(self.subject.teeth)))
         if image_light is not None and image_light.dark:

@@ -13,6 +13,7 @@ from services.core.errors import CaptureInputError
 from services.core.records import MaskBit
 from services.core.results import PreparedManifest
 from services.core.store import open_stage
+from services.preprocess.masking import valid as valid_masks
 from tests.support.folder_captures import prepare, rename_camera, write_folder, write_tree
 from tests.support.shared_data import shared_path
 
@@ -62,6 +63,19 @@ def test_padding_and_absent_pairs_are_not_valid(tmp_path: Path) -> None:
     assert (valid[0, :, :, 20:] == MaskBit.OUTSIDE).all()
     assert (valid[1, 1] & MaskBit.UNLIT > 0).all()
     assert (valid[1, 0] == 0).any()
+
+
+def test_highlights_are_masked_unless_a_job_says_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_folder(tmp_path)
+    # A mask that takes every second row for highlights, given the mask of the pixels that could be one.
+    monkeypatch.setattr(
+        valid_masks, "highlight_mask", lambda *given: given[2] & (np.arange(len(given[2])) % 2 == 0)[:, None]
+    )
+    for option in (True, False):
+        root = tmp_path / str(option)
+        prepare(tmp_path, root, highlights=option)
+        valid = np.asarray(zarr.open_array(root / "prepared" / "prepared.zarr" / "valid", mode="r"))
+        assert (valid & np.uint16(MaskBit.HIGHLIGHT) > 0).any() == option
 
 
 def test_few_dead_pixels_and_zero_variance_are_masked(tmp_path: Path) -> None:

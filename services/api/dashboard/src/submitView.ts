@@ -34,6 +34,7 @@ const GROUPS: [string, string[]][] = [
       "calibration",
       "accept_calibration",
       "instrument",
+      "highlights",
       "shadows",
       "pixel_step",
       "sensor_noise_relative",
