@@ -40,7 +40,7 @@ def address_of(server: httpx.Client) -> str:
     return str(server.base_url).rstrip("/")
 
 
-@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], LOOKS[3]])
+@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], pytest.param(*LOOKS[3], marks=pytest.mark.slow)])
 def test_an_empty_page_leads_to_the_report_in_three_clicks(
     chromium: Browser, tmp_path: Path, scheme: str, width: int
 ) -> None:

@@ -31,7 +31,9 @@ def cameras(distance_mm: float | None) -> list[dict[str, Any]]:
     return [camera | lens for camera in told]
 
 
-@pytest.mark.parametrize("beam", BEAMS, ids=["gaussian", "disc"])
+@pytest.mark.parametrize(
+    "beam", [pytest.param(BEAMS[0], id="gaussian"), pytest.param(BEAMS[1], id="disc", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize(("index", "photons"), [(1.0, 160_000), (1.5, 32_000)])
 def test_both_walks_give_the_same_images(index: float, photons: int, beam: dict[str, Any]) -> None:
     cell = {"width_mm": 1.0, "index": index, "boundary": "smooth" if index > 1 else "matched"}
