@@ -28,7 +28,7 @@ FITTED, FAILED, TIED = ("11", "12"), "21", "22"
 
 
 def spec_for(root: Path, **options: Any) -> JobSpec:
-    return jaw_spec(root, **({"samples_per_pixel": 64, "max_samples_per_pixel": 1024} | options))
+    return jaw_spec(root, **({"samples_per_pixel": 64, "max_samples_per_pixel": 512} | options))
 
 
 def fit(root: Path, attempt: int = 1, events: list[StageEvent] | None = None, **options: Any) -> FitReport:
@@ -174,7 +174,9 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
     truth: tuple[float, ...] = (1.0, 0.0, 1.0)
     # This engine's renders are too noisy to estimate a shape together with errors of the instrument;
     # test_jaw_instrument.py fits those errors.
-    options: dict[str, Any] = {"dentin": "fit", "max_steps": 5, "search_candidates": 400, "instrument": "off"}
+    options: dict[str, Any] = {
+        "dentin": "fit", "max_samples_per_pixel": 1024, "max_steps": 5, "search_candidates": 400, "instrument": "off"
+    }  # fmt: skip
     write_prepared_jaw(tmp_path, FAKE, (11, 12, 21), hidden=(21,), shape=truth, noise=0.003, samples=20_000)
     report = fit(tmp_path, **options)
     for fdi in ("11", "12"):

@@ -67,8 +67,8 @@ def test_the_answer_does_not_depend_on_where_blocks_run(small_folder: Path) -> N
     def elsewhere(task, blocks):  # type: ignore[no-untyped-def]
         return [task(block) for block in reversed(blocks)][::-1]
 
-    (here,) = fit_slab(small_folder, SlabOptions(effort=0.02))
-    (there,) = fit_slab(small_folder, SlabOptions(effort=0.02), elsewhere)
+    (here,) = fit_slab(small_folder, SlabOptions(effort=0.01))
+    (there,) = fit_slab(small_folder, SlabOptions(effort=0.01), elsewhere)
     assert there.parameters == here.parameters
     assert there.phase == here.phase
 

@@ -179,7 +179,7 @@ def test_a_cancel_ends_the_fit_between_two_blocks(spread: bool, spec: JobSpec, t
     assert not (tmp_path / "532").exists()
 
 
-def test_blocks_on_many_workers_go_on_where_a_wavelength_was_cut_short_and_give_the_answer_of_one(
+def test_many_workers_go_on_with_a_cut_wavelength_and_give_the_answer_of_one(
     job: Path, spec: JobSpec, tmp_path: Path
 ) -> None:
     class CutShortError(Exception):
