@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,8 +18,8 @@ FITTED = 11
 ENGINE = "services.fit.transport.engine:Engine"
 
 
-def fit(root: Path, *, surroundings: bool, max_steps: int) -> FitReport:
-    write_prepared_jaw(root, ENGINE, only=FITTED)
+def fit(photographed: Path, root: Path, *, surroundings: bool, max_steps: int) -> FitReport:
+    shutil.copytree(photographed, root, dirs_exist_ok=True)
     if not surroundings:
         manifest = json.loads((root / "prepared" / MANIFEST).read_text())
         manifest["record"]["surroundings"] = False
@@ -30,15 +31,24 @@ def fit(root: Path, *, surroundings: bool, max_steps: int) -> FitReport:
 
 
 @pytest.fixture(scope="module")
-def around(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FitReport]:
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("photographed")
+    write_prepared_jaw(root, ENGINE, only=FITTED)
+    return root
+
+
+@pytest.fixture(scope="module")
+def around(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FitReport]:
     root = tmp_path_factory.mktemp("around")
-    return root, fit(root, surroundings=True, max_steps=6)
+    return root, fit(photographed, root, surroundings=True, max_steps=6)
 
 
-def test_light_from_gums_and_other_teeth_is_explained(around: tuple[Path, FitReport], tmp_path: Path) -> None:
+def test_light_from_gums_and_other_teeth_is_explained(
+    photographed: Path, around: tuple[Path, FitReport], tmp_path: Path
+) -> None:
     _, with_them = around
     # These few coarse pixels hardly determine the media; tests.benchmarks.surroundings compares them with the truth.
-    alone = fit(tmp_path, surroundings=False, max_steps=2)
+    alone = fit(photographed, tmp_path, surroundings=False, max_steps=2)
     assert with_them.converged
     assert alone.held_out_error["green"] > 3 * with_them.held_out_error["green"]
 
