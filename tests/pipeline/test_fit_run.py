@@ -284,7 +284,7 @@ def test_three_channels_and_no_dentin(tmp_path: Path) -> None:
         ({}, {"held_out_cameras": ("c0", "c1")}, SettingsError, "held out"),
         ({}, {"held_out_cameras": ("moon",)}, SettingsError, "'moon'"),
         ({}, {"left_out_lights": ("moon",)}, SettingsError, "'moon'"),
-        ({}, {"left_out_lights": tuple(f"l{k}" for k in range(6))}, CaptureInputError, "No pixel is valid"),
+        ({}, {"left_out_lights": tuple(f"l{k}" for k in range(6))}, SettingsError, "No light is left to fit"),
         ({}, {"channels": ("violet",)}, SettingsError, "'violet'"),
     ],
 )

@@ -1,0 +1,49 @@
+"""Whether the fits of a job's channels count as converged, and what is said of errors that no noise explains."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from services.fit.checks.evaluate import ErrorSums
+from services.fit.execution.attempt import assess_convergence
+from services.fit.solve.gauss_newton import Result
+
+
+def fit(error: float, product_noise: float = 0.0) -> Any:
+    """A fit of images whose square is 1, with a held-out error."""
+    held_out = ErrorSums(error**2, 1.0, 0.0, product_noise)
+    solution = SimpleNamespace(result=Result.CONVERGED, advice="")
+    return cast(
+        "Any",
+        SimpleNamespace(
+            solution=solution,
+            fit_error=0.01,
+            held_out_error=error,
+            evaluation=SimpleNamespace(fitted=ErrorSums(1e-4, 1.0), held_out=held_out),
+        ),
+    )
+
+
+def test_a_small_error_is_not_mentioned() -> None:
+    assert assess_convergence({"green": fit(0.045)}) == (True, [])
+
+
+def test_an_error_of_the_model_makes_a_converged_fit_doubtful() -> None:
+    converged, (told,) = assess_convergence({"red": fit(0.02), "green": fit(0.068)})
+    assert converged
+    assert told.startswith("green: unseen images are 6.8 % off beside their noise")
+
+
+def test_an_error_that_the_renders_noise_may_explain_is_not_mentioned() -> None:
+    # The standard error of the error is 1 %: that of its square is 2 x 0.068 x 0.01.
+    assert assess_convergence({"green": fit(0.068, (2 * 0.068 * 0.01) ** 2)}) == (True, [])
+
+
+@pytest.mark.parametrize("error", [0.2, 0.35])
+def test_a_large_error_is_not_converged_and_said_once(error: float) -> None:
+    converged, (told,) = assess_convergence({"green": fit(error)})
+    assert not converged
+    assert "the images are still" in told
