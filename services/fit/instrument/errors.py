@@ -37,10 +37,9 @@ LINEAR_REACH = 0.1
 FAULT_Z: Mapping[str, float] = MappingProxyType({"light_gain": 3.0, "flare": 4.0})
 """Kinds of errors that images show to be faults of the calibration, and the number of standard errors from its prior
 beyond which such an error is one. One sound light in 370 lies beyond 3 by chance. A flare also takes up light that the
-model leaves out, so sound flares lie beyond 3 more often; one of 2 % lies 6.7 from its prior. The gain of all is not
-among them, because images can hardly tell it from absorption: freed of its prior it follows other errors, such as the
-model's own. Of 36 good captures 4 put it 11 to 15 % too low, with absorption 35 to 65 % too low, and of 7 with a gain
-10 % too high none showed it."""
+model leaves out, so sound flares lie beyond 3 more often. The gain of all is not among them, because images can hardly
+tell it from absorption: freed of its prior it follows other errors, such as the model's own. Of 36 good captures 4 put
+it 11 to 15 % too low, with absorption 35 to 65 % too low, and of 7 with a gain 10 % too high none showed it."""
 MANY_FAULTS = 3
 """Least number of checked errors far from their prior that show a cause common to them."""
 FAULT_SHARE = 1 / 4
