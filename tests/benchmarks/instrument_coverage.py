@@ -8,7 +8,8 @@ How a fit's solution responds to them, and the ± that must contain it, come fro
 closing measurement is made once more with stock's changes of the images in place of its own. In each draw the errors
 are normal with the standard errors that the fit assumes, and the rest of the solution's error is normal with the
 covariance that the fit states for photographs, rendering and what else is not the instrument's. The images are linear
-in all of these.
+in all of these. ``shift_over_se`` is the linear prediction of ``instrument_errors``: how far one standard error of each
+error of the instrument moves each quantity, over the quantity's ±.
 
 ``bound`` is the Cramér–Rao bound of each quantity: photographs' noise, instrument errors with their priors, moves too
 as unknowns that photographs determine (with stock's changes), and the held mean cosines, of which photographs are
@@ -116,6 +117,8 @@ class Recorder:
     """What photographs know of the moves, (12, 12), by stock's changes."""
     effect: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Change (F, K) of the solution by each change."""
+    names: tuple[str, ...] = ()
+    """Names (K,) of the instrument's errors that cause the changes."""
     solution: CombinedSolution | None = None
     slopes: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Relative derivatives (Q, F) of the reported quantities."""
@@ -125,6 +128,7 @@ class Recorder:
     ) -> ClosingSums:
         """The closing measurement with the fit's own changes, which is returned, and with stock's, which is kept."""
         errors = problem.domain.errors.names
+        self.names = (*errors, *self.changes.moves)
         self.information = np.zeros((len(moves), len(moves)))
 
         def by_stock(_: Any, tasks: Sequence[BlockTask], *__: Any) -> list[list[Any]]:
@@ -178,6 +182,7 @@ def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:
     parts = {name: slopes @ part @ slopes.T for name, part in recorder.solution.parts.items()}
     whole = slopes @ recorder.solution.covariance @ slopes.T
     own = sum(parts[name] for name in INSTRUMENT if name in parts)
+    shifts = slopes @ recorder.effect / np.sqrt(np.diag(whole))[:, None]
     instrument = rng.standard_normal((draws, len(recorder.shifts))) @ (slopes @ recorder.effect).T
     rest = rng.standard_normal((draws, len(QUANTITIES))) @ _root(whole - own).T
     return {
@@ -187,6 +192,7 @@ def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:
         "bound": np.sqrt(np.diag(recorder.bound())).tolist(),
         "se_by_instrument": np.sqrt(np.diag(np.asarray(own))).tolist(),
         "by_stock": np.sqrt(((slopes @ recorder.effect) ** 2).sum(axis=1)).tolist(),
+        "shift_over_se": dict(zip(recorder.names, shifts.T.round(3).tolist(), strict=True)),
         "covered": _shares(instrument + rest, whole),
         "covered_by_instrument_alone": _shares(instrument, np.asarray(own)),
         "seconds": found["seconds"],
