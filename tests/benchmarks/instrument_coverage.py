@@ -124,7 +124,15 @@ class Recorder:
     """Relative derivatives (Q, F) of the reported quantities."""
 
     def measure(
-        self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any, shapes: Any
+        self,
+        problem: Any,
+        x: Array,
+        whiten: Array,
+        held: Any,
+        samples: int,
+        moves: Any,
+        shapes: Any,
+        displaced: None,
     ) -> ClosingSums:
         """The closing measurement with the fit's own changes, which is returned, and with stock's, which is kept."""
         errors = problem.domain.errors.names
@@ -139,10 +147,10 @@ class Recorder:
             return found
 
         with patch.object(closing, "_changes_by_moves", by_stock):
-            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves, shapes)
+            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves, shapes, displaced)
         self.shifts = stock.shifts[len(held) :]
         self.slopes = relative_slopes(problem.domain, problem.base, x)
-        return closing.measure_closing(problem, x, whiten, held, samples, moves, shapes)
+        return closing.measure_closing(problem, x, whiten, held, samples, moves, shapes, displaced)
 
     def combine(
         self, domain: Domain, x: Array, sandwich: Sandwich, meats: Any, unfinished: Array, parts: int = 1
