@@ -166,9 +166,9 @@ def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
     authentication and a lost database are added, as they may occur on every route.
     """
     chosen = sorted({400, 401, 403, 429, 503, *statuses})
-    return {
-        status: {"model": Problem, "description": phrase_of(status), "content": {MEDIA_TYPE: {}}} for status in chosen
-    }
+    # Refer to the schema by its name: FastAPI would build a validator for every model of every route.
+    content = {MEDIA_TYPE: {"schema": {"$ref": f"#/components/schemas/{Problem.__name__}"}}}
+    return {status: {"description": phrase_of(status), "content": content} for status in chosen}
 
 
 def install(app: FastAPI) -> None:
@@ -184,6 +184,7 @@ def install(app: FastAPI) -> None:
     def describe_refusals() -> dict[str, Any]:
         # FastAPI describes a problem document with the media type of the route; give it its own.
         described = describe()
+        described["components"]["schemas"][Problem.__name__] = Problem.model_json_schema()
         for operation in (one for path in described["paths"].values() for one in path.values()):
             for content in (response.get("content", {}) for response in operation["responses"].values()):
                 for other in [name for name in content if MEDIA_TYPE in content and name != MEDIA_TYPE]:
