@@ -124,15 +124,7 @@ class Recorder:
     """Relative derivatives (Q, F) of the reported quantities."""
 
     def measure(
-        self,
-        problem: Any,
-        x: Array,
-        whiten: Array,
-        held: Any,
-        samples: int,
-        moves: Any,
-        shapes: Any,
-        displaced: None,
+        self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any, *more: Any
     ) -> ClosingSums:
         """The closing measurement with the fit's own changes, which is returned, and with stock's, which is kept."""
         errors = problem.domain.errors.names
@@ -146,11 +138,11 @@ class Recorder:
                 self.information += self.changes.information(block)
             return found
 
-        with patch.object(closing, "_changes_by_moves", by_stock):
-            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves, shapes, displaced)
+        with patch.object(closing, closing._changes_by_scene.__name__, by_stock):
+            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves, *more)
         self.shifts = stock.shifts[len(held) :]
         self.slopes = relative_slopes(problem.domain, problem.base, x)
-        return closing.measure_closing(problem, x, whiten, held, samples, moves, shapes, displaced)
+        return closing.measure_closing(problem, x, whiten, held, samples, moves, *more)
 
     def combine(
         self, domain: Domain, x: Array, sandwich: Sandwich, meats: Any, unfinished: Array, parts: int = 1
