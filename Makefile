@@ -17,7 +17,7 @@ figures: setup ## the figures of teeth 2018 from fits of this project's own, in 
 
 test: ## all but the tests that take many minutes; what the machine cannot run is skipped with its reason
 	@deploy/setup.sh dashboard browser
-	@$(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n 3 --dist loadfile
 
 test-all: ## the slow ones too: fits of the real incisor, long slab tables
 	@deploy/setup.sh dashboard browser

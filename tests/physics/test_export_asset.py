@@ -102,7 +102,13 @@ def stains(rig: Rig) -> ToothStains:
 
 
 @pytest.mark.parametrize(
-    ("boundary", "stained"), [("matched", False), ("thin", False), ("matched", True), ("thin", True)]
+    ("boundary", "stained"),
+    [
+        ("matched", False),
+        ("thin", True),
+        pytest.param("thin", False, marks=pytest.mark.slow),
+        pytest.param("matched", True, marks=pytest.mark.slow),
+    ],
 )
 def test_stock_mitsuba_shows_what_the_engine_shows(
     rig: Rig, stains: ToothStains, boundary: Boundary, stained: bool, tmp_path: Path

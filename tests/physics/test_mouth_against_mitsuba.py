@@ -21,7 +21,7 @@ from tests.support.small_mouth import LIGHTS_MM, MOUTH, mouth_recipe, stock_mout
 from tests.support.small_tooth import camera_at, whole_view
 
 
-@pytest.mark.parametrize("boundary", ["matched", "thin"])
+@pytest.mark.parametrize("boundary", [pytest.param("matched", marks=pytest.mark.slow), "thin"])
 def test_the_small_mouth_looks_as_in_mitsuba(boundary: Boundary, tmp_path: Path) -> None:
     prepare_device()
     # The thin boundary's plug-in shares no code with the engine.

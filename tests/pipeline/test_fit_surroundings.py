@@ -43,13 +43,19 @@ def around(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return root, fit(photographed, root, surroundings=True, max_steps=6)
 
 
+def test_a_fit_among_other_teeth_converges(around: tuple[Path, FitReport]) -> None:
+    # These few coarse pixels hardly determine the media; tests.benchmarks.surroundings compares them with the truth.
+    # Fitted without them, as in the slow test below, the held-out error is 0.28.
+    assert around[1].converged
+    assert around[1].held_out_error["green"] < 0.1
+
+
+@pytest.mark.slow
 def test_light_from_gums_and_other_teeth_is_explained(
     photographed: Path, around: tuple[Path, FitReport], tmp_path: Path
 ) -> None:
     _, with_them = around
-    # These few coarse pixels hardly determine the media; tests.benchmarks.surroundings compares them with the truth.
     alone = fit(photographed, tmp_path, surroundings=False, max_steps=2)
-    assert with_them.converged
     assert alone.held_out_error["green"] > 3 * with_them.held_out_error["green"]
 
 
