@@ -78,6 +78,19 @@ def test_a_gain_that_is_off_is_in_the_errors(brighter: tuple[Path, FitReport], t
     assert alone.instrument_told[0].startswith("The ± take the instrument for perfect")
 
 
+def test_a_gain_that_is_off_moves_the_media_as_the_linear_model_predicts(tmp_path: Path) -> None:
+    right, dimmer = (
+        fit(tmp_path / str(gain), gains=(gain,) * 6, max_samples_per_pixel=4096, image_tolerance=0.001)
+        for gain in (1.0, 0.98)
+    )
+    for name in TRUE:
+        one, other = right.parameters["green"][name], dimmer.parameters["green"][name]
+        assert one.se is not None
+        # Two prior errors of the gain; a distance of 0.3 is what the design allows.
+        moved, predicted = (other.value - one.value) / one.se, 2 * one.se_parts["gain"] / one.se
+        assert abs(moved) == pytest.approx(predicted, abs=0.3), name
+
+
 def test_every_error_says_what_it_is_made_of(brighter: tuple[Path, FitReport]) -> None:
     _, report = brighter
     for one in (*report.parameters["green"].values(), *report.instrument["green"].values()):
