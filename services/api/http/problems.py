@@ -182,8 +182,9 @@ def install(app: FastAPI) -> None:
     describe = app.openapi
 
     def describe_refusals() -> dict[str, Any]:
-        # FastAPI describes a problem document with the media type of the route; give it its own.
         described = describe()
+        # Routes name this schema without declaring it. FastAPI gives other models of a problem document the media type
+        # of the route; give them their own.
         described["components"]["schemas"][Problem.__name__] = Problem.model_json_schema()
         for operation in (one for path in described["paths"].values() for one in path.values()):
             for content in (response.get("content", {}) for response in operation["responses"].values()):
