@@ -79,7 +79,8 @@ def dentin_blend_shape(
         MeshError: the mesh cannot bound a medium, or is too thin for any dentin.
     """
     outer.require_solid("of the enamel")
-    axes = (frame or ToothFrame.identity()).axes
+    frame = frame or ToothFrame.identity()
+    axes = frame.axes
     grid, surface = SignedDistanceGrid(outer), SurfaceDistance(outer)
     base = _base(outer, grid, surface, faces)
     inward = _unit(_smooth(base, grid.inward(base.vertices_mm), 6))
@@ -100,7 +101,7 @@ def dentin_blend_shape(
         if attempt < UNFOLDING_ROUNDS:
             short[np.unique(base.faces[_turned_over(base, modes)])] = True
         if not short.any():
-            return DentinShape(base, modes)
+            return DentinShape(base, modes, frame)
         share = _smooth_below(base, np.where(short, 0.8 * share, share))
     raise MeshError(
         "The enamel mesh leaves no room for dentin between its walls; check its scale and that it is one solid tooth."

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.frame import ToothFrame
 from services.core.geometry import Mesh
 
 
@@ -18,6 +19,8 @@ class DentinShape:
     """Surface B0 at zero weights."""
     modes_mm: NDArray[np.float64]
     """Displacements B_m - B0, (M, V, 3); M = 0 for a known surface."""
+    frame: ToothFrame | None = None
+    """Canonical frame of the tooth, along whose axes the modes point; None where they do not."""
 
     @staticmethod
     def known(surface: Mesh) -> DentinShape:

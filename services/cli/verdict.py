@@ -17,7 +17,7 @@ def require_converged(verdict: Verdict) -> None:
         typer.Exit: the fit did not converge.
     """
     print(verdict.headline, file=sys.stderr)
+    if verdict.advice and (verdict.doubtful or not verdict.converged):
+        print(verdict.advice, file=sys.stderr)
     if not verdict.converged:
-        if verdict.advice:
-            print(verdict.advice, file=sys.stderr)
         raise typer.Exit(NOT_CONVERGED_STATUS)

@@ -65,6 +65,9 @@ class FitReport(Record):
     """Report of a fit, published by the fit stage, and by export as parameters.json and errors.json."""
 
     converged: bool
+    doubtful: bool = Field(
+        default=False, description="whether unseen images are farther off than a model that holds would leave them"
+    )
     advice: str = Field(description="what to do when it did not converge, or for a better answer; may be empty")
     parameters: dict[str, dict[str, Estimate]] = Field(
         description="per channel: name -> estimate, derived quantities included"
@@ -139,6 +142,9 @@ class Verdict(Record):
 
     headline: str = Field(description="one sentence, the worst first")
     converged: bool = Field(description="whether the numbers are those of a fit that ended where it should")
+    doubtful: bool = Field(
+        default=False, description="of a fit that converged: whether the numbers may be farther off than their ±"
+    )
     is_above_limit: bool = Field(
         description="whether an image error, fitted or held out, of some channel is above the limit"
     )

@@ -39,12 +39,15 @@ def verdict_of(report: FitReport) -> Verdict:
     if is_above_limit and error.value <= MAX_ERROR:
         above = f"{_FITTED if fitted > MAX_ERROR else _HELD_OUT} error{' of one channel' if len(errors) > 1 else ''}"
         error_text += f", {above} {percent(Figure(value=worst, se=None))}"
-    convergence_text = f"{'Converged' if converged else 'Not converged'} after {report.steps} steps: {error_text}."
+    doubtful = converged and report.doubtful
+    outcome = ("Converged, but doubtful," if doubtful else "Converged") if converged else "Not converged"
+    convergence_text = f"{outcome} after {report.steps} steps: {error_text}."
     return Verdict(
         headline=f"Not converged: {error_text}; no fit above {100 * MAX_ERROR:g} % is believed."
         if is_above_limit
         else convergence_text,
         converged=converged,
+        doubtful=doubtful,
         is_above_limit=is_above_limit,
         limit=MAX_ERROR,
         error_of=error_of,

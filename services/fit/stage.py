@@ -109,7 +109,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     prepared_folder, prepared = open_stage(context.root, "prepared", PreparedManifest, verify=False)
     writer = StageWriter(context.root, "asset", context.attempt)
     channels = tuple(report.parameters)
-    teeth = fitted_teeth(prepared_folder, prepared, spec, report)
+    shaped = fitted_dentins(prepared_folder, prepared, spec, report)
+    teeth = tuple(_with_dentin(*each) for each in shaped)
     surroundings = [prepared_folder / name for name in ("gums.ply", "cavity.ply")]
     gums, cavity = (read_mesh(path) if spec.kind == "jaw" and path.is_file() else None for path in surroundings)
     index = [prepared.channels.index(channel) for channel in channels]
@@ -142,11 +143,10 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         "ior": spec.ior,
         "provenance": {"source": _source(spec), "seed": str(spec.seed), "options": describe_options(spec)},
     }
-    thickness = (
-        None
-        if spec.kind == "jaw"
-        else fitted_thickness(teeth[0], prepared.cameras, spec, report.shape, report.shape_covariance)
-    )
+    thickness = None
+    if spec.kind == "tooth":
+        ((tooth, dentin, shape),) = shaped
+        thickness = fitted_thickness(tooth.outer, dentin, shape, report.shape_covariance, prepared.cameras[0])
     pictures = read_pictures(
         fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, thickness, stains
     )
@@ -182,6 +182,13 @@ def fitted_teeth(
     prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport
 ) -> tuple[Tooth, ...]:
     """The teeth with the fitted dentin surfaces."""
+    return tuple(_with_dentin(*each) for each in fitted_dentins(prepared_folder, prepared, spec, report))
+
+
+def fitted_dentins(
+    prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport
+) -> list[tuple[Tooth, DentinShape | None, tuple[float, ...]]]:
+    """Each tooth as it was prepared, its dentin as it was modelled, and the fitted weights of its blend modes."""
     from services.core.files.meshes import read_teeth
     from services.fit.inputs.dentin import dentin_shape, jaw_dentins
 
@@ -192,11 +199,9 @@ def fitted_teeth(
             dentin if layered else None
             for dentin, (_, layered) in zip(jaw_dentins(teeth, prepared.cameras, spec), shapes, strict=True)
         ]
-        return tuple(
-            _with_dentin(tooth, dentin, shape) for tooth, dentin, (shape, _) in zip(teeth, dentins, shapes, strict=True)
-        )
+        return [(tooth, dentin, shape) for tooth, dentin, (shape, _) in zip(teeth, dentins, shapes, strict=True)]
     (tooth,) = teeth
-    return (_with_dentin(tooth, dentin_shape(tooth, prepared.cameras, spec), report.shape),)
+    return [(tooth, dentin_shape(tooth, prepared.cameras, spec), report.shape)]
 
 
 def _is_layered(tooth: ToothReport) -> bool:

@@ -33,6 +33,7 @@ from services.core.records import JobSpec
 from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import open_stage
+from services.fit.inputs.dentin import dentin_shape
 from services.fit.optics.domain import to_natural
 from services.fit.optics.parameters import Medium, Tissue
 from services.fit.optics.priors import COSINE, WEAK
@@ -113,7 +114,9 @@ def fit_rows(
         thickness = None
         if truth.shape:
             stage, prepared = open_stage(root, "prepared", PreparedManifest)
-            thickness = fitted_thickness(read_teeth(stage, prepared.fdi)[0], prepared.cameras, spec, truth.shape, ())
+            (scanned,) = read_teeth(stage, prepared.fdi)
+            dentin = dentin_shape(scanned, prepared.cameras, spec)
+            thickness = fitted_thickness(scanned.outer, dentin, truth.shape, (), prepared.cameras[0])
         last = json.loads((root / "fit" / "history.json").read_text())[-1]
     found = {
         f"{part}.{leaf}": (report.parameters["green"][f"{part}.{leaf}"], getattr(getattr(truth, part), leaf))

@@ -27,10 +27,10 @@ pytestmark = pytest.mark.browser
 THICKNESS = Estimate(value=0.703, se=0.061, unit="mm", determined=True)
 
 
-def report(error: float, *, converged: bool) -> FitReport:
+def report(error: float, *, converged: bool, doubtful: bool = False) -> FitReport:
     errors = {"green": error, "red": error + 0.02}
     advice = (
-        ""
+        {False: "", True: "red: unseen images are 9.4 % off beside their noise."}[doubtful]
         if converged
         else "red: the images are still 35 % off; check mesh, lights and boundary model, or raise the samples."
     )
@@ -40,7 +40,14 @@ def report(error: float, *, converged: bool) -> FitReport:
         "enamel_thickness": THICKNESS,
     }
     return FitReport(
-        converged=converged, advice=advice, parameters={}, fit_error=errors, steps=2 * STEPS, seconds=1.0, **told
+        converged=converged,
+        doubtful=doubtful,
+        advice=advice,
+        parameters={},
+        fit_error=errors,
+        steps=2 * STEPS,
+        seconds=1.0,
+        **told,
     )
 
 
@@ -63,16 +70,19 @@ def address_of(server: httpx.Client) -> str:
 @pytest.mark.parametrize(
     ("scheme", "width"), [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])]
 )
-@pytest.mark.parametrize("is_good", [True, False], ids=["converged", "not-converged"])
+@pytest.mark.parametrize("outcome", ["converged", "doubtful", "not converged"])
 def test_the_page_leads_with_the_reports_judgement(
-    chromium: Browser, server: httpx.Client, job: ScriptedJob, scheme: str, width: int, is_good: bool
+    chromium: Browser, server: httpx.Client, job: ScriptedJob, scheme: str, width: int, outcome: str
 ) -> None:
-    verdict = job.verdict = verdict_of(report(0.0741 if is_good else 0.336, converged=is_good))
+    converged = outcome != "not converged"
+    verdict = job.verdict = verdict_of(
+        report(0.0741 if converged else 0.336, converged=converged, doubtful=outcome == "doubtful")
+    )
     with watched_page(chromium, address_of(server), scheme, width) as page:
         submitted = submit(page)
         page.goto(f"/#/{submitted}")
         job.steps.release(STEPS)
-        word = "succeeded" if is_good else "not converged"
+        word = "succeeded" if converged else outcome
         expect(page.locator(".job .badge")).to_have_text(word)
         expect(page.locator(f"#jobs a[href='#/{submitted}'] .badge")).to_have_text(word)
         shown = page.locator(".job .verdict")
@@ -89,13 +99,13 @@ def test_the_page_leads_with_the_reports_judgement(
         expect(page.locator(".comparison .scale")).to_contain_text("−25 % of white")
         expect(page.locator(".comparison .scale")).to_contain_text("+25 % of white")
         alert = page.get_by_role("alert")
-        if is_good:
+        if outcome == "converged":
             expect(alert).to_have_count(0)
         else:
             expect(alert).to_have_text(f"{verdict.headline} {verdict.advice}")
             above = "(one, other) => Boolean(one.compareDocumentPosition(other) & Node.DOCUMENT_POSITION_FOLLOWING)"
             assert alert.evaluate(above, page.locator(".stages").element_handle()), "what went wrong leads the view"
-        looked_at(page, f"verdict-{word.replace(' ', '-')}-{scheme}-{width}")
+        looked_at(page, f"verdict-{outcome.replace(' ', '-')}-{scheme}-{width}")
 
 
 def test_a_job_without_a_verdict_shows_none(chromium: Browser, server: httpx.Client, job: ScriptedJob) -> None:

@@ -64,7 +64,7 @@ def test_no_shadow_ray_is_cast_where_its_weight_would_be_0_over_0(monkeypatch: p
         return check, rng
 
     def transmittance(ray: ShadowRay) -> mi.Float:
-        return ray.surface * dr.maximum(dr.exp(-ray.depth), 1e-37)
+        return dr.prod([*ray.surface, dr.maximum(dr.exp(-ray.depth), 1e-37)])
 
     monkeypatch.setattr(Connections, "_connect_by_maps", marked)
     monkeypatch.setattr(ShadowRay, "transmittance", transmittance)

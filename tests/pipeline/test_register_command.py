@@ -91,6 +91,8 @@ def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     answer = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
     assert answer.returncode == 0, answer.stderr
     assert "teeth: 11, 12, 13, 21, 22, 23" in answer.stdout
+    # The cameras stand where a pixel covers 0.2 mm at the teeth.
+    assert "a pixel covers 0.20 mm at the teeth; with pixel_step = 3 a job fits squares of 0.59 mm" in answer.stdout
     record = read_record(out / "registration.json", Registration)
     beyond = (
         "Calibration calibration.json is beyond its limits: Lights' positions is 5 mm, and 2 mm is the limit; calibrate"

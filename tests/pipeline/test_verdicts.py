@@ -25,16 +25,17 @@ from services.pipeline.event_log import EventAddress
 from tests.support.live_server import serving
 
 
-def verdict(*, converged: bool) -> Verdict:
+def verdict(*, converged: bool, advice: str = "") -> Verdict:
     errors = {"green": 0.04 if converged else 0.336}
     report = FitReport(
-        converged=converged, advice="" if converged else "Check the mesh.", parameters={}, fit_error=errors,
-        held_out_error=errors, held_out_error_se={"green": 0.012}, steps=9, seconds=1.0,
+        converged=converged, doubtful=bool(advice), advice=advice if converged else "Check the mesh.", parameters={},
+        fit_error=errors, held_out_error=errors, held_out_error_se={"green": 0.012}, steps=9, seconds=1.0,
     )  # fmt: skip
     return verdict_of(report)
 
 
 GOOD, BAD = verdict(converged=True), verdict(converged=False)
+DOUBTFUL = verdict(converged=True, advice="Unseen images are far off.")
 
 
 def run(spec: JobSpec, _folder: Path, events: EventAddress) -> None:
@@ -120,7 +121,7 @@ def test_submit_tells_it_with_its_exit_status(server: httpx.Client, tmp_path: Pa
     assert (status, told.splitlines()[-1]) == (NOT_CONVERGED_STATUS, "NOT CONVERGED")
 
 
-@pytest.mark.parametrize(("judged", "status"), [(GOOD, 0), (BAD, NOT_CONVERGED_STATUS), (None, 0)])
+@pytest.mark.parametrize(("judged", "status"), [(GOOD, 0), (DOUBTFUL, 0), (BAD, NOT_CONVERGED_STATUS), (None, 0)])
 @pytest.mark.parametrize("as_json", [False, True])
 def test_a_run_without_a_server_tells_it_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, judged: Verdict | None, status: int, as_json: bool
@@ -136,8 +137,10 @@ def test_a_run_without_a_server_tells_it_too(
         shown = {
             None: "held-out error: 20.00 %",
             GOOD.headline: "held-out error: 4.0 ± 1.2 %",
+            DOUBTFUL.headline: "held-out error: 4.0 ± 1.2 %",
             BAD.headline: "held-out error: 33.6 ± 1.2 %",
         }
         assert told.splitlines()[0] == shown[None if judged is None else judged.headline]
     if judged is not None:
         assert judged.headline in said
+        assert said.endswith(f"{judged.advice}\n")

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from services.fit.checks.evaluate import ErrorSums
-from services.fit.execution.attempt import assess_convergence
+from services.fit.execution.attempt import Assessment, assess_convergence
 from services.fit.solve.gauss_newton import Result
 
 
@@ -28,22 +28,24 @@ def fit(error: float, product_noise: float = 0.0) -> Any:
 
 
 def test_a_small_error_is_not_mentioned() -> None:
-    assert assess_convergence({"green": fit(0.045)}) == (True, [])
+    assert assess_convergence({"green": fit(0.045)}) == Assessment(True, False, [])
 
 
 def test_an_error_of_the_model_makes_a_converged_fit_doubtful() -> None:
-    converged, (told,) = assess_convergence({"red": fit(0.02), "green": fit(0.068)})
-    assert converged
+    found = assess_convergence({"red": fit(0.02), "green": fit(0.068)})
+    assert (found.converged, found.doubtful) == (True, True)
+    (told,) = found.advice
     assert told.startswith("green: unseen images are 6.8 % off beside their noise")
 
 
 def test_an_error_that_the_renders_noise_may_explain_is_not_mentioned() -> None:
     # The standard error of the error is 1 %: that of its square is 2 x 0.068 x 0.01.
-    assert assess_convergence({"green": fit(0.068, (2 * 0.068 * 0.01) ** 2)}) == (True, [])
+    assert assess_convergence({"green": fit(0.068, (2 * 0.068 * 0.01) ** 2)}) == Assessment(True, False, [])
 
 
 @pytest.mark.parametrize("error", [0.2, 0.35])
 def test_a_large_error_is_not_converged_and_said_once(error: float) -> None:
-    converged, (told,) = assess_convergence({"green": fit(error)})
-    assert not converged
+    found = assess_convergence({"green": fit(error)})
+    assert (found.converged, found.doubtful) == (False, False)
+    (told,) = found.advice
     assert "the images are still" in told

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from services.anatomy.blend import dentin_blend_shape
+from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
-from services.core.geometry import Tooth
-from services.core.records import JobSpec
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty
 from services.fit.tooth.driver import fitted_thickness, shape_covariance
@@ -32,15 +32,12 @@ def test_the_blend_weights_covariance_is_cut_out_of_the_whole() -> None:
 
 def test_thickness_has_an_error_only_where_the_dentin_was_fitted() -> None:
     incisor = build_incisor()
-    tooth = Tooth(11, incisor.outer, incisor.dentin)
-    cameras = dome_cameras(1, 1.0, (tooth.outer,))
-    given = fitted_thickness(tooth, cameras, JobSpec.model_validate({"capture": "c", "dentin": "known"}), (), ())
+    (camera,) = dome_cameras(1, 1.0, (incisor.outer,))
+    given = fitted_thickness(incisor.outer, DentinShape.known(incisor.dentin), (), (), camera)
     assert given is not None
     assert given.mean.se is None
-    fitted = JobSpec.model_validate({"capture": "c", "dentin": "fit"})
-    spread = fitted_thickness(
-        tooth, cameras, fitted, (0.5, 0.5, 0.5), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
-    )
+    covariance = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
+    spread = fitted_thickness(incisor.outer, dentin_blend_shape(incisor.outer), (0.5, 0.5, 0.5), covariance, camera)
     assert spread is not None
     assert spread.mean.se is not None
     # Independent weights of 0.1 move the mean by some hundredths of a millimetre, and each point's by at least as much
@@ -48,4 +45,4 @@ def test_thickness_has_an_error_only_where_the_dentin_was_fitted() -> None:
     assert 0.005 < spread.mean.se < 0.1
     assert spread.errors_mm is not None
     assert np.sqrt(np.nanmean(spread.errors_mm**2)) >= spread.mean.se
-    assert fitted_thickness(tooth, cameras, JobSpec.model_validate({"capture": "c", "dentin": "none"}), (), ()) is None
+    assert fitted_thickness(incisor.outer, None, (), (), camera) is None

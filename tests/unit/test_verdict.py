@@ -69,6 +69,13 @@ def test_a_fit_that_stopped_early_did_not_converge_however_small_its_error() -> 
     assert (verdict.converged, verdict.is_above_limit, verdict.advice) == (False, False, "Raise max_steps.")
 
 
+def test_a_doubt_is_told_in_the_headline_of_a_fit_that_converged() -> None:
+    verdict = verdict_of(report(doubtful=True))
+    assert (verdict.converged, verdict.doubtful) == (True, True)
+    assert verdict.headline == "Converged, but doubtful, after 12 steps: held-out error 6.00 ± 0.25 %."
+    assert not verdict_of(report(converged=False, doubtful=True)).doubtful
+
+
 def test_fitted_images_stand_in_where_none_was_held_out() -> None:
     verdict = verdict_of(report(held_out_error={}, held_out_error_se={}))
     assert verdict.error_of == "fitted"

@@ -116,7 +116,8 @@ def register_folder(
         path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (root / folder.scan.file, calibration_path)
     }
     warnings = warnings_of(calibration, calibration_path.name, time.time())
-    record = _record(steps, scanned, misfit_mm, inputs, tuple(pictures), warnings)
+    pixel_mm = float(np.median([view.camera.pixel_mm(pose.apply(scanned.centre_mm[None])[0]) for view in cropped]))
+    record = _record(steps, scanned, misfit_mm, pixel_mm, inputs, tuple(pictures), warnings)
     write_atomic(out / PAGE, report_page(record).encode())
     write_record(out / REGISTRATION, record)
     return record
@@ -236,6 +237,7 @@ def _record(
     steps: Sequence[PoseStep],
     scanned: ScannedTeeth,
     misfit_mm: float,
+    pixel_mm: float,
     inputs: dict[str, str],
     pictures: tuple[str, ...],
     warnings: tuple[str, ...],
@@ -260,6 +262,7 @@ def _record(
             for step in steps
         ),
         misfit_mm=misfit_mm,
+        pixel_mm=pixel_mm,
         teeth=scanned.fdi,
         repairs=scanned.repairs,
         inputs=inputs,

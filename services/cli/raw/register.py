@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+FITTED_SQUARE_MM = 0.5
+"""Edge in mm, at the teeth, of the squares of pixels that are advised for a fit; see docs/use/jobs.md."""
+
 
 def register(
     raw: Annotated[
@@ -41,5 +44,9 @@ def register(
             print(f"  left out: {text}")
     for sentence in record.warnings:
         print(sentence)
+    if record.pixel_mm is not None:
+        pixel_step = max(1, round(FITTED_SQUARE_MM / record.pixel_mm))
+        squares = f"with {pixel_step = } a job fits squares of {pixel_step * record.pixel_mm:.2f} mm"
+        print(f"a pixel covers {record.pixel_mm:.2f} mm at the teeth; {squares}")
     print(f"teeth: {', '.join(map(str, record.teeth))}; {record.repairs}")
     print(f"report: {(raw if out is None else out) / PAGE}")

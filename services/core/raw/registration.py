@@ -47,6 +47,10 @@ class Registration(Record):
     uncertainty: CalibrationUncertainty = Field(description="of teeth.rx to teeth.tz, about that centre")
     steps: tuple[RegistrationStep, ...]
     misfit_mm: float = Field(description="median distance of the teeth's outlines from those in the photographs")
+    pixel_mm: float | None = Field(
+        default=None,
+        description="what a pixel covers at the teeth, median over the cameras; null if an earlier version wrote this",
+    )
     teeth: tuple[int, ...] = Field(description="FDI numbers")
     repairs: str = Field(description="what was mended in the scan, in words")
     inputs: dict[str, str] = Field(description="SHA-256 of the scan and of the calibration, by file name")

@@ -11,6 +11,10 @@ from services.core.results import Correlation, Estimate
 from services.fit.solve.covariance import Uncertainty
 
 NOT_EXPLAINED = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."
+PARTLY_EXPLAINED = (
+    "The model leaves out part of these images, so the coefficients may be farther off than their ± and what this"
+    " capture tells of the tooth is not known."
+)
 QUANTITIES = {"sigma_s_reduced": "scattering", "sigma_a": "absorption"}
 COORDINATES = {"sigma": ("scattering", 1), "alpha": ("absorption", -1)}
 """Quantity that changes with a coordinate, and the sign of the change."""

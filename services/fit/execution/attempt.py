@@ -176,8 +176,18 @@ def standard_errors(sums: Mapping[str, ErrorSums]) -> dict[str, float]:
     return {channel: se for channel, own in sums.items() if (se := own.error_se) is not None}
 
 
-def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[str]]:
-    """Whether the fits of these channels count as converged, and advice where they do not."""
+@dataclass(frozen=True)
+class Assessment:
+    """How far the fits of a job's channels can be believed."""
+
+    converged: bool
+    doubtful: bool
+    """Whether unseen images are farther off than a model that holds would leave them."""
+    advice: list[str]
+
+
+def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> Assessment:
+    """Judge the fits of these channels, with advice where they did not converge or are doubtful."""
     advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
     errors = {c: worst_error(fit) for c, fit in fits.items()}
     unexplained = [c for c, error in errors.items() if error > MAX_ERROR]
@@ -186,14 +196,15 @@ def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> tuple[bool, list[
         " samples."
         for c in unexplained
     ]
-    advice += [
+    doubts = [
         f"{c}: unseen images are {100 * error:.1f} % off beside their noise, so the model leaves out more than the ±"
         " contain. In virtual mouths with such errors, whose enamel scatters little, coefficients were up to 11 of"
         " their ± off."
         for c, fit in fits.items()
         if c not in unexplained and (error := _doubtful_error(fit)) is not None
     ]
-    return not unexplained and all(fit.solution.result.converged for fit in fits.values()), advice
+    converged = not unexplained and all(fit.solution.result.converged for fit in fits.values())
+    return Assessment(converged, bool(doubts), advice + doubts)
 
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:

@@ -90,18 +90,14 @@ def neighbour_surfaces(
     return tuple(ToothSurfaces(other.outer, at_rest(dentin)) for other, dentin in zip(neighbours, dentins, strict=True))
 
 
-def with_shape_errors(
-    surfaces: ToothSurfaces, shape: tuple[float, ...], tooth: Tooth, cameras: tuple[Camera, ...]
-) -> ToothSurfaces:
+def with_shape_errors(surfaces: ToothSurfaces, shape: tuple[float, ...], frame: ToothFrame, fdi: int) -> ToothSurfaces:
     """The tooth with further blend modes: the errors of its dentin's shape at the blend weights ``shape``, and their
-    opposites.
+    opposites. ``frame`` is the tooth's canonical frame.
     """
-    from services.anatomy.jaw_frames import tooth_frame
     from services.anatomy.shape_errors import shape_errors
 
     assert surfaces.dentin is not None
-    frame, crown = tooth_frame(tooth, viewpoints_mm(cameras)), upper_tooth(tooth.fdi % 10)
-    errors = shape_errors(surfaces.outer, surfaces.dentin, shape, frame, crown)
+    errors = shape_errors(surfaces.outer, surfaces.dentin, shape, frame, upper_tooth(fdi % 10))
     modes = np.concatenate([surfaces.dentin.modes_mm, errors, -errors])
     return replace(surfaces, dentin=replace(surfaces.dentin, modes_mm=modes))
 

@@ -60,7 +60,7 @@ def report(
         seconds: duration of the fit.
     """
     first = fits[shaped_by]
-    converged, advice = assess_convergence({c: jaw.fit for c, jaw in fits.items()})
+    assessment = assess_convergence({c: jaw.fit for c, jaw in fits.items()})
     misplaced = offset_sentences(
         _evaluations(fits),
         {c: worst_error(jaw.fit) for c, jaw in fits.items()},
@@ -69,7 +69,7 @@ def report(
         "the jaw's meshes",
     )
     wrong = photograph_sentences(_evaluations(fits), observations, _views(fits), is_placed=not misplaced)
-    advice = misplaced + wrong + advice
+    advice = misplaced + wrong + assessment.advice
     teeth = {
         str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced)
         for k, start in enumerate(first.starts)
@@ -77,7 +77,8 @@ def report(
     unexplained = [fdi for fdi, tooth in teeth.items() if tooth.state == "fitted" and tooth.sentence]
     advice += [tooth.sentence for tooth in teeth.values() if tooth.state != "tied" and tooth.sentence]
     return FitReport(
-        converged=converged and not unexplained and not misplaced and not wrong,
+        converged=assessment.converged and not unexplained and not misplaced and not wrong,
+        doubtful=assessment.doubtful,
         advice=" ".join(advice),
         parameters={
             c: estimates(jaw.fit.tissue, _surroundings(jaw.fit.tissue), jaw.fit.uncertainty) for c, jaw in fits.items()

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from services.core.geometry import Camera, Tooth
+from services.anatomy.dentin_shape import DentinShape
+from services.anatomy.frame import ToothFrame
+from services.core.geometry import Camera, Mesh, Tooth
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.fit.checks.alignment import offset_sentences
 from services.fit.checks.frames import photograph_sentences
-from services.fit.checks.identifiability import NOT_EXPLAINED, correlation, determined_sentences
+from services.fit.checks.identifiability import NOT_EXPLAINED, PARTLY_EXPLAINED, correlation, determined_sentences
 from services.fit.checks.next_calibration import calibration_advice
 from services.fit.checks.thickness import ThicknessMap, thickness_map
 from services.fit.execution.attempt import Attempt, assess_convergence, standard_errors, worst_error
@@ -97,8 +99,8 @@ class FitDriver:
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
                 schedule.gums = None if observations.gums is None else GUMS_START
                 schedule.shape_covariance = covariance
-                if modes:
-                    given = files[channel].recipe, tooth, observations.manifest.cameras
+                if dentin is not None and dentin.frame is not None:
+                    given = files[channel].recipe, dentin.frame, tooth.fdi
                     schedule.make_displaced_scene = partial(_displaced_scene, attempt.inputs, *given)
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
@@ -112,7 +114,7 @@ class FitDriver:
         if layout is not None and textures:
             store_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
         report = self._publish(
-            observations, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun
+            observations, dentin, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun
         )
         if numbering_fault:
             report = report.model_copy(
@@ -123,7 +125,7 @@ class FitDriver:
                 }
             )
         where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
-        return report.model_copy(update={"next_capture": where + next_capture})
+        return report.model_copy(update={"next_capture": "" if report.doubtful else where + next_capture})
 
     def _schedule(
         self,
@@ -158,6 +160,7 @@ class FitDriver:
     def _publish(
         self,
         observations: Observations,
+        dentin: DentinShape | None,
         fits: dict[str, ChannelFit[Tissue]],
         first: str,
         views: Mapping[str, tuple[ViewStack, ...]],
@@ -168,7 +171,7 @@ class FitDriver:
         self.attempt.write_records(journal, observations, evaluations, views)
         uncertainties = {c: fit.uncertainty for c, fit in fits.items()}
         tables = {c: self._table(fit, uncertainties[c], uncertainties[first]) for c, fit in fits.items()}
-        converged, advice = assess_convergence(fits)
+        assessment = assess_convergence(fits)
         misplaced = offset_sentences(
             evaluations,
             {c: worst_error(fit) for c, fit in fits.items()},
@@ -177,15 +180,16 @@ class FitDriver:
             f"the mesh of tooth {observations.teeth[0].fdi}",
         )
         wrong = photograph_sentences(evaluations, observations, views, is_placed=not misplaced)
-        converged, advice = converged and not misplaced and not wrong, misplaced + wrong + advice
+        converged = assessment.converged and not misplaced and not wrong
         correlations = {c: correlation(uncertainties[c]) for c in fits}
         shape, covariance = fits[first].tissue.shape, shape_covariance(uncertainties[first])
         thickness = fitted_thickness(
-            observations.teeth[0], observations.manifest.cameras, self.attempt.spec, shape, covariance
+            observations.teeth[0].outer, dentin, shape, covariance, observations.manifest.cameras[0]
         )
         return FitReport(
             converged=converged,
-            advice=" ".join(advice),
+            doubtful=assessment.doubtful,
+            advice=" ".join(misplaced + wrong + assessment.advice),
             parameters=tables,
             fit_error={c: fit.fit_error for c, fit in fits.items()},
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
@@ -196,7 +200,11 @@ class FitDriver:
             shape_covariance=covariance,
             enamel_thickness=None if thickness is None else thickness.mean,
             correlations=correlations,
-            told=determined_sentences(tables, correlations) if converged else NOT_EXPLAINED,
+            told=NOT_EXPLAINED
+            if not converged
+            else PARTLY_EXPLAINED
+            if assessment.doubtful
+            else determined_sentences(tables, correlations),
             seconds=seconds,
             **instrument_report(self.attempt.spec, uncertainties, observations.manifest),
         )
@@ -220,11 +228,9 @@ def _numbering_fault(tooth: Tooth, spec: JobSpec) -> str:
     return fdi_mismatch_note(tooth) if spec.dentin == "fit" else ""
 
 
-def _displaced_scene(
-    folder: Path, recipe: StoredFile, tooth: Tooth, cameras: tuple[Camera, ...], tissue: Tissue
-) -> DisplacedScene:
+def _displaced_scene(folder: Path, recipe: StoredFile, frame: ToothFrame, fdi: int, tissue: Tissue) -> DisplacedScene:
     scene = read_recipe(recipe)
-    surfaces = with_shape_errors(scene.teeth[0], tissue.shape, tooth, cameras)
+    surfaces = with_shape_errors(scene.teeth[0], tissue.shape, frame, fdi)
     assert surfaces.dentin is not None
     count = (len(surfaces.dentin.modes_mm) - len(tissue.shape)) // 2
     return DisplacedScene(write_recipe(folder, replace(scene, teeth=(surfaces,))), count)
@@ -241,27 +247,26 @@ def shape_covariance(uncertainty: Uncertainty, tooth: int | None = None) -> tupl
 
 
 def fitted_thickness(
-    tooth: Tooth,
-    cameras: tuple[Camera, ...],
-    spec: JobSpec,
+    outer: Mesh,
+    dentin: DentinShape | None,
     shape: tuple[float, ...],
     covariance: tuple[tuple[float, ...], ...],
+    camera: Camera,
 ) -> ThicknessMap | None:
-    """Map of the enamel's thickness over the fitted dentin, as the first camera sees it; None without dentin, or where
-    the camera does not see the tooth.
+    """Map of the enamel's thickness over the fitted dentin, as a camera sees it; None without dentin, or where the
+    camera does not see the tooth.
 
     Args:
-        tooth: the tooth, with its dentin where the job takes it as known.
-        cameras: cameras of the capture.
-        spec: the job.
+        outer: the tooth's outer surface.
+        dentin: the dentin, given or as a blend shape.
         shape: blend weights.
         covariance: covariance of the blend weights; empty where they were not fitted.
+        camera: the camera that sees the map.
     """
-    dentin = dentin_shape(tooth, cameras, spec)
     return (
         None
         if dentin is None
-        else thickness_map(tooth.outer, dentin, shape, np.array(covariance) if covariance else None, cameras[0])
+        else thickness_map(outer, dentin, shape, np.array(covariance) if covariance else None, camera)
     )
 
 

@@ -23,6 +23,8 @@ export interface Verdict {
   /** One sentence that names the worst fault first. */
   headline: string;
   converged: boolean;
+  /** Of a fit that converged: whether the numbers may be farther off than their ±. */
+  doubtful: boolean;
   is_above_limit: boolean;
   limit: number;
   error_of: "held-out" | "fitted";

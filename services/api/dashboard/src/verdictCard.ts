@@ -34,15 +34,16 @@ export class VerdictCard {
     ];
     const trouble = element(
       "p",
-      { class: "failure", role: "alert" },
+      { class: verdict.converged ? "doubt" : "failure", role: "alert" },
       element("strong", {}, verdict.headline),
       ` ${verdict.advice}`,
     );
     const advice = verdict.advice ? [element("p", { class: "soft" }, verdict.advice)] : [];
+    const isTrouble = verdict.doubtful || !verdict.converged;
     this.root.replaceChildren(
-      ...(verdict.converged ? [] : [trouble]),
+      ...(isTrouble ? [trouble] : []),
       element("dl", {}, ...facts),
-      ...(verdict.converged ? advice : []),
+      ...(isTrouble ? [] : advice),
     );
   }
 }

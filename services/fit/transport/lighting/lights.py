@@ -90,8 +90,8 @@ class ShadowRay:
     place: mi.UInt32
     depth: mi.Float
     """Optical depth so far."""
-    surface: mi.Float
-    """Transmittance of the faces crossed."""
+    surface: list[mi.Float]
+    """Transmittance of the faces crossed; empty where no face of the scene reflects or absorbs."""
     lengths: list[mi.Float]
     """Path length in mm inside each of the ``measured`` media."""
     border: list[mi.Float]
@@ -102,7 +102,7 @@ class ShadowRay:
 
     def transmittance(self) -> mi.Float:
         """Transmittance; 0 where the optical depth is too large to matter."""
-        return dr.select(self.depth < DARK_DEPTH, self.surface * dr.exp(-self.depth), 0)
+        return dr.select(self.depth < DARK_DEPTH, dr.prod([*self.surface, dr.exp(-self.depth)]), 0)
 
 
 def shadow(
@@ -146,13 +146,13 @@ def shadow(
             ]
         if thin_ior is not None:
             contrast = geometry.contrast(thin_ior, ray.place, behind)
-            ray.surface *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), contrast), 1)
+            ray.surface[0] *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), contrast), 1)
         if geometry.stained:
             crosses = ray.alive & geometry.on_stain(hit, ray.place, behind)
-            ray.surface *= geometry.stain(hit, crosses)
+            ray.surface[0] *= geometry.stain(hit, crosses)
             ray.stains = [reservoir.offer(hit, crosses) for reservoir in ray.stains]
         if geometry.opaque:
-            ray.surface = dr.select(hit.opaque, 0, ray.surface)
+            ray.surface[0] = dr.select(hit.opaque, 0, ray.surface[0])
         ray.point = dr.select(hit.valid, geometry.advance(ray.point, direction, hit, hit.valid), ray.point)
         ray.place = dr.select(hit.valid, behind, ray.place)
         ray.alive &= hit.valid & ~hit.opaque & (ray.depth < DARK_DEPTH)
@@ -160,7 +160,8 @@ def shadow(
 
     modes = 0 if shape is None else geometry.modes_of[shape]
     lengths, border = [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)]
-    ray = ShadowRay(point, place, mi.Float(0), mi.Float(1), lengths, border, stains or [], mi.Bool(active))
+    surface = [mi.Float(1)] * (thin_ior is not None or geometry.stained or geometry.opaque)
+    ray = ShadowRay(point, place, mi.Float(0), surface, lengths, border, stains or [], mi.Bool(active))
     ended: ShadowRay
     ended, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")
     return ended

@@ -46,7 +46,8 @@ class Vertex:
     scatterings: Scatterings
     sums: list[mi.Float]
     border_sums: list[mi.Float]
-    secondary: mi.Bool
+    secondary: list[mi.Bool]
+    """Whether the path is a border crossing's secondary walk; empty unless shape derivatives are computed."""
     shape_factor: list[mi.Float]
     wall: list[mi.Bool]
     """Whether the vertex lies on an opaque surface, whose normal ``omega`` then is; empty in scenes without such
@@ -55,6 +56,11 @@ class Vertex:
     """One of the stained faces that the path crossed; empty unless stain derivatives are computed."""
     total: mi.Float
     """Sum of ``throughput * max_transmittance`` over the vertices offered; 0 when there was none."""
+
+    @property
+    def primary(self) -> mi.Bool:
+        """Lanes whose path is not a secondary walk."""
+        return ~self.secondary[0] if self.secondary else mi.Bool(True)
 
 
 @dataclass
@@ -104,7 +110,7 @@ class Connections:
 
         return Vertex(
             mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.scores.unscattered(),
-            zeros(len(self.plan.scores)), zeros(self.modes), mi.Bool(False), zeros(self.modes),
+            zeros(len(self.plan.scores)), zeros(self.modes), [mi.Bool(False)] * self.plan.moves, zeros(self.modes),
             [mi.Bool(False)] * self.geometry.opaque, [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
         )  # fmt: skip
 
@@ -260,7 +266,7 @@ class Connections:
         tally: Tally,
     ) -> None:
         """Add a connection's value to its image and, times the score of the whole path, to the derivatives."""
-        slot, primary = self._slot(vertex, light), active & ~vertex.secondary
+        slot, primary = self._slot(vertex, light), active & vertex.primary
         tally.add(lane, slot, value, primary)
         medium = self._medium(vertex)
         terms = PhaseFunction(self.media, medium).scores(self.scores.phase_fields, vertex.omega, direction)
@@ -276,7 +282,7 @@ class Connections:
             border_sums = [dr.fma(change, rate, total) for rate, total in zip(motion, border_sums, strict=True)]
         for mode in range(self.modes):
             border_score = border_sums[mode] if border is None else border_sums[mode] + border[mode]
-            factor = dr.select(vertex.secondary, vertex.shape_factor[mode], border_score)
+            factor = dr.select(vertex.primary, border_score, vertex.shape_factor[mode])
             tally.add_derivative(len(self.plan.scores) + mode, lane, slot, value * factor, active)
 
     def _medium(self, vertex: Vertex) -> mi.UInt32 | Mixed:

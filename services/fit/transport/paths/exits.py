@@ -52,7 +52,7 @@ class Exits:
         ring = mi.UInt32(0)
         for edge in range(len(self.plan.ring_edges_mm)):
             ring += dr.select(radius >= dr.gather(mi.Float, self.edges_mm, edge), mi.UInt32(1), mi.UInt32(0))
-        scattered = walker.active & hit.valid & hit.outer & (order > 0) & ~walker.secondary
+        scattered = walker.active & hit.valid & hit.outer & (order > 0) & walker.primary
         tally.add(walker.lane, self._first_ring + 2 * ring + face, value, scattered)
 
     def connect(self, walker: Walker, hit: Hit, sigma: mi.Float, scattered: mi.Float, tally: Tally) -> None:
@@ -66,7 +66,7 @@ class Exits:
         begin = mi.Vector2f(*self.geometry.depths(walker.origin.z, self.media.sigma))
         landing = dr.select(hit.valid, dr.fma(walker.omega.z, hit.distance, walker.origin.z), walker.origin.z)
         end = mi.Vector2f(*self.geometry.depths(landing, self.media.sigma))
-        optical_depth, active = sigma * hit.distance, walker.active & ~walker.secondary
+        optical_depth, active = sigma * hit.distance, walker.active & walker.primary
 
         def step(
             which: mi.UInt32, omega: mi.Vector3f, across: mi.Vector2f, begin: mi.Vector2f, end: mi.Vector2f,

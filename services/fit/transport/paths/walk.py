@@ -61,7 +61,12 @@ class Walk:
         return tally
 
     def trace(self, samples: int, tally: Tally) -> None:
-        """Record the loop; it adds to ``tally`` without evaluating it."""
+        """Record the loop; it adds to ``tally`` without evaluating it.
+
+        Dr.Jit would record a loop's body a second time, four times where loops are nested, to take constant state out
+        of it. The kernel gains nothing by that, and recording is half the time of a small image. So that is turned off,
+        and state that a plan does not need is left out by hand.
+        """
         limit = dr.opaque(mi.UInt32, samples)
         lane = dr.arange(mi.UInt32, self.start.lanes)
         path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
@@ -80,21 +85,25 @@ class Walk:
             steps=[mi.UInt32(0) for _ in range(self.limited)],
             sums=self.scores.zero(),
             border_sums=zeros(self.modes),
-            border_crossing=no_crossing(self.modes),
+            border_crossing=[no_crossing(self.modes)] * self.plan.moves,
             stains=[FaceCrossing.none(path.rng.next_float32()) for _ in range(self.plan.stains)],
             vertex=None if self.connections is None else self.connections.no_vertex(),
             connection_step=mi.UInt32(0),
-            secondary=mi.Bool(False),
+            secondary=[mi.Bool(False)] * self.plan.moves,
             shape_factor=zeros(self.modes),
             lane=lane,
             sample=mi.UInt32(0),
             active=lane < dr.opaque(mi.UInt32, self.start.lanes),
         )
-        (walker,) = dr.while_loop(
-            (walker,), lambda walker: walker.active, lambda walker: (self._step(walker, tally, limit),), label="walk"
-        )
-        if self.connections is not None:
-            self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            (walker,) = dr.while_loop(
+                (walker,),
+                lambda walker: walker.active,
+                lambda walker: (self._step(walker, tally, limit),),
+                label="walk",
+            )
+            if self.connections is not None:
+                self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
 
     def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
         throughput = self._throughput(walker)
@@ -144,7 +153,7 @@ class Walk:
         """Lanes whose reflection at an outer face is left out: camera rays that would mirror empty space."""
         if not self.geometry.single:
             return mi.Bool(False)
-        return (self.scores.order(walker.scatterings) == 0) & (medium == 0) & ~walker.secondary
+        return (self.scores.order(walker.scatterings) == 0) & (medium == 0) & walker.primary
 
     def _fly_past_faces(self, walker: Walker, throughput: mi.Float, tally: Tally) -> Flight:
         medium = self.geometry.medium(walker.place)
@@ -162,7 +171,7 @@ class Walk:
         face = dr.select(walker.omega.z > 0, mi.UInt32(1), mi.UInt32(0))
         value = throughput * (1 - collides) * through
         lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.scores.sigma_media}
-        primary = walker.active & leaving & ~walker.secondary
+        primary = walker.active & leaving & walker.primary
         tally.add(walker.lane, face, value, primary)
         if self.exits is not None:
             self.exits.count_ring(walker, self.scores.order(walker.scatterings), hit, face, value, tally)
@@ -172,7 +181,7 @@ class Walk:
         for which, score in enumerate(self.scores.complete(walker.sums, walker.scatterings, mi.UInt32(0), {}, lengths)):
             tally.add_derivative(which, walker.lane, face, value * score, primary)
         for mode in range(self.modes):
-            factor = dr.select(walker.secondary, walker.shape_factor[mode], walker.border_sums[mode])
+            factor = dr.select(walker.primary, walker.border_sums[mode], walker.shape_factor[mode])
             tally.add_derivative(
                 len(self.plan.scores) + mode, walker.lane, face, value * factor, walker.active & leaving
             )
@@ -183,7 +192,7 @@ class Walk:
         distance = minus_log1m(walker.rng.next_float32() * dr.select(leaving, collides, 1)) / sigma
         scatters = walker.active & dr.select(leaving, ~reflects, distance < hit.distance)
         distance = dr.select(leaving, dr.minimum(distance, hit.distance), distance)
-        first = scatters & (self.scores.order(walker.scatterings) == 0) & ~walker.secondary
+        first = scatters & (self.scores.order(walker.scatterings) == 0) & walker.primary
         walker.weight *= remains
         # Compare roulette with the weight after one scattering, so that single scattering survives at any albedo.
         walker.reference = dr.select(
@@ -207,19 +216,13 @@ class Walk:
             walker.border_sums = [
                 dr.fma(jump, shift, total) for shift, total in zip(shifts, walker.border_sums, strict=True)
             ]
-            at_border = crosses & ~hit.outer & ~walker.secondary
-            walker.border_crossing = offer(
-                walker.border_crossing,
-                dr.fma(omega, hit.distance, walker.origin),
-                omega,
-                hit,
-                walker.place,
-                behind,
-                throughput,
-                shifts,
-                walker.rng.next_float32(),
-                at_border,
-            )
+            at_border = crosses & ~hit.outer & walker.primary
+            u = walker.rng.next_float32()
+            reached = dr.fma(omega, hit.distance, walker.origin)
+            walker.border_crossing = [
+                offer(kept, reached, omega, hit, walker.place, behind, throughput, shifts, u, at_border)
+                for kept in walker.border_crossing
+            ]
         if self.geometry.stained:
             stained = crosses & self.geometry.on_stain(hit, walker.place, behind)
             walker.weight *= self.geometry.stain(hit, stained)
@@ -324,15 +327,15 @@ class Walk:
         walker.steps = [count + 1 for count in walker.steps]
         cut = walker.active & ~ended & (walker.steps[0] >= most_steps)
         if self.plan.faces:
-            tally.add(walker.lane, mi.UInt32(2), self._throughput(walker), cut & ~walker.secondary)
+            tally.add(walker.lane, mi.UInt32(2), self._throughput(walker), cut & walker.primary)
         return ended | cut
 
     def _start_secondary(self, walker: Walker, ended: mi.Bool, tally: Tally) -> mi.Bool:
         """Start the kept crossing's secondary walk where paths ended; returns the lanes that are wholly finished."""
-        begins = ended & ~walker.secondary & (walker.border_crossing.total > 0)
+        begins = ended & walker.primary & (walker.border_crossing[0].total > 0)
 
         def begin(walker: Walker, begins: mi.Bool) -> Walker:
-            crossing, rng = walker.border_crossing, walker.rng
+            crossing, rng = walker.border_crossing[0], walker.rng
             scattering = BorderScattering(self.geometry, self.media, crossing)
             size = sum((dr.abs(shift) for shift in crossing.shifts), start=mi.Float(0))
             strength = crossing.throughput * crossing.total / crossing.importance * size
@@ -357,7 +360,7 @@ class Walk:
             walker.shape_factor = [dr.mulsign(ratio, balance) for ratio in ratios]
             walker.scatterings = self.scores.unscattered()
             walker.steps = [dr.zeros(mi.UInt32) for _ in walker.steps]
-            walker.secondary = mi.Bool(True)
+            walker.secondary = [mi.Bool(True)]
             walker.rng = rng
             return walker
 
@@ -389,10 +392,10 @@ class Walk:
             walker.steps = [mi.UInt32(0) for _ in walker.steps]
             walker.sums = [mi.Float(0) for _ in walker.sums]
             walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
-            walker.border_crossing.total = mi.Float(0)
+            for crossing in walker.border_crossing:
+                crossing.total = mi.Float(0)
             walker.stains = [FaceCrossing.none(walker.rng.next_float32()) for _ in walker.stains]
-            if self.plan.shape is not None:
-                walker.secondary = mi.Bool(False)
+            walker.secondary = [mi.Bool(False) for _ in walker.secondary]
             walker.active = walker.sample < limit
             return walker
 

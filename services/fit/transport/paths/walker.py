@@ -34,22 +34,28 @@ class Walker:
     """Scores of the media's parameters so far."""
     border_sums: list[mi.Float]
     """Scores of the shape modes so far."""
-    border_crossing: Crossing
-    """Border crossing from which the secondary walk will start."""
+    border_crossing: list[Crossing]
+    """Border crossing from which the secondary walk will start; empty unless shape derivatives are computed."""
     stains: list[FaceCrossing]
     """One of the stained faces crossed; empty unless stain derivatives are computed."""
     vertex: Vertex | None
     """Scattering vertex that waits for its connection to the lights."""
     connection_step: mi.UInt32
     """Steps since the last connection."""
-    secondary: mi.Bool
-    """Whether this is a border crossing's secondary walk; it feeds the shape derivatives alone."""
+    secondary: list[mi.Bool]
+    """Whether this is a border crossing's secondary walk, which feeds the shape derivatives alone; empty unless these
+    are computed."""
     shape_factor: list[mi.Float]
     """For a secondary walk: dt_b of each mode over the sum of their magnitudes, with the sign of the scattering
     difference."""
     lane: mi.UInt32
     sample: mi.UInt32
     active: mi.Bool
+
+    @property
+    def primary(self) -> mi.Bool:
+        """Lanes whose walk is not a secondary one."""
+        return ~self.secondary[0] if self.secondary else mi.Bool(True)
 
 
 @dataclass
