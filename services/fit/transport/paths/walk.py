@@ -63,9 +63,8 @@ class Walk:
     def trace(self, samples: int, tally: Tally) -> None:
         """Record the loop; it adds to ``tally`` without evaluating it.
 
-        Dr.Jit would record a loop's body a second time, four times where loops are nested, to take constant state out
-        of it. The kernel gains nothing by that, and recording is half the time of a small image. So that is turned off,
-        and state that a plan does not need is left out by hand.
+        Dr.Jit would record a body again, four times in nested loops, to take constant state out of it. This is turned
+        off, and such state left out by hand: recording is half the time of a small image.
         """
         limit = dr.opaque(mi.UInt32, samples)
         lane = dr.arange(mi.UInt32, self.start.lanes)
@@ -96,12 +95,9 @@ class Walk:
             active=lane < dr.opaque(mi.UInt32, self.start.lanes),
         )
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-            (walker,) = dr.while_loop(
-                (walker,),
-                lambda walker: walker.active,
-                lambda walker: (self._step(walker, tally, limit),),
-                label="walk",
-            )
+            walker = dr.while_loop(
+                (walker,), lambda walker: walker.active, lambda one: (self._step(one, tally, limit),), label="walk"
+            )[0]
             if self.connections is not None:
                 self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
 
