@@ -13,6 +13,8 @@ from services.api.app import STATIC
 from tests.browser.contrast import contrast_failures
 
 WIDE, PHONE = (1440, 900), (390, 844)
+LOOKS = (("light", WIDE[0]), ("dark", PHONE[0]))
+"""Colour scheme and width of the two looks in which a page is tested: each scheme and each width once."""
 
 
 @contextmanager

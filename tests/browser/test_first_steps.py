@@ -18,15 +18,13 @@ from playwright.sync_api import Browser, Page, expect
 from services.api.app import create_app
 from services.core.records import JobSpec
 from services.core.settings import DomeSettings, ServerSettings
-from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.browser.pages import LOOKS, looked_at, watched_page
 from tests.support.calibration_jobs import publish_calibration
 from tests.support.guarded_server import run_nothing
 from tests.support.live_server import serving, toy_server
 from tests.support.uploading import contents_of, upload_capture, write_capture
 
 pytestmark = pytest.mark.browser
-
-LOOKS = [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])]
 
 
 @pytest.fixture
@@ -40,7 +38,7 @@ def address_of(server: httpx.Client) -> str:
     return str(server.base_url).rstrip("/")
 
 
-@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], pytest.param(*LOOKS[3], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], pytest.param(*LOOKS[1], marks=pytest.mark.slow)])
 def test_an_empty_page_leads_to_the_report_in_three_clicks(
     chromium: Browser, tmp_path: Path, scheme: str, width: int
 ) -> None:
@@ -82,7 +80,7 @@ def test_what_the_demonstration_is_refused_for_is_told(chromium: Browser, server
 
 
 @pytest.mark.parametrize("server", ["simulated"], indirect=True)
-@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], LOOKS[3]])
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 def test_a_rig_is_explained_and_its_dome_is_looked_at(
     chromium: Browser, server: httpx.Client, scheme: str, width: int
 ) -> None:
@@ -123,7 +121,7 @@ def test_calibrations_are_shown_with_their_state_and_offered_to_jobs(
         )
 
 
-@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], LOOKS[3]])
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 def test_what_a_calibration_job_made_is_kept_from_its_page(
     chromium: Browser, tmp_path: Path, scheme: str, width: int
 ) -> None:

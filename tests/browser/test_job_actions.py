@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Page, expect
 from services.api.app import create_app
 from services.core.errors import CaptureInputError
 from services.core.settings import ServerSettings
-from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.browser.pages import LOOKS, looked_at, watched_page
 from tests.browser.scripted_job import STEPS, ScriptedJob, submit
 from tests.support.live_server import serving
 
@@ -26,16 +26,14 @@ def job() -> ScriptedJob:
 
 @pytest.fixture
 def page(chromium: Browser, tmp_path: Path, job: ScriptedJob, request: pytest.FixtureRequest) -> Iterator[Page]:
-    scheme, width = getattr(request, "param", ("light", WIDE[0]))
+    scheme, width = getattr(request, "param", LOOKS[0])
     with serving(create_app(ServerSettings(data=tmp_path / "data"), job)) as client:
         with watched_page(chromium, str(client.base_url).rstrip("/"), scheme, width, expected=("409",)) as page:
             yield page
         job.steps.release(STEPS)
 
 
-@pytest.mark.parametrize(
-    "page", [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])], indirect=True
-)
+@pytest.mark.parametrize("page", LOOKS, indirect=True)
 def test_a_job_is_named_downloaded_and_deleted(
     page: Page, job: ScriptedJob, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

@@ -13,7 +13,7 @@ from services.api.app import create_app
 from services.api.auth.setup_links import SetupLinks
 from services.core.settings import ServerSettings
 from services.pipeline.database import open_database
-from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.browser.pages import LOOKS, looked_at, watched_page
 from tests.support.guarded_server import run_nothing
 from tests.support.live_server import serving
 
@@ -35,7 +35,7 @@ def link(server: httpx.Client, tmp_path: Path) -> str:
     return f"/#/setup/{secret.get_secret_value()}"
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", WIDE[0]), ("dark", PHONE[0])])
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 def test_a_setup_link_works_once(chromium: Browser, server: httpx.Client, link: str, scheme: str, width: int) -> None:
     address = str(server.base_url).rstrip("/")
     with watched_page(chromium, address, scheme, width) as page:

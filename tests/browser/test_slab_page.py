@@ -21,7 +21,7 @@ from services.fit.slab.model.dictionary import ANGLES_RAD, hg_values
 from services.fit.slab.results.chart import phase_picture
 from services.fit.slab.results.result import PhaseFunction
 from services.pipeline.event_log import EventAddress
-from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.browser.pages import LOOKS, looked_at, watched_page
 from tests.browser.scripted_job import expect_state
 from tests.support.live_server import serving
 from tests.support.small_slab import description, write_folder
@@ -75,8 +75,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Cli
         yield client, answer.json()["id"]
 
 
-@pytest.mark.parametrize("width", [WIDE[0], PHONE[0]])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 def test_the_page_shows_wavelengths_coefficients_and_phase_functions(
     chromium: Browser, server: tuple[httpx.Client, str], scheme: str, width: int
 ) -> None:
@@ -106,7 +105,7 @@ def test_the_page_shows_wavelengths_coefficients_and_phase_functions(
 
 def test_the_form_shows_the_options_of_the_chosen_kind(chromium: Browser, server: tuple[httpx.Client, str]) -> None:
     client, _ = server
-    with watched_page(chromium, str(client.base_url).rstrip("/"), "light", WIDE[0]) as page:
+    with watched_page(chromium, str(client.base_url).rstrip("/")) as page:
         page.goto("/#/submit")
         page.locator("summary", has_text="Accuracy and time").click()
         expect(page.locator("#option-max_steps")).to_be_visible()
@@ -128,7 +127,7 @@ def test_a_slabs_capture_chooses_the_kind_of_its_job(
 ) -> None:
     client, _ = server
     folders = write_capture(tmp_path / "tooth"), write_folder(tmp_path / "cell", description())
-    with watched_page(chromium, str(client.base_url).rstrip("/"), "light", WIDE[0]) as page:
+    with watched_page(chromium, str(client.base_url).rstrip("/")) as page:
         for folder, kind in zip(folders, ("tooth", "slab"), strict=True):
             page.goto("/#/new")
             page.set_input_files("#folder", str(folder))

@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Page, Request, Route, expect
 
 from services.api.app import create_app
 from services.core.settings import ServerSettings
-from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.browser.pages import LOOKS, looked_at, watched_page
 from tests.support.guarded_server import run_nothing
 from tests.support.live_server import serving
 from tests.support.uploading import contents_of, write_capture
@@ -52,7 +52,7 @@ def expect_uploaded(page: Page, server: httpx.Client, data: Path, contents: dict
     assert contents_of(data / "captures" / capture["id"]) == contents
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", WIDE[0]), ("dark", PHONE[0])])
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 def test_a_folder_is_uploaded_and_its_job_submitted(
     chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path, scheme: str, width: int
 ) -> None:

@@ -18,7 +18,7 @@ from services.core.results import Estimate, FitReport
 from services.core.settings import ServerSettings
 from services.core.verdict import percent, verdict_of
 from services.fit.export.report import _spread
-from tests.browser.pages import PHONE, WIDE, looked_at, watched_page
+from tests.browser.pages import LOOKS, looked_at, watched_page
 from tests.browser.scripted_job import STEPS, ScriptedJob, expect_state, submit
 from tests.support.live_server import serving
 
@@ -67,9 +67,7 @@ def address_of(server: httpx.Client) -> str:
     return str(server.base_url).rstrip("/")
 
 
-@pytest.mark.parametrize(
-    ("scheme", "width"), [("light", WIDE[0]), ("dark", WIDE[0]), ("light", PHONE[0]), ("dark", PHONE[0])]
-)
+@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 @pytest.mark.parametrize("outcome", ["converged", "doubtful", "not converged"])
 def test_the_page_leads_with_the_reports_judgement(
     chromium: Browser, server: httpx.Client, job: ScriptedJob, scheme: str, width: int, outcome: str
