@@ -214,9 +214,9 @@ class Walk:
             ]
             at_border = crosses & ~hit.outer & walker.primary
             u = walker.rng.next_float32()
-            reached = dr.fma(omega, hit.distance, walker.origin)
+            crossing_point = dr.fma(omega, hit.distance, walker.origin)
             walker.border_crossing = [
-                offer(kept, reached, omega, hit, walker.place, behind, throughput, shifts, u, at_border)
+                offer(kept, crossing_point, omega, hit, walker.place, behind, throughput, shifts, u, at_border)
                 for kept in walker.border_crossing
             ]
         if self.geometry.stained:
