@@ -30,7 +30,7 @@ THICKNESS = Estimate(value=0.703, se=0.061, unit="mm", determined=True)
 def report(error: float, *, converged: bool, doubtful: bool = False) -> FitReport:
     errors = {"green": error, "red": error + 0.02}
     advice = (
-        {False: "", True: "red: unseen images are 9.4 % off beside their noise."}[doubtful]
+        ("red: unseen images are 9.4 % off beside their noise." if doubtful else "")
         if converged
         else "red: the images are still 35 % off; check mesh, lights and boundary model, or raise the samples."
     )

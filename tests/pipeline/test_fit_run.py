@@ -15,7 +15,7 @@ from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.core.verdict import VERDICT, verdict_of
-from services.fit.checks.identifiability import NOT_EXPLAINED
+from services.fit.checks.identifiability import NOT_EXPLAINED, PARTLY_EXPLAINED
 from services.fit.execution.numerics import NUMERICS, numerics_name
 from services.fit.stage import export, run
 from tests.support.prepared import FAKE, TRUTH, write_prepared
@@ -240,6 +240,20 @@ def test_a_fit_out_of_steps_says_what_to_do(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert page.index("did not converge") < page.index("Error on held-out images")
     assert "max_steps = 1; " in page  # one of the job's options
+
+
+def test_photographs_that_the_model_explains_in_part_are_doubtful(tmp_path: Path) -> None:
+    # Alternate photographs differ by a factor 1.2: an error between the 5 % of a doubt and the limit of 15 %.
+    write_prepared(tmp_path, uneven=0.2)
+    report = fit(tmp_path)
+    assert 0.05 < report.held_out_error["green"] < 0.15
+    assert (report.converged, report.doubtful) == (True, True)
+    assert "unseen images are" in report.advice
+    assert (report.told, report.next_capture) == (PARTLY_EXPLAINED, "")
+    export(spec_for(tmp_path), LocalContext(tmp_path))
+    page = (tmp_path / "report.html").read_text()
+    assert page.index("is doubtful") < page.index("Error on held-out images")
+    assert json.loads((tmp_path / "errors.json").read_text())["verdict"]["doubtful"]
 
 
 def test_what_the_preparation_noted_leads_the_report(tmp_path: Path) -> None:

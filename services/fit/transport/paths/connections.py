@@ -110,8 +110,9 @@ class Connections:
 
         return Vertex(
             mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.scores.unscattered(),
-            zeros(len(self.plan.scores)), zeros(self.modes), [mi.Bool(False)] * self.plan.moves, zeros(self.modes),
-            [mi.Bool(False)] * self.geometry.opaque, [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
+            zeros(len(self.plan.scores)), zeros(self.modes), [mi.Bool(False)] * (self.plan.shape is not None),
+            zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque,
+            [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
         )  # fmt: skip
 
     def offer(self, reservoir: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:

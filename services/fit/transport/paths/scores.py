@@ -43,11 +43,6 @@ class Plan:
     paths ended in this way is counted in a third slot."""
 
     @property
-    def moves(self) -> bool:
-        """Whether derivatives to a dentin's shape are computed."""
-        return self.shape is not None
-
-    @property
     def rings(self) -> int:
         """Number of rings, the unbounded one included."""
         return len(self.ring_edges_mm) + 1 if self.ring_edges_mm else 0
