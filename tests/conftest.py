@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.support.processor_times import ProcessorTimes
 from tests.support.unclosed_databases import watch_databases
 
 SLOW_TIMEOUT_S = 3600
@@ -19,8 +20,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     watch_databases()
+    config.pluginmanager.register(ProcessorTimes())
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
