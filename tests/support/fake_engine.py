@@ -15,7 +15,7 @@ camera, light and pixel alone.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,24 @@ NOISE = 1.0
 SCORE_NOISE = 1.0
 
 
+@dataclass(frozen=True)
+class Geometry:
+    """What the formula takes from a view alone: N pixels under L lights."""
+
+    x: Array
+    """Horizontal coordinate (N,) of the pixels."""
+    thickness: Array
+    """Thickness d (N,) of the enamel."""
+    cosine: Array
+    """Cosine c (L, N) of the light's angle."""
+    root_cosine: Array
+    square_cosine: Array
+    own: NDArray[np.uint64]
+    """Counters (L, N) of the noise that each light has alone."""
+    shared: NDArray[np.uint64]
+    """Counters (L, N) of the noise that all lights share."""
+
+
 class FakeEngine:
     """Stand-in with the methods of the real engine."""
 
@@ -47,6 +65,7 @@ class FakeEngine:
 
     def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
         self.recipe = recipe
+        self._geometries: dict[bytes, Geometry] = {}
 
     def images(self, tissue: Tissue, view: View, *, samples: int, seed: int, batches: int = 16) -> StackEstimate:
         truth = self._formula(tissue, view)
@@ -108,21 +127,21 @@ class FakeEngine:
         return share[:, None, None] / share.sum() * image
 
     def _formula(self, tissue: Tissue, view: View) -> Array:
-        x, y = view.pixels.T.astype(float)
-        thickness = 0.3 + 0.9 * y / 34.0
-        if self.recipe.teeth[0].dentin is None:
-            thickness = thickness + 50.0
+        geometry = self._geometry(view)
+        thickness, cosine = geometry.thickness, geometry.cosine
         # Displacements of the dentin, which follow the weights of the blend shape, change nothing here.
         for m, c in enumerate(tissue.shape[: len(MODES)]):
-            thickness = thickness * (1 + 0.3 * c * np.cos((m + 1) * x / 9.0))
-        lights = np.arange(len(self.recipe.light_positions_mm))[:, None]
-        direction = np.abs(self.recipe.light_positions_mm[:, :1]).astype(float) / 1000
-        cosine = 0.35 + 0.6 * np.abs(np.cos(0.12 * x + direction * 3.0 + 0.1 * y))
+            thickness = thickness * (1 + 0.3 * c * np.cos((m + 1) * geometry.x / 9.0))
         enamel, dentin = tissue.enamel, tissue.dentin
         through = np.exp(-enamel.sigma_s_reduced * (1 + self.directness * enamel.mean_cosine) * thickness)
         near = cosine * (1 - through) * enamel.alpha_reduced**1.5
-        deep = np.sqrt(cosine) * through * dentin.alpha_reduced**1.5 * (1 - np.exp(-dentin.sigma_s_reduced * cosine**2))
-        image = np.asarray(near + deep + 0.05 + 0.0 * lights)
+        deep = (
+            geometry.root_cosine
+            * through
+            * dentin.alpha_reduced**1.5
+            * (1 - np.exp(-dentin.sigma_s_reduced * geometry.square_cosine))
+        )
+        image = np.asarray(near + deep + 0.05)
         if tissue.stain is not None:
             texels, shares = self._texels(view, tissue.stain)
             values = tissue.stain.transmittance.reshape(-1)
@@ -131,22 +150,36 @@ class FakeEngine:
             raise NonFiniteError("The formula is not finite; check the parameters.")
         return image
 
-    def _normal(self, view: View, seed: int, stream: int) -> Array:
-        own, shared = (
-            self._numbers(view, seed, stream, by_light=True),
-            self._numbers(view, seed, stream, by_light=False),
-        )
-        return np.sqrt(1 - self.shared_noise) * own + np.sqrt(self.shared_noise) * shared if self.shared_noise else own
+    def _geometry(self, view: View) -> Geometry:
+        # The part of the formula that does not depend on the tissue, once for each view.
+        key = view.pixels.tobytes()
+        if key not in self._geometries:
+            x, y = view.pixels.T.astype(float)
+            thickness = 0.3 + 0.9 * y / 34.0
+            if self.recipe.teeth[0].dentin is None:
+                thickness = thickness + 50.0
+            direction = np.abs(self.recipe.light_positions_mm[:, :1]).astype(float) / 1000
+            cosine = 0.35 + 0.6 * np.abs(np.cos(0.12 * x + direction * 3.0 + 0.1 * y))
+            lights = np.arange(len(direction), dtype=np.uint64)[:, None]
+            pixel = (view.pixels[:, 0] + 4096 * view.pixels[:, 1]).astype(np.uint64)[None]
+            own, shared = (pixel + np.uint64(2**40) * place for place in (lights, np.full_like(lights, 1000)))
+            self._geometries[key] = Geometry(x, thickness, cosine, np.sqrt(cosine), cosine**2, own, shared)
+        return self._geometries[key]
 
-    def _numbers(self, view: View, seed: int, stream: int, *, by_light: bool) -> Array:
+    def _normal(self, view: View, seed: int, stream: int) -> Array:
         # Counter-based random numbers per (seed, stream, light, pixel), so that blocks and order do not matter.
-        lights = np.arange(len(self.recipe.light_positions_mm), dtype=np.uint64)[:, None]
-        place = lights if by_light else np.full_like(lights, 1000)
-        pixel = (view.pixels[:, 0] + 4096 * view.pixels[:, 1]).astype(np.uint64)[None] + np.uint64(2**40) * place
-        key = np.uint64((seed * 131 + stream * 7919 + sum(view.camera.name.encode())) % 2**63)
-        u = _uniform(pixel ^ _mix(np.full_like(pixel, key)))
-        v = _uniform(_mix(pixel + np.uint64(0x9E3779B9)) ^ _mix(np.full_like(pixel, key + np.uint64(1))))
-        return np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)
+        geometry, key = self._geometry(view), (seed * 131 + stream * 7919 + sum(view.camera.name.encode())) % 2**63
+        own = _normal(geometry.own, key)
+        if not self.shared_noise:
+            return own
+        return np.sqrt(1 - self.shared_noise) * own + np.sqrt(self.shared_noise) * _normal(geometry.shared, key)
+
+
+def _normal(places: NDArray[np.uint64], key: int) -> Array:
+    first, second = _mix(np.array([key, key + 1], dtype=np.uint64))
+    u = _uniform(places ^ first)
+    v = _uniform(_mix(places + np.uint64(0x9E3779B9)) ^ second)
+    return np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)
 
 
 def _with_albedo(tissue: Tissue, alpha: float) -> Tissue:

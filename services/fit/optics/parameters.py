@@ -100,16 +100,16 @@ class Tissue:
 
     def with_values(self, values: dict[str, float]) -> Tissue:
         """A copy with some parameters replaced."""
-        changed, shape = self, list(self.shape)
+        media: dict[str, dict[str, Any]] = {}
+        shape = list(self.shape)
         for name, value in values.items():
             part, leaf = name.split(".")
             if part == "shape":
                 shape[int(leaf)] = value
             else:
-                medium: dict[str, Any] = {leaf: value}
-                part_changed: dict[str, Any] = {part: replace(changed.medium(part), **medium)}
-                changed = replace(changed, **part_changed)
-        return replace(changed, shape=tuple(shape))
+                media.setdefault(part, {})[leaf] = value
+        changed: dict[str, Any] = {part: replace(self.medium(part), **leaves) for part, leaves in media.items()}
+        return replace(self, shape=tuple(shape), **changed)
 
 
 @dataclass(frozen=True)
@@ -145,16 +145,18 @@ class Mouth:
     def with_values(self, values: dict[str, float]) -> Mouth:
         """A copy with some parameters replaced."""
         teeth, gums, reflectance = list(self.teeth), self.gums, self.reflectance
+        parts: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
             part, leaf = name.split(".", 1)
+            parts.setdefault(part, {})[leaf] = value
+        for part, leaves in parts.items():
             if part == "gums":
                 assert gums is not None
-                change: dict[str, Any] = {leaf: value}
-                gums = replace(gums, **change)
+                gums = replace(gums, **leaves)
             elif part == "cavity":
-                reflectance = value
+                reflectance = leaves["reflectance"]
             else:
-                teeth[int(part)] = teeth[int(part)].with_values({leaf: value})
+                teeth[int(part)] = teeth[int(part)].with_values(leaves)
         return Mouth(tuple(teeth), gums, reflectance)
 
 

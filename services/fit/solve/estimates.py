@@ -26,6 +26,8 @@ DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
     }
 )
 """Derived quantities of a medium that are reported beside its parameters: unit and formula."""
+DIFFERENCE_STEP = 1e-5
+"""Step of central differences in the unbounded domain, far below every scale and far above rounding."""
 
 
 def estimates(
@@ -52,14 +54,15 @@ def estimates(
             names = [f"{part}.{k}" for k in range(len(_weights(tissue, part)))]
             out |= {name: _raw(tissue, name, uncertainty if name in fitted else shape_uncertainty) for name in names}
             continue
+        around = {} if uncertainty is None else _media_around(tissue, uncertainty, part)
         for leaf in MEDIUM_FIELDS:
             name = f"{part}.{leaf}"
             if f"{part}.cosine" in fitted and leaf in {"sigma", "alpha", "g1"}:
-                out[name] = _derived(tissue, uncertainty, part, attrgetter(leaf), UNITS[leaf])
+                out[name] = _derived(tissue.medium(part), around, uncertainty, attrgetter(leaf), UNITS[leaf])
             else:
                 out[name] = _raw(tissue, name, uncertainty if name in fitted else None)
         for leaf, (unit, quantity) in DERIVED.items():
-            out[f"{part}.{leaf}"] = _derived(tissue, uncertainty, part, quantity, unit)
+            out[f"{part}.{leaf}"] = _derived(tissue.medium(part), around, uncertainty, quantity, unit)
     return out
 
 
@@ -84,23 +87,33 @@ def _estimate(value: float, unit: str, uncertainty: Uncertainty, slope: Array) -
     return Estimate(value=value, se=se, unit=unit, determined=determined, se_parts=uncertainty.se_parts(slope))
 
 
-def _derived(
-    tissue: Optics, uncertainty: Uncertainty | None, part: str, quantity: Callable[[Medium], float], unit: str
-) -> Estimate:
-    value = quantity(tissue.medium(part))
-    if uncertainty is None:
-        return Estimate(value=value, se=None, unit=unit, determined=False)
-    # Central differences in the unbounded domain; the step is far below every scale and far above rounding.
-    slope, step = np.zeros(len(uncertainty.x)), 1e-5
+def _media_around(tissue: Optics, uncertainty: Uncertainty, part: str) -> dict[int, tuple[Medium, Medium]]:
+    # The part's medium one step above and one step below x, by the coordinates that change it.
+    around = {}
     for k, coordinate in enumerate(uncertainty.domain.coordinates):
         if any(target.startswith(f"{part}.") for target in coordinate.targets):
             shift = np.zeros(len(uncertainty.x))
-            shift[k] = step
+            shift[k] = DIFFERENCE_STEP
             high, low = (
-                quantity(uncertainty.domain.tissue_at(uncertainty.x + sign * shift, tissue).medium(part))
-                for sign in (1, -1)
+                uncertainty.domain.tissue_at(uncertainty.x + sign * shift, tissue).medium(part) for sign in (1, -1)
             )
-            slope[k] = (high - low) / (2 * step)
+            around[k] = high, low
+    return around
+
+
+def _derived(
+    medium: Medium,
+    around: Mapping[int, tuple[Medium, Medium]],
+    uncertainty: Uncertainty | None,
+    quantity: Callable[[Medium], float],
+    unit: str,
+) -> Estimate:
+    value = quantity(medium)
+    if uncertainty is None:
+        return Estimate(value=value, se=None, unit=unit, determined=False)
+    slope = np.zeros(len(uncertainty.x))
+    for k, (high, low) in around.items():
+        slope[k] = (quantity(high) - quantity(low)) / (2 * DIFFERENCE_STEP)
     if not slope.any():
         return Estimate(value=value, se=None, unit=unit, determined=False)
     return _estimate(value, unit, uncertainty, slope)
