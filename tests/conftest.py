@@ -41,3 +41,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))
+    # Worker processes take file after file, so that a dear file at the end would keep one busy while the others idle.
+    dear = {item.path for item in items if item.get_closest_marker("dear")}
+    items.sort(key=lambda item: item.path not in dear)

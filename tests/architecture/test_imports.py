@@ -1,4 +1,4 @@
-"""The import rules hold, and the light packages load no heavy ones."""
+"""The light packages load no heavy ones, and one room alone reads the environment. import-linter keeps the rest."""
 
 from __future__ import annotations
 
@@ -29,12 +29,6 @@ def modules_below(room: str) -> list[str]:
     )
     # Migration steps are files that Alembic reads, not modules.
     return [".".join(("services", room, *path.parts)) for path in paths if path.parts[0] != "migrations"]
-
-
-def test_import_contracts_are_kept() -> None:
-    command = [str(Path(sys.executable).parent / "lint-imports"), "--no-cache"]
-    answer = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
-    assert answer.returncode == 0, answer.stdout
 
 
 @pytest.mark.parametrize("room", ["core", "api"])
