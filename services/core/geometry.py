@@ -101,7 +101,10 @@ class Mesh:
     def edge_counts(self) -> NDArray[np.int64]:
         """Number of faces that share each undirected edge, (E,)."""
         edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return np.unique(edges, axis=0, return_counts=True)[1]
+        # Both numbers in one, because single numbers are sorted ten times as fast as rows.
+        numbers: NDArray[np.int64] = (edges[:, 0].astype(np.int64) << 32) | edges[:, 1]
+        _, counts = np.unique(numbers, return_counts=True)
+        return counts
 
     def signed_volume_mm3(self) -> float:
         """Volume by the divergence theorem; negative when the mesh is inside out."""

@@ -114,7 +114,7 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    vertices, faces = tooth_mesh()
+    vertices, faces = tooth_mesh(options.get("rings", 96))
     # Texture coordinates are the front view, 16 mm across
     x, z = np.meshgrid(16 * (np.arange(512) + 0.5) / 512 - 8, 8 - 16 * (np.arange(512) + 0.5) / 512)
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(tooth_colour(x, z).astype(np.float32)), "raw": True}
@@ -126,7 +126,7 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
     lights = light_positions(options["lights"])
     intensity = np.asarray(options.get("light_colour", [1.0, 0.9, 0.75])) * 1e6
 
-    def tooth(pose: FloatArray, specular: float) -> Any:
+    def tooth(pose: FloatArray) -> Any:
         properties = mi.Properties()
         properties["bsdf"] = mi.load_dict(
             {
@@ -136,7 +136,7 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
                 "int_ior": 1.631,
                 "nonlinear": False,
                 "diffuse_reflectance": texture,
-                "specular_reflectance": specular,
+                "specular_reflectance": 1.0,
             }
         )
         mesh = mi.Mesh(
@@ -150,12 +150,10 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
         mesh.recompute_vertex_normals()
         return mesh
 
-    total: list[NDArray[np.float32]] = []
-    diffuse: list[NDArray[np.float32]] = []
-    for pose in poses:
+    def sensor(pose: FloatArray) -> dict[str, Any]:
         # Mitsuba's camera looks along +z with x to the left; OpenCV's has x right, y down
         to_world = np.linalg.inv(pose) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-        sensor = {
+        return {
             "type": "perspective",
             "fov": float(np.degrees(2 * np.arctan(width / 2 / focal))),
             "fov_axis": "x",
@@ -172,31 +170,33 @@ def render(options: dict[str, Any]) -> dict[str, NDArray[Any]]:
             },
             "sampler": {"type": "independent", "sample_count": options.get("spp", 16)},
         }
-        for light, time in options["frames"]:
-            pose_now = motion(time, options["amplitude_mm"])
-            for images, specular in ((total, 1.0), (diffuse, 0.0)):
-                # Render light by light, because a random choice of the light per sample would add noise. The diffuse
-                # image is needed for frames of single lights alone.
-                image = np.zeros((height, width, 3), dtype=np.float32)
-                for k in [light] if light >= 0 else range(len(lights) if specular else 0):
-                    lamp = {
-                        "type": "point",
-                        "position": lights[k].tolist(),
-                        "intensity": {"type": "rgb", "value": intensity.tolist()},
-                    }
-                    scene = {
-                        "type": "scene",
-                        "integrator": {"type": "direct"},
-                        "sensor": sensor,
-                        "tooth": tooth(pose_now, specular),
-                        "lamp": lamp,
-                    }
-                    image += np.array(mi.render(mi.load_dict(scene), seed=11))
-                images.append(image)
+
     shape = (len(poses), len(options["frames"]), height, width, 3)
+    total, diffuse = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    lamp = {"type": "point", "position": [0, 0, 0], "intensity": {"type": "rgb", "value": intensity.tolist()}}
+    for frame, (light, time) in enumerate(options["frames"]):
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "direct"},
+                "tooth": tooth(motion(time, options["amplitude_mm"])),
+                "lamp": lamp,
+                **{f"sensor{k}": sensor(pose) for k, pose in enumerate(poses)},
+            }
+        )
+        parameters = mi.traverse(scene)
+        for images, specular in ((total, 1.0), (diffuse, 0.0)):
+            parameters["tooth.bsdf.specular_reflectance.value"] = specular
+            # Render light by light, because a random choice of the light per sample would add noise. The diffuse image
+            # is needed for frames of single lights alone.
+            for k in [light] if light >= 0 else range(len(lights) if specular else 0):
+                parameters["lamp.position"] = lights[k].tolist()
+                parameters.update()
+                for view in range(len(poses)):
+                    images[view, frame] += np.array(mi.render(scene, sensor=view, seed=11))
     return {
-        "total": np.asarray(total).reshape(shape),
-        "diffuse": np.asarray(diffuse).reshape(shape),
+        "total": total,
+        "diffuse": diffuse,
         "vertices_mm": vertices,
         "faces": faces,
         "K": K,
