@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.request import Request, urlopen
 
-import httpx
 import obstore
 import pytest
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
@@ -107,12 +107,12 @@ def s3_server() -> Iterator[S3Server]:
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = make_server("127.0.0.1", 0, application, threaded=True, request_handler=Quiet)
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
     thread.start()
     told.port = server.server_port
     try:
-        httpx.post(f"{told.endpoint}/moto-api/reset").raise_for_status()
-        httpx.put(f"{told.endpoint}/{BUCKET}").raise_for_status()
+        for method, path in (("POST", "moto-api/reset"), ("PUT", BUCKET)):
+            urlopen(Request(f"{told.endpoint}/{path}", b"", method=method)).close()
         told.asked.clear()
         yield told
     finally:
