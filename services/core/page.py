@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 
+@cache
 def page_template(path: Path) -> Template:
     """Load the template of a page; its variable ``style`` holds the style that all reports share."""
     from jinja2 import Environment, StrictUndefined

@@ -32,13 +32,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from zarr.codecs import BloscCodec, Crc32cCodec
 
 from services.core.errors import (
     CaptureInputError,
@@ -51,6 +49,9 @@ from services.core.errors import (
 from services.core.files.object_store import array_location, discard, remote_folder
 from services.core.files.validation import parse_record
 from services.core.geometry import Record
+
+if TYPE_CHECKING:
+    import zarr
 
 R = TypeVar("R", bound=Record)
 FORMAT_VERSION = 1
@@ -280,6 +281,9 @@ def create_array(
     Args:
         codec: compression; lz4 takes a third of zstd's time and 5 % more space for noisy single-precision numbers.
     """
+    import zarr
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
     return zarr.create_array(
         array_location(folder / name),
         shape=shape,
@@ -304,6 +308,8 @@ def image_pieces(height: int, width: int) -> tuple[tuple[int, int], tuple[int, i
 
 def writable_array(path: Path) -> zarr.Array[Any]:
     """Open an array that ``create_array`` has made, for writing."""
+    import zarr
+
     return zarr.open_array(array_location(path), mode="r+", zarr_format=3)
 
 
@@ -315,6 +321,8 @@ class StoredArray:
     """
 
     def __init__(self, path: Path) -> None:
+        import zarr
+
         self._path = path
         with self._translate_read_errors():
             self._array = zarr.open_array(array_location(path), mode="r", zarr_format=3)

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from services.core.errors import SettingsError
-from services.core.files.object_store import require_library
+from services.core.files.server_faults import require_library
 from services.core.files.store_url import STORE_URL
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings

@@ -12,62 +12,29 @@ two attempts with different stores never write the same object.
 
 from __future__ import annotations
 
-import importlib
-import re
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic import Field, ValidationError
-from zarr.storage import ObjectStore, StorePath
 
-from services.core.errors import CorruptStoreError, StoreError
+from services.core.errors import CorruptStoreError
+from services.core.files.server_faults import library, require_library, translate_server_errors
 from services.core.geometry import Record
-from services.core.installed import require_packages
 
 if TYPE_CHECKING:
-    from zarr.abc.store import ByteRequest
-    from zarr.core.buffer import Buffer, BufferPrototype
+    from zarr.storage import StorePath
 
-LIBRARY, EXTRA = "obstore", "s3"
+    from services.core.files.zarr_store import ErrorTranslatingStore
+
 RETRIES = 5
 """Number of retries of a request that was not answered. They take some 3 s in all; a stage that fails nevertheless can
 be continued later."""
 CONNECT_S, ANSWER_S = "5s", "300s"
 """Longest time to connect, and longest time for an answer; the largest answers are an image's shards, 100 MB."""
-_FAULTS: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "bucket": ("has no bucket of that name", "create it, or correct the option 'store'"),
-        "permission": ("does not permit this", "let these credentials list, read, write and delete there"),
-        "credentials": (
-            "takes no request without valid credentials",
-            "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY where the job runs",
-        ),
-        "region": ("says that its bucket is in another region", "set AWS_REGION where the job runs"),
-        "silence": ("does not answer", "check AWS_ENDPOINT_URL and the network, then retry the job"),
-    }
-)
-"""Kind of fault -> what is wrong and what to do, as the parts of an error message."""
-_FAULT_PATTERNS: Mapping[str, re.Pattern[str]] = MappingProxyType(
-    {
-        "credentials": re.compile(
-            r" 401 |InvalidAccessKeyId|SignatureDoesNotMatch|ExpiredToken|InvalidToken|[Cc]redential|AccessKey"
-        ),
-        "bucket": re.compile(r"NoSuchBucket"),
-        "permission": re.compile(r" 403 |AccessDenied"),
-        "region": re.compile(r"region"),
-    }
-)
-"""Kind of fault -> words of the server or the library by which it is recognised."""
-_METADATA_SERVICE = re.compile(r"//[^/ ]+/latest/(api/token|meta-data)")
-"""URL of the metadata service of Amazon machines, which the library asks for credentials if the environment has
-none."""
 
 
 class StoredObject(Record):
@@ -85,6 +52,8 @@ class RemoteFolder(Record):
 
     def array(self, name: str) -> StorePath:
         """Zarr's path of one of the arrays."""
+        from zarr.storage import StorePath
+
         return StorePath(_opened(self.url), name)
 
     def listed(self, prefix: str = "") -> dict[str, StoredObject]:
@@ -96,8 +65,8 @@ class RemoteFolder(Record):
         Raises:
             StoreError: the server refuses or does not answer.
         """
-        with _translate_server_errors(self.url):
-            batches = list(_library().list(_opened(self.url).store, prefix=prefix or None))
+        with translate_server_errors(self.url):
+            batches = list(library().list(_opened(self.url).store, prefix=prefix or None))
         return {
             one["path"]: StoredObject(bytes=one["size"], etag=one["e_tag"] or "") for batch in batches for one in batch
         }
@@ -123,17 +92,8 @@ class RemoteFolder(Record):
             StoreError: as ``listed``.
         """
         names = list(self.listed())
-        with _translate_server_errors(self.url):
-            _library().delete(_opened(self.url).store, names)
-
-
-def require_library() -> None:
-    """Import the library for S3 servers.
-
-    Raises:
-        PlatformError: the library is not installed.
-    """
-    require_packages((LIBRARY,), EXTRA)
+        with translate_server_errors(self.url):
+            library().delete(_opened(self.url).store, names)
 
 
 def remote_folder(path: Path) -> RemoteFolder | None:
@@ -203,43 +163,14 @@ def discard_remote(folder: Path, pattern: str = "*.zarr") -> None:
             remote.remove()
 
 
-class _ErrorTranslatingStore(ObjectStore[Any]):
-    """Zarr's store on an object store that raises this project's errors."""
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:  # fmt: skip
-        """See zarr."""
-        with _translate_server_errors(_url_of(self.store)):
-            return await super().get(key, prototype, byte_range)
-
-    async def set(self, key: str, value: Buffer) -> None:
-        """See zarr."""
-        with _translate_server_errors(_url_of(self.store)):
-            await super().set(key, value)
-
-    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """See zarr."""
-        with _translate_server_errors(_url_of(self.store)):
-            await super().set_if_not_exists(key, value)
-
-    async def delete(self, key: str) -> None:
-        """See zarr."""
-        with _translate_server_errors(_url_of(self.store)):
-            await super().delete(key)
-
-
-def _library(part: str = "") -> Any:
-    require_library()
-    return importlib.import_module(LIBRARY + part)
-
-
 @lru_cache(maxsize=8)
-def _opened(url: str) -> _ErrorTranslatingStore:
+def _opened(url: str) -> ErrorTranslatingStore:
     """A client with its connections. Making one takes a tenth of a second, so each process keeps the last few."""
+    from services.core.files.zarr_store import ErrorTranslatingStore
+
     bucket, _, prefix = url.removeprefix("s3://").partition("/")
-    with _translate_server_errors(url):
-        client = _library(".store").S3Store(
+    with translate_server_errors(url):
+        client = library(".store").S3Store(
             bucket,
             prefix=prefix,
             retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=60)},
@@ -247,26 +178,4 @@ def _opened(url: str) -> _ErrorTranslatingStore:
             # it.
             client_options={"connect_timeout": CONNECT_S, "timeout": ANSWER_S, "allow_http": True},
         )
-    return _ErrorTranslatingStore(client)
-
-
-def _url_of(client: Any) -> str:
-    return f"s3://{client.config['bucket']}/{client.prefix}"
-
-
-@contextmanager
-def _translate_server_errors(url: str) -> Iterator[None]:
-    """Replace an error of the server, or of a server that does not answer, by a ``StoreError`` of one sentence.
-
-    Raises:
-        StoreError: in place of any fault of the server; a retried job goes on from what it had stored.
-    """
-    try:
-        yield
-    except (_library(".exceptions").BaseError, FileNotFoundError) as problem:
-        # The library's message reads "<request> <URL> in <time> - <result>", followed by the same in detail.
-        request, _, result = str(problem).partition("Debug source:")[0].partition(" - ")
-        reason = "credentials" if _METADATA_SERVICE.search(request) else result or request
-        kind = next((kind for kind, pattern in _FAULT_PATTERNS.items() if pattern.search(reason)), "silence")
-        what, remedy = _FAULTS[kind]
-        raise StoreError(f"The S3 server of {url} {what}; {remedy}.") from problem
+    return ErrorTranslatingStore(client)
