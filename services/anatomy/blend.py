@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
-from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.anatomy.distance import SignedDistanceGrid
 from services.anatomy.frame import ToothFrame
 from services.anatomy.isosurface import surface_net
 from services.anatomy.templates.dimensions import ToothDimensions
@@ -81,8 +81,8 @@ def dentin_blend_shape(
     outer.require_solid("of the enamel")
     frame = frame or ToothFrame.identity()
     axes = frame.axes
-    grid, surface = SignedDistanceGrid(outer), SurfaceDistance(outer)
-    base = _base(outer, grid, surface, faces)
+    grid = SignedDistanceGrid(outer)
+    base = _base(outer, grid, faces)
     inward = _unit(_smooth(base, grid.inward(base.vertices_mm), 6))
 
     height = crown_height(base.vertices_mm @ axes.T, crown)
@@ -142,7 +142,7 @@ def _side(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(reach * np.sign(across) * np.minimum(np.abs(across) / half_mm, 1) ** 2)
 
 
-def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces: int) -> Mesh:
+def _base(outer: Mesh, grid: SignedDistanceGrid, faces: int) -> Mesh:
     # Extract a surface net at the base's depth, which is closed by construction and evenly spaced, unlike the scan's
     # own triangles moved inward.
     corners = outer.vertices_mm[outer.faces]
@@ -164,7 +164,7 @@ def _base(outer: Mesh, grid: SignedDistanceGrid, surface: SurfaceDistance, faces
     vertices = _smooth(base, base.vertices_mm, 2)
     depth = np.full(len(vertices), BASE_DEPTH_MM)
     for _ in range(5):
-        nearest, distance, _hit = surface.closest(vertices)
+        nearest, distance, _hit = grid.surface.closest(vertices)
         signed = np.where(grid.depth_mm(vertices) > 0, distance, -distance)
         direction = (vertices - nearest) / np.where(np.abs(signed) > 1e-9, signed, 1e-9)[:, None]
         vertices = vertices + (depth - signed)[:, None] * direction

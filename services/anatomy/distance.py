@@ -11,6 +11,8 @@ from services.core.geometry import Mesh
 
 CANDIDATES = 6
 """Number of nearest surface samples whose triangles are tested for the closest point."""
+BLOCK = 8192
+"""Number of points measured at a time, so that intermediate values stay in the processor's cache."""
 
 
 class SurfaceDistance:
@@ -24,7 +26,7 @@ class SurfaceDistance:
     def __init__(self, mesh: Mesh, spacing_mm: float = 0.1) -> None:
         from scipy.spatial import cKDTree
 
-        self.mesh = mesh
+        self.mesh, self._spacing_mm = mesh, spacing_mm
         self._corners = mesh.vertices_mm[mesh.faces]
         samples, self._owner = _sample_triangles(self._corners, spacing_mm)
         self._tree = cKDTree(samples)
@@ -33,16 +35,36 @@ class SurfaceDistance:
         self, points_mm: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Closest surface points (N, 3), unsigned distances (N,) in mm and their faces (N,)."""
+        parts = [self._closest(points_mm[start : start + BLOCK]) for start in range(0, max(len(points_mm), 1), BLOCK)]
+        nearest, distance, faces = (np.concatenate(values) for values in zip(*parts, strict=True))
+        return nearest, distance, faces
+
+    def _closest(
+        self, points_mm: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         from trimesh.triangles import closest_point
 
         _, neighbour = self._tree.query(points_mm, k=CANDIDATES)
         faces = self._owner[neighbour]
-        repeated = np.repeat(points_mm, CANDIDATES, axis=0)
-        on_surface = closest_point(self._corners[faces.reshape(-1)], repeated).reshape(-1, CANDIDATES, 3)
-        squared = ((on_surface - points_mm[:, None]) ** 2).sum(axis=-1)
-        best = squared.argmin(axis=1)
-        row = np.arange(len(points_mm))
-        return on_surface[row, best], np.sqrt(squared[row, best]), faces[row, best]
+        # Near samples often lie in one triangle, which is tested once.
+        first = np.ones(faces.shape, dtype=bool)
+        for k in range(1, CANDIDATES):
+            first[:, k] = (faces[:, :k] != faces[:, k, None]).all(axis=1)
+        tested = points_mm[np.nonzero(first)[0]]
+        on_surface = closest_point(self._corners[faces[first]], tested)
+        squared = np.full(faces.shape, np.inf)
+        squared[first] = ((on_surface - tested) ** 2).sum(axis=-1)
+        row, best = np.arange(len(points_mm)), squared.argmin(axis=1)
+        place = np.cumsum(first).reshape(first.shape) - 1
+        return on_surface[place[row, best]], np.sqrt(squared[row, best]), faces[row, best]
+
+    def smallest_mm(self, points_mm: NDArray[np.float64]) -> float:
+        """Smallest of the distances of points (N, 3), in mm."""
+        # A sample lies within the spacing of each surface point, so that only points whose sample is at most that much
+        # farther than the nearest one can be nearest to the surface.
+        among_few = self._tree.query(points_mm[::16])[0].min()
+        distance = self._tree.query(points_mm, distance_upper_bound=among_few + self._spacing_mm)[0]
+        return float(self.closest(points_mm[distance <= distance.min() + self._spacing_mm])[1].min())
 
 
 class SignedDistanceGrid:
@@ -54,17 +76,25 @@ class SignedDistanceGrid:
         self._low, self._pitch = low, pitch_mm
         axes = [low[k] + pitch_mm * np.arange(shape[k]) for k in range(3)]
         inside = _inside_columns(mesh, axes)
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         # Find exact closest points in a shell around the surface; points farther away inherit the closest point of the
         # nearest shell point (about pitch² / depth too far).
         from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
         shell = binary_dilation(inside, iterations=2) & ~binary_erosion(inside, iterations=2)
-        nearest = np.zeros((*shell.shape, 3))
-        nearest[shell] = SurfaceDistance(mesh).closest(points[shell.reshape(-1)])[0]
+        place = np.nonzero(shell)
+        self.surface = SurfaceDistance(mesh)
+        """Exact distances from the same surface."""
+        nearest = self.surface.closest(np.stack([axes[k][place[k]] for k in range(3)], axis=-1))[0]
+        number = np.zeros(shell.shape, dtype=np.int32)
+        number[place] = np.arange(len(nearest))
         source = distance_transform_edt(~shell, return_distances=False, return_indices=True)
-        distance = np.linalg.norm(points.reshape(*shell.shape, 3) - nearest[tuple(source)], axis=-1)
-        self.depth = np.where(inside, distance, -distance)
+        self.depth = np.empty(shell.shape)
+        for i, x in enumerate(axes[0]):
+            point = nearest[number[tuple(source[:, i])]]
+            squared = (
+                (x - point[..., 0]) ** 2 + (axes[1][:, None] - point[..., 1]) ** 2 + (axes[2] - point[..., 2]) ** 2
+            )
+            self.depth[i] = np.where(inside[i], 1.0, -1.0) * np.sqrt(squared)
 
     @property
     def bounds_mm(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -129,6 +159,6 @@ def _inside_columns(mesh: Mesh, axes: list[NDArray[np.float64]]) -> NDArray[np.b
         v = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
         hit = (area != 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
     height = a[face, 2] + u * (b - a)[face, 2] + v * (c - a)[face, 2]
-    crossings = np.zeros((len(xs), len(ys), len(zs) + 1), dtype=np.int32)
-    np.add.at(crossings, (i[hit], j[hit], np.searchsorted(zs, height[hit])), 1)
-    return np.asarray(np.cumsum(crossings, axis=2)[..., :-1] % 2 == 1)
+    odd = np.zeros((len(xs), len(ys), len(zs) + 1), dtype=bool)
+    np.logical_xor.at(odd, (i[hit], j[hit], np.searchsorted(zs, height[hit])), True)
+    return np.asarray(np.logical_xor.accumulate(odd, axis=2)[..., :-1])

@@ -10,12 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.templates.sections import close_rings, superellipse
 from services.core.geometry import Mesh
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PchipInterpolator
 
 Profile = tuple[NDArray[np.float64], ...]
 
@@ -88,12 +93,15 @@ def cervix_height_mm() -> float:
 def _outer_profile(height_mm: NDArray[np.float64]) -> Profile:
     # Half axes along x and y, and labial offset of the centre line, interpolated monotonically between the measured
     # heights, so that no waist appears.
+    labial, diameter, width = (curve(height_mm) for curve in _curves())
+    return width / 2, diameter / 2, labial - diameter / 2
+
+
+@cache
+def _curves() -> tuple[PchipInterpolator, ...]:
     from scipy.interpolate import PchipInterpolator
 
-    labial, diameter, width = (
-        PchipInterpolator(HEIGHT_MM, values)(height_mm) for values in (LABIAL_MM, LABIOLINGUAL_MM, MESIODISTAL_MM)
-    )
-    return width / 2, diameter / 2, labial - diameter / 2
+    return tuple(PchipInterpolator(HEIGHT_MM, values) for values in (LABIAL_MM, LABIOLINGUAL_MM, MESIODISTAL_MM))
 
 
 def _dentin_profile(height_mm: NDArray[np.float64]) -> Profile:

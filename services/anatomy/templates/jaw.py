@@ -158,7 +158,7 @@ def _quadrant(
                 break
             points = frame.world_from_canonical(facing)
             gap_error_mm = float(
-                -points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.closest(points)[1].min() - GAP_MM
+                -points[:, 0].max() - GAP_MM / 2 if neighbour is None else neighbour.smallest_mm(points) - GAP_MM
             )
             # Move by a little less than the gap, because turning with the arch may bring a corner nearer than the move.
             arc_mm += 0.85 * gap_error_mm

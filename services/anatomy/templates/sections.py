@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,16 +18,21 @@ def superellipse(
     They lie at equal steps of a sum of arc length and turning angle, so that neighbouring rows stay aligned and tight
     bends stay round.
     """
-    angle = np.linspace(0, 2 * np.pi, 64 * columns + 1)
-    radius = (np.abs(np.cos(angle) / half_x_mm) ** exponent + np.abs(np.sin(angle) / half_y_mm) ** exponent) ** (
-        -1 / exponent
-    )
-    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    cosine, sine = _directions(64 * columns + 1)
+    radius = (np.abs(cosine / half_x_mm) ** exponent + np.abs(sine / half_y_mm) ** exponent) ** (-1 / exponent)
+    x, y = radius * cosine, radius * sine
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
     measure = arc / arc[-1] + 0.5 * (heading - heading[0]) / (heading[-1] - heading[0])
     at = np.linspace(measure[0], measure[-1], columns, endpoint=False)
     return np.interp(at, measure, x), np.interp(at, measure, y)
+
+
+@cache
+def _directions(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # Cosines and sines (count,) of a full turn in equal steps.
+    angle = np.linspace(0, 2 * np.pi, count)
+    return np.cos(angle), np.sin(angle)
 
 
 def close_rings(vertices_mm: NDArray[np.float64], rows: int, columns: int) -> Mesh:

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
+from services.anatomy.distance import SignedDistanceGrid
 from services.core.geometry import Mesh
 
 WIDTHS_PER_SCALE = 8.0
@@ -54,7 +54,7 @@ class MixedBorder:
         near = np.abs(distance) < margin
         axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, self._shape, strict=True)]
         points = np.stack([axis[index] for axis, index in zip(axes, np.nonzero(near), strict=True)], axis=-1)
-        nearest, length, face = SurfaceDistance(dentin).closest(points)
+        nearest, length, face = grid.surface.closest(points)
         distance[near] = np.copysign(length, distance[near])
         self._distance = _texture(distance)
         self._motion = []
