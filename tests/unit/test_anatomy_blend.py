@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 import pytest
 import trimesh
@@ -14,12 +17,12 @@ from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
 from services.anatomy.frame import ToothFrame, estimate_frame
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.incisor import build_incisor
-from services.anatomy.templates.jaw import build_jaw
 from services.core.errors import MeshError
 from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
+from tests.support.phantom_bodies import phantom_jaw
 from tests.support.shared_data import shared_path
 
 GRID_ERROR_MM = 0.02
@@ -46,21 +49,27 @@ class Case:
     def __init__(self, outer: Mesh, frame: ToothFrame) -> None:
         self.outer, self.frame = outer, frame
         self.shape: DentinShape = dentin_blend_shape(outer, frame)
-        self.grid = SignedDistanceGrid(outer, 0.1)
+        # In the canonical frame the tooth's box is smallest.
+        self.grid = SignedDistanceGrid(Mesh(frame.canonical_from_world(outer.vertices_mm), outer.faces), 0.1, 0.3)
 
     def smallest_depth_mm(self, weights: tuple[float, ...]) -> float:
-        vertices = self.shape.vertices_mm(weights)
+        vertices = self.frame.canonical_from_world(self.shape.vertices_mm(weights))
         return float(self.grid.depth_mm(np.concatenate([vertices, vertices[self.shape.base.faces].mean(axis=1)])).min())
+
+
+@cache
+def made(make: Callable[[], tuple[Mesh, ToothFrame]]) -> Case:
+    return Case(*make())
 
 
 @pytest.fixture(scope="module", params=[procedural, scanned_incisor, scanned_crown], ids=lambda make: make.__name__)
 def case(request: pytest.FixtureRequest) -> Case:
-    return Case(*request.param())
+    return made(request.param)
 
 
 def test_base_is_a_solid_a_tenth_of_a_millimetre_inside(case: Case) -> None:
     case.shape.base.require_solid("base")
-    depth = SurfaceDistance(case.outer).closest(case.shape.base.vertices_mm)[1]
+    depth = case.grid.surface.closest(case.frame.canonical_from_world(case.shape.base.vertices_mm))[1]
     assert np.median(depth) == pytest.approx(BASE_DEPTH_MM, abs=1e-3)
     assert depth.min() >= BASE_DEPTH_MM - 1e-3
     # Only corners of concave creases are deeper.
@@ -94,7 +103,7 @@ def test_each_mode_moves_along_its_axis_and_thickens_enamel(case: Case) -> None:
     assert volumes == sorted(volumes, reverse=True)
 
 
-@pytest.mark.parametrize("fdi", [13, 16, 36, 45])
+@pytest.mark.parametrize("fdi", [13, 36])
 def test_other_teeth_of_a_scan_have_a_blend_shape_too(fdi: int) -> None:
     tooth = Case(
         read_mesh(shared_path(f"data/intraoral-photos/ref_mesh/Ref_Mesh_Tag=0_FDI={fdi}.obj")), ToothFrame.identity()
@@ -123,29 +132,28 @@ def test_weights_make_enamel_thicken_with_the_root_of_height() -> None:
     np.testing.assert_allclose(shape.modes_mm[:, height < -0.1], 0, atol=GRID_ERROR_MM)
 
 
-@pytest.mark.parametrize("fdi", [11, 13, 14, 16])
-def test_some_weights_are_near_the_dentin_of_other_makers(fdi: int) -> None:
-    # The phantom's dentin does not come from this family. Bound: the 0.15 mm that a fit is to reach on average on this
-    # half of the crown.
-    tooth = build_jaw(1).tooth(fdi)
+@pytest.mark.parametrize(
+    ("fdi", "weights"),
+    [(11, (0.55, 0.55, 1.0)), (13, (0.55, 0.55, 0.55)), (14, (0.55, 0.55, 0.55)), (16, (0.55, 0.55, 0.55))],
+)
+def test_some_weights_are_near_the_dentin_of_other_makers(fdi: int, weights: tuple[float, float, float]) -> None:
+    # The phantom's dentin does not come from this family; these are the nearest of 64 combinations of weights. Bound:
+    # the 0.15 mm that a fit is to reach on average on this half of the crown.
+    tooth = phantom_jaw(1).tooth(fdi)
     shape = dentin_blend_shape(tooth.outer, tooth.frame, crown=upper_tooth(fdi % 10))
     height = tooth.outer.vertices_mm @ tooth.frame.axes[2]
     points = tooth.outer.vertices_mm[height > height.max() - upper_tooth(fdi % 10).crown_length_mm / 2][::7]
     true = SurfaceDistance(tooth.dentin).closest(points)[1]
-    grid = np.stack(np.meshgrid(*[(0.3, 0.55, 0.8, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    errors = [
-        np.abs(SurfaceDistance(Mesh(shape.vertices_mm(tuple(c)), shape.base.faces)).closest(points)[1] - true).mean()
-        for c in grid
-    ]
-    assert min(errors) < 0.15
+    found = SurfaceDistance(Mesh(shape.vertices_mm(weights), shape.base.faces)).closest(points)[1]
+    assert np.abs(found - true).mean() < 0.15
 
 
 def test_building_is_deterministic_and_of_the_size_asked_for() -> None:
     outer, _ = procedural()
-    coarse, again, fine = (dentin_blend_shape(outer, faces=faces) for faces in (2000, 2000, 8000))
-    assert np.array_equal(coarse.modes_mm, again.modes_mm)
+    coarse, again, first = dentin_blend_shape(outer, faces=2000), dentin_blend_shape(outer), made(procedural).shape
+    assert np.array_equal(first.modes_mm, again.modes_mm)
     assert 1500 < len(coarse.base.faces) < 2500
-    assert 6000 < len(fine.base.faces) < 10000
+    assert 3000 < len(first.base.faces) < 5000
 
 
 def test_a_shell_without_room_for_dentin_is_refused() -> None:
