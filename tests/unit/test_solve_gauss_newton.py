@@ -68,9 +68,9 @@ def _random_problem(rng: np.random.Generator) -> tuple[Quadratic, Domain, np.nda
     return Quadratic((basis * spectrum) @ basis.T, best), domain, start
 
 
-def test_thousand_ill_conditioned_or_indefinite_systems_never_worsen() -> None:
+def test_ill_conditioned_or_indefinite_systems_never_worsen() -> None:
     rng, improved = np.random.default_rng(1), 0
-    for case in range(1000):
+    for case in range(250):
         problem, domain, x = _random_problem(rng)
         problem.seed = case
         size = float(np.abs(problem.a).max())
@@ -86,15 +86,15 @@ def test_thousand_ill_conditioned_or_indefinite_systems_never_worsen() -> None:
             # The comparison is exact here, so the rule must hold exactly.
             assert problem.loss(state.x) <= before
         improved += problem.loss(state.x) < first
-    assert improved > 500
+    assert improved > 125
 
 
 def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
     # A flat problem: every accepted step is a false alarm. At z = 3 each of at most 3 comparisons a step passes with
-    # 1.35e-3; 500 systems x 5 steps x 3 comparisons give at most 10 on average, and more than 22 with probability 1e-3
+    # 1.35e-3; 200 systems x 5 steps x 3 comparisons give at most 4 on average, and more than 11 with probability 1e-3
     # (Poisson).
     accepted = 0
-    for case in range(500):
+    for case in range(200):
         problem = Quadratic(
             np.zeros((4, 4)), np.zeros(4), gradient_noise=1.0, hessian_noise=1.0, loss_noise=1.0, seed=case
         )
@@ -106,17 +106,17 @@ def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
             state = solver.step(problem, state)
             assert np.isfinite(state.x).all()
         accepted += state.accepted
-    assert accepted <= 22
+    assert accepted <= 11
 
 
-def test_thousand_noisy_systems_take_worse_steps_no_more_often_than_stated() -> None:
+def test_noisy_systems_take_worse_steps_no_more_often_than_stated() -> None:
     # One third each ill-conditioned, indefinite and nothing but noise, and the comparison itself is noisy. A step that
     # is taken although it is worse is a false alarm at z = 3: at most 1.35e-3 of all comparisons. Their number is
     # Poisson distributed; four standard deviations and one above its mean is one case in 10,000. The last step, to the
     # minimum of all that is known, is refused only when it is surely worse, so it may lose as much as the comparison
     # cannot detect: with 3 standard errors to refuse and one case in 150,000 to be missed, 7.5 of them.
     rng, worse, compared = np.random.default_rng(5), 0, 0
-    for case in range(1000):
+    for case in range(300):
         problem, domain, x = _random_problem(rng)
         if case % 3 == 1:
             problem.a = problem.a - 0.3 * float(np.abs(problem.a).max()) * np.eye(len(x))

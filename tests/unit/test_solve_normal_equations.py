@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,13 @@ ROUNDS = 3000
 MEASUREMENTS, LIGHTS = 160, 4
 
 
-def _noisy(rng: np.random.Generator) -> tuple[NormalEquations, ...]:
+@lru_cache(maxsize=1)
+def _many() -> tuple[NormalEquations, ...]:
+    # Draws at which several tests look.
+    return _noisy(np.random.default_rng(1), ROUNDS)
+
+
+def _noisy(rng: np.random.Generator, count: int) -> tuple[NormalEquations, ...]:
     # Lights of a pixel share half of the variance of their noise, like lights of one walk.
     j, r, weight = _problem()
     reference = np.full(MEASUREMENTS, 0.05)
@@ -25,7 +33,7 @@ def _noisy(rng: np.random.Generator) -> tuple[NormalEquations, ...]:
         r1, r2 = (r + np.sqrt(0.6) * noise() for _ in range(2))
         return normal_equations(j1, j2, r1, r2, reference, weight, LIGHTS)
 
-    return tuple(draw() for _ in range(ROUNDS))
+    return tuple(draw() for _ in range(count))
 
 
 def _problem() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -35,7 +43,7 @@ def _problem() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_sums_are_unbiased_and_their_errors_true() -> None:
     j, r, weight = _problem()
-    many = _noisy(np.random.default_rng(1))
+    many = _many()
     gradients = np.array([e.gradient for e in many])
     hessians = np.array([e.hessian for e in many])
 
@@ -59,7 +67,7 @@ def test_sums_are_unbiased_and_their_errors_true() -> None:
 
 def test_data_noise_is_unbiased() -> None:
     j, _, weight = _problem()
-    many = _noisy(np.random.default_rng(4))
+    many = _many()
     sample = np.array([e.data_noise for e in many])
     exact = (weight**2 * 0.05 * j) @ j.T
     z = (sample.mean(axis=0) - exact) / (sample.std(axis=0) / np.sqrt(ROUNDS))
@@ -110,7 +118,7 @@ def test_a_cell_without_weight_counts_for_nothing() -> None:
 
 
 def test_pooling_averages_monte_carlo_noise_but_not_the_data() -> None:
-    first, second = _noisy(np.random.default_rng(9))[:2]
+    first, second = _noisy(np.random.default_rng(9), 2)
     both = pool(first, 64, second, 64)
     np.testing.assert_allclose(both.gradient, 0.5 * (first.gradient + second.gradient))
     np.testing.assert_allclose(both.gradient_noise, 0.25 * (first.gradient_noise + second.gradient_noise))
@@ -118,7 +126,7 @@ def test_pooling_averages_monte_carlo_noise_but_not_the_data() -> None:
 
 
 def test_moving_the_model_keeps_its_predictions() -> None:
-    equations = _noisy(np.random.default_rng(11))[0]
+    (equations,) = _noisy(np.random.default_rng(11), 1)
     step, further = np.array([0.3, -0.2, 0.1]), np.array([-0.1, 0.4, 0.2])
     moved = equations.moved(step)
 

@@ -221,13 +221,17 @@ def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors
 
 def _between_variance(values: Array, noise: Array) -> float:
     # Root tau^2 of sum values^2 / (tau^2 + noise) = count, which falls with tau^2, by bisection.
+    squares = values**2
+
     def excess(between: float) -> float:
-        return float((values**2 / (between + noise)).sum()) - values.size
+        return float((squares / (between + noise)).sum()) - values.size
 
     if excess(0.0) <= 0:
         return 0.0
-    low, high = 0.0, float((values**2).max()) * values.size
+    low, high = 0.0, float(squares.max()) * values.size
     for _ in range(100):
         middle = 0.5 * (low + high)
+        if middle in {low, high}:
+            break
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
     return 0.5 * (low + high)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+@lru_cache(maxsize=64)
 def pairs_of(count: int, exact: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices a and b (P,) of the noisy entries H_ab: pairs of the noisy coordinates, then each of them with every
     exact one.
@@ -29,7 +31,10 @@ def pairs_of(count: int, exact: int) -> tuple[NDArray[np.intp], NDArray[np.intp]
     """
     first, second = np.triu_indices(count)
     noisy, known = np.divmod(np.arange(count * exact), max(exact, 1))
-    return np.concatenate([first, noisy]), np.concatenate([second, count + known])
+    pairs = np.concatenate([first, noisy]), np.concatenate([second, count + known])
+    for indices in pairs:
+        indices.flags.writeable = False
+    return pairs
 
 
 @dataclass(frozen=True)
@@ -161,7 +166,7 @@ def curvature_noise(
         exact: further coordinates, whose derivatives have no noise.
     """
     m, d = mean[list(coordinates)], difference[list(coordinates)]
-    first, second = np.triu_indices(len(m))
+    first, second = pairs_of(len(m), 0)
     entries = per_pixel(0.5 * (m[first] * d[second] + d[first] * m[second]) * weight, lights)
     if len(exact):
         # One noisy coordinate at a time, to save memory: a capture may have a gain for each of hundreds of lights.

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -57,7 +58,8 @@ def solve_ball(hessian: Array, gradient: Array, radius: float, curvature_floor: 
     # Find one damping for all directions by bisection on the length of the step, which falls monotonically with the
     # damping.
     def length(damping: float) -> float:
-        return float(np.linalg.norm(slope / (curvature + damping)))
+        damped = slope / (curvature + damping)
+        return math.sqrt(damped @ damped)
 
     if length(0.0) <= radius:
         return np.asarray(-vectors @ (slope / curvature))
