@@ -6,7 +6,7 @@ everywhere in the cell: a flight shorter than that meets nothing, exactly and no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -23,6 +23,8 @@ MAX_CELLS = 6_000_000
 """Largest number of grid cells; larger scenes have larger cells."""
 SPACING_PER_CELL = 0.3
 """Largest distance from any surface point to the nearest sample of its surface, over the size of a cell."""
+SAMPLES_AT_A_TIME = 1 << 15
+"""Number of samples of surfaces made at a time, so that they stay in the processor's cache."""
 REBUILD_MM = 0.1
 """Largest motion of a border in mm that only lowers the bound; after a larger one the distance is measured again."""
 MARGIN_MM = 1.5
@@ -32,20 +34,22 @@ surfaces; all other places are taken to be just as far away."""
 
 def surface_samples(
     vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], spacing_mm: float
-) -> NDArray[np.float64]:
-    """Sample points (S, 3) on every triangle, such that no surface point is farther than the spacing from the nearest
-    sample.
+) -> Iterator[NDArray[np.float64]]:
+    """Sample points (S, 3) on every triangle, some triangles at a time, such that no surface point is farther than the
+    spacing from the nearest sample.
     """
     corners = vertices_mm[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     # A sub-triangle of edge e has no point farther than e / sqrt(3) from its nearest corner.
     parts = np.maximum(1, np.ceil(longest / (np.sqrt(3) * spacing_mm)).astype(int))
-    points = [vertices_mm]
+    yield vertices_mm
     for count in np.unique(parts[parts > 1]):
         i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
         weights = np.stack([i, j, count - i - j], axis=-1)[i + j <= count] / count
-        points.append(np.einsum("wk,tkd->twd", weights, corners[parts == count]).reshape(-1, 3))
-    return np.concatenate(points)
+        chosen = corners[parts == count]
+        step = max(1, SAMPLES_AT_A_TIME // len(weights))
+        for first in range(0, len(chosen), step):
+            yield np.einsum("wk,tkd->twd", weights, chosen[first : first + step]).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -115,16 +119,23 @@ class Clearance:
         first = np.array([one.start for one in window])
         empty = np.ones([max(one.stop - one.start, 0) for one in window], dtype=bool)
         spacing = SPACING_PER_CELL * self._cell_mm
-        cells = (
-            np.floor((surface_samples(vertices_mm, faces, spacing) - self._corner) / self._cell_mm).astype(int) - first
-        )
-        kept = ((cells >= 0) & (cells < empty.shape)).all(axis=1)
-        empty[tuple(cells[kept].T)] = False
+        for samples in surface_samples(vertices_mm, faces, spacing):
+            cells = np.floor((samples - self._corner) / self._cell_mm).astype(int) - first
+            kept = ((cells >= 0) & (cells < empty.shape)).all(axis=1)
+            empty[tuple(cells[kept].T)] = False
         if empty.all():
             return np.zeros(empty.shape)
         # The transform measures from cell centre to cell centre; a sample may sit in its cell's corner.
-        between_centres = ndimage.distance_transform_edt(empty, sampling=self._cell_mm)
-        return np.asarray(between_centres - np.sqrt(3) / 2 * self._cell_mm - spacing)
+        nearest = ndimage.distance_transform_edt(
+            empty, sampling=self._cell_mm, return_distances=False, return_indices=True
+        )
+        bound = np.empty(empty.shape)
+        _, y, z = np.ogrid[tuple(slice(count) for count in empty.shape)]
+        for x, (layer, there) in enumerate(zip(bound, np.moveaxis(nearest, 1, 0), strict=True)):
+            steps_mm = [self._cell_mm * (to - here) for to, here in zip(there, (x, y[0], z[0]), strict=True)]
+            between_centres = np.sqrt(steps_mm[0] ** 2 + steps_mm[1] ** 2 + steps_mm[2] ** 2)
+            layer[:] = between_centres - np.sqrt(3) / 2 * self._cell_mm - spacing
+        return bound
 
     def _upload(self, bound: NDArray[np.float64]) -> None:
         self._table = mi.Float(bound.reshape(-1).astype(np.float32))
