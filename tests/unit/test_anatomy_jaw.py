@@ -22,6 +22,7 @@ from services.fit.transport.engine import Engine
 from services.fit.transport.scene.nesting import require_nested
 from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 from services.phantom.dome_rig import dome_cameras, dome_lights
+from tests.support.phantom_bodies import phantom_jaw
 from tests.support.shared_data import shared_path
 
 FDI = (17, 16, 15, 14, 13, 12, 11, 21, 22, 23, 24, 25, 26, 27)
@@ -31,12 +32,12 @@ DIMENSIONS_REL = 0.03
 
 @pytest.fixture(scope="module")
 def average() -> Jaw:
-    return build_jaw()
+    return phantom_jaw(None)
 
 
 @pytest.fixture(scope="module")
 def subject() -> Jaw:
-    return build_jaw(SUBJECT)
+    return phantom_jaw(SUBJECT)
 
 
 @pytest.fixture(params=["average", "subject"])
@@ -185,7 +186,10 @@ def test_neighbours_all_but_touch_and_never_overlap(subject: Jaw) -> None:
     surfaces = [SurfaceDistance(tooth.outer) for tooth in subject.teeth]
     for (one, one_surface), (other, other_surface) in pairwise(zip(subject.teeth, surfaces, strict=True)):
         for still, near in ((one_surface, other), (other_surface, one)):
-            deepest = depth_mm(still, near.outer.vertices_mm).max()
+            # Only vertices within a millimetre of the other tooth's box can be the nearest.
+            box, points = still.mesh.vertices_mm, near.outer.vertices_mm
+            within = ((points > box.min(axis=0) - 1) & (points < box.max(axis=0) + 1)).all(axis=1)
+            deepest = depth_mm(still, points[within]).max()
             assert abs(deepest + GAP_MM) < 0.005 + 0.008 + 0.05 * GAP_MM, (one.fdi, other.fdi)
 
 
@@ -198,12 +202,12 @@ def test_the_average_is_symmetric(average: Jaw) -> None:
     # The gums' surface is symmetric, its vertices are not: a mirrored vertex is off the surface by at most what its
     # faces cut off from bends of 0.6 mm radius.
     points = mirror * average.gums.vertices_mm[::7]
-    assert SurfaceDistance(average.gums).closest(points)[1].max() < 0.6**2 / (8 * 0.6)
+    assert SurfaceDistance(average.gums, 0.2).closest(points)[1].max() < 0.6**2 / (8 * 0.6)
 
 
-def test_gums_hold_the_roots_and_leave_the_crowns_free(jaw: Jaw) -> None:
-    gums = SurfaceDistance(jaw.gums, 0.3)
-    for tooth in jaw.teeth:
+def test_gums_hold_the_roots_and_leave_the_crowns_free(subject: Jaw) -> None:
+    gums = SurfaceDistance(subject.gums, 0.3)
+    for tooth in subject.teeth:
         height = heights_mm(tooth, tooth.outer)
         assert depth_mm(gums, tooth.outer.vertices_mm[height < -0.1]).min() > 0, tooth.fdi
         # Papillae between front teeth cover about an eighth of the crown's vertices.
@@ -253,7 +257,7 @@ def test_average_teeth_stand_upright_with_the_front_on_the_occlusal_plane(averag
 
 
 def test_a_seed_repeats_and_seeds_differ(subject: Jaw, average: Jaw) -> None:
-    again, other = build_jaw(SUBJECT), build_jaw(SUBJECT + 1)
+    again, other = build_jaw(SUBJECT), phantom_jaw(SUBJECT + 1)
     for one, same, different in zip(subject.teeth, again.teeth, other.teeth, strict=True):
         np.testing.assert_array_equal(one.outer.vertices_mm, same.outer.vertices_mm)
         np.testing.assert_array_equal(one.dentin.vertices_mm, same.dentin.vertices_mm)
@@ -269,7 +273,9 @@ def test_a_seed_repeats_and_seeds_differ(subject: Jaw, average: Jaw) -> None:
         assert 0.01 < np.ptp(change) < 0.15
 
 
-def test_the_engine_takes_the_whole_jaw(subject: Jaw) -> None:
+def test_the_engine_takes_the_whole_jaw(subject: Jaw, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A coarse grid of clearances is soon measured, and changes no image.
+    monkeypatch.setattr("services.fit.transport.scene.clearance.MAX_CELLS", 300_000)
     lights = dome_lights(3, ("green",), seed=1)
     teeth = tuple(ToothSurfaces(t.outer, DentinShape.known(t.dentin)) for t in subject.teeth)
     recipe = SceneRecipe(

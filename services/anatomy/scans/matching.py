@@ -8,12 +8,13 @@ free within limits.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.templates.average_arch import side_of_front
-from services.anatomy.templates.crown import build_tooth
+from services.anatomy.templates.crown import ToothSolid, build_tooth
 from services.anatomy.templates.dimensions import upper_tooth
 from services.core.geometry import Mesh
 
@@ -79,7 +80,7 @@ class CrownMatch:
         """
         from scipy.spatial import cKDTree
 
-        average = build_tooth(upper_tooth(fdi % 10))
+        average = _average_tooth(fdi % 10)
         crown = average.outer.faces[
             average.outer.vertices_mm[average.outer.faces].mean(axis=1)[:, 2] > average.cervix_mm
         ]
@@ -90,7 +91,10 @@ class CrownMatch:
             average.outer.vertices_mm[crown].min(axis=(0, 1)) + average.outer.vertices_mm[crown].max(axis=(0, 1))
         ) / 2
         self._mesh, self._average = _sampled(outer, MESH_POINTS), self._crown_points(CROWN_POINTS)
-        self._mesh_tree, self._average_tree = cKDTree(self._mesh.features), cKDTree(self._average.features)
+        # Leaves of some thirty points are fastest in six dimensions.
+        self._mesh_tree, self._average_tree = (
+            cKDTree(surface.features, leafsize=32) for surface in (self._mesh, self._average)
+        )
 
     @property
     def half_size_mm(self) -> Array:
@@ -138,12 +142,12 @@ class CrownMatch:
         return Placements(axes, top_mm - np.ptp(crown_mm[:, 2]) / 2 * axes[:, 2], ones, ones)
 
     def _initial_placements(self, axes: Array, crown_mm: Array) -> Placements:
-        along = np.einsum("gkj,nj->gkn", axes, self._mesh.points_mm)
-        length, top = float(np.ptp(crown_mm[:, 2])), along[:, 2].max(axis=1)
-        within = (along[:, 2] > (top - length)[:, None])[:, None]
-        low, high = np.where(within, along, np.inf).min(axis=2), np.where(within, along, -np.inf).max(axis=2)
-        middle = (low + high) / 2
-        middle[:, 2] = top - length / 2
+        length, middle = float(np.ptp(crown_mm[:, 2])), np.empty((len(axes), 3))
+        for g, own in enumerate(axes):
+            along = np.einsum("kj,nj->kn", own, self._mesh.points_mm)
+            top = along[2].max()
+            within = along[:2, along[2] > top - length]
+            middle[g] = [*(within.min(axis=1) + within.max(axis=1)) / 2, top - length / 2]
         ones = np.ones(len(axes))
         return Placements(axes, np.einsum("gkj,gk->gj", axes, middle), ones, ones)
 
@@ -173,6 +177,12 @@ class CrownMatch:
         return Placements(
             axes, to_middle - scales[:, None] * np.einsum("gkj,gk->gj", axes, from_middle), scales, placed.misfits_mm
         )
+
+
+@cache
+def _average_tooth(position: int) -> ToothSolid:
+    # At most eight teeth, which do not change.
+    return build_tooth(upper_tooth(position))
 
 
 def _sampled(mesh: Mesh, count: int) -> SurfacePoints:
