@@ -176,8 +176,13 @@ def fitted(tmp_path: Path) -> Fitted:
 
 @pytest.mark.parametrize(
     ("name", "parts", "effort"),
-    # Light from the largest spheres is hard to separate from light that was not scattered, which needs more paths.
-    [("hg", {4: 0.3, 10: 0.9}, 0.02), ("mie", {45: 1.2}, 0.1), ("table", {0: 0.2, 1: 0.4, 2: 0.6}, 0.02)],
+    [
+        # Slow: the fit goes the way of a table's, whose atoms are phase functions of Henyey and Greenstein too.
+        pytest.param("hg", {4: 0.3, 10: 0.9}, 0.02, marks=pytest.mark.slow),
+        # Light from the largest spheres is hard to separate from light that was not scattered, which needs more paths.
+        ("mie", {45: 1.2}, 0.1),
+        ("table", {0: 0.2, 1: 0.4, 2: 0.6}, 0.02),
+    ],
 )
 def test_a_mix_of_a_dictionary_is_found(
     name: str,

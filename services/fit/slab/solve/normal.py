@@ -199,16 +199,14 @@ def normal_equations(
         term = (jacobian.T @ total - 2 * own_product + whole.T @ residual) / others
         return jacobian.T @ jacobian, scattered.T @ scattered, own_product, term
 
-    squares, data_squares, own_products, terms = (
-        np.stack(one) for one in zip(*each(products_of, range(count)), strict=True)
-    )
-    own = np.stack([squares[:middle].sum(axis=0), squares[middle:].sum(axis=0)])
-    own_data = data_squares.sum(axis=0)
+    squares, data_squares, own_products, each_term = zip(*each(products_of, range(count)), strict=True)
+    own, own_data = np.stack([_summed(squares[:middle]), _summed(squares[middle:])]), _summed(data_squares)
+    terms = np.stack(each_term)
     present = DerivativeSums(halves, own, (middle, count - middle))
     every = present if earlier is None else earlier + present
     matrix = every.matrix()
     place = np.append(np.log(material.scattering), material.absorption_per_mm)
-    sums = ResidualSums(total, own_products.sum(axis=0), count, place)
+    sums = ResidualSums(total, _summed(own_products), count, place)
     sums = sums if nearby is None else sums + nearby
     gradient = (whole.T @ sums.total - sums.products) / (sums.count * others)
     # The gradient is a U-statistic of batches: its variance is that of a batch's part, twice the mean over its pairs.
