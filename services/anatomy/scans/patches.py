@@ -20,8 +20,10 @@ def neighbours(faces: Faces) -> NDArray[np.int64]:
     count = int(faces.max()) + 1
     start, end = faces.astype(np.int64).reshape(-1), np.roll(faces, -1, axis=1).astype(np.int64).reshape(-1)
     key, twin = start * count + end, end * count + start
-    order = np.argsort(key)
-    found = np.minimum(np.searchsorted(key[order], twin), len(key) - 1)
+    # Keys that are looked up in their order are found soonest.
+    order, asked = np.argsort(key), np.argsort(twin)
+    found = np.empty_like(order)
+    found[asked] = np.minimum(np.searchsorted(key[order], twin[asked]), len(key) - 1)
     return np.where(key[order][found] == twin, order[found] // 3, -1).reshape(-1, 3)
 
 
@@ -190,8 +192,6 @@ def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Me
 
     A vertex is not moved if a face about it would fold or nearly vanish.
     """
-    from services.anatomy.distance import SurfaceDistance
-
     # Move each vertex on an edge between labels towards the mean of its neighbours along these edges, except where a
     # line ends at the scan's rim.
     across = neighbours(mesh.faces)
@@ -205,7 +205,8 @@ def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Me
             [np.bincount(start, weights=vertices[end, axis], minlength=len(vertices)) for axis in range(3)], axis=-1
         )
         vertices[moving] = (vertices[moving] + total[moving] / degree[moving, None]) / 2
-    vertices[moving] = SurfaceDistance(mesh).closest(vertices[moving])[0]
+    if len(moving):
+        vertices[moving] = _back_on_surface(mesh, mesh.vertices_mm[moving], vertices[moving])
 
     normals, area = _crosses(mesh), 2 * areas_mm2(mesh)
     for _ in range(20):
@@ -217,6 +218,21 @@ def smooth_borders(mesh: Mesh, labels: NDArray[np.int64], rounds: int = 6) -> Me
             break
         vertices[mesh.faces[bad]] = mesh.vertices_mm[mesh.faces[bad]]
     return Mesh(vertices, mesh.faces)
+
+
+def _back_on_surface(mesh: Mesh, before_mm: NDArray[np.float64], moved_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Points (N, 3) of the surface nearest to points that were on it before they moved. None is farther from it than it
+    # moved, so that faces whose corners are all farther than this and an edge need no search.
+    from scipy.spatial import cKDTree
+
+    from services.anatomy.distance import SurfaceDistance
+
+    corners = mesh.vertices_mm[mesh.faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
+    farthest = np.linalg.norm(moved_mm - before_mm, axis=1).max()
+    apart = cKDTree(moved_mm).query(mesh.vertices_mm)[0][mesh.faces].min(axis=1)
+    near = Mesh(mesh.vertices_mm, mesh.faces[apart <= farthest + longest])
+    return SurfaceDistance(near).closest(moved_mm)[0]
 
 
 def _crosses(mesh: Mesh) -> NDArray[np.float64]:
