@@ -133,7 +133,7 @@ def test_photographs_that_were_exchanged_are_named(tmp_path: Path) -> None:
         return first, replace(second, reference=second.reference[order], variance=second.variance[order])
 
     with patch("services.fit.tooth.driver.read_channel", exchanged):
-        spec = JobSpec.model_validate(OPTIONS | {"capture": tmp_path, "max_steps": 3})
+        spec = JobSpec.model_validate(OPTIONS | {"capture": tmp_path, "max_steps": 2})
         report = run(spec, LocalContext(tmp_path), engine=ENGINE)
     assert "The photographs of camera c1 under lights l0 and l2 seem exchanged" in report.advice
     assert not report.converged
@@ -149,7 +149,7 @@ def test_a_stated_calibration_takes_the_place_of_what_is_assumed(tmp_path: Path)
     stored["record"]["uncertainty"] = stated
     assert PreparedManifest.model_validate(stored["record"]).uncertainty is not None
     manifest.write_text(json.dumps(stored))
-    spec = JobSpec.model_validate(OPTIONS | {"capture": tmp_path})
+    spec = JobSpec.model_validate(OPTIONS | {"capture": tmp_path, "max_steps": 1})
     report = run(spec, LocalContext(tmp_path), engine=ENGINE)
     assert report.assumed == ()
     assert report.instrument_told == ()
