@@ -77,7 +77,7 @@ def test_errors_of_a_rig_are_as_large_as_its_covariance_says() -> None:
 
 def test_bad_corners_are_named_and_do_no_harm() -> None:
     random = np.random.default_rng(3)
-    rig = true_rig(random)
+    rig = true_rig(random, n_places=6)
     views = photographed(rig, 0.1, random)
     bad = views[4].pixels.copy()
     bad[[2, 7]] += [[3.0, -2.0], [0.0, 9.0]]
@@ -86,6 +86,7 @@ def test_bad_corners_are_named_and_do_no_harm() -> None:
     wrong = np.flatnonzero(~fit.inliers)
     assert fit.corners.view[wrong].tolist() == [4, 4]
     assert (wrong - np.flatnonzero(fit.corners.view == 4)[0]).tolist() == [2, 7]
+    # Some 1,700 coordinates less 78 parameters: a standard error of 1.8 %.
     assert fit.sigma_px == pytest.approx(0.1, rel=0.05)
 
 
@@ -112,7 +113,10 @@ def test_what_a_lens_draws_wrong_is_as_large_as_its_uncertainty_says() -> None:
     assert 0.75 < np.sqrt(np.mean(np.square(ratios))) < 1.65
 
 
-@pytest.mark.parametrize(("camera", "rms_px"), [(0, 0.34), (1, 0.50), (2, 0.82), (3, 0.36)])
+# The third camera's boards hardly determine its lens, so that its fit takes four seconds.
+@pytest.mark.parametrize(
+    ("camera", "rms_px"), [(0, 0.34), (1, 0.50), pytest.param(2, 0.82, marks=pytest.mark.slow), (3, 0.36)]
+)
 def test_single_cameras_of_a_recording_reach_its_errors(camera: int, rms_px: float) -> None:
     folder = shared_path("data/charuco-rig") / "intrinsic"
     views = table_views(folder / CORNERS_OF_A_RECORDING.format("intrinsic"))

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibrate.cameras.bundle import Rig, pose_apply
+from services.calibrate.cameras.bundle import Rig
 from services.calibrate.cameras.lens import HALF_PIXEL, MODELS, Lens
 from services.calibrate.cameras.rotations import pose_matrix, pose_vector
 from services.calibrate.cameras.sightings import View
@@ -175,14 +175,13 @@ def _best(candidates: Sequence[tuple[View, Lens, list[Floats]]]) -> int:
         candidates: for each view, its lens and the proposed poses camera_from_board (4, 4), in the same order for all
             views.
     """
-    distances_px = [
-        [
-            np.linalg.norm(lens.project(pose_apply(pose_vector(pose), view.corners_mm)) - view.pixels, axis=1)
-            for pose in proposed
-        ]
-        for view, lens, proposed in candidates
-    ]
-    return int(np.argmin([np.median(np.concatenate(own)) for own in zip(*distances_px, strict=True)]))
+    distances_px = []
+    for view, lens, proposed in candidates:
+        poses = np.stack(proposed)
+        points = np.einsum("pij,nj->pni", poses[:, :3, :3], view.corners_mm) + poses[:, None, :3, 3]
+        drawn = lens.project(points.reshape(-1, 3)).reshape(len(poses), -1, 2)
+        distances_px.append(np.linalg.norm(drawn - view.pixels, axis=2))
+    return int(np.argmin(np.median(np.concatenate(distances_px, axis=1), axis=1)))
 
 
 def _spans_a_plane(corners_mm: Floats) -> bool:
