@@ -72,13 +72,13 @@ def test_the_stated_error_is_the_scatter_over_draws_of_noise(noise: float, sprea
 
 
 def test_few_are_accused_in_place_and_most_are_found_a_millimetre_beside() -> None:
-    """40 balls each, with noise of 1 to 10 % of the brightest pixel, half of it understated.
+    """20 balls each, with noise of 1 to 10 % of the brightest pixel, half of it understated.
 
     By the benchmark's limits the check may report 2 of 100 balls that are in place and miss 5 of 100 that are not; of
-    40 balls with fixed seeds, 1 and 2.
+    20 balls with fixed seeds, none and 1.
     """
     accused = found = 0
-    for number in range(40):
+    for number in range(20):
         rng = np.random.default_rng([3, number])
         angle, noise = rng.uniform(0, 2 * np.pi), rng.uniform(0.01, 0.1)
         stated = 0.01 if number % 2 else None
@@ -88,8 +88,8 @@ def test_few_are_accused_in_place_and_most_are_found_a_millimetre_beside() -> No
             images = [compared(render, photo, noise, rng, stated, spread=0.05) for render, photo in pairs]
             told = reported_offset("c0", images, pixels(pairs[0][0]), PIXEL_MM) is not None
             accused, found = (accused + told, found) if offset_px == (0.0, 0.0) else (accused, found + told)
-    assert accused <= 1
-    assert found >= 38
+    assert accused == 0
+    assert found >= 19
 
 
 def test_a_rare_bright_path_in_the_render_is_not_taken_for_an_offset() -> None:
@@ -102,3 +102,23 @@ def test_a_rare_bright_path_in_the_render_is_not_taken_for_an_offset() -> None:
         one.render[y, x], one.spread[y, x] = 20.0, 19.0  # in one of two renders alone
         accused += reported_offset("c0", [one], pixels(render), PIXEL_MM) is not None
     assert accused == 0
+
+
+def accused(photo: Array, render: Array, noise: float, count: int) -> list[int]:
+    """Seeds of noise for which an offset is reported."""
+    images = [compared(render, photo, noise, np.random.default_rng([6, seed])) for seed in range(count)]
+    told = [reported_offset("c0", [image], pixels(render), PIXEL_MM) is not None for image in images]
+    return [seed for seed, is_told in enumerate(told) if is_told]
+
+
+def test_a_dim_photograph_in_place_is_not_said_to_lie_elsewhere() -> None:
+    # Beside the tooth there is only noise; its variance explains it as well as the render explains the tooth.
+    render, _ = ball(np.random.default_rng(1))
+    assert accused(0.06 * render, np.where(render > 0, render**0.7, 0.0), 0.05, 12) == []
+
+
+def test_what_noise_alone_leaves_unexplained_has_no_offset() -> None:
+    # 20 captures of noise about a flat render; a shift explains none of it.
+    render, _ = ball(np.random.default_rng(1))
+    flat = np.where(render > 0, 1.0, 0.0)
+    assert accused(flat, flat, 0.3, 20) == []

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
@@ -75,9 +76,41 @@ class _Match:
         return self.b - beta * self.a
 
     def beta(self, render_noise: float) -> float:
-        # Best brightness of the render; 0 where the render is all noise.
-        energy = float(self.a @ self.a) - render_noise
-        return float(self.a @ self.b) / energy if energy > 0 else 0.0
+        return _beta(self.b, self.a, render_noise)
+
+
+def _beta(b: Array, a: Array, render_noise: float) -> float:
+    # Best brightness of the render; 0 where the render is all noise.
+    energy = float(a @ a) - render_noise
+    return float(a @ b) / energy if energy > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class _Shown:
+    # Pixels (n,) of a render that are known: their places and values, and the photograph for a search that reads it at
+    # hundreds of shifts.
+    photo: Array
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    a: Array
+
+    @staticmethod
+    def of(image: Comparison, pixels: NDArray[np.int64]) -> _Shown:
+        x, y = pixels.T
+        values = image.render[y, x]
+        known = np.isfinite(values)
+        return _Shown(image.photo, x[known], y[known], values[known])
+
+    def under(self, shift: Shift) -> tuple[Array, Array]:
+        # Values of photograph and render where both are known.
+        height, width = self.photo.shape
+        x, y, a = self.x + shift[0], self.y + shift[1], self.a
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        if not inside.all():
+            x, y, a = x[inside], y[inside], a[inside]
+        b = self.photo[y, x]
+        known = np.isfinite(b)
+        return (b, a) if known.all() else (b[known], a[known])
 
 
 @dataclass(frozen=True)
@@ -105,11 +138,11 @@ class ShiftedRender:
 
         Infinite where too few pixels are known.
         """
-        matches = self._matches(shift)
-        energy = sum(float(match.b @ match.b) for match in matches)
-        if not matches or energy <= 0:
+        pairs = [shown.under(shift) for shown in self._shown]
+        energy = sum(float(b @ b) for b, _ in pairs)
+        if energy <= 0 or not all(self._is_enough(a) for _, a in pairs):
             return np.inf
-        return sum(float(match.residual(max(match.beta(0.0), 0.0)) @ match.b) for match in matches) / energy
+        return sum(float((b - max(_beta(b, a, 0.0), 0.0) * a) @ b) for b, a in pairs) / energy
 
     def noise(self, shift: Shift) -> float:
         """Ratio of the photographs' noise variance to the stated one, from differences of neighbouring residuals; at
@@ -145,7 +178,14 @@ class ShiftedRender:
     def _matches(self, shift: Shift) -> list[_Match]:
         # Matches of all images; none where one of the images is known on too few pixels.
         matches = [_match(image, self.pixels, shift) for image in self.images]
-        return matches if all(len(match.a) >= MIN_KNOWN * len(self.pixels) for match in matches) else []
+        return matches if all(self._is_enough(match.a) for match in matches) else []
+
+    def _is_enough(self, known: Array) -> bool:
+        return len(known) >= MIN_KNOWN * len(self.pixels)
+
+    @cached_property
+    def _shown(self) -> list[_Shown]:
+        return [_Shown.of(image, self.pixels) for image in self.images]
 
 
 def _match(image: Comparison, pixels: NDArray[np.int64], shift: Shift) -> _Match:
