@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -30,6 +31,8 @@ BLOCK_BYTES = 4 * 2**20
 """Largest residual block that travels between tasks, in bytes: mean and variance, float64."""
 BLOCK_PIXELS = 4096
 """Largest number of pixels in a block: enough to fill a kernel, and few enough that a lost worker costs little."""
+SMALL_BYTES = 2**18
+"""Largest file whose arrays stay in memory, in bytes."""
 MIN_BLOCKS = 4
 """Least number of blocks of all views together, so that two workers have enough to do; fewer where there are too few
 pixels."""
@@ -55,9 +58,17 @@ class StoredFile:
             raise CorruptStoreError(
                 f"{self.path} is missing or altered; remove its folder so that the fit starts again."
             )
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return dict(arrays)
+        return _small_arrays(content) if len(content) <= SMALL_BYTES else _arrays(content)
 
+
+def _arrays(content: bytes) -> dict[str, NDArray[np.generic]]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+_small_arrays = lru_cache(maxsize=32)(_arrays)
+"""The arrays of small files, which are read for every task and take longer to take apart than to check. They are
+recognised by their whole content."""
 
 GUMS, CAVITY = -1, -2
 """Codes of pixels that show no tooth but gums or oral cavity."""
