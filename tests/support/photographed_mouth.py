@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.anatomy.templates.jaw import Jaw, build_jaw
+from services.anatomy.templates.jaw import Jaw
 from services.anatomy.visibility import visible_surfaces
 from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View
 from services.calibrate.registration.pose import RigidPose
 from services.core.geometry import Camera, Mesh
 from services.phantom.dome_rig import dome_cameras
+from tests.support.phantom_bodies import phantom_jaw
 
 TOOTH, GUMS, LIP, DARK = (0.80, 0.72, 0.58), (0.55, 0.25, 0.24), (0.45, 0.28, 0.27), (0.03, 0.02, 0.02)
 FINER = 2
@@ -43,7 +44,7 @@ class Mouth:
 def photographed_mouth(subject: int | None, seed: int, pixel_mm: float = 0.15, jaw: Jaw | None = None) -> Mouth:
     """Draw a subject's jaw as three cameras of the dome see it, and move its meshes to a scan frame of random pose."""
     rng = np.random.default_rng(seed)
-    jaw = build_jaw(subject) if jaw is None else jaw
+    jaw = phantom_jaw(subject) if jaw is None else jaw
     outers = tuple(tooth.outer for tooth in jaw.teeth)
     # The rig's frame is that of the jaw; the scan's frame is random.
     away = RigidPose(np.eye(3), np.zeros(3)).moved(

@@ -67,6 +67,7 @@ def test_cameras_are_where_they_were(made: tuple[Path, Calibration], session: Se
         assert off.max() < 0.4
 
 
+@pytest.mark.dear("It makes the images of a calibration and calibrates from them, for all tests of this file.")
 def test_lights_are_as_far_off_as_their_errors_say(made: tuple[Path, Calibration], session: Session) -> None:
     assert session.lights is not None
     fit = session.lights.fit

@@ -70,7 +70,8 @@ def warped_photograph(path: Path, seed: int) -> tuple[np.ndarray, np.ndarray, np
     return noisy[0].astype(np.float32), noisy[1].astype(np.float32), truth
 
 
-@pytest.mark.parametrize("view", [0, 4])
+# A second photograph and a second pair take the same way as the first.
+@pytest.mark.parametrize("view", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_known_warp_of_an_intraoral_photograph_under_changed_light(view: int) -> None:
     """The accuracy that the capture design demands: median < 0.1 px, 95 % < 0.3 px."""
     reference, frame, truth = warped_photograph(shared_path(f"data/intraoral-photos/image/0-{view}.png"), seed=view)
@@ -83,7 +84,9 @@ def test_known_warp_of_an_intraoral_photograph_under_changed_light(view: int) ->
     assert np.quantile(error, 0.95) < 0.3
 
 
-@pytest.mark.parametrize(("pair", "dense_px"), [("motorcycle", 0.42), ("aloe", 0.69)])
+@pytest.mark.parametrize(
+    ("pair", "dense_px"), [("motorcycle", 0.42), pytest.param("aloe", 0.69, marks=pytest.mark.slow)]
+)
 def test_parallax_of_a_real_stereo_pair(pair: str, dense_px: float) -> None:
     """With the true relief given, the displacement follows it; dense flow (DIS medium) has the given median error."""
     left, right, disparity = stereo_pair(pair)
