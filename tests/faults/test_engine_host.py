@@ -17,13 +17,13 @@ import psutil
 import pytest
 from distributed import Client, LocalCluster, get_worker
 
-from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import CrashError, JobCancelledError, MemoryKillError, ResourceError, WorkerLostError
 from services.fit.execution.blocks import StoredFile, write_recipe
 from services.fit.execution.engine_host import CancellableHost, ChildHost, EngineHost
 from services.fit.execution.engine_process import memory_kills
 from services.fit.execution.executors import DaskExecutor
 from services.fit.transport.scene.recipe import single_tooth
+from tests.support.prepared import sphere
 
 BROKEN = "tests.support.broken_engine:BrokenEngine"
 MIB = 2**20
@@ -33,7 +33,7 @@ MIB = 2**20
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> StoredFile:
     return write_recipe(
         tmp_path_factory.mktemp("recipe"),
-        single_tooth(build_incisor().outer, None, np.array([[0.0, 0.0, 99.0]]), np.ones(1)),
+        single_tooth(sphere(4.0), None, np.array([[0.0, 0.0, 99.0]]), np.ones(1)),
     )
 
 
@@ -45,14 +45,14 @@ def host() -> Iterator[ChildHost]:
 
 
 def test_a_process_that_outgrows_its_share_is_ended_with_evidence(recipe: StoredFile) -> None:
-    host = ChildHost(BROKEN, memory_bytes=600 * MIB)
-    with pytest.raises(MemoryKillError, match=r"grew beyond its 0\.6 GiB") as failure:
-        host.call("grow", recipe, 8 * MIB)
+    host = ChildHost(BROKEN, memory_bytes=300 * MIB)
+    with pytest.raises(MemoryKillError, match=r"grew beyond its 0\.3 GiB") as failure:
+        host.call("grow", recipe, 4 * MIB)
     evidence = failure.value.evidence
-    assert evidence["memory_limit_bytes"] == 600 * MIB
-    # Memory is checked every quarter of a second and grows by at most 8 MiB in ten milliseconds, so it stays below one
+    assert evidence["memory_limit_bytes"] == 300 * MIB
+    # Memory is checked every quarter of a second and grows by at most 4 MiB in ten milliseconds, so it stays below one
     # and a half times the limit.
-    assert 600 * MIB < int(evidence["peak_memory_bytes"] or 0) < 900 * MIB
+    assert 300 * MIB < int(evidence["peak_memory_bytes"] or 0) < 450 * MIB
     assert host.pid is None
     assert host.call("answer", recipe, 3) == 3
     host.close()
@@ -93,14 +93,12 @@ def test_closing_does_not_wait_for_a_kernel(recipe: StoredFile, tmp_path: Path) 
     assert not psutil.pid_exists(int(started.read_text()))
 
 
-@pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGABRT, signal.SIGKILL])
-def test_a_crash_is_told_by_its_signal_after_a_second_try(
-    host: ChildHost, recipe: StoredFile, number: signal.Signals
-) -> None:
+def test_a_crash_is_told_by_its_signal_after_a_second_try(host: ChildHost, recipe: StoredFile) -> None:
     before = memory_kills()
-    with pytest.raises(CrashError, match=f"ended by {number.name} twice") as failure:
-        host.call("die", recipe, int(number))
-    assert failure.value.evidence["exit_status"] == -number
+    for number in (signal.SIGSEGV, signal.SIGKILL):  # a kill might also be one for memory
+        with pytest.raises(CrashError, match=f"ended by {number.name} twice") as failure:
+            host.call("die", recipe, int(number))
+        assert failure.value.evidence["exit_status"] == -number
     assert memory_kills() == before
     assert host.call("answer", recipe, 4) == 4
 

@@ -34,7 +34,7 @@ GUMS, CAVITY = len(FDI), len(FDI) + 1
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("jaw") / "capture"
-    options = "--jaw --subject 1 --pixel-mm 2 --cameras 2 --lights 3 --held-out 1 --samples 64"
+    options = "--jaw --subject 1 --pixel-mm 2 --cameras 2 --lights 2 --held-out 1 --samples 64"
     outcome = CliRunner().invoke(
         build_app(), ["phantom", "--out", str(folder), *options.split()], catch_exceptions=False
     )
@@ -69,9 +69,12 @@ def first_surface(scene: RayScene, camera: Camera, offset: tuple[float, float]) 
     return np.where(hits.hit, hits.mesh, -1).reshape(camera.size[::-1])
 
 
+@pytest.mark.dear(
+    "It waits for the jaw that the command writes: the engine renders fourteen teeth."
+)
 def test_the_folder_says_what_it_shows(capture: Path) -> None:
     description = read_record(capture / "capture.json", FolderCapture)
-    assert len(description.images) == 6
+    assert len(description.images) == 4
     assert {entry.light for entry in description.images if entry.held_out} == {"l1"}
     assert tuple(tooth.fdi for tooth in read_teeth(capture)) == FDI
     assert all(tooth.dentin is not None for tooth in read_teeth(capture))
