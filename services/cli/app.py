@@ -123,7 +123,10 @@ def _remedy(missing: ModuleNotFoundError) -> str:
     if (missing.name or "services").partition(".")[0] == "services":
         raise missing
     extra = _EXTRAS.get(next(iter(sys.argv[1:]), ""), "worker")
-    return f"This command needs {missing.name}, which is not installed; pip install 'dentine[{extra}]' brings it."
+    return (
+        f"This command needs {missing.name}, which is not installed; pip install '.[{extra}]' in the project's folder"
+        " brings it."
+    )
 
 
 def _print_version(wanted: bool) -> None:

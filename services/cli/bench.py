@@ -87,8 +87,8 @@ def _draw(module: Any, rows: list[dict[str, Any]], png: Path) -> None:
         from services.bench.plots import error_against_time, write_png
     except ModuleNotFoundError as missing:
         print(
-            f"{png} was not drawn, as {missing.name} is missing; install the extra bench, pip install"
-            " 'dentine[bench]'.",
+            f"{png} was not drawn, as {missing.name} is missing; pip install '.[bench]' in the project's folder brings"
+            " it.",
             file=sys.stderr,
         )
         return

@@ -184,5 +184,5 @@ def test_a_command_without_its_packages_names_the_extra(programs: dict[str, Path
             command, cwd=tmp_path, env=environment_without_this_tree(), capture_output=True, text=True, check=False
         )
         assert (ended.returncode, ended.stdout) == (4, ""), ended.stderr
-        assert f"dentine[{extra}]" in ended.stderr
+        assert f"'.[{extra}]'" in ended.stderr
         assert len(ended.stderr.splitlines()) == 1, ended.stderr
