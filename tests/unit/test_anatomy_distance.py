@@ -35,7 +35,7 @@ def test_closest_points_on_a_box_are_exact() -> None:
 @pytest.mark.parametrize("spacing_mm", [0.1, 1.0])
 @pytest.mark.parametrize("apart_mm", [0.05, 0.5, 3.0])
 def test_the_smallest_distance_is_that_of_the_nearest_point(apart_mm: float, spacing_mm: float) -> None:
-    points = np.random.default_rng(1).uniform([4, -3, -4], [6, 3, 4], (2000, 3)) + [apart_mm - 2, 0, 0]
+    points = np.random.default_rng(1).uniform([2 + apart_mm, -3, -4], [4 + apart_mm, 3, 4], (2000, 3))
     surface = SurfaceDistance(BOX, spacing_mm)
     assert surface.smallest_mm(points) == surface.closest(points)[1].min()
     assert surface.smallest_mm(points) == pytest.approx(apart_mm, abs=0.01)

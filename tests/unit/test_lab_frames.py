@@ -116,12 +116,10 @@ def test_the_measured_tooth_stands_in_gums_among_teeth_with_dentin(mouth: LabMou
     mouth.gums.require_solid("gums")
     for tooth in mouth.teeth:
         assert tooth.dentin is not None
-        points = tooth.outer.vertices_mm[::12]
-        held, height_mm = gums.contains(points), points[:, 2]
-        assert (height_mm < -6).sum() > 15
-        assert (height_mm > 1).sum() > 15
-        assert held[height_mm < -6].all()
-        assert not held[height_mm > 1].any()
+        points = tooth.outer.vertices_mm
+        low, high = points[points[:, 2] < -6][::5], points[points[:, 2] > 1][::20]
+        assert gums.contains(low).all()
+        assert not gums.contains(high).any()
 
 
 def test_a_scans_root_is_as_wide_below_the_gums_as_the_one_it_does_not_see(mouth: LabMouth) -> None:
