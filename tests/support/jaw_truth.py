@@ -7,6 +7,7 @@ the images check that the surfaces are still the same. Sensor noise is added whe
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +53,19 @@ def lights() -> tuple[Light, ...]:
     return dome_lights(LIGHTS, (CHANNEL,), seed=SUBJECT)
 
 
+@cache
+def subjects_jaw() -> JawSurfaces:
+    """The jaw of ``SUBJECT``, built once in a process; nobody may change its arrays."""
+    return jaw_surfaces(SUBJECT)
+
+
 def pack(stored: Path, passes: list[NDArray[np.float64]], samples: int) -> None:
     """Store the mean and standard error of images (P, L, H, W) of every camera, from P independent passes.
 
     Args:
         samples: paths per pixel of all passes together.
     """
-    arrays: dict[str, NDArray[Any]] = {"samples": np.array(samples), "moments": _moments(jaw_surfaces(SUBJECT))}
+    arrays: dict[str, NDArray[Any]] = {"samples": np.array(samples), "moments": _moments(subjects_jaw())}
     for k, images in enumerate(passes):
         arrays[f"mean_{k}"] = images.mean(axis=0).astype(np.float32)
         arrays[f"standard_error_{k}"] = (images.std(axis=0, ddof=1) / np.sqrt(len(images))).astype(np.float16)
@@ -68,7 +75,7 @@ def pack(stored: Path, passes: list[NDArray[np.float64]], samples: int) -> None:
 
 def read_jaw_truth(stored: Path = STORED) -> JawTruth:
     """Read the images, and build the jaw that they show."""
-    jaw = jaw_surfaces(SUBJECT)
+    jaw = subjects_jaw()
     with np.load(stored) as arrays:
         assert np.allclose(arrays["moments"], _moments(jaw), rtol=1e-6), (
             f"the phantom jaw is not the one of {stored.name}; render it again"

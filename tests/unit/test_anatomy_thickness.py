@@ -69,15 +69,15 @@ def test_errors_of_weights_become_errors_of_thickness() -> None:
 
 
 def test_errors_against_many_drawn_shapes() -> None:
-    # Two modes with correlated weights: 400 draws give a standard deviation to 3.5 %. The tolerance is 4 times that,
+    # Two modes with correlated weights: 150 draws give a standard deviation to 5.8 %. The tolerance is 4 times that,
     # plus the second order of a spread of 0.05.
     shape, points = dentin_shape(), ellipsoid(SEMI_AXES_MM).vertices_mm[::40]
     weights, covariance = np.array([0.5, 0.4]), np.array([[0.0025, -0.001], [-0.001, 0.002]])
     found = uncertain_thickness(points, shape, weights, covariance)
-    drawn = np.random.default_rng(1).multivariate_normal(weights, covariance, 400)
+    drawn = np.random.default_rng(1).multivariate_normal(weights, covariance, 150)
     seen = np.array([enamel_thickness_mm(points, Mesh(shape.vertices_mm(tuple(c)), shape.base.faces)) for c in drawn])
-    np.testing.assert_allclose(found.errors_mm, seen.std(axis=0), rtol=0.16)
-    assert abs(found.mean_error_mm / seen.mean(axis=1).std() - 1) < 0.16
+    np.testing.assert_allclose(found.errors_mm, seen.std(axis=0), rtol=0.25)
+    assert abs(found.mean_error_mm / seen.mean(axis=1).std() - 1) < 0.25
 
 
 def test_a_camera_sees_thickness_and_its_error_at_the_same_pixels() -> None:

@@ -11,14 +11,19 @@ from scipy.spatial import cKDTree
 
 from services.core.geometry import Mesh
 from services.phantom.dome_rig import dome_cameras
-from services.phantom.jaw import jaw_surfaces
+from services.phantom.jaw import JawSurfaces, jaw_surfaces
 from services.phantom.lips import LIP_RADIUS_MM, lips_and_retractor
 from services.preprocess.projection import project
 
 
 @pytest.fixture(scope="module")
-def teeth() -> list[Mesh]:
-    return [tooth.outer for tooth in jaw_surfaces().teeth]
+def surfaces() -> JawSurfaces:
+    return jaw_surfaces()
+
+
+@pytest.fixture(scope="module")
+def teeth(surfaces: JawSurfaces) -> list[Mesh]:
+    return [tooth.outer for tooth in surfaces.teeth]
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +49,11 @@ def test_they_stand_before_the_teeth_without_touching(lips: Mesh, teeth: list[Me
     assert gap_mm > 1.0
 
 
-def test_the_front_camera_sees_the_front_teeth_between_them(lips: Mesh, teeth: list[Mesh]) -> None:
+def test_the_front_camera_sees_the_front_teeth_between_them(
+    lips: Mesh, teeth: list[Mesh], surfaces: JawSurfaces
+) -> None:
     camera = dome_cameras(3, 1.0, tuple(teeth))[1]
-    fdi = [tooth.fdi for tooth in jaw_surfaces().teeth]
+    fdi = [tooth.fdi for tooth in surfaces.teeth]
     free, hidden = project(camera, teeth).mesh, project(camera, teeth, [lips]).mesh
     for number in (11, 21, 12, 22):
         place = fdi.index(number)
