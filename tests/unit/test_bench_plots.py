@@ -106,4 +106,4 @@ def test_without_a_drawing_library_the_rows_are_still_written(
     command.bench("toy", tmp_path / "one.json")
     assert json.loads((tmp_path / "one.json").read_text()) == ROWS
     assert not (tmp_path / "one.png").exists()
-    assert "install the extra bench" in capsys.readouterr().err
+    assert "pip install '.[bench]'" in capsys.readouterr().err
