@@ -93,10 +93,14 @@ def postgres_server(network: Network | None = None) -> Iterator[PostgresServer]:
         server.remove()
 
 
-def new_database(server: PostgresServer, name: str) -> str:
-    """Create an empty database on a server; returns its URL."""
+def new_database(server: PostgresServer, name: str, like: str = "template1") -> str:
+    """Create a database on a server; returns its URL.
+
+    Args:
+        like: database that is copied, to which nobody is connected. That of Postgres itself is empty.
+    """
     engine = open_database(server.url("postgres"))
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-        connection.execute(sql.text(f'CREATE DATABASE "{name}"'))
+        connection.execute(sql.text(f'CREATE DATABASE "{name}" TEMPLATE "{like}"'))
     engine.dispose()
     return server.url(name)

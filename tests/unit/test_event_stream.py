@@ -21,7 +21,7 @@ from services.api.jobs.records import Lease
 from services.api.jobs.repository import Repository
 from services.core.records import JobSpec
 from services.core.stage import StageEvent
-from services.pipeline.database import sqlite_url
+from tests.support.empty_database import empty_database
 
 STREAMS, STEPS = 40, 60
 
@@ -29,7 +29,7 @@ STREAMS, STEPS = 40, 60
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Repository]:
     monkeypatch.setattr(event_stream, "PERIOD_S", 0.002)
-    repository = Repository(sqlite_url(tmp_path / "jobs.sqlite"))
+    repository = Repository(empty_database(tmp_path / "jobs.sqlite"))
     yield repository
     repository.close()
 

@@ -26,9 +26,12 @@ from services.core.errors import FencedError, SettingsError
 from services.core.records import JobSpec
 from services.pipeline.database import Query, metadata, open_database, retry_while_lost, sqlite_url, writing
 from services.pipeline.event_log import event_table
+from tests.support.empty_database import empty_database
 from tests.support.postgres import PostgresServer, new_database, postgres_server
 
 SPEC = JobSpec(capture=Path("/mouth"))
+UPGRADED = "upgraded"
+"""Database of the Postgres server that has all tables, and is copied."""
 names = (f"test_{number}" for number in itertools.count())
 
 
@@ -45,11 +48,22 @@ class Clock:
 @pytest.fixture(scope="module")
 def server() -> Iterator[PostgresServer]:
     with postgres_server() as running:
+        engine = open_database(new_database(running, UPGRADED))
+        upgrade(engine)
+        engine.dispose()
         yield running
 
 
 @pytest.fixture(params=["sqlite", "postgres"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A database that has all tables."""
+    if request.param == "sqlite":
+        return empty_database(tmp_path / "jobs.sqlite")
+    return new_database(request.getfixturevalue("server"), next(names), UPGRADED)
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def url_without_tables(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "sqlite":
         return sqlite_url(tmp_path / "jobs.sqlite")
     return new_database(request.getfixturevalue("server"), next(names))
@@ -258,8 +272,8 @@ def test_the_steps_lead_to_the_tables_that_the_code_knows(repository: Repository
         assert compare_metadata(MigrationContext.configure(connection), metadata) == []
 
 
-def test_a_database_from_before_the_steps_keeps_its_jobs(url: str, clock: Clock) -> None:
-    engine = open_database(url)
+def test_a_database_from_before_the_steps_keeps_its_jobs(url_without_tables: str, clock: Clock) -> None:
+    engine = open_database(url_without_tables)
     upgrade(engine, FIRST)
     row = {
         "id": "old",
@@ -273,7 +287,7 @@ def test_a_database_from_before_the_steps_keeps_its_jobs(url: str, clock: Clock)
         connection.execute(job_table.insert().values(row))
         connection.execute(sql.text("DROP TABLE alembic_version"))
     engine.dispose()
-    repository = Repository(url, clock)
+    repository = Repository(url_without_tables, clock)
     assert [job.id for job in repository.page(9, only=JobFilter(kind="tooth", source="MOUTH"))] == ["old"]
     assert repository.lose_expired() == ["old"]
     assert repository.lease("old", "me", 60).number == 1
@@ -311,8 +325,7 @@ def test_writers_of_one_process_take_turns_before_they_ask_sqlite(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("services.pipeline.database.BUSY_MS", 0)  # a writer that is not first is refused at once
-    engine = open_database(sqlite_url(tmp_path / "jobs.sqlite"))
-    upgrade(engine)
+    engine = open_database(empty_database(tmp_path / "jobs.sqlite"))
     written: list[bool] = []
 
     def write() -> None:
