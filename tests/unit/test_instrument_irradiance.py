@@ -27,31 +27,33 @@ NAMES = ("gain.red", *(f"light_gain.{light.name}.red" for light in LIGHTS))
 NAMES += tuple(f"light.{light.name}.{axis}" for light in LIGHTS for axis in "xyz")
 
 
-def calibrated(rng: np.random.Generator, off_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """One calibration with a white sphere at the place of the teeth: errors of NAMES (10,), and relative errors of
-    photographs over renders (3,).
+def calibrated(rng: np.random.Generator, off_mm: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Calibrations with a white sphere at the place of the teeth: errors of NAMES (count, 13), and relative errors of
+    photographs over renders (count, 3).
 
     Lights are believed to be away from where they are, mostly along the line of sight. Intensities and the radiance per
     count still agree with what the sphere shows; the gauge is that the mean intensity is 1.
     """
     away = PLACES_MM / np.linalg.norm(PLACES_MM, axis=1, keepdims=True)
     # The lights' errors are equal in part, as all of them depend on where the spheres were.
-    off = off_mm * (rng.normal(size=(3, 1)) + rng.normal()) * away + rng.normal(0, 2, (3, 3))
-    seen = INTENSITY / (PLACES_MM**2).sum(axis=1) * np.exp(rng.normal(0, MEASURED, 3))
-    relative = seen * ((PLACES_MM + off) ** 2).sum(axis=1)
-    found, radiance = relative / relative.mean(), 1 / relative.mean()
-    modelled = found / ((PLACES_MM + off) ** 2).sum(axis=1)
+    along = rng.normal(size=(count, 3, 1)) + rng.normal(size=(count, 1, 1))
+    believed = PLACES_MM + (off := off_mm * along * away + rng.normal(0, 2, (count, 3, 3)))
+    seen = INTENSITY / (PLACES_MM**2).sum(axis=1) * np.exp(rng.normal(0, MEASURED, (count, 3)))
+    relative = seen * (believed**2).sum(axis=2)
+    radiance = 1 / relative.mean(axis=1, keepdims=True)
+    found = relative * radiance
+    modelled = found / (believed**2).sum(axis=2)
     photographed = radiance * INTENSITY / (PLACES_MM**2).sum(axis=1)
-    errors = np.concatenate([[rng.normal(0, 0.01)], np.log(found / INTENSITY), off.ravel()])
+    gains = rng.normal(0, 0.01, (count, 1))
+    errors = np.concatenate([gains, np.log(found / INTENSITY), off.reshape(count, -1)], axis=1)
     return errors, np.log(photographed / modelled)
 
 
 def drawn(off_mm: float) -> tuple[CalibrationUncertainty, np.ndarray]:
-    rng = np.random.default_rng(1)
-    pairs = [calibrated(rng, off_mm) for _ in range(8000)]
-    covariance = np.cov(np.array([errors for errors, _ in pairs]).T) + 1e-12 * np.eye(len(NAMES))
+    errors, photographs = calibrated(np.random.default_rng(1), off_mm, 8000)
+    covariance = np.cov(errors.T) + 1e-12 * np.eye(len(NAMES))
     stated = CalibrationUncertainty(names=NAMES, covariance=tuple(map(tuple, covariance.tolist())))
-    return stated, np.array([photographs for _, photographs in pairs])
+    return stated, photographs
 
 
 @pytest.mark.parametrize("off_mm", [2.0, 15.0])

@@ -12,7 +12,7 @@ from services.core.errors import FencedError
 from services.core.geometry import Record
 from services.core.store import StageWriter, open_stage, write_atomic
 
-HEAD_START_S = 1.0
+HEAD_START_S = 0.4
 """How long the overtaking writer is given while the other is held back; one that waits for a lock uses all of it."""
 
 
