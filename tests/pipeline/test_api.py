@@ -42,6 +42,26 @@ def serve(tmp_path: Path) -> Iterator[Callable[..., Client]]:
         )
 
 
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def shared(data: Path) -> Iterator[Client]:
+    """A server that tests share which change nothing, or only what they make themselves."""
+    with serving(create_app(ServerSettings(data=data), write_results)) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def done(shared: Client) -> str:
+    """A job of the shared server that has ended."""
+    job_id = str(submit(shared, "/").json()["id"])
+    finish(shared, job_id)
+    return job_id
+
+
 @pytest.fixture
 def capture_folder(tmp_path: Path) -> str:
     folder = tmp_path / "capture"
@@ -60,8 +80,8 @@ def finish(client: Client, job_id: str) -> str:
     return client.get(f"/v1/jobs/{job_id}/events").text
 
 
-def test_a_job_is_created_runs_and_tells_its_events(serve: Any, capture_folder: str) -> None:
-    client = serve()
+def test_a_job_is_created_runs_and_tells_its_events(shared: Client, capture_folder: str) -> None:
+    client = shared
     answer = submit(client, capture_folder)
     assert answer.status_code == 201
     job_id = answer.json()["id"]
@@ -76,8 +96,8 @@ def test_a_job_is_created_runs_and_tells_its_events(serve: Any, capture_folder: 
     assert [line for line in replayed.splitlines() if line.startswith("id: ")] == [f"id: {ids[-1]}"]
 
 
-def test_an_idempotency_key_makes_one_job(serve: Any, capture_folder: str) -> None:
-    client = serve()
+def test_an_idempotency_key_makes_one_job(shared: Client, capture_folder: str) -> None:
+    client = shared
     first, second = (submit(client, capture_folder, key="k1") for _ in range(2))
     assert (first.status_code, second.status_code) == (201, 200)
     assert first.json()["id"] == second.json()["id"]
@@ -109,8 +129,8 @@ def test_pages_follow_each_other(serve: Any, capture_folder: str) -> None:
         ({}, "give exactly one of 'capture'"),
     ],
 )
-def test_bad_options_are_a_problem_document_that_names_them(serve: Any, body: dict[str, Any], named: str) -> None:
-    answer = serve().post("/v1/jobs", json=body)
+def test_bad_options_are_a_problem_document_that_names_them(shared: Client, body: dict[str, Any], named: str) -> None:
+    answer = shared.post("/v1/jobs", json=body)
     problem = answer.json()
     assert answer.status_code == problem["status"] == 422
     assert answer.headers["content-type"] == "application/problem+json"
@@ -119,8 +139,8 @@ def test_bad_options_are_a_problem_document_that_names_them(serve: Any, body: di
 
 
 @pytest.mark.parametrize("path", ["/v1/jobs/none", "/v1/jobs/none/events", "/v1/jobs/none/artifacts", "/v1/nothing"])
-def test_what_is_not_there_is_a_problem_document(serve: Any, path: str) -> None:
-    answer = serve().get(path)
+def test_what_is_not_there_is_a_problem_document(shared: Client, path: str) -> None:
+    answer = shared.get(path)
     assert answer.status_code == 404
     assert answer.headers["content-type"] == "application/problem+json"
 
@@ -153,13 +173,10 @@ def test_a_failure_is_data_and_a_retry_runs_again(
 
 @pytest.mark.parametrize("at_once", [1000, 5], ids=["at once", "block by block"])
 def test_artifacts_are_listed_and_read_in_ranges(
-    serve: Any, capture_folder: str, at_once: int, monkeypatch: pytest.MonkeyPatch
+    shared: Client, done: str, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("services.api.http.artifacts.MAX_BYTES_AT_ONCE", at_once)
-    client = serve()
-    job_id = submit(client, capture_folder).json()["id"]
-    finish(client, job_id)
-    base = f"/v1/jobs/{job_id}/artifacts"
+    client, base = shared, f"/v1/jobs/{done}/artifacts"
     assert [artifact["path"] for artifact in client.get(base).json()] == ["asset/scene.xml", "report.html"]
     whole = client.get(f"{base}/asset/scene.xml")
     assert whole.content == bytes(range(100))
@@ -186,9 +203,13 @@ def test_artifacts_are_listed_and_read_in_ranges(
     assert "sandbox" in client.get(f"{base}/report.html").headers["content-security-policy"]
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
+@pytest.mark.attack("traversal", "an artifact's path that leads out of the job's folder")
+def test_no_path_leads_out_of_the_artifacts(shared: Client, capture_folder: str, data: Path) -> None:
+    job_id = submit(shared, capture_folder).json()["id"]
+    finish(shared, job_id)
+    (data / "jobs" / job_id / "link").symlink_to("/etc/passwd")
+    (data / "jobs" / job_id / "linked").symlink_to("/etc")
+    for path in (
         "..%2f..%2fdentine.sqlite",
         "%2e%2e/%2e%2e/dentine.sqlite",
         "%2fetc%2fpasswd",
@@ -199,21 +220,13 @@ def test_artifacts_are_listed_and_read_in_ranges(
         "link",
         "linked%2fpasswd",
         "a%00b",
-    ],
-)
-@pytest.mark.attack("traversal", "an artifact's path that leads out of the job's folder")
-def test_no_path_leads_out_of_the_artifacts(serve: Any, capture_folder: str, tmp_path: Path, path: str) -> None:
-    client = serve()
-    job_id = submit(client, capture_folder).json()["id"]
-    finish(client, job_id)
-    (tmp_path / "data" / "jobs" / job_id / "link").symlink_to("/etc/passwd")
-    (tmp_path / "data" / "jobs" / job_id / "linked").symlink_to("/etc")
-    assert client.get(f"/v1/jobs/{job_id}/artifacts/{path}").status_code == 404
+    ):
+        assert shared.get(f"/v1/jobs/{job_id}/artifacts/{path}").status_code == 404, path
 
 
 @pytest.mark.attack("cross-site", "another origin or host name (DNS rebinding)")
-def test_other_sites_and_other_hosts_are_refused(serve: Any, capture_folder: str) -> None:
-    client = serve()
+def test_other_sites_and_other_hosts_are_refused(shared: Client, capture_folder: str) -> None:
+    client = shared
     foreign = client.post("/v1/jobs", json={"capture": capture_folder}, headers={"Origin": "http://elsewhere.example"})
     assert (foreign.status_code, foreign.json()["code"]) == (403, "foreign-origin")
     assert (
@@ -226,15 +239,15 @@ def test_other_sites_and_other_hosts_are_refused(serve: Any, capture_folder: str
 
 
 @pytest.mark.attack("cross-site", "a script in the page or in a report")
-def test_pages_carry_a_strict_policy(serve: Any) -> None:
-    headers = serve().get("/").headers
+def test_pages_carry_a_strict_policy(shared: Client) -> None:
+    headers = shared.get("/").headers
     assert "default-src 'none'" in headers["content-security-policy"]
     assert "unsafe" not in headers["content-security-policy"]
     assert headers["x-content-type-options"] == "nosniff"
 
 
-def test_health_and_options(serve: Any) -> None:
-    client = serve()
+def test_health_and_options(shared: Client) -> None:
+    client = shared
     assert client.get("/v1/health/live").json()["status"] == "live"
     assert client.get("/v1/health/ready").json()["status"] == "ready"
     options = client.get("/v1/options").json()
@@ -291,8 +304,8 @@ def test_a_job_under_way_is_not_deleted(serve: Any, capture_folder: str) -> None
         finish(client, job_id)
 
 
-def test_what_the_machine_could_never_run_is_refused_with_507(serve: Any, capture_folder: str) -> None:
-    answer = submit(serve(), capture_folder, workers=64)
+def test_what_the_machine_could_never_run_is_refused_with_507(shared: Client, capture_folder: str) -> None:
+    answer = submit(shared, capture_folder, workers=64)
     assert (answer.status_code, answer.json()["code"]) == (507, "job-too-large")
     assert "fewer workers" in answer.json()["detail"]
 

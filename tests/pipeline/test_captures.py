@@ -32,6 +32,19 @@ def serve(tmp_path: Path) -> Iterator[Serve]:
         yield start
 
 
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def shared(data: Path) -> Iterator[httpx.Client]:
+    """A server that tests share; each uploads captures of its own."""
+    settings = ServerSettings(data=data, uploads=UploadLimits(keep_free_bytes=0))
+    with serving(create_app(settings, lambda *_: None)) as client:
+        yield client
+
+
 def send_missing(client: httpx.Client, capture: dict[str, Any], contents: dict[str, bytes]) -> None:
     for file in capture["files"]:
         if not file["is_known"]:
@@ -73,20 +86,22 @@ def test_a_capture_is_uploaded_committed_and_used_by_a_job(serve: Serve, tmp_pat
     assert (used.status_code, used.json()["code"]) == (409, "capture-state")
 
 
-def test_published_files_are_read_only_and_share_their_content(serve: Serve, tmp_path: Path) -> None:
-    client = serve()
-    contents = contents_of(write_capture(tmp_path / "mine"))
+def test_published_files_are_read_only_and_share_their_content(
+    shared: httpx.Client, data: Path, tmp_path: Path
+) -> None:
+    client = shared
+    contents = contents_of(write_capture(tmp_path / "mine", seed=1))
     capture = announce(client, contents)
     send_missing(client, capture, contents)
     commit(client, capture)
-    folder = tmp_path / "data" / capture["path"]
+    folder = data / capture["path"]
     assert {path.stat().st_mode & 0o777 for path in folder.rglob("*") if path.is_file()} == {0o400}
     assert {path.stat().st_nlink for path in folder.rglob("*") if path.is_file()} == {2}
 
 
-def test_nothing_is_sent_twice(serve: Serve, tmp_path: Path) -> None:
-    client = serve()
-    contents = contents_of(write_capture(tmp_path / "mine"))
+def test_nothing_is_sent_twice(shared: httpx.Client, tmp_path: Path) -> None:
+    client = shared
+    contents = contents_of(write_capture(tmp_path / "mine", seed=2))
     first = announce(client, contents)
     assert announce(client, contents)["id"] == first["id"]
     send_missing(client, first, contents)
@@ -98,9 +113,9 @@ def test_nothing_is_sent_twice(serve: Serve, tmp_path: Path) -> None:
     assert other["missing_bytes"] == 2
 
 
-def test_an_idempotency_key_belongs_to_one_manifest(serve: Serve, tmp_path: Path) -> None:
-    client = serve()
-    contents = contents_of(write_capture(tmp_path / "mine"))
+def test_an_idempotency_key_belongs_to_one_manifest(shared: httpx.Client, tmp_path: Path) -> None:
+    client = shared
+    contents = contents_of(write_capture(tmp_path / "mine", seed=3))
     answers = [
         client.post("/v1/captures", json=manifest_of(contents), headers={"Idempotency-Key": "k"}) for _ in range(2)
     ]
@@ -111,9 +126,9 @@ def test_an_idempotency_key_belongs_to_one_manifest(serve: Serve, tmp_path: Path
     assert (other.status_code, other.json()["code"]) == (409, "capture-state")
 
 
-def test_a_commit_lists_exactly_what_is_missing_or_corrupt(serve: Serve, tmp_path: Path) -> None:
-    client = serve()
-    contents = contents_of(write_capture(tmp_path / "mine"))
+def test_a_commit_lists_exactly_what_is_missing_or_corrupt(shared: httpx.Client, data: Path, tmp_path: Path) -> None:
+    client = shared
+    contents = contents_of(write_capture(tmp_path / "mine", seed=4))
     capture = announce(client, contents)
     damaged = bytearray(contents["c0_l1.npy"])
     damaged[-1] ^= 1
@@ -126,14 +141,14 @@ def test_a_commit_lists_exactly_what_is_missing_or_corrupt(serve: Serve, tmp_pat
     assert problem.headers["content-type"] == "application/problem+json"
     faults = {fault["path"]: fault["kind"] for fault in problem.json()["files"]}
     assert faults == {"c0_l0.npy": "missing", "c0_l1.npy": "corrupt", "teeth/11/outer.ply": "missing"}
-    assert not (tmp_path / "data" / capture["path"]).exists()
+    assert not (data / capture["path"]).exists()
     send_missing(client, client.get(f"/v1/captures/{capture['id']}").json(), contents)
     assert commit(client, capture).status_code == 200
 
 
-def test_an_image_bomb_is_refused_by_name(serve: Serve, tmp_path: Path) -> None:
-    client = serve()
-    contents = contents_of(write_capture(tmp_path / "mine"))
+def test_an_image_bomb_is_refused_by_name(shared: httpx.Client, tmp_path: Path) -> None:
+    client = shared
+    contents = contents_of(write_capture(tmp_path / "mine", seed=5))
     shape = (
         b"\x93NUMPY\x01\x00\x76\x00"
         + b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999, 3), }".ljust(117)
@@ -147,9 +162,9 @@ def test_an_image_bomb_is_refused_by_name(serve: Serve, tmp_path: Path) -> None:
     assert "99999 x 99999 x 3" in fault["detail"]
 
 
-def test_an_image_with_metadata_is_refused_by_name(serve: Serve, tmp_path: Path) -> None:
-    client = serve()
-    contents = contents_of(write_capture(tmp_path / "mine")) | {"beauty.png": told_png()}
+def test_an_image_with_metadata_is_refused_by_name(shared: httpx.Client, tmp_path: Path) -> None:
+    client = shared
+    contents = contents_of(write_capture(tmp_path / "mine", seed=6)) | {"beauty.png": told_png()}
     capture = announce(client, contents)
     send_missing(client, capture, contents)
     (fault,) = commit(client, capture).json()["files"]
@@ -215,14 +230,14 @@ def test_a_capture_that_the_disk_cannot_hold_is_refused(serve: Serve) -> None:
 @pytest.mark.parametrize(
     "path", ["/v1/captures/none", "/v1/captures/a%00b", "/v1/uploads/none/0", "/v1/captures/%27--/commit"]
 )
-def test_what_is_not_there_is_a_problem_document(serve: Serve, path: str) -> None:
-    client = serve()
+def test_what_is_not_there_is_a_problem_document(shared: httpx.Client, path: str) -> None:
+    client = shared
     method = client.post if path.endswith("commit") else client.head if "uploads" in path else client.get
     answer = method(path, headers={"Tus-Resumable": "1.0.0"})
     assert answer.status_code == 404
     assert answer.headers["content-type"] == "application/problem+json"
 
 
-def test_a_job_cannot_name_an_unknown_capture(serve: Serve) -> None:
-    answer = serve().post("/v1/jobs", json={"capture": "captures/0123456789abcdef"})
+def test_a_job_cannot_name_an_unknown_capture(shared: httpx.Client) -> None:
+    answer = shared.post("/v1/jobs", json={"capture": "captures/0123456789abcdef"})
     assert (answer.status_code, "There is no capture" in answer.json()["detail"]) == (422, True)

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import threading
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -19,11 +20,11 @@ import pytest
 
 from services.api.app import create_app
 from services.core.settings import ServerSettings
-from tests.support.live_server import serving, toy_server
+from tests.support.command_line import dentine
+from tests.support.live_server import serving
 from tests.support.uploading import write_capture
 
 ROOT = Path(__file__).parents[2]
-DENTINE = [sys.executable, "-m", "services"]
 BEYOND_THE_BASE = (
     "alembic",
     "fastapi",
@@ -39,22 +40,41 @@ BEYOND_THE_BASE = (
     "psycopg",
 )
 WITHOUT = f"""
-import runpy, sys
+import json, sys
 class Absent:
     def find_spec(self, name, path=None, target=None):
         if name.partition('.')[0] in {BEYOND_THE_BASE!r}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Absent())
-runpy.run_module('services', run_name='__main__', alter_sys=True)
+from tests.support.command_line import dentine
+for line in sys.stdin:
+    print(json.dumps(vars(dentine(*json.loads(line)))), flush=True)
 """
-"""Program that runs the command line with only the base dependencies of ``pip install dentine``."""
+"""Program that runs command lines with only the base dependencies of ``pip install dentine``: one a line, as JSON."""
 
 
-def dentine(*arguments: str, command: list[str] = DENTINE) -> subprocess.CompletedProcess[str]:
+class BareInstall:
+    """A process with the base dependencies alone, and its command line."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def dentine(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run one command."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(arguments) + "\n")
+        self._process.stdin.flush()
+        return subprocess.CompletedProcess(**json.loads(self._process.stdout.readline()))
+
+
+@pytest.fixture
+def bare() -> Iterator[BareInstall]:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        [*command, *arguments], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL, env=environment
-    )
+    with subprocess.Popen(
+        [sys.executable, "-c", WITHOUT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        yield BareInstall(process)
 
 
 def sentence(answer: subprocess.CompletedProcess[str]) -> str:
@@ -81,34 +101,33 @@ def submitted(server: httpx.Client, **body: object) -> str:
     return job
 
 
-def test_a_job_is_named_listed_downloaded_and_deleted_by_the_base_install(tmp_path: Path, server: httpx.Client) -> None:
-    bare = [sys.executable, "-c", WITHOUT]
+def test_a_job_is_named_listed_downloaded_and_deleted_by_the_base_install(
+    tmp_path: Path, server: httpx.Client, bare: BareInstall
+) -> None:
     address = ("--server", str(server.base_url))
     job_file = tmp_path / "job.toml"
     job_file.write_text(f'capture = "{write_capture(tmp_path / "mine")}"\n')
-    made = dentine(
-        "submit", str(job_file), "--upload", "--name", " Anna, upper left ", "--watch", *address, command=bare
-    )
+    made = bare.dentine("submit", str(job_file), "--upload", "--name", " Anna, upper left ", "--watch", *address)
     assert made.returncode == 0, made.stderr
     job = made.stdout.split()[0]
-    listed = dentine("jobs", *address, command=bare)
+    listed = bare.dentine("jobs", *address)
     assert re.fullmatch(
         rf"{job}  SUCCEEDED      \d{{4}}-\d\d-\d\d \d\d:\d\d UTC  Anna, upper left  captures/\w+\n", listed.stdout
     )
     (told,) = json.loads(
-        dentine("jobs", "--state", "succeeded", "--capture", "captures/", "--json", *address, command=bare).stdout
+        bare.dentine("jobs", "--state", "succeeded", "--capture", "captures/", "--json", *address).stdout
     )
     assert (told["id"], told["name"]) == (job, "Anna, upper left")
-    assert dentine("jobs", "--state", "failed", *address, command=bare).stdout == "There is no such job.\n"
+    assert bare.dentine("jobs", "--state", "failed", *address).stdout == "There is no such job.\n"
 
     zipped = tmp_path / "new" / "files.zip"
-    assert dentine("download", job, "--out", str(zipped), *address, command=bare).stdout == f"{zipped}\n"
+    assert bare.dentine("download", job, "--out", str(zipped), *address).stdout == f"{zipped}\n"
     with zipfile.ZipFile(zipped) as archive:
         assert archive.testzip() is None
         assert {"report.html", "asset/scene.xml"} <= set(archive.namelist())
     assert "exists already" in sentence(dentine("download", job, "--out", str(zipped), *address))
 
-    receipt = json.loads(dentine("delete", job, "--json", *address, command=bare).stdout)
+    receipt = json.loads(bare.dentine("delete", job, "--json", *address).stdout)
     assert (receipt["job"], receipt["files"]) == (job, 2)
     assert "There is no job" in sentence(dentine("delete", job, *address))
     assert "There is no job" in sentence(dentine("download", job, "--out", str(tmp_path / "gone.zip"), *address))
@@ -132,17 +151,19 @@ def test_more_jobs_are_listed_than_one_answer_holds(server: httpx.Client, monkey
 
 
 def test_a_job_under_way_is_not_deleted(tmp_path: Path) -> None:
-    with toy_server(tmp_path / "data") as (client, _):
-        mine = tmp_path / "mine"
-        (mine / "steering").mkdir(parents=True)
-        (mine / "steering" / "hold-prepare-start").touch()
-        job = client.post("/v1/jobs", json={"capture": str(mine)}).json()["id"]
-        while client.get(f"/v1/jobs/{job}").json()["state"] != "RUNNING":
-            pass
+    started, released = threading.Event(), threading.Event()
+
+    def run(*_: object) -> None:
+        started.set()
+        released.wait(60)
+
+    with serving(create_app(ServerSettings(data=tmp_path / "data"), run)) as client:
+        job = client.post("/v1/jobs", json={"capture": str(tmp_path)}).json()["id"]
+        assert started.wait(60)
         refused = dentine("delete", job, "--server", str(client.base_url))
         assert refused.returncode == 2
         assert "A job that is RUNNING does not take 'delete'; it takes cancel" in sentence(refused)
-        (mine / "steering" / "hold-prepare-start").unlink()
+        released.set()
 
 
 @pytest.mark.parametrize(

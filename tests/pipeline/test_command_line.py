@@ -12,21 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.live_server import toy_server
+from services.api.app import create_app
+from services.core.settings import ServerSettings
+from tests.support.command_line import dentine
+from tests.support.live_server import serving
 from tests.support.small_slab import description
-
-DENTINE = [sys.executable, "-m", "services"]
-
-
-def dentine(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*DENTINE, *arguments],
-        capture_output=True,
-        text=True,
-        env=os.environ | environment,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+from tests.support.toy_stages import run_here
 
 
 def sentence(answer: subprocess.CompletedProcess[str]) -> str:
@@ -91,8 +82,19 @@ def test_unknown_options_and_commands_exit_2() -> None:
 
 
 def test_version_and_help_need_nothing() -> None:
-    assert re.fullmatch(r"\d+\.\d+\.\d+\n", dentine("--version").stdout)
+    for command in ([sys.executable, "-m", "services"], [str(Path(sys.executable).with_name("dentine"))]):
+        told = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True).stdout
+        assert re.fullmatch(r"\d+\.\d+\.\d+\n", told)
     assert "simulate" in dentine("--help").stdout
+
+
+def test_a_process_tells_an_error_as_the_command_line_here_does() -> None:
+    answer = subprocess.run(
+        [sys.executable, "-m", "services", "run", "--frobnicate"], capture_output=True, text=True, check=False
+    )
+    here = dentine("run", "--frobnicate")
+    assert (answer.returncode, answer.stdout) == (here.returncode, here.stdout) == (2, "")
+    assert answer.stderr.splitlines()[-1] == here.stderr.splitlines()[-1]
 
 
 def test_benchmarks_are_listed_and_an_unknown_one_is_named() -> None:
@@ -142,7 +144,7 @@ def test_no_server_is_a_sentence(job_file: Path) -> None:
 
 
 def test_submit_watch_and_retry_through_a_server(tmp_path: Path, job_file: Path) -> None:
-    with toy_server(tmp_path / "data") as (client, _):
+    with serving(create_app(ServerSettings(data=tmp_path / "data"), run_here)) as client:
         server = str(client.base_url)
         job = json.loads(dentine("submit", str(job_file), "--server", server, "--key", "once", "--json").stdout)["id"]
         assert dentine("submit", str(job_file), "--server", server, "--key", "once").stdout == f"{job}\n"

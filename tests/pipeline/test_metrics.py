@@ -17,6 +17,7 @@ from services.api.jobs.jobs import Jobs
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.pipeline.event_log import EventAddress
+from tests.support.guarded_server import run_nothing
 from tests.support.live_server import serving
 from tests.support.telling_job import STEPS, tell
 
@@ -82,7 +83,7 @@ def test_jobs_steps_and_requests_are_counted(tmp_path: Path) -> None:
 
 
 def test_strangers_cannot_make_series(tmp_path: Path) -> None:
-    with serving(create_app(ServerSettings(data=tmp_path))) as client:
+    with serving(create_app(ServerSettings(data=tmp_path), run_nothing)) as client:
         client.get("/v1/health/live")
         scrape(client)
         client.get("/v1/nothing")

@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.support.command_line import dentine
 from tests.support.guarded_server import guarded
-
-DENTINE = [sys.executable, "-m", "services"]
-
-
-def dentine(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*DENTINE, *arguments], capture_output=True, text=True, env=os.environ | environment, check=False
-    )
 
 
 def test_a_token_is_made_used_by_the_command_line_and_revoked(tmp_path: Path) -> None:

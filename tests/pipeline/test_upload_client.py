@@ -5,8 +5,6 @@ has.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,12 +18,11 @@ from services.client.errors import CorruptUploadError, IncompleteCaptureError, T
 from services.client.uploader import CHUNK_BYTES, Uploader, UploadProgress
 from services.core.errors import CaptureInputError, DiskFullError, PlatformError
 from services.core.settings import ServerSettings, UploadLimits
+from tests.support.command_line import dentine
 from tests.support.cutting_proxy import cutting
 from tests.support.live_server import serving
 from tests.support.told_images import told_png
 from tests.support.uploading import contents_of, write_capture
-
-DENTINE = [sys.executable, "-m", "services"]
 
 
 @pytest.fixture
@@ -147,10 +144,6 @@ def test_an_error_of_the_tree_is_found_by_its_code() -> None:
     answer = httpx.Response(507, json={"detail": "The disk is full.", "code": "disk-full"})
     assert type(error_in(answer)) is DiskFullError
     assert "is it a dentine server" in error_in(httpx.Response(500, text="x")).message
-
-
-def dentine(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*DENTINE, *arguments], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
 
 
 def test_the_command_uploads_and_a_job_is_submitted_with_it(server: httpx.Client, folder: Path, tmp_path: Path) -> None:

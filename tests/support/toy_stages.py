@@ -17,10 +17,19 @@ from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.stage import StageContext, StageEvent, StageName
 from services.core.store import StageWriter, require_intact, write_atomic
+from services.pipeline.event_log import EventAddress
+from services.pipeline.stage_task import StageTask
+from services.pipeline.stages import stages_of
 
 DOORS: dict[StageName, str] = {
     stage: f"tests.support.toy_stages:{stage}" for stage in ("phantom", "capture", "prepare", "fit", "export")
 }
+
+
+def run_here(spec: JobSpec, root: Path, events: EventAddress) -> None:
+    """Run a job's stages in this thread, for tests that need no workers: the ``run`` of ``create_app``."""
+    for stage in stages_of(spec):
+        StageTask(stage, DOORS[stage], spec, root.resolve(), events)()
 
 
 def _steering(spec: JobSpec, context: StageContext) -> Path:

@@ -14,7 +14,7 @@ from services.api.auth.scopes import needs
 from services.api.auth.tokens import Scope
 from services.core.settings import ServerSettings
 from tests.support.access_requests import add_first, audit, write_report
-from tests.support.guarded_server import Guarded, guarded
+from tests.support.guarded_server import Guarded, guarded, run_nothing
 from tests.support.live_server import serving
 
 
@@ -81,7 +81,7 @@ def test_nothing_is_handed_out_that_cannot_be_audited(tmp_path: Path) -> None:
 
 
 def test_a_change_that_breaks_is_audited_as_broken(tmp_path: Path) -> None:
-    app = create_app(ServerSettings(data=tmp_path))
+    app = create_app(ServerSettings(data=tmp_path), run_nothing)
 
     def break_down() -> None:
         raise ZeroDivisionError

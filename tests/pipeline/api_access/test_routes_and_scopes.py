@@ -14,7 +14,7 @@ from services.api.auth.scopes import LIVENESS, SETUP, needs, scoped_routes
 from services.api.auth.tokens import Caller, Scope
 from services.core.settings import ServerSettings
 from tests.support.access_requests import add_first
-from tests.support.guarded_server import Guarded, guarded
+from tests.support.guarded_server import Guarded, guarded, run_nothing
 from tests.support.live_server import serving
 
 KNOWN_SCOPES = {
@@ -56,19 +56,15 @@ def operations(app: FastAPI) -> list[tuple[str, str, Scope]]:
 
 
 @pytest.mark.attack("routes × scopes", "a route that declares no scope")
-def test_every_route_declares_exactly_one_scope(tmp_path: Path) -> None:
-    app = create_app(ServerSettings(data=tmp_path))
-    # Serve the application to its end, because it closes its database only then.
-    with serving(app):
-        declared = {f"{method} {template}": scope for method, template, scope in operations(app)}
+def test_every_route_declares_exactly_one_scope(server: Guarded) -> None:
+    declared = {f"{method} {template}": scope for method, template, scope in operations(server.app)}
     assert len(declared) > len(KNOWN_SCOPES)
     assert {name: declared.get(name) for name in KNOWN_SCOPES} == KNOWN_SCOPES
 
 
-def test_the_walk_sees_every_route_that_is_described(tmp_path: Path) -> None:
-    app = create_app(ServerSettings(data=tmp_path))
-    with serving(app):
-        walked = {f"{method} {template}" for method, template, _ in operations(app)}
+def test_the_walk_sees_every_route_that_is_described(server: Guarded) -> None:
+    app = server.app
+    walked = {f"{method} {template}" for method, template, _ in operations(app)}
     described = {f"{method.upper()} {path}" for path, methods in app.openapi()["paths"].items() for method in methods}
     assert walked == described - {
         f"GET {LIVENESS}",
@@ -120,29 +116,24 @@ def test_what_is_not_there_is_not_told_to_strangers(server: Guarded, method: str
     assert answer.headers.get("allow") == {404: None, 405: "GET, POST"}[status]
 
 
-@pytest.mark.parametrize("declared", [0, 2])
-@pytest.mark.parametrize("path", ["/v1/thing", "/thing"])
 @pytest.mark.attack("routes × scopes", "a route that somebody adds without a scope")
-def test_a_route_without_exactly_one_scope_is_closed(tmp_path: Path, declared: int, path: str) -> None:
+def test_a_route_that_others_add_is_open_with_exactly_one_scope(tmp_path: Path) -> None:
     called = []
-    router = APIRouter()
-    router.add_api_route(path, lambda: called.append(1), dependencies=[needs("read") for _ in range(declared)])
-    app = create_app(ServerSettings(data=tmp_path))
-    add_first(app, router)
+    app, closed = create_app(ServerSettings(data=tmp_path), run_nothing), APIRouter()
+    paths = {f"{folder}/thing-{count}": count for folder in ("/v1", "") for count in (0, 2)}
+    for path, declared in paths.items():
+        closed.add_api_route(path, lambda: called.append(1), dependencies=[needs("read") for _ in range(declared)])
+    add_first(app, closed)
+    opened = APIRouter(prefix="/v1", dependencies=[needs("read")])
+    opened.add_api_route("/thing", lambda: 7)
+    add_first(app, opened)
     with serving(app) as client:
-        answer = client.get(path)
-    assert answer.status_code == 403
-    assert "does not declare exactly one scope" in answer.json()["detail"]
-    assert not called
-
-
-def test_a_route_that_others_add_with_one_scope_is_open(tmp_path: Path) -> None:
-    router = APIRouter(prefix="/v1", dependencies=[needs("read")])
-    router.add_api_route("/thing", lambda: 7)
-    app = create_app(ServerSettings(data=tmp_path))
-    add_first(app, router)
-    with serving(app) as client:
+        for path in paths:
+            answer = client.get(path)
+            assert answer.status_code == 403, path
+            assert "does not declare exactly one scope" in answer.json()["detail"]
         assert client.get("/v1/thing").json() == 7
+    assert not called
 
 
 @pytest.mark.attack("routes × scopes", "a route behind no gate")

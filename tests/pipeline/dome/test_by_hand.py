@@ -18,7 +18,7 @@ from services.capture.dome.simulator import order_fault
 from services.core.errors import RigUnreachableError
 from services.core.settings import ServerSettings
 from tests.support.dome_by_hand import LIGHTS, Address, console, lit, problem_of, settings_of, wait_until
-from tests.support.guarded_server import guarded
+from tests.support.guarded_server import guarded, run_nothing
 from tests.support.live_server import serving
 from tests.support.small_system import free_port
 
@@ -99,7 +99,7 @@ def test_an_open_interlock_is_a_sentence(client: httpx.Client, shared_dome: Addr
 
 
 def test_a_server_without_a_dome_says_so(tmp_path: Path) -> None:
-    with serving(create_app(ServerSettings(data=tmp_path))) as client:
+    with serving(create_app(ServerSettings(data=tmp_path), run_nothing)) as client:
         for method, path, body in (
             ("GET", "", None),
             ("POST", "/off", None),
@@ -115,7 +115,7 @@ def test_without_the_packages_of_the_dome_the_server_says_so(
     shared_dome: Address, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with serving(create_app(settings_of(shared_dome, tmp_path))) as client:
+    with serving(create_app(settings_of(shared_dome, tmp_path), run_nothing)) as client:
         answer = client.get("/v1/dome")
         assert problem_of(answer) == (503, "platform-missing")
         assert "dentine[capture]" in answer.json()["detail"]
