@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
@@ -104,6 +105,7 @@ def slab_totals(optics: Optics, width_mm: float, interface: Interface, nodes: in
     )
 
 
+@lru_cache(maxsize=8)
 def _quadrature(interface: Interface, nodes: int) -> _Quadrature:
     """Gauss-Legendre nodes in the cosine in the medium where all light is reflected, and in the cosine outside
     elsewhere.
@@ -122,6 +124,8 @@ def _quadrature(interface: Interface, nodes: int) -> _Quadrature:
     diffuse = np.concatenate([np.zeros(nodes if trapped else 0), 2 * unit * weight, [0.0]])
     sines = np.sqrt(np.maximum(1 - cosines**2, 0))
     passes = np.array([interface.transmittance(float(sine)) for sine in sines])
+    for array in (cosines, weights, passes, diffuse):
+        array.flags.writeable = False
     return _Quadrature(cosines, weights, passes, diffuse)
 
 
