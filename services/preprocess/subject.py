@@ -97,7 +97,12 @@ class Subject:
 
 
 def read_subject(
-    root: Path, whole: bool, fdi: int | None = None, surroundings: Literal["auto", "on", "off"] = "off"
+    root: Path,
+    whole: bool,
+    fdi: int | None = None,
+    surroundings: Literal["auto", "on", "off"] = "off",
+    *,
+    verify: bool = True,
 ) -> Subject:
     """Read ``teeth/``, ``gums.ply`` and, if everything is fitted, ``cavity.ply`` of a capture.
 
@@ -106,12 +111,13 @@ def read_subject(
         whole: whether gums and wall are fitted too.
         fdi: number of the only tooth to fit; None for all.
         surroundings: whether the fit of a tooth renders gums and other teeth; auto for where they were registered.
+        verify: whether the surfaces are checked.
 
     Raises:
         CaptureInputError: there is no tooth, or not the one asked for, or a file cannot be read. MeshError: a surface
             cannot bound a medium.
     """
-    teeth, gums = read_teeth(root), _optional(root / "gums.ply")
+    teeth, gums = read_teeth(root, verify=verify), _optional(root / "gums.ply")
     chosen = tuple(tooth for tooth in teeth if fdi in {None, tooth.fdi})
     if not chosen:
         raise CaptureInputError(
@@ -122,9 +128,9 @@ def read_subject(
     others = tuple(tooth for tooth in teeth if fdi not in {None, tooth.fdi})
     asked = surroundings == "on" or (surroundings == "auto" and (root / REGISTRATION).is_file())
     are_rendered = asked and not whole and (gums is not None or bool(others))
-    if (whole or are_rendered) and gums is not None:
+    if verify and (whole or are_rendered) and gums is not None:
         gums.require_solid("gums.ply")
-    if cavity is not None:
+    if verify and cavity is not None:
         cavity.require_surface("cavity.ply")
     return Subject(chosen, gums, cavity, whole, others, are_rendered)
 

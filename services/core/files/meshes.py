@@ -78,8 +78,12 @@ def fdi_numbers(root: Path) -> tuple[int, ...]:
     return tuple(sorted(int(p.name) for p in (root / "teeth").glob("*") if p.name.isascii() and p.name.isdigit()))
 
 
-def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, ...]:
+def read_teeth(root: Path, fdi: tuple[int, ...] | None = None, *, verify: bool = True) -> tuple[Tooth, ...]:
     """Read and check every tooth below ``root/teeth``.
+
+    Args:
+        fdi: numbers of the teeth to read; None for all.
+        verify: whether the surfaces are checked, which takes longer than to read them.
 
     Raises:
         CaptureInputError: no tooth is there. MeshError: a surface cannot bound a medium.
@@ -97,14 +101,15 @@ def read_teeth(root: Path, fdi: tuple[int, ...] | None = None) -> tuple[Tooth, .
     for number in numbers:
         folder = teeth_folder(root, number)
         outer = read_mesh(folder / "outer.ply")
-        outer.require_solid(f"teeth/{number}/outer.ply", TOOTH_EXTENT_MM)
-        outer.require_one_shell(f"teeth/{number}/outer.ply")
-        dentin = None
-        if (folder / "dentin.ply").exists():
-            dentin = read_mesh(folder / "dentin.ply")
+        if verify:
+            outer.require_solid(f"teeth/{number}/outer.ply", TOOTH_EXTENT_MM)
+            outer.require_one_shell(f"teeth/{number}/outer.ply")
+        dentin = read_mesh(folder / "dentin.ply") if (folder / "dentin.ply").exists() else None
+        if verify and dentin is not None:
             dentin.require_solid(f"teeth/{number}/dentin.ply", TOOTH_EXTENT_MM)
         teeth.append(Tooth(number, outer, dentin))
-    _require_apart(teeth)
+    if verify:
+        _require_apart(teeth)
     return tuple(teeth)
 
 

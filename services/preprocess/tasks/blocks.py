@@ -72,8 +72,10 @@ class Block:
         context = LocalContext(self.files.writer.root, self.files.writer.attempt)
         context.raise_if_cancelled()
         self.files.writer.require_lease()
+        # The stage has checked them both.
         source = open_source(self.spec, context.root, verify=False)
-        subject = read_subject(source.root, self.spec.kind == "jaw", self.spec.fdi, self.spec.surroundings)
+        whole = self.spec.kind == "jaw"
+        subject = read_subject(source.root, whole, self.spec.fdi, self.spec.surroundings, verify=False)
         if self.step == "locate":
             _locate(self.files, source, subject, self.camera)
             return
