@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -12,10 +13,12 @@ from pathlib import Path
 from types import MappingProxyType
 
 import pytest
+from typer.testing import CliRunner
 
 from services.api.jobs.admission import DEMO_CAPTURE_BYTES, DISK_PER_CAPTURE, MIN_DISK_BYTES, predict
 from services.api.jobs.size import size_of
 from services.api.presets import find_preset
+from services.cli.app import build_app
 from services.core.errors import CrashError, JobCancelledError, SettingsError
 from services.core.records import DEMO_MOUTH, FolderCapture, JobSpec
 from services.core.settings import job_from_tree, read_job
@@ -65,7 +68,7 @@ def test_little_disk_is_predicted_and_its_size_is_known() -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_the_mouth_is_rendered_once_and_published_for_each_job(tmp_path: Path) -> None:
+def test_the_mouth_is_rendered_once_and_published_for_each_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[StageEvent] = []
     for number in (1, 2):
         phantom(stage_spec(tmp_path / "kept"), LocalContext(tmp_path / f"{number}", listener=told.append))
@@ -81,13 +84,14 @@ def test_the_mouth_is_rendered_once_and_published_for_each_job(tmp_path: Path) -
         assert (second[0] / path.relative_to(first[0])).read_bytes() == path.read_bytes()
     assert (first[0] / "teeth" / "11" / "outer.ply").is_file()
 
-
-@pytest.mark.usefixtures("small")
-def test_a_mouth_that_was_kept_in_part_is_made_again(tmp_path: Path) -> None:
-    (tmp_path / "kept" / "small").mkdir(parents=True)
-    (tmp_path / "kept" / "small" / "c0_l0.npy").touch()
-    phantom(stage_spec(tmp_path / "kept"), LocalContext(tmp_path / "job"))
-    assert open_stage(tmp_path / "job", "phantom", FolderCapture)[1].images
+    # A mouth that was kept in part is made again.
+    (tmp_path / "kept" / "small" / "capture.json").unlink()
+    monkeypatch.setattr(
+        demo_mouth, "_render", lambda folder, _report: shutil.copytree(first[0], folder, dirs_exist_ok=True)
+    )
+    phantom(stage_spec(tmp_path / "kept"), LocalContext(tmp_path / "3", listener=told.append))
+    assert told[-1].message == "A virtual incisor was rendered."
+    assert open_stage(tmp_path / "3", "phantom", FolderCapture)[1].images
 
 
 def test_a_cancel_ends_the_rendering_in_mid_kernel(tmp_path: Path) -> None:
@@ -142,13 +146,13 @@ def tell_mouth(spec: JobSpec, context: LocalContext) -> None:
     context.report(StageEvent(stage="capture", kind="log", message=str(spec.rig.mouth)))
 
 
-def test_one_command_runs_it_on_a_server(tmp_path: Path) -> None:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+@pytest.mark.dear("A server runs two jobs of five stages each, with workers of their own.")
+def test_one_command_runs_it_on_a_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     with toy_server(tmp_path / "data") as (client, _):
         server = str(client.base_url).rstrip("/")
-        command = [sys.executable, "-m", "services", "demo", "--server", server]
-        ran = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
-        assert ran.returncode == 0, ran.stderr
+        ran = CliRunner().invoke(build_app(), ["demo", "--server", server])
+        assert ran.exit_code == 0, ran.output
         (job,) = client.get("/v1/jobs").json()["jobs"]
         assert (job["state"], job["name"], job["spec"]["rig"]["mouth"]) == ("SUCCEEDED", "Demonstration", "demo")
         assert ran.stdout.splitlines()[-1] == f"report: {server}/v1/jobs/{job['id']}/artifacts/report.html"
@@ -157,12 +161,7 @@ def test_one_command_runs_it_on_a_server(tmp_path: Path) -> None:
             (name, "finished") for name in stages_of(DEMO)
         ]
         example = ["submit", str(ROOT / "deploy" / "examples" / "demo.toml"), "--watch", "--server", server]
-        assert (
-            subprocess.run(
-                [sys.executable, "-m", "services", *example], capture_output=True, check=False, env=environment
-            ).returncode
-            == 0
-        )
+        assert CliRunner().invoke(build_app(), example).exit_code == 0
     assert list(tmp_path.iterdir()) == [tmp_path / "data"]
 
 

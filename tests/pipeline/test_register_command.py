@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from services.calibrate.registration.pose import RigidPose
 from services.calibrate.registration.register import register_folder
+from services.cli.app import build_app
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.raw.registration import Registration
@@ -86,10 +86,9 @@ def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     known = json.loads((mouth.root / "calibration.json").read_text())
     limit = {"what": "Lights' positions", "value": 5.0, "limit": 2.0, "unit": "mm"}
     calibration.write_text(json.dumps(known | {"limits": [limit]}))
-    command = [sys.executable, "-m", "services", "register", str(mouth.root)]
-    command += ["--calibration", str(calibration), "--out", str(out)]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
-    assert answer.returncode == 0, answer.stderr
+    command = ["register", str(mouth.root), "--calibration", str(calibration), "--out", str(out)]
+    answer = CliRunner().invoke(build_app(), command)
+    assert answer.exit_code == 0, answer.output
     assert "teeth: 11, 12, 13, 21, 22, 23" in answer.stdout
     # The cameras stand where a pixel covers 0.2 mm at the teeth.
     assert "a pixel covers 0.20 mm at the teeth; with pixel_step = 3 a job fits squares of 0.59 mm" in answer.stdout
