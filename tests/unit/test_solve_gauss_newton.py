@@ -70,7 +70,7 @@ def _random_problem(rng: np.random.Generator) -> tuple[Quadratic, Domain, np.nda
 
 def test_ill_conditioned_or_indefinite_systems_never_worsen() -> None:
     rng, improved = np.random.default_rng(1), 0
-    for case in range(250):
+    for case in range(150):
         problem, domain, x = _random_problem(rng)
         problem.seed = case
         size = float(np.abs(problem.a).max())
@@ -86,15 +86,15 @@ def test_ill_conditioned_or_indefinite_systems_never_worsen() -> None:
             # The comparison is exact here, so the rule must hold exactly.
             assert problem.loss(state.x) <= before
         improved += problem.loss(state.x) < first
-    assert improved > 125
+    assert improved > 75
 
 
 def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
     # A flat problem: every accepted step is a false alarm. At z = 3 each of at most 3 comparisons a step passes with
-    # 1.35e-3; 200 systems x 5 steps x 3 comparisons give at most 4 on average, and more than 11 with probability 1e-3
+    # 1.35e-3; 100 systems x 5 steps x 3 comparisons give at most 2 on average, and more than 7 with probability 1e-3
     # (Poisson).
     accepted = 0
-    for case in range(200):
+    for case in range(100):
         problem = Quadratic(
             np.zeros((4, 4)), np.zeros(4), gradient_noise=1.0, hessian_noise=1.0, loss_noise=1.0, seed=case
         )
@@ -106,7 +106,7 @@ def test_pure_noise_moves_no_further_than_its_stated_rate() -> None:
             state = solver.step(problem, state)
             assert np.isfinite(state.x).all()
         accepted += state.accepted
-    assert accepted <= 11
+    assert accepted <= 7
 
 
 def test_noisy_systems_take_worse_steps_no_more_often_than_stated() -> None:
