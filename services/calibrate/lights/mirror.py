@@ -61,26 +61,31 @@ def sphere_from_outline(camera: PosedCamera, outline_px: Floats, radius_mm: floa
 
 
 def outline_errors(camera: PosedCamera, outline_px: Floats, centres_mm: Floats, radii_mm: Floats | float) -> Floats:
-    """Return the signed distances (E,) in px of pixels (E, 2) from the projected outlines of spheres, positive outside.
+    """Return the signed distances (..., E) in px of pixels (E, 2) from the projected outlines of spheres, positive
+    outside.
 
     Args:
         camera: the calibrated camera.
         outline_px: detected points of outlines (E, 2).
-        centres_mm: centre of the one sphere (3,), or of each pixel's sphere (E, 3).
+        centres_mm: centre of the one sphere (3,), or of each pixel's sphere (E, 3), or several of these (..., E, 3).
         radii_mm: radius of the one sphere, or of each pixel's sphere (E,).
     """
-    towards = np.broadcast_to(centres_mm - camera.centre_mm, (len(outline_px), 3))
-    distance = np.linalg.norm(towards, axis=1, keepdims=True)
+    towards = np.asarray(centres_mm - camera.centre_mm)
+    towards = np.broadcast_to(towards, (*towards.shape[:-2], len(outline_px), 3))
+    distance = np.linalg.norm(towards, axis=-1, keepdims=True)
     axis, sine = towards / distance, np.broadcast_to(radii_mm, len(outline_px))[:, None] / distance
     rays = camera.directions(outline_px)
     # The outline's point next to each pixel: tilt the cone's axis towards the pixel's ray by exactly the half angle.
-    across = rays - (rays * axis).sum(axis=1, keepdims=True) * axis
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = rays - (rays * axis).sum(axis=-1, keepdims=True) * axis
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
     edge = np.sqrt(1 - sine**2) * axis + sine * across
-    projected = camera.project(camera.centre_mm + distance * edge)
-    outward = camera.project(camera.centre_mm + distance * (edge + 1e-3 * across)) - projected
-    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    return np.asarray(((outline_px - projected) * outward).sum(axis=1))
+    projected, beside = (
+        camera.project((camera.centre_mm + distance * point).reshape(-1, 3)).reshape(*edge.shape[:-1], 2)
+        for point in (edge, edge + 1e-3 * across)
+    )
+    outward = beside - projected
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
+    return np.asarray(((outline_px - projected) * outward).sum(axis=-1))
 
 
 def highlight_points(

@@ -9,7 +9,7 @@ improve the cameras a little.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -132,20 +132,25 @@ class _Weighted:
         sides = np.arange(n_highlights).reshape(-1, 2)
         edges = n_highlights + np.arange(n_edges)
         weight = self.good[:, None] / self.sigmas[0]
-        for axis in range(3):
-            lights, centres = 3 * problem.row + axis, problem.first_centre + 3 * problem.place + axis
-            for columns in (lights, centres):
-                step = np.zeros(len(values))
-                step[columns] = STEP
-                slope = (problem.highlights(cameras, values + step) - problem.highlights(cameras, values - step)) / (
-                    2 * STEP
-                )
-                derivative[sides, columns[:, None]] = slope * weight
-            edge_columns = problem.first_centre + 3 * problem.edge_place + axis
-            step = np.zeros(len(values))
-            step[edge_columns] = STEP
-            slope = (problem.outlines(cameras, values + step) - problem.outlines(cameras, values - step)) / (2 * STEP)
-            derivative[edges, edge_columns] = slope / self.sigmas[1]
+
+        def slopes(
+            of: Callable[[Sequence[PosedCamera], Floats], Floats], columns: Sequence[NDArray[np.int64]]
+        ) -> Floats:
+            # By central differences: a step along some columns at a time.
+            steps = np.zeros((len(columns), len(values)))
+            for step, own in zip(steps, columns, strict=True):
+                step[own] = STEP
+            ahead, back = of(cameras, np.concatenate([values + steps, values - steps])).reshape(2, len(columns), -1)
+            return np.asarray((ahead - back) / (2 * STEP))
+
+        axes = range(3)
+        columns = [3 * problem.row + axis for axis in axes]
+        columns += [problem.first_centre + 3 * problem.place + axis for axis in axes]
+        for own, slope in zip(columns, slopes(problem.highlights, columns), strict=True):
+            derivative[sides, own[:, None]] = slope.reshape(-1, 2) * weight
+        columns = [problem.first_centre + 3 * problem.edge_place + axis for axis in axes]
+        for own, slope in zip(columns, slopes(problem.outlines, columns), strict=True):
+            derivative[edges, own] = slope / self.sigmas[1]
         derivative[edges, problem.first_shift + problem.edge_camera] = -1 / self.sigmas[1]
         shifts = np.arange(problem.n_cameras)
         derivative[n_highlights + n_edges + shifts, problem.first_shift + shifts] = 1 / EDGE_SHIFT_SE_PX

@@ -85,9 +85,15 @@ class Problem:
         return self.first_centre + 3 * self.n_places
 
     def split(self, values: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the lights (M, 3) and centres (P, 3) in mm and the edge shifts (K,) in px."""
-        first, second = self.first_centre, self.first_shift
-        return values[:first].reshape(-1, 3), values[first:second].reshape(-1, 3), values[second : self.length]
+        """Return the lights (..., M, 3) and centres (..., P, 3) in mm and the edge shifts (..., K) in px of values
+        (..., U).
+        """
+        first, second, sets = self.first_centre, self.first_shift, values.shape[:-1]
+        return (
+            values[..., :first].reshape(*sets, -1, 3),
+            values[..., first:second].reshape(*sets, -1, 3),
+            values[..., second : self.length],
+        )
 
     def start(self, cameras: Sequence[PosedCamera]) -> Floats:
         """Return first values of the unknowns: each sphere from its outlines alone, and each light at the point nearest
@@ -107,28 +113,36 @@ class Problem:
         return np.concatenate([np.ravel(lights), centres.ravel(), np.zeros(self.n_cameras)])
 
     def highlights(self, cameras: Sequence[PosedCamera], values: Floats) -> Floats:
-        """Return detected minus projected highlights (N, 2) in px."""
+        """Return detected minus projected highlights (..., N, 2) in px for values (..., U)."""
         lights, centres, _ = self.split(values)
-        where = np.array([camera.centre_mm for camera in cameras])[self.camera]
-        points = highlight_points(where, lights[self.row], centres[self.place], self._radius)
-        off = np.empty_like(self._highlights_px)
+        off = np.empty((*values.shape[:-1], *self._highlights_px.shape))
+        where = np.broadcast_to(
+            np.array([camera.centre_mm for camera in cameras])[self.camera], (*off.shape[:-1], 3)
+        ).reshape(-1, 3)
+        points = highlight_points(
+            where,
+            lights[..., self.row, :].reshape(-1, 3),
+            centres[..., self.place, :].reshape(-1, 3),
+            np.broadcast_to(self._radius, off.shape[:-1]).reshape(-1),
+        ).reshape(*off.shape[:-1], 3)
         for number, camera in enumerate(cameras):
             mine = self.camera == number
             if mine.any():
-                off[mine] = self._highlights_px[mine] - camera.project(points[mine])
+                seen = points[..., mine, :]
+                drawn = camera.project(seen.reshape(-1, 3)).reshape(*seen.shape[:-1], 2)
+                off[..., mine, :] = self._highlights_px[mine] - drawn
         return off
 
     def outlines(self, cameras: Sequence[PosedCamera], values: Floats) -> Floats:
-        """Return the distances (E,) in px of detected edges from the projected outlines, positive outside, minus the
-        camera's edge shift.
+        """Return the distances (..., E) in px of detected edges from the projected outlines, positive outside, minus
+        the camera's edge shift, for values (..., U).
         """
         _, centres, shifts = self.split(values)
-        off = np.empty(len(self._edges_px))
+        off = np.empty((*values.shape[:-1], len(self._edges_px)))
         for number, camera in enumerate(cameras):
             mine = self.edge_camera == number
             if mine.any():
-                where = centres[self.edge_place[mine]]
-                off[mine] = (
-                    outline_errors(camera, self._edges_px[mine], where, self._edge_radius[mine]) - shifts[number]
-                )
+                where = centres[..., self.edge_place[mine], :]
+                found = outline_errors(camera, self._edges_px[mine], where, self._edge_radius[mine])
+                off[..., mine] = found - shifts[..., number, None]
         return off
