@@ -109,8 +109,8 @@ def test_meshes_are_fine_even_and_smooth(average: Jaw) -> None:
 
 def test_dentin_lies_inside_enamel(subject: Jaw) -> None:
     # The root's cover is 0.08 mm along the normal; faces of 0.4 mm over its rounding of 0.8 mm cut in by 0.4² / (8 x
-    # 0.8) = 0.025 mm.
-    for tooth in subject.teeth:
+    # 0.8) = 0.025 mm. Every second tooth: one of each kind.
+    for tooth in subject.teeth[::2]:
         require_nested(tooth.outer, tooth.dentin, 0.05)
 
 
