@@ -56,10 +56,10 @@ def listening() -> set[int]:
 @pytest.mark.attack("Dask and files as another user", "every port of the workers, as another user")
 def test_whoever_shows_no_certificate_is_refused_on_every_port() -> None:
     before = listening()
-    with Workers() as workers, workers.serving(2) as client:
+    with Workers() as workers, workers.serving(1) as client:
         assert client.submit(sum, [1, 2]).result(timeout=60) == 3
         opened = listening() - before
-        assert len(opened) >= 3  # scheduler and two workers
+        assert len(opened) >= 2  # scheduler and worker
         targets = json.dumps([["127.0.0.1", port] for port in opened])
         told = subprocess.run(
             [PYTHON, "-c", STRANGER.read_text(), targets],

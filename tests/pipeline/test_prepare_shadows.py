@@ -63,31 +63,38 @@ def shadows(root: Path) -> NDArray[np.bool_]:
     return valid & np.uint16(MaskBit.SHADOW) > 0
 
 
-def test_shadows_are_flagged_where_a_job_asks(tmp_path: Path) -> None:
-    (tmp_path / "capture").mkdir()
-    shadow = write_capture(tmp_path / "capture", lights=8)
-    prepare(tmp_path / "capture", tmp_path / "plain")
-    prepare(tmp_path / "capture", tmp_path / "asked", shadows=True)
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.bool_]]:
+    """Folder with a capture of eight lights and a job ``asked`` that asked for its shadows, and the true shadow."""
+    root = tmp_path_factory.mktemp("shadows")
+    (root / "capture").mkdir()
+    shadow = write_capture(root / "capture", lights=8)
+    prepare(root / "capture", root / "asked", shadows=True)
+    return root, shadow
+
+
+def test_shadows_are_flagged_where_a_job_asks(asked: tuple[Path, NDArray[np.bool_]], tmp_path: Path) -> None:
+    root, shadow = asked
+    prepare(root / "capture", tmp_path / "plain")
     assert not shadows(tmp_path / "plain").any()
-    flagged = shadows(tmp_path / "asked")
+    flagged = shadows(root / "asked")
     assert shadow.sum() > 500
     assert flagged[SHADED][shadow].mean() > 0.9
     others = np.delete(flagged, SHADED, axis=0)
-    outside = zarr.open_array(tmp_path / "asked" / "prepared" / "prepared.zarr" / "valid", mode="r")[0, 0]
+    outside = zarr.open_array(root / "asked" / "prepared" / "prepared.zarr" / "valid", mode="r")[0, 0]
     assert others[:, np.asarray(outside) & np.uint16(MaskBit.OUTSIDE) == 0].mean() < 0.03
-    sure = np.asarray(zarr.open_array(tmp_path / "asked" / "prepared" / "prepared.zarr" / "shadow", mode="r")[0])
+    sure = np.asarray(zarr.open_array(root / "asked" / "prepared" / "prepared.zarr" / "shadow", mode="r")[0])
     assert (sure[flagged] >= 50).all()
-    report = QualityReport.model_validate_json((tmp_path / "asked" / "prepared" / "quality.json").read_text())
+    report = QualityReport.model_validate_json((root / "asked" / "prepared" / "quality.json").read_text())
     shares = {image.light: image.masked.get("shadow", 0.0) for image in report.images}
     assert max(shares, key=lambda light: shares[light]) == f"l{SHADED}"
 
 
 def test_shading_that_was_cut_off_is_done_again_on_another_worker(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    asked: tuple[Path, NDArray[np.bool_]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Dask runs a block again if its worker died between writing an image's flags and writing their record."""
-    (tmp_path / "capture").mkdir()
-    write_capture(tmp_path / "capture", lights=8)
+    root, _ = asked
     kept = Block.__call__
 
     def twice(block: Block) -> None:
@@ -100,21 +107,18 @@ def test_shading_that_was_cut_off_is_done_again_on_another_worker(
         kept(block)
 
     monkeypatch.setattr(Block, "__call__", twice)
-    prepare(tmp_path / "capture", tmp_path / "cut_off", shadows=True)
-    monkeypatch.undo()
-    prepare(tmp_path / "capture", tmp_path / "whole", shadows=True)
-    assert shadows(tmp_path / "whole").any()
-    for path in (tmp_path / "whole" / "prepared").rglob("*"):
+    prepare(root / "capture", tmp_path / "cut_off", shadows=True)
+    assert shadows(root / "asked").any()
+    for path in (root / "asked" / "prepared").rglob("*"):
         if path.is_file() and path.name != "manifest.json":
-            assert (tmp_path / "cut_off" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+            assert (tmp_path / "cut_off" / path.relative_to(root / "asked")).read_bytes() == path.read_bytes()
 
 
 def test_a_shadow_is_found_among_pixels_that_are_masked_as_highlights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    asked: tuple[Path, NDArray[np.bool_]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A highlight adds light, so what is dark in spite of it is shadowed."""
-    (tmp_path / "capture").mkdir()
-    shadow = write_capture(tmp_path / "capture", lights=8)
+    root, shadow = asked
     kept = valid_bits
 
     def all_highlights(*args: Any) -> Bits:
@@ -122,7 +126,7 @@ def test_a_shadow_is_found_among_pixels_that_are_masked_as_highlights(
         return kept(*args) | np.uint16(MaskBit.HIGHLIGHT if of_light else 0)
 
     monkeypatch.setattr(blocks, "valid_bits", all_highlights)
-    prepare(tmp_path / "capture", tmp_path / "asked", shadows=True)
+    prepare(root / "capture", tmp_path / "asked", shadows=True)
     flagged = shadows(tmp_path / "asked")[SHADED]
     assert flagged[shadow].mean() > 0.9
     assert flagged[~shadow].mean() < 0.03

@@ -18,12 +18,12 @@ from services.core.files.meshes import read_mesh, read_teeth
 from services.core.raw.registration import Registration
 from services.core.store import read_record
 from tests.support.raw_folders import Tree, write_toml
-from tests.support.raw_mouth import RawMouth, write_raw_mouth
+from tests.support.raw_mouth import RawMouth, shared_mouth, write_raw_mouth
 
 
 @pytest.fixture(scope="module")
 def mouth(tmp_path_factory: pytest.TempPathFactory) -> RawMouth:
-    return write_raw_mouth(tmp_path_factory.mktemp("raw"))
+    return shared_mouth(tmp_path_factory)
 
 
 def altered(mouth: RawMouth, root: Path, change: Tree) -> Path:

@@ -17,7 +17,7 @@ from services.core.results import PreparedManifest
 from services.core.store import open_stage, read_record
 from services.pipeline.stages import run_job, stages_of
 from tests.support.raw_folders import write_toml
-from tests.support.raw_mouth import RawMouth, write_raw_mouth
+from tests.support.raw_mouth import RawMouth, shared_mouth
 from tests.support.toy_stages import DOORS
 
 NAMES = tuple(f"teeth.{axis}" for axis in ("rx", "ry", "rz", "tx", "ty", "tz"))
@@ -25,7 +25,22 @@ NAMES = tuple(f"teeth.{axis}" for axis in ("rx", "ry", "rz", "tx", "ty", "tz"))
 
 @pytest.fixture(scope="module")
 def mouth(tmp_path_factory: pytest.TempPathFactory) -> RawMouth:
-    return write_raw_mouth(tmp_path_factory.mktemp("raw"))
+    return shared_mouth(tmp_path_factory)
+
+
+def test_only_a_raw_folder_with_a_scan_and_no_teeth_lacks_a_pose(mouth: RawMouth, tmp_path: Path) -> None:
+    assert lacks_pose(mouth.root)
+    raw = tmp_path / "raw"
+    shutil.copytree(mouth.root, raw)
+    write_toml(raw, {key: value for key, value in mouth.tree.items() if key != "scan"})
+    assert not lacks_pose(raw)
+    write_toml(raw, mouth.tree)
+    (raw / "teeth").mkdir()
+    assert not lacks_pose(raw)
+    (raw / "teeth").rmdir()
+    (raw / "raw.toml").write_text("units = ")
+    assert not lacks_pose(raw)
+    assert not lacks_pose(tmp_path)
 
 
 @pytest.mark.slow
@@ -61,18 +76,3 @@ def test_a_refusal_leaves_its_pictures_with_the_job(mouth: RawMouth, tmp_path: P
     assert (job / "registration" / "refused_c0.png").is_file()
     assert not (job / REGISTERED).exists()
     assert not (job / "prepared").exists()
-
-
-def test_only_a_raw_folder_with_a_scan_and_no_teeth_lacks_a_pose(mouth: RawMouth, tmp_path: Path) -> None:
-    assert lacks_pose(mouth.root)
-    raw = tmp_path / "raw"
-    shutil.copytree(mouth.root, raw)
-    write_toml(raw, {key: value for key, value in mouth.tree.items() if key != "scan"})
-    assert not lacks_pose(raw)
-    write_toml(raw, mouth.tree)
-    (raw / "teeth").mkdir()
-    assert not lacks_pose(raw)
-    (raw / "teeth").rmdir()
-    (raw / "raw.toml").write_text("units = ")
-    assert not lacks_pose(raw)
-    assert not lacks_pose(tmp_path)

@@ -20,6 +20,8 @@ from tests.support.shared_data import shared_path
 from tests.support.small_slab import WAVELENGTH_NM, description
 
 NOISE = 0.01
+SMALL = SlabOptions(effort=0.04)
+"""Options with which the ± of the small cell are still below 4 %."""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,7 @@ def small_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def small_fit(small_folder: Path) -> SlabFit:
-    (fit,) = fit_slab(small_folder, SlabOptions(effort=0.1))
+    (fit,) = fit_slab(small_folder, SMALL)
     return fit
 
 
@@ -63,14 +65,13 @@ def test_a_small_cell_gives_back_what_it_holds(small_fit: SlabFit) -> None:
     assert "shot noise of 1 %" in small_fit.notes[0]
 
 
-def test_the_answer_does_not_depend_on_where_blocks_run(small_folder: Path) -> None:
+def test_the_answer_does_not_depend_on_where_blocks_run(small_folder: Path, small_fit: SlabFit) -> None:
     def elsewhere(task, blocks):  # type: ignore[no-untyped-def]
         return [task(block) for block in reversed(blocks)][::-1]
 
-    (here,) = fit_slab(small_folder, SlabOptions(effort=0.01))
-    (there,) = fit_slab(small_folder, SlabOptions(effort=0.01), elsewhere)
-    assert there.parameters == here.parameters
-    assert there.phase == here.phase
+    (there,) = fit_slab(small_folder, SMALL, elsewhere)
+    assert there.parameters == small_fit.parameters
+    assert there.phase == small_fit.phase
 
 
 def test_results_are_written_by_wavelength(small_fit: SlabFit, tmp_path: Path) -> None:

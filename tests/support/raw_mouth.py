@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
 
 from services.anatomy.templates.jaw import build_jaw
@@ -18,6 +19,7 @@ from services.core.calibration.record import Calibration
 from services.core.geometry import Mesh
 from services.core.store import write_record
 from services.phantom.lab.scan import scan_of
+from tests.support.computed_once import computed_once, run_folder
 from tests.support.labelled_scan import write_labelled_ply
 from tests.support.photographed_mouth import clicks_on, photographed_mouth
 from tests.support.raw_folders import Tree, write_toml
@@ -36,6 +38,17 @@ class RawMouth:
     tree: Tree
     rig_from_scan: RigidPose
     centre_mm: np.ndarray
+
+
+def shared_mouth(factory: pytest.TempPathFactory) -> RawMouth:
+    """A raw folder that all tests of the run share. Nobody may write into it."""
+
+    def made() -> RawMouth:
+        root = run_folder(factory) / "raw-mouth"
+        root.mkdir()
+        return write_raw_mouth(root)
+
+    return computed_once(factory, "raw-mouth-record", made)
 
 
 def write_raw_mouth(
