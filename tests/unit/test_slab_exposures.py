@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -38,22 +39,35 @@ def radiance() -> np.ndarray:
     return np.asarray(2 + 20_000 * np.exp(-2 * np.hypot(x, y)))
 
 
-def write_stack(root: Path, *, blacks: int = 4, change: Callable[[dict[str, Any]], object] = lambda _: None) -> Path:
+@lru_cache(maxsize=1)
+def frames() -> dict[str, np.ndarray]:
+    """Frames by file: three exposures of two cameras under two lights, and four black frames of each camera."""
+    rng, light, shown = np.random.default_rng(3), radiance()[..., None], dict[str, np.ndarray]()
+    for image in description()["images"]:
+        for number, time_s in enumerate(TIMES_S):
+            shown[image["file"].replace(".npy", f"_{number}.npy")] = SENSOR.counts(light, time_s, rng)[..., 0]
+    for camera in ("f0", "b0"):
+        for number in range(4):
+            shown[f"{camera}_black_{number}.npy"] = SENSOR.counts(0 * light, 1.0, rng)[..., 0]
+    return shown
+
+
+def write_stack(root: Path, *, change: Callable[[dict[str, Any]], object] = lambda _: None) -> Path:
     """Writes a folder of two cameras and two lights in three exposures, with black frames."""
-    told, rng, noise = description(), np.random.default_rng(3), radiance()[..., None]
+    told = description()
     told["pixels"] |= {"columns": EDGE, "rows": EDGE}
     told["beam"]["power"] = POWER
     told["exposures"] = []
     for image in told.pop("images"):
         for number, time_s in enumerate(TIMES_S):
             file = image["file"].replace(".npy", f"_{number}.npy")
-            np.save(root / file, SENSOR.counts(noise, time_s, rng)[..., 0])
             told["exposures"].append(image | EXPOSURE | {"file": file, "exposure_s": time_s})
     for camera in ("f0", "b0"):
-        for number in range(blacks):
+        for number in range(4):
             file = f"{camera}_black_{number}.npy"
-            np.save(root / file, SENSOR.counts(0 * noise, 1.0, rng)[..., 0])
             told["exposures"].append(EXPOSURE | {"camera": camera, "kind": "black", "file": file})
+    for file, frame in frames().items():
+        np.save(root / file, frame)
     change(told)
     (root / "slab.json").write_text(json.dumps(told))
     return root

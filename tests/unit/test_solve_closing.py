@@ -87,9 +87,9 @@ def fitted(problem: Linear, *, measured: bool, offset: float) -> tuple[np.ndarra
     return x + last, uncertainty(DOMAIN, x + last, equations, sums, last)
 
 
-def rms(*, measured: bool, held: bool) -> np.ndarray:
+def rms(*, measured: bool, held: bool, rounds: int = ROUNDS) -> np.ndarray:
     rng, z = np.random.default_rng(7), []
-    for seed in range(ROUNDS):
+    for seed in range(rounds):
         problem = Linear(seed, held)
         x, known = fitted(problem, measured=measured, offset=float(rng.standard_normal()) if held else 0.0)
         z.append((x - problem.truth) / np.sqrt(np.diag(known.covariance)))
@@ -142,7 +142,8 @@ def test_a_step_s_promise_and_its_slope_are_those_of_the_loss(monkeypatch: pytes
 
 
 def test_without_the_measurement_they_are_not() -> None:
-    assert rms(measured=False, held=True).max() > 1.5
+    # The rms of 100 values is known to 7 %.
+    assert rms(measured=False, held=True, rounds=100).max() > 1.5
 
 
 def test_a_response_is_without_bias_and_its_stated_noise_is_what_is_seen() -> None:
