@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 
+from services.core import end_with_parent
 from services.core.errors import CrashError
 from services.core.store import write_atomic
 
@@ -50,11 +50,14 @@ def _render(folder: Path, report_fraction: Callable[[float], None]) -> None:
     # Render in a child process, because a kernel may hold the interpreter for seconds, during which the worker must
     # answer its scheduler, and because a process can be ended during a kernel.
     options = [part for name, value in OPTIONS.items() for part in (f"--{name}", value)]
-    command = [sys.executable, "-m", "services", "phantom", "--out", str(folder), *options]
+    command = end_with_parent.command("services", ["phantom", "--out", str(folder), *options])
     log = folder.with_name(f"{folder.name}.words")
     images = int(OPTIONS["cameras"]) * int(OPTIONS["lights"])
     try:
-        with log.open("wb") as stream, subprocess.Popen(command, stdout=stream, stderr=stream) as process:  # noqa: S603
+        with (
+            log.open("wb") as stream,
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=stream, stderr=stream) as process,  # noqa: S603
+        ):
             try:
                 while process.poll() is None:
                     report_fraction(len(list(folder.glob("*_var.npy"))) / images)
