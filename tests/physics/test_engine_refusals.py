@@ -323,6 +323,11 @@ def mouth_scene(**changes: Any) -> SceneRecipe:
     return replace(mouth_recipe("thin"), **changes)
 
 
+@pytest.fixture(scope="module")
+def whole_mouth() -> Engine:
+    return Engine(mouth_scene())
+
+
 @pytest.mark.parametrize(
     ("changes", "facts"),
     [
@@ -358,7 +363,9 @@ def test_parts_that_no_mouth_has_are_refused(no_kernel: None, changes: dict[str,
         ),
     ],
 )
-def test_media_that_do_not_belong_to_the_scene_are_refused(mouth: Mouth, facts: tuple[str, ...]) -> None:
+def test_media_that_do_not_belong_to_the_scene_are_refused(
+    whole_mouth: Engine, no_kernel: None, mouth: Mouth, facts: tuple[str, ...]
+) -> None:
     with pytest.raises(InputError) as caught:
-        Engine(mouth_scene()).images(mouth, whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
+        whole_mouth.images(mouth, whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
     require_sentence(caught.value, *facts)

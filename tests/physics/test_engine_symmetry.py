@@ -26,8 +26,11 @@ def uniform_room(count: int) -> NDArray[np.float64]:
     return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
 
 
+@pytest.mark.parametrize(("samples", "tolerance"), [(6144, 0.02), pytest.param(24576, 0.01, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("boundary", "first_surface"), [("matched", 0.0), ("thin", ((1.631 - 1) / (1.631 + 1)) ** 2)])
-def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surface: float) -> None:
+def test_a_white_tooth_vanishes_in_a_uniform_room(
+    boundary: Boundary, first_surface: float, samples: int, tolerance: float
+) -> None:
     # Radiance 1 from all directions gives radiance 1 everywhere. The camera sees the centre of a ball so deep that no
     # unscattered light passes (optical depth 16). The first reflection of a thin boundary is left out, like highlights.
     lights = uniform_room(200)
@@ -38,11 +41,11 @@ def test_a_white_tooth_vanishes_in_a_uniform_room(boundary: Boundary, first_surf
     )
     tissue = Tissue(Medium(2, 1, 0.8, 0.5, -0.2), Medium(4, 1, 1, 0.3))
     view = whole_view(camera_at((0.3, 1, 0.2), size=4, span_mm=0.8))
-    estimate = Engine(scene).images(tissue, view, samples=24576, seed=4)
+    estimate = Engine(scene).images(tissue, view, samples=samples, seed=4)
     pixel = estimate.mean.sum(axis=0)
     error = pixel.std(ddof=1) / np.sqrt(len(pixel))
-    # Tolerance 1 %; all pixels see the same radiance, so their spread is the noise.
-    assert error <= 0.01 / 3
+    # All pixels see the same radiance, so their spread is the noise.
+    assert error <= tolerance / 3
     assert abs(pixel.mean() - (1 - first_surface)) <= LARGEST_Z * error
 
 
@@ -59,10 +62,10 @@ def test_camera_and_light_may_change_places(boundary: Boundary) -> None:
             recipe(boundary), light_positions_mm=50 * CAMERA_DISTANCE_MM * unit[None], light_intensities=np.array([1e8])
         )
         camera = camera_at(towards_camera, size=8, span_mm=9.0, distance_mm=50 * CAMERA_DISTANCE_MM)
-        estimate = Engine(scene).images(tissue, whole_view(camera), samples=16384, seed=seed)
+        estimate = Engine(scene).images(tissue, whole_view(camera), samples=4096, seed=seed)
         values.append(estimate.mean.sum())
         variances.append(estimate.variance.sum())
     noise = np.sqrt(sum(variances))
     # From the two directions the outlines have different areas, so equality is no coincidence.
-    assert noise <= 0.01 * values[0]
+    assert noise <= 0.02 * values[0]
     assert abs(values[0] - values[1]) <= LARGEST_Z * noise

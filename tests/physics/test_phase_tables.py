@@ -178,22 +178,23 @@ def test_tabulated_lobes_reproduce_slab_totals() -> None:
         table, distance = henyey_greenstein(layer.g1, spacing=0.002)
         scatterings = layer.alpha / (1 - layer.alpha) * (1 - case.values[0].sum())
         tabulated = replace(case, layers=(layer.model_copy(update={"table": table, "g1": 0.0}),))
-        sums = simulate(tabulated, lambda sums: float(sums.standard_error().max() * 3 / 1e-3), seed=901 + number)
+        sums = simulate(tabulated, lambda sums: float(sums.standard_error().max() * 3 / 2e-3), seed=901 + number)
         assert scatterings * distance < 0.1 * sums.standard_error().max()
         scores.append(z_scores(sums.mean(), case.values, sums.standard_error()))
     require_unbiased(np.concatenate(scores), independent=len(cases))
 
 
 def test_connections_know_the_table() -> None:
-    # Compare to radiances of van de Hulst's slab within 1 %; the table's own error is 2e-6.
-    for number, case in enumerate(angular_cases(0.01)):
+    # Compare to radiances of van de Hulst's slab within 2 %; the table's own error is 2e-6.
+    for number, case in enumerate(angular_cases(0.02)):
         if case.layer.g1 != 0:
             table, _ = henyey_greenstein(case.layer.g1, spacing=0.002)
             tabulated = replace(case, layer=case.layer.model_copy(update={"table": table, "g1": 0.0}))
             require_unbiased(tabulated.scores(tabulated.simulate(921 + number)), independent=1)
 
 
-def test_a_tabulated_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [8, pytest.param(16, marks=pytest.mark.slow)])
+def test_a_tabulated_tooth_looks_as_in_mitsuba(size: int, tmp_path: Path) -> None:
     prepare_device()
     # The table has equal steps of the cosine, as Mitsuba's tabphase needs, with a forward lobe, a gap and a backward
     # lobe.
@@ -205,7 +206,7 @@ def test_a_tabulated_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     dentin = DentinShape.known(type(outer)(core, outer.faces))
     write_mesh(tmp_path / "outer.ply", outer)
     write_mesh(tmp_path / "dentin.ply", dentin.base)
-    camera, light = camera_at((0.2, 1, 0.1), size=16, span_mm=5.0), LIGHTS_MM[1]
+    camera, light = camera_at((0.2, 1, 0.1), size=size, span_mm=5.0), LIGHTS_MM[1]
     scene = single_tooth(outer, dentin, light[None], np.array([INTENSITY]))
     ours = Engine(scene).images(tissue, whole_view(camera), samples=2048, seed=931, batches=BATCHES)
     stock = nested_scene(
@@ -221,7 +222,7 @@ def test_a_tabulated_tooth_looks_as_in_mitsuba(tmp_path: Path) -> None:
     }
     mean, variance = render_batches(load_scene(stock), 0, samples=2048, seed=941, batches=BATCHES)
     scores = pixel_scores([ours.mean.reshape(mean.shape), mean], [ours.variance.reshape(mean.shape), variance])
-    require_same_pictures(scores, least=250)
+    require_same_pictures(scores, least=size**2 - 6)
 
 
 @pytest.mark.parametrize(

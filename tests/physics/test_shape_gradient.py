@@ -38,7 +38,7 @@ CLEAR = Tissue(Medium(2, 0.8, 0.8, 0.6, -0.3), Medium(0.5, 0.9, 0.7, 0.6, -0.3),
 FORWARD = Tissue(Medium(2, 0.95, 0.93, 0.82, -0.1), Medium(4, 0.85, 1.0, 0.75), (0.5, 0.4))
 """Tissue of the benchmark's dark incisor; enamel is thinner here."""
 CASES = [
-    pytest.param(CLEAR, "matched", 1024, 0.03, id="clear-matched"),
+    pytest.param(CLEAR, "matched", 256, 0.03, id="clear-matched"),
     pytest.param(CLEAR, "thin", 1024, 0.03, id="clear-thin", marks=pytest.mark.slow),
     pytest.param(FORWARD, "matched", 16384, 0.15, id="forward-matched", marks=pytest.mark.slow),
 ]
@@ -53,14 +53,14 @@ def test_it_is_the_derivative_of_the_weighted_images(
     weights = _residual(engine, tissue, view)
     found = np.array(
         [
-            engine.shape_gradient(tissue, view, weights, seed=seed, samples=1024, photons=16384).gradient
+            engine.shape_gradient(tissue, view, weights, seed=seed, samples=256, photons=4096).gradient
             for seed in range(SEEDS)
         ]
     )
     limit = stats.t.isf(FALSE_ALARM / (2 * 2 * len(CASES)), SEEDS - 1)
     for mode in range(2):
-        expected = [_difference(engine, tissue, view, weights, mode, paths, seed) for seed in range(SEEDS)]
-        gradients, differences = found[:, mode] / np.mean(expected), np.array(expected) / np.mean(expected)
+        expected = _differences(engine, tissue, view, weights, mode, paths)
+        gradients, differences = found[:, mode] / expected.mean(), expected / expected.mean()
         assert _standard_error(gradients) <= LARGEST_ERROR
         assert _standard_error(differences) <= LARGEST_ERROR
         # Seeds are unrelated, so their pairing is arbitrary.
@@ -71,12 +71,12 @@ def test_it_is_the_derivative_of_the_weighted_images(
 def test_its_errors_are_honest() -> None:
     engine, view = Engine(recipe()), whole_view(camera_at((0.2, 1, 0.1)), 1)
     weights = _residual(engine, CLEAR, view)
-    runs = [engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=64, photons=512) for seed in range(64)]
+    runs = [engine.shape_gradient(CLEAR, view, weights, seed=seed, samples=64, photons=512) for seed in range(48)]
     claimed = np.mean([run.variance for run in runs], axis=0)
     found = np.var([run.gradient for run in runs], axis=0, ddof=1)
-    # The variance of 64 values is chi-square with 63 degrees of freedom and lies in 0.6 to 1.6 except once in 1e4; the
-    # bounds also allow for the noise of the claimed variance.
-    assert ((found / claimed > 0.55) & (found / claimed < 1.7)).all()
+    # The variance of 48 values is chi-square with 47 degrees of freedom and lies in 0.5 to 1.8 except twice in a
+    # thousand runs; seeds are fixed.
+    assert ((found / claimed > 0.5) & (found / claimed < 1.8)).all()
 
 
 def test_it_repeats_bit_for_bit_and_seeds_matter() -> None:
@@ -170,22 +170,31 @@ def test_in_a_mouth_one_tooth_moves() -> None:
 
 def _residual(engine: Engine, tissue: Tissue, view: View) -> NDArray[np.float64]:
     other = tissue.with_values({"shape.0": 0.8, "shape.1": 0.8})
-    images = [engine.images(one, view, samples=1024, seed=900).mean for one in (other, tissue)]
+    images = [engine.images(one, view, samples=256, seed=900).mean for one in (other, tissue)]
     return images[1] - images[0]
 
 
-def _difference(
-    engine: Engine, tissue: Tissue, view: View, weights: NDArray[np.float64], mode: int, paths: int, seed: int
-) -> float:
-    """Central difference extrapolated from two steps, with an error of fourth order."""
+def _differences(
+    engine: Engine, tissue: Tissue, view: View, weights: NDArray[np.float64], mode: int, paths: int
+) -> NDArray[np.float64]:
+    """Central differences (S,) over seeds, extrapolated from two steps, with an error of fourth order."""
     middle = tissue.shape[mode]
 
-    def at(step: float) -> float:
-        sides = [tissue.with_values({f"shape.{mode}": middle + sign * step}) for sign in (1, -1)]
-        up, down = (engine.images(side, view, samples=paths, seed=1000 + seed).mean for side in sides)
-        return float(((up - down) * weights).sum()) / (2 * step)
+    def at(step: float, samples: int) -> NDArray[np.float64]:
+        # Render all seeds at one value before the next value, because a new value needs new surfaces.
+        up, down = (
+            np.array(
+                [
+                    (engine.images(side, view, samples=samples, seed=1000 + seed).mean * weights).sum()
+                    for seed in range(SEEDS)
+                ]
+            )
+            for side in (tissue.with_values({f"shape.{mode}": middle + sign * step}) for sign in (1, -1))
+        )
+        return (up - down) / (2 * step)
 
-    return (4 * at(STEP / 2) - at(STEP)) / 3
+    # The wide difference has a quarter of the narrow one's weight and less noise, so fewer paths are enough for it.
+    return (4 * at(STEP / 2, paths) - at(STEP, paths // 4)) / 3
 
 
 def _standard_error(values: NDArray[np.float64]) -> float:

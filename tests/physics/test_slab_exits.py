@@ -1,9 +1,9 @@
 """Positions and directions in which light leaves a slab, compared to van de Hulst's tables, Chandrasekhar's H function
 and rings of a pencil beam.
 
-The rule is that of ``tests.support.z_scores``. Totals have a tolerance of 1e-3 (rings 5e-4, the half space of albedo
-0.5 1e-4) in every run and of 1e-4 in the slow ones. Radiances have a tolerance of 0.3 % of their value; their standard
-error of 0.1 % is then at least ten times the rounding error of the printed digits.
+The rule is that of ``tests.support.z_scores``. Totals have a tolerance of 2.5e-3 (rings 1e-3) in every run and of 1e-4
+in the slow ones. Radiances have a tolerance of 0.8 % of their value, and of 0.3 % in the slow runs. There their
+standard error of 0.1 % is at least ten times the rounding error of the printed digits.
 """
 
 from __future__ import annotations
@@ -16,10 +16,16 @@ from numpy.typing import NDArray
 
 from services.fit.slab.simulate import Layer, SlabResult, simulate_slab
 from tests.support.exit_tables import ExitCase, angular_cases, half_space_cases, ring_case
+from tests.support.slab_tables import fewer_lanes
 from tests.support.z_scores import LARGEST_Z, require_unbiased
 
-RADIANCE_TOLERANCE = 0.003
-TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
+RADIANCE_TOLERANCE, FINE_RADIANCE_TOLERANCE = 0.008, 0.003
+TOLERANCE, FINE_TOLERANCE = 2.5e-3, 1e-4
+
+
+@pytest.fixture(autouse=True)
+def _short_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    fewer_lanes(monkeypatch)
 
 
 def require_truth(cases: list[ExitCase], seed: int) -> None:
@@ -29,16 +35,17 @@ def require_truth(cases: list[ExitCase], seed: int) -> None:
     require_unbiased(np.concatenate(scores), independent=len(cases))
 
 
-def test_radiance_at_every_exit_cosine_agrees_with_van_de_hulst() -> None:
-    cases = angular_cases(RADIANCE_TOLERANCE)
+@pytest.mark.parametrize(
+    "tolerance", [RADIANCE_TOLERANCE, pytest.param(FINE_RADIANCE_TOLERANCE, marks=pytest.mark.slow)]
+)
+def test_radiance_at_every_exit_cosine_agrees_with_van_de_hulst(tolerance: float) -> None:
+    cases = angular_cases(tolerance)
     assert [np.count_nonzero(~np.isnan(case.values)) for case in cases] == [12, 11]
     require_truth(cases, seed=801)
 
 
 def test_half_spaces_agree_with_the_h_function() -> None:
-    cases = half_space_cases(FINE_TOLERANCE, RADIANCE_TOLERANCE, "0.5") + half_space_cases(
-        TOLERANCE, RADIANCE_TOLERANCE, "0.8", "0.9", "0.99"
-    )
+    cases = half_space_cases(TOLERANCE, RADIANCE_TOLERANCE, "0.5", "0.8", "0.9", "0.99")
     assert len(cases) == 12
     require_truth(cases, seed=811)
 
@@ -47,12 +54,12 @@ def test_half_spaces_agree_with_the_h_function() -> None:
 def test_half_spaces_agree_with_the_h_function_to_four_digits() -> None:
     # At albedo 0.999 a path scatters 40 times on average. At 0.99999 it scatters several hundred times, so this case
     # has the wider tolerance.
-    cases = half_space_cases(FINE_TOLERANCE, RADIANCE_TOLERANCE, "0.5", "0.8", "0.9", "0.99", "0.999")
-    require_truth(cases + half_space_cases(TOLERANCE, RADIANCE_TOLERANCE, "0.99999"), seed=821)
+    cases = half_space_cases(FINE_TOLERANCE, FINE_RADIANCE_TOLERANCE, "0.5", "0.8", "0.9", "0.99", "0.999")
+    require_truth(cases + half_space_cases(1e-3, FINE_RADIANCE_TOLERANCE, "0.99999"), seed=821)
 
 
 def test_a_pencil_beam_leaves_within_its_rings() -> None:
-    case = ring_case(5e-4)
+    case = ring_case(1e-3)
     assert case.values.size == 26
     require_truth([case], seed=841)
 
@@ -91,9 +98,9 @@ def test_radiance_adds_up_to_the_reference_totals(layer: Layer, boundary: str, i
     # rows of the slab tables; 16 Gauss nodes integrate these smooth radiances to 1e-5.
     nodes, weights = np.polynomial.legendre.leggauss(16)
     cosines = 0.5 * (nodes + 1)
-    result = simulate_slab((layer,), boundary=boundary, ior=ior, exit_cosines=tuple(cosines), rel_error=4e-3, seed=851)  # type: ignore[arg-type]
+    result = simulate_slab((layer,), boundary=boundary, ior=ior, exit_cosines=tuple(cosines), rel_error=8e-3, seed=851)  # type: ignore[arg-type]
     flux, error = hemisphere(result, math.pi * cosines * weights)
-    assert (error < 4e-3 * flux + 1e-4).all()
+    assert (error < 8e-3 * flux + 2e-4).all()
     assert (np.abs(flux - scattered_totals(layer, ior, boundary, R, T)) <= LARGEST_Z * error).all()
 
 
@@ -101,7 +108,7 @@ def test_layers_cut_in_two_look_as_one() -> None:
     # Light leaves through several layers. Two equal halves must give the same radiance and rings as the whole layer.
     whole = Layer(sigma=2, alpha=0.95, g1=0.5, thickness_mm=1)
     half = whole.model_copy(update={"thickness_mm": 0.5})
-    options = {"mu_incident": 0.6, "exit_cosines": (0.2, 0.9), "ring_edges_mm": (0.2, 1.0), "rel_error": 4e-3}
+    options = {"mu_incident": 0.6, "exit_cosines": (0.2, 0.9), "ring_edges_mm": (0.2, 1.0), "rel_error": 8e-3}
     one, two = (simulate_slab(layers, seed=seed, **options) for seed, layers in ((861, (whole,)), (862, (half, half))))  # type: ignore[arg-type]
     for kind in ("radiance", "rings"):
         ours, theirs = getattr(one, kind), getattr(two, kind)

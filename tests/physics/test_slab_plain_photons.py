@@ -35,10 +35,10 @@ def test_both_walks_give_the_same_images(index: float) -> None:
     # Two by two pixels receive all light, so that each collects enough photons for its noise to be normal.
     pixels = {"x_mm": [-40.0, 40.0], "y_mm": [-40.0, 40.0], "columns": 2, "rows": 2}
     folder = SlabFolder.model_validate(description(cell=cell, pixels=pixels))
-    images, variances = plain_images(folder, 2.2, 2.0 / 2.2, henyey_greenstein_shape, photons=160_000, seed=5)
+    images, variances = plain_images(folder, 2.2, 2.0 / 2.2, henyey_greenstein_shape, photons=80_000, seed=5)
     rig = rig_of(folder, WAVELENGTH_NM)
     ours = render(
-        rig, henyey_greenstein(2.0, G, 0.2), seed=3, step=0, batches=KERNEL_BATCHES, paths=20_000, scores=False
+        rig, henyey_greenstein(2.0, G, 0.2), seed=3, step=0, batches=KERNEL_BATCHES, paths=10_000, scores=False
     ).images
     # The kernel's grid is folded at y = 0, so its expected value is that of both rows of the plain images.
     plain, of_plain = images.mean(axis=1), variances.sum(axis=1) / 4

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from services.fit.slab.simulate import Layer, Sums
-from tests.support.slab_tables import SOURCES, SlabCase, is_costly, simulate, total_cases
+from tests.support.slab_tables import SOURCES, SlabCase, fewer_lanes, is_costly, simulate, total_cases
 from tests.support.z_scores import require_unbiased, z_scores
 
-TOLERANCE, FINE_TOLERANCE = 1e-3, 1e-4
+TOLERANCE, THIN_TOLERANCE, FINE_TOLERANCE = 2e-3, 3e-4, 1e-4
+"""Tolerances of all slabs, of thin ones, whose paths are short, and of all in a slow run."""
+
+
+@pytest.fixture(autouse=True)
+def _short_first_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    fewer_lanes(monkeypatch)
 
 
 def simulate_totals(case: SlabCase, tolerance: float, seed: int) -> Sums:
@@ -34,10 +40,10 @@ def test_totals_agree_with_adding_doubling() -> None:
     require_totals(cases, TOLERANCE, seed=101)
 
 
-def test_totals_of_thin_slabs_agree_to_four_digits() -> None:
+def test_totals_of_thin_slabs_agree_more_closely() -> None:
     cases = [case for case in total_cases() if case.layers[0].thickness_mm <= 1 and case.source == "normal"]
     assert len(cases) == 5
-    require_totals(cases, FINE_TOLERANCE, seed=131)
+    require_totals(cases, THIN_TOLERANCE, seed=131)
 
 
 @pytest.mark.slow
@@ -50,7 +56,7 @@ def test_totals_agree_to_four_digits() -> None:
 def test_totals_of_the_deepest_white_slabs_agree(source: str) -> None:
     cases = [case for case in total_cases() if is_costly(case) and case.source == source]
     assert len(cases) == 3
-    require_totals(cases, TOLERANCE, seed=201)
+    require_totals(cases, 1e-3, seed=201)
 
 
 @pytest.mark.parametrize(("boundary", "ior"), [("matched", 1.0), ("thin", 1.631), ("smooth", 1.5)])
@@ -63,7 +69,7 @@ def test_white_slabs_return_all_light(boundary: str, ior: float, source: str) ->
         Layer(sigma=6, alpha=1, beta=0.8, g1=0.7, g2=-0.2, thickness_mm=0.5),
     )
     case = SlabCase("white", layers, boundary, ior, source, (), np.zeros((1, 2)))
-    mean = simulate_totals(case, 1e-3, seed=7).mean()[0]
+    mean = simulate_totals(case, 3e-3, seed=7).mean()[0]
     assert abs(mean.sum() - 1) < 1e-3
     assert 0.1 < mean[0] < 0.9
 

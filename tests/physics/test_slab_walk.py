@@ -69,11 +69,11 @@ def test_totals_agree_with_adding_doubling() -> None:
             continue
         sigma = row["tau"]
         got, error = totals(
-            henyey_greenstein(sigma * row["a"], row["g"], sigma * (1 - row["a"])), row["n"], blocks=16, paths=12000
+            henyey_greenstein(sigma * row["a"], row["g"], sigma * (1 - row["a"])), row["n"], blocks=16, paths=9000
         )
         truth = np.array([row["R_normal"], row["T_normal"]])
-        # The tolerance is 3e-3. Linear interpolation of HG between knots 0.9 degrees apart changes totals by some 1e-5.
-        assert (error <= 1e-3).all(), row
+        # The tolerance is 4.5e-3. Linear interpolation of HG between knots 0.9 degrees apart changes totals by 1e-5.
+        assert (error <= 1.5e-3).all(), row
         scores.append(student_to_normal((got - truth) / error, 15))
     assert len(scores) >= 6
     require_unbiased(np.concatenate(scores), independent=len(scores))
@@ -166,7 +166,7 @@ def test_scores_agree_with_differences(thickness: float) -> None:
     """
     rig = small_rig(pixels={"x_mm": [-4.0, 4.0], "y_mm": [-4.0, 4.0], "columns": 4, "rows": 4})
     material = henyey_greenstein(thickness, 0.6, 0.05)
-    batches, paths = 16, int(3000 / thickness)
+    batches, paths = 16, int(1000 / thickness)
     estimate = render(rig, material, seed=11, step=0, batches=batches, paths=paths, scores=True)
     weights = 1 / estimate.mean
     gradients = np.stack([np.einsum("ip,ipn->n", weights, derivative_rows(rows, material)) for rows in estimate.rows])

@@ -1,4 +1,4 @@
-"""Run in a fresh process: build the small tooth's engine and send back its images and derivatives."""
+"""Run in a fresh process: build the small tooth's engine and send back its images and derivatives, once or more."""
 
 from __future__ import annotations
 
@@ -49,10 +49,19 @@ def picture(engine: Engine) -> Picture:
     return Picture(image.mean, image.variance, jacobian.jacobian, orders, shape, texels)
 
 
-def render_into(connection: Connection, threads: int, boundary: Boundary) -> None:
-    """Send Dr.Jit's number of threads, and the ``picture`` of an engine built with ``threads``."""
+def render_into(connection: Connection, boundary: Boundary, thread_counts: tuple[int, ...]) -> None:
+    """Send the numbers of Dr.Jit's threads that were used, and the ``picture`` of an engine with each number.
+
+    The first engine sets the number, and later engines of a process leave it as it is.
+    """
     import drjit as dr
 
-    result = picture(Engine(stained_recipe(boundary), threads))
-    connection.send((dr.thread_count(), result))
+    used, results = [], []
+    for number, threads in enumerate(thread_counts):
+        engine = Engine(stained_recipe(boundary), threads)
+        if number > 0:
+            dr.set_thread_count(threads)
+        used.append(dr.thread_count())
+        results.append(picture(engine))
+    connection.send((tuple(used), results))
     connection.close()

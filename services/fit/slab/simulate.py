@@ -6,6 +6,7 @@ either face is counted instead of connected to lights.
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -370,9 +371,15 @@ def specular_share(ior: ArrayLike, source: str, mu_incident: float = 1.0) -> NDA
     eta = np.asarray(ior, dtype=np.float64)
     if source == "normal":
         return _fresnel(eta, mu_incident)
-    nodes, weights = np.polynomial.legendre.leggauss(400)
+    nodes, weights = _gauss_nodes()
     cosine = 0.5 * (nodes + 1)
     return np.asarray(np.sum(weights * cosine * _fresnel(eta[..., None], cosine), axis=-1))
+
+
+@functools.cache
+def _gauss_nodes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Nodes from -1 to 1 and weights of Lambertian light's quadrature."""
+    return np.polynomial.legendre.leggauss(400)
 
 
 def _fresnel(eta: NDArray[np.float64], cosine: NDArray[np.float64] | float) -> NDArray[np.float64]:
