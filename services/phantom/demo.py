@@ -10,9 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 
-from services.core import end_with_parent
 from services.core.errors import CrashError
 from services.core.store import write_atomic
+from services.phantom import end_with_parent
 
 OPTIONS: Mapping[str, str] = MappingProxyType({"pixel-mm": "0.5", "cameras": "3", "lights": "8", "samples": "8192"})
 """Options of ``dentine phantom``. With this number of samples the noise of the images is 3 %, and the held-out error is

@@ -9,7 +9,7 @@ import psutil
 
 PARENT = """
 import subprocess, sys
-from services.core.end_with_parent import command
+from services.phantom.end_with_parent import command
 child = subprocess.Popen(command("tests.support.sleeper", ["60"]), stdin=subprocess.PIPE)
 print(child.pid, flush=True)
 child.wait()
@@ -30,7 +30,7 @@ def test_a_killed_parent_leaves_no_child() -> None:
 
 
 def test_the_module_gets_its_arguments_and_its_exit_status_counts() -> None:
-    command = [sys.executable, "-m", "services.core.end_with_parent", "tests.support.sleeper", "0"]
+    command = [sys.executable, "-m", "services.phantom.end_with_parent", "tests.support.sleeper", "0"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
         assert child.stdout.read() == "sleeping for 0 s\n"

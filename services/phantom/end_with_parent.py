@@ -1,8 +1,8 @@
 """Run a module as a process that ends when its parent does, however that ends.
 
-``python -m services.core.end_with_parent MODULE ARGUMENTS`` runs the module as ``python -m MODULE ARGUMENTS`` does. Its
-standard input is a pipe that the parent holds open and writes nothing to. The system closes the pipe when the parent is
-gone, even by SIGKILL, and this process then ends at once without cleaning up.
+``python -m services.phantom.end_with_parent MODULE ARGUMENTS`` runs the module as ``python -m MODULE ARGUMENTS`` does.
+Its standard input is a pipe that the parent holds open and writes nothing to. The system closes the pipe when the parent
+is gone, even by SIGKILL, and this process then ends at once without cleaning up.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 def command(module: str, arguments: Sequence[str]) -> list[str]:
     """Command line of a Python process that runs ``module`` and ends with its parent; give it a pipe as its input."""
-    return [sys.executable, "-m", "services.core.end_with_parent", module, *arguments]
+    return [sys.executable, "-m", "services.phantom.end_with_parent", module, *arguments]
 
 
 def _end_at_eof() -> None:
