@@ -1,8 +1,8 @@
 """Run a module as a process that ends when its parent does, however that ends.
 
 ``python -m services.phantom.end_with_parent MODULE ARGUMENTS`` runs the module as ``python -m MODULE ARGUMENTS`` does.
-Its standard input is a pipe that the parent holds open and writes nothing to. The system closes the pipe when the parent
-is gone, even by SIGKILL, and this process then ends at once without cleaning up.
+Its standard input is a pipe that the parent holds open and writes nothing to. When the parent is gone, even by SIGKILL,
+the system closes the pipe, and this process ends at once without cleaning up.
 """
 
 from __future__ import annotations
