@@ -12,8 +12,12 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.support.live_server import toy_server
+from services.api.app import create_app
+from services.core.settings import ServerSettings
+from tests.support.live_server import serving, toy_server
 from tests.support.small_system import PATIENCE_S, SmallSystem, small_system
+from tests.support.toy_server import RETRY_S, ROUND_S
+from tests.support.toy_stages import DOORS
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -71,11 +75,12 @@ def jobs(system: SmallSystem, tmp_path: Path) -> Iterator[HeldJobs]:
         yield HeldJobs(client, tmp_path)
 
 
-@pytest.fixture
-def own_workers(tmp_path: Path) -> Iterator[HeldJobs]:
+@pytest.fixture(scope="module")
+def own_workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HeldJobs]:
     """A server with workers of its own."""
-    with toy_server(tmp_path / "data") as (client, _):
-        yield HeldJobs(client, tmp_path)
+    folder = tmp_path_factory.mktemp("own")
+    with toy_server(folder / "data") as (client, _):
+        yield HeldJobs(client, folder)
 
 
 def both_fit_and_a_capture_ends(jobs: HeldJobs) -> None:
@@ -93,6 +98,9 @@ def both_fit_and_a_capture_ends(jobs: HeldJobs) -> None:
     assert [jobs.end(job) for job in (first, second, captured)] == ["SUCCEEDED"] * 3
 
 
+@pytest.mark.dear(
+    "It is the first to ask for the system: a database, a scheduler, three workers and an API are started as processes."
+)
 def test_two_fits_and_a_capture_run_side_by_side(jobs: HeldJobs) -> None:
     both_fit_and_a_capture_ends(jobs)
 
@@ -116,8 +124,13 @@ def test_a_cancel_that_stops_a_worker_leaves_the_other_jobs(own_workers: HeldJob
     assert (fit["attempt"], (other_steering / "at-fit-end").read_text()) == (1, pid)
 
 
-def test_what_a_queued_job_waits_for_is_told(tmp_path: Path) -> None:
-    with toy_server(tmp_path / "data", jobs_at_once=1) as (client, _):
+def test_what_a_queued_job_waits_for_is_told(
+    system: SmallSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.api.jobs.runner.ROUND_S", ROUND_S)
+    monkeypatch.setattr("services.api.jobs.admission.RETRY_S", RETRY_S)
+    settings = ServerSettings(data=tmp_path / "data", jobs_at_once=1, scheduler=system.scheduler)
+    with serving(create_app(settings, doors=DOORS)) as client:
         jobs = HeldJobs(client, tmp_path)
         running, steering = jobs.submit()
         wait_until((steering / "at-fit-start").exists, "the first job does not start")

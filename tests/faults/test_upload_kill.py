@@ -20,6 +20,7 @@ import pytest
 from services.api.captures.captures import Captures
 from services.client.capture_records import UploadManifest
 from services.core.settings import UploadLimits
+from tests.support.command_line import dentine
 from tests.support.live_server import toy_server
 from tests.support.uploading import (
     announce,
@@ -40,9 +41,8 @@ class Death(BaseException):
     """Exception that stands for the end of the process, because no handler of ``Exception`` catches it."""
 
 
-def upload_in_new_process(folder: Path, server: str) -> dict[str, object]:
-    command = [sys.executable, "-m", "services", "upload", str(folder), "--server", server, "--json"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+def upload_by_command(folder: Path, server: str) -> dict[str, object]:
+    answer = dentine("upload", str(folder), "--server", server, "--json")
     assert answer.returncode == 0, answer.stderr
     return json.loads(answer.stdout)
 
@@ -94,7 +94,7 @@ def test_a_server_killed_in_mid_request_loses_at_most_what_it_had_not_acknowledg
             send_until_killed(server, process, upload, acknowledged, large[acknowledged : acknowledged + more])
     with toy_server(tmp_path / "data") as (server, _):
         assert offset_of(server, upload) == acknowledged
-        uploaded = upload_in_new_process(folder, str(server.base_url))
+        uploaded = upload_by_command(folder, str(server.base_url))
     assert uploaded["id"] == capture
     assert uploaded["sent_bytes"] == sum(map(len, contents.values())) - acknowledged
     assert contents_of(tmp_path / "data" / "captures" / capture) == contents
@@ -115,7 +115,7 @@ def test_a_killed_client_is_continued_by_another(tmp_path: Path) -> None:
             client.kill()
         missing = server.get(address).json()["missing_bytes"]
         assert 0 < missing <= 50 * MIB
-        uploaded = upload_in_new_process(folder, str(server.base_url))
+        uploaded = upload_by_command(folder, str(server.base_url))
     assert uploaded["id"] == captures[0]["id"]
     sent = uploaded["sent_bytes"]
     assert isinstance(sent, int)

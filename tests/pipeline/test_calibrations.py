@@ -26,6 +26,7 @@ from services.core.store import open_stage
 from services.pipeline.event_log import EventAddress
 from services.preprocess import stage
 from tests.support.calibration_jobs import publish_calibration
+from tests.support.command_line import dentine
 from tests.support.live_server import serving
 from tests.support.mouth import write_mouth
 from tests.support.uploading import announce, contents_of, send
@@ -257,11 +258,9 @@ def test_what_a_calibration_job_made_is_put_under_a_name(
     kept = client.put(f"/v1/jobs/{made}/calibration/by-job")
     assert (kept.status_code, kept.headers["location"]) == (201, "/v1/calibrations/by-job"), kept.text
     assert kept.json()["state"] == "beyond its limits", "kept, and refused by jobs as any other"
-    command = [sys.executable, "-m", "services", "keep-calibration", made, "by-job", "--server", str(client.base_url)]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    told = dentine("keep-calibration", made, "by-job", "--server", str(client.base_url)).stdout
     assert told == "calibrations/by-job: beyond its limits\n"
-    command = [sys.executable, "-m", "services", "calibrations", "--server", str(client.base_url)]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    told = dentine("calibrations", "--server", str(client.base_url)).stdout
     assert told.startswith("calibrations/by-job  beyond its limits: ")
     assert client.put(f"/v1/jobs/{made}/calibration/by-job").status_code == 200
     assert client.put("/v1/calibrations/by-hand", json=calibration | BEYOND).json()["id"] == kept.json()["id"]

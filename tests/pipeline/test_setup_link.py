@@ -7,8 +7,6 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,8 +22,9 @@ from services.api.migrations import upgrade
 from services.client.errors import SetupLinkError
 from services.core.settings import DATABASE_FILE, RateSettings, ServerSettings
 from services.pipeline.database import open_database
+from tests.support.command_line import dentine
 from tests.support.guarded_server import make_deed, make_token, run_nothing
-from tests.support.live_server import running_server, serving
+from tests.support.live_server import serving, toy_server
 
 LINK = re.compile(r"http://127\.0\.0\.1:\d+/#/setup/([\w-]{43})")
 
@@ -147,27 +146,23 @@ def links_told(said: Path) -> list[str]:
 
 def test_each_start_without_a_token_writes_one_link(tmp_path: Path) -> None:
     said = tmp_path / "said.txt"
-    command = [sys.executable, "-m", "services", "serve", "--port", "0", "--data", str(tmp_path / "data")]
-    environment = {"PATH": "/usr/bin:/bin", "DENTINE__SERVER__ACCESS": "tokens"}
     for start in range(3):
-        with said.open("a") as log, running_server(command, log, environment=environment) as (client, _):
+        with said.open("a") as log, toy_server(tmp_path / "data", log, access="tokens") as (client, _):
             client.get("/v1/health/live")
             links = links_told(said)
             if start == 1:
                 assert client.post("/v1/setup", json={"secret": links[0]}).status_code == 201
     assert len(links) == len(set(links)) == 2
-    with said.open("w") as log, running_server(command, log, environment={"PATH": "/usr/bin:/bin"}) as (client, _):
+
+
+def test_an_open_server_writes_no_link(tmp_path: Path) -> None:
+    said = tmp_path / "said.txt"
+    with said.open("w") as log, toy_server(tmp_path / "data", log) as (client, _):
         client.get("/v1/health/live")
     assert links_told(said) == []
 
 
 def test_help_names_the_setting() -> None:
-    answer = subprocess.run(
-        [sys.executable, "-m", "services", "jobs"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={"DENTINE__SERVER__PUBLIC_URL": "lab"},
-    )
+    answer = dentine("jobs", DENTINE__SERVER__PUBLIC_URL="lab")
     assert answer.returncode == 2
     assert "DENTINE__SERVER__PUBLIC_URL" in answer.stderr

@@ -80,7 +80,7 @@ class SmallSystem:
         def inside(name: str) -> list[str]:
             return network.inside(name) if network else []
 
-        scheduler = f"tcp://{host('scheduler')}:{free_port()}"
+        self.scheduler = scheduler = f"tcp://{host('scheduler')}:{free_port()}"
         settings = {
             "data": str(self.data),
             "port": free_port(),
