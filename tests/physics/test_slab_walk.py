@@ -59,7 +59,8 @@ def test_white_cells_return_all_light(index: float, glass: float | None) -> None
     assert abs(got.sum() - 1) < 1e-3
 
 
-def test_totals_agree_with_adding_doubling() -> None:
+@pytest.mark.parametrize(("max_error", "paths"), [(1.5e-3, 9000), pytest.param(1e-3, 12000, marks=pytest.mark.slow)])
+def test_totals_agree_with_adding_doubling(max_error: float, paths: int) -> None:
     with shared_path("reference/slab_totals.csv").open() as file:
         rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
     scores = []
@@ -69,11 +70,12 @@ def test_totals_agree_with_adding_doubling() -> None:
             continue
         sigma = row["tau"]
         got, error = totals(
-            henyey_greenstein(sigma * row["a"], row["g"], sigma * (1 - row["a"])), row["n"], blocks=16, paths=9000
+            henyey_greenstein(sigma * row["a"], row["g"], sigma * (1 - row["a"])), row["n"], blocks=16, paths=paths
         )
         truth = np.array([row["R_normal"], row["T_normal"]])
-        # The tolerance is 4.5e-3. Linear interpolation of HG between knots 0.9 degrees apart changes totals by 1e-5.
-        assert (error <= 1.5e-3).all(), row
+        # The tolerance is three standard errors. Linear interpolation of HG between knots 0.9 degrees apart changes
+        # totals by 1e-5.
+        assert (error <= max_error).all(), row
         scores.append(student_to_normal((got - truth) / error, 15))
     assert len(scores) >= 6
     require_unbiased(np.concatenate(scores), independent=len(scores))
