@@ -4,6 +4,8 @@ databases are closed.
 
 from __future__ import annotations
 
+from itertools import count
+
 import pytest
 
 from tests.support.processor_times import ProcessorTimes
@@ -35,6 +37,14 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             prepare_device(backend=device)
         except PlatformError as problem:
             raise pytest.UsageError(str(problem)) from problem
+
+
+@pytest.fixture
+def unhurried_flashes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock for the flashes of drivers in this process that is a second on whenever it is read, so that no test
+    waits until a light may go on.
+    """
+    monkeypatch.setattr("services.capture.dome.flashes.monotonic", map(float, count()).__next__)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -24,20 +24,20 @@ from services.capture.dome.address import dome_address
 from services.capture.dome.all_off import all_off
 from services.capture.dome.controller import DomeObserver
 from services.capture.dome.driver import ModbusDome
+from services.capture.dome.flashes import Flashes
 from services.capture.dome.protocol import ExposureBudget
 from services.core.dome import DomeAnswer, DomeCommand, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigError, RigStoppedError, SettingsError
+from services.core.records import LOWERED_LIMITS, SIMULATED_DOME
 from services.core.settings import DomeSettings
 
 CHECK_INTERVAL_S = 0.1
 """Interval at which a light that is on is checked, seconds."""
-LOCK_TIMEOUT_S = 1.0
-"""Time that a command waits for another one that drives the dome, seconds."""
+LOCK_TIMEOUT_S = 2.0
+"""Time that a command waits for another one that drives the dome, seconds; a light waits for a second before it."""
 DOSE_WINDOW_S = 1e4
 """Time over which doses of light add up (IEC 62471), seconds. A limit holds for all manual light since the dome was
 last dark for this long."""
-SHARED_LIMITS = ("watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s")
-"""Names of the limits for which the smaller of the preflight rig's and the server's values is used."""
 SIMULATED_LIGHTS = 155
 """Number of lights of a simulated dome."""
 
@@ -47,6 +47,7 @@ class Console:
 
     def __init__(self, host: str, port: int, settings: DomeSettings) -> None:
         self._host, self._port, self._settings = host, port, settings
+        self._is_simulated = settings.address == SIMULATED_DOME
         self._driver_lock, self._closing = threading.Lock(), threading.Event()
         self._resources = ExitStack()
         self._dome: ModbusDome | None = None
@@ -130,7 +131,7 @@ class Console:
             if self._dome is None:
                 self._forget_old_dose()
                 self._dome = self._resources.enter_context(
-                    ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s)
+                    ModbusDome(self._host, self._port, self._budget, self._settings.watchdog_s, self._flashes())
                 )
             self._require_current(command)
             _require_light(command.light, self._dome.light_count)
@@ -147,16 +148,20 @@ class Console:
 
         if command.rig is None:
             raise SettingsError("A preflight needs a rig; give its mouth folder.")
-        limits = {name: min(getattr(command.rig, name), getattr(self._settings, name)) for name in SHARED_LIMITS}
+        limits = {name: min(getattr(command.rig, name), getattr(self._settings, name)) for name in LOWERED_LIMITS}
+        limits["assessment"] = command.rig.assessment or self._settings.assessment
         planned = PlannedRig.read(command.rig.model_copy(update={"dome": f"{self._host}:{self._port}", **limits}))
         self._forget_old_dose()
         try:
-            with planned.in_use(self._budget.spent_s) as (self._dome, cameras):
+            with planned.in_use(self._budget.spent_s, is_simulated=self._is_simulated) as (self._dome, cameras):
                 return preflight(
                     planned.plan, self._dome, cameras, planned.spec, partial(self._require_current, command)
                 )
         finally:
             self._dome, self._until_s = None, time.monotonic()
+
+    def _flashes(self) -> Flashes:
+        return Flashes.of_no_real_light() if self._is_simulated else Flashes()
 
     def _forget_old_dose(self) -> None:
         if time.monotonic() > self._until_s + DOSE_WINDOW_S:

@@ -74,6 +74,22 @@ def preflight_frames(plan: Sequence[PlannedFrame]) -> tuple[PlannedFrame, ...]:
     return (*flashes, next((frame for frame in plan if frame.kind == "tracking"), plan[-1]))
 
 
+def shortest_s(frames: Sequence[PlannedFrame], flash_interval_s: float) -> float:
+    """Time in s that frames take at least: their exposures, and what their flashes need not to come too often.
+
+    Args:
+        flash_interval_s: shortest time in s between two lights.
+    """
+    return sum(frame.exposure_s if frame.kind == "black" else max(frame.on_s, flash_interval_s) for frame in frames)
+
+
+def told_of_time(plan: Sequence[PlannedFrame], flash_interval_s: float) -> str:
+    """Say how long preflight and capture take at least."""
+    first_s, then_s = (shortest_s(frames, flash_interval_s) for frames in (preflight_frames(plan), plan))
+    rate = f" at one light every {flash_interval_s:.2f} s" if flash_interval_s else ""
+    return f"The preflight takes at least {first_s:.0f} s{rate}, the capture {then_s:.0f} s more."
+
+
 def require_exposure(frames: Sequence[PlannedFrame], lights: int, rig: RigSpec) -> None:
     """Raise ExposureLimitError if the planned dose exceeds a limit of the rig."""
     budget = ExposureBudget(rig.light_exposure_limit_s, rig.total_exposure_limit_s)

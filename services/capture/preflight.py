@@ -1,4 +1,4 @@
-"""Checks that take seconds, made before a capture while the subject sits in the dome."""
+"""Checks that take seconds to a minute, made before a capture while the subject sits in the dome."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BLACK_TOLERANCE = 0.005
 def preflight(
     plan: Sequence[PlannedFrame], dome: Dome, cameras: Cameras, rig: RigSpec, raise_if_cancelled: Callable[[], None]
 ) -> tuple[str, ...]:
-    """Switch on every light for a moment, then expose one black and one lit frame.
+    """Switch on every light for a moment, as often as the dome may flash, then expose one black and one lit frame.
 
     Args:
         plan: planned frames of the capture.

@@ -13,11 +13,13 @@ from services.capture.cameras.simulated import PlaybackCameras, SimulatedCameras
 from services.capture.cameras.stills import Stills
 from services.capture.dome.address import dome_address
 from services.capture.dome.driver import ModbusDome
+from services.capture.dome.flashes import Flashes
 from services.capture.dome.protocol import ExposureBudget
 from services.capture.plan import PlannedFrame, plan_capture, preflight_frames, require_exposure
 from services.core.calibration.record import require_consistent
 from services.core.choices import chosen
 from services.core.errors import CaptureInputError, RigError, SettingsError
+from services.core.light.safety import FlashAcknowledgement, unassessed
 from services.core.records import FolderCapture, RigSpec, SimulatedCameraSpec
 from services.core.store import read_record
 
@@ -51,6 +53,9 @@ class PlannedRig:
         """
         description = _read_description(spec.mouth / "capture.json")
         _require_sensor(spec.simulation)
+        limits = spec.light_exposure_limit_s, spec.total_exposure_limit_s
+        if not spec.is_simulated and (lacking := unassessed(*limits, spec.assessment)):
+            raise SettingsError(f"rig.{lacking}.")
         lights = len(description.lights)
         plan = plan_capture(spec, lights)
         # Count the preflight's dose too; otherwise a capture could reach the limit before its last frames.
@@ -63,11 +68,19 @@ class PlannedRig:
         return tuple(light.name for light in self.description.lights)
 
     @contextmanager
-    def in_use(self, spent_s: dict[int, float] | None = None) -> Iterator[tuple[ModbusDome, Cameras]]:
+    def in_use(
+        self,
+        spent_s: dict[int, float] | None = None,
+        before_flashes: Callable[[FlashAcknowledgement], None] = lambda _: None,
+        *,
+        is_simulated: bool = False,
+    ) -> Iterator[tuple[ModbusDome, Cameras]]:
         """Connect to the dome and the cameras for a block; the dome is dark at its end.
 
         Args:
             spent_s: dose of each light so far, in level-seconds; emitted light is added to it.
+            before_flashes: called before the first light under an acknowledgement of a higher rate of flashes.
+            is_simulated: the dome is a simulated one, also where the rig gives its address.
 
         Raises:
             RigError: the dome does not answer, or has too few lights. SettingsError: its address is invalid.
@@ -77,7 +90,12 @@ class PlannedRig:
             budget = ExposureBudget(
                 spec.light_exposure_limit_s, spec.total_exposure_limit_s, {} if spent_s is None else spent_s
             )
-            with ModbusDome(host, port, budget, spec.watchdog_s) as dome:
+            flashes = (
+                Flashes.of_no_real_light()
+                if is_simulated or spec.is_simulated
+                else Flashes(spec.flashes, before_first=before_flashes)
+            )
+            with ModbusDome(host, port, budget, spec.watchdog_s, flashes) as dome:
                 if dome.light_count < len(self.lights):
                     listing = f"{spec.mouth / 'capture.json'} lists {len(self.lights)}"
                     raise RigError(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from services.capture.cameras.protocol import Cameras
 from services.capture.dome.protocol import Dome, Rgb
 from services.capture.frames import FrameStore
-from services.capture.plan import PlannedFrame
+from services.capture.plan import PlannedFrame, shortest_s
 from services.core.results import FrameRecord
 from services.core.stage import StageContext, StageEvent
 
@@ -70,7 +70,10 @@ def capture_frames(
             readback=readback,
         )
         store.store(record, images)
-        remaining_s = (time.monotonic() - began_s) / count * (len(missing) - count)
+        remaining_s = max(
+            (time.monotonic() - began_s) / count * (len(missing) - count),
+            shortest_s(missing[count:], dome.flash_interval_s),
+        )
         context.report(
             StageEvent(
                 stage="capture",

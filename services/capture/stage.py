@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import shutil
+from functools import partial
 from pathlib import Path
 
 from services.core.errors import SettingsError
 from services.core.installed import require_packages
+from services.core.light.flash_record import record_use, used_in
 from services.core.records import LIMITS_OF_A_RIG, JobSpec
 from services.core.results import CaptureManifest
 from services.core.stage import StageContext, StageEvent
@@ -33,12 +35,14 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
     All checks of the input are made before a light is switched on.
 
     Raises:
-        SettingsError: there is no rig, or a level or address is invalid. CaptureInputError, MeshError: the mouth folder
+        SettingsError: there is no rig, a level or address is invalid, or an earlier attempt has flashed under the
+            acknowledgement of this one. CaptureInputError, MeshError: the mouth folder
             is incomplete or contradictory. RigError and its kinds: the dome or a camera failed; lights are dark.
             StoreError: a frame cannot be stored. JobCancelledError: the job was cancelled.
     """
     from services.capture.cancel_watch import interrupt_on_cancel
     from services.capture.frames import FrameStore, fingerprint
+    from services.capture.plan import told_of_time
     from services.capture.preflight import preflight
     from services.capture.rig import PlannedRig
     from services.capture.sequence import capture_frames
@@ -50,6 +54,8 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
         )
     rig = PlannedRig.read(spec.rig)
     description, plan = rig.description, rig.plan
+    if spec.rig.flashes is not None and not spec.rig.is_simulated:
+        spec.rig.flashes.require_newer(used_in(context.root))
     teeth = read_teeth(spec.rig.mouth)
 
     writer = StageWriter(context.root, "capture", context.attempt)
@@ -66,10 +72,14 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
         writer, shape, fingerprint(pixels, description.model_dump(mode="json"), rig.stills.peak_radiance)
     )
 
-    with rig.in_use() as (dome, cameras), interrupt_on_cancel(context.raise_if_cancelled, dome.interrupt):
+    with (
+        rig.in_use(before_flashes=partial(record_use, context.root)) as (dome, cameras),
+        interrupt_on_cancel(context.raise_if_cancelled, dome.interrupt),
+    ):
         # Check for a cancel after the watchdog is armed. An ALL OFF before that moment has left a cancel; after a later
         # ALL OFF the dome itself refuses light.
         context.raise_if_cancelled()
+        context.report(StageEvent(stage="capture", kind="log", message=told_of_time(plan, dome.flash_interval_s)))
         for finding in preflight(plan, dome, cameras, spec.rig, context.raise_if_cancelled):
             context.report(StageEvent(stage="capture", kind="log", message=finding))
         capture_frames(plan, rig.lights, dome, cameras, spec.rig.settle_s, store, context)
@@ -82,6 +92,7 @@ def run(spec: JobSpec, context: StageContext) -> CaptureManifest:
             sensor_noise_relative=spec.rig.simulation.noise_relative,
             sensor_noise_floor=spec.rig.simulation.noise_floor,
             fdi=tuple(tooth.fdi for tooth in teeth),
+            flashes=used_in(context.root),
         )
 
     _copy_meshes(spec.rig.mouth, writer.folder, manifest.fdi)

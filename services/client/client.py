@@ -19,6 +19,7 @@ from services.client.downloads import atomic_file, translated_transport_errors
 from services.client.flows import RECONNECT_S, BlockingCall, EventCursor, Flow, HttpRequest, Pause, error_in
 from services.client.requests import Requests
 from services.core.events import JobEvent
+from services.core.light.safety import FlashAcknowledgement
 from services.core.records import JobSpec
 
 if TYPE_CHECKING:
@@ -105,9 +106,9 @@ class Client:
         """Ask a job to stop."""
         return self.run(self._requests.cancel(job_id))
 
-    def retry(self, job_id: str) -> dict[str, Any]:
-        """Queue a failed or cancelled job again."""
-        return self.run(self._requests.retry(job_id))
+    def retry(self, job_id: str, flashes: FlashAcknowledgement | None = None) -> dict[str, Any]:
+        """Queue a failed or cancelled job again; ``flashes`` is its new acknowledgement of faster flashes."""
+        return self.run(self._requests.retry(job_id, flashes))
 
     def workers(self) -> dict[str, Any]:
         """The workers, the present work of each, and the number of jobs that they have finished."""
@@ -229,9 +230,9 @@ class AsyncClient:
         """See ``Client``."""
         return await self.run(self._requests.cancel(job_id))
 
-    async def retry(self, job_id: str) -> dict[str, Any]:
+    async def retry(self, job_id: str, flashes: FlashAcknowledgement | None = None) -> dict[str, Any]:
         """See ``Client``."""
-        return await self.run(self._requests.retry(job_id))
+        return await self.run(self._requests.retry(job_id, flashes))
 
     async def workers(self) -> dict[str, Any]:
         """See ``Client``."""

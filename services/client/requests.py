@@ -11,6 +11,7 @@ from pydantic import SecretStr
 
 from services.client.flows import Flow, HttpRequest, answer
 from services.client.uploader import Uploader, UploadProgress, UploadResult
+from services.core.light.safety import FlashAcknowledgement
 from services.core.records import JobSpec
 
 
@@ -80,9 +81,10 @@ class Requests:
         """Ask a job to stop."""
         return self._answer("POST", f"/jobs/{job_id}/cancel")
 
-    def retry(self, job_id: str) -> Flow[dict[str, Any]]:
-        """Queue a failed or cancelled job again."""
-        return self._answer("POST", f"/jobs/{job_id}/retry")
+    def retry(self, job_id: str, flashes: FlashAcknowledgement | None = None) -> Flow[dict[str, Any]]:
+        """Queue a failed or cancelled job again; ``flashes`` is its new acknowledgement of faster flashes."""
+        body = {} if flashes is None else {"json": {"flashes": flashes.model_dump(mode="json")}}
+        return self._answer("POST", f"/jobs/{job_id}/retry", **body)
 
     def workers(self) -> Flow[dict[str, Any]]:
         """The workers and the present work of each."""

@@ -14,6 +14,7 @@ from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.files.store_url import StoreUrl
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
+from services.core.light.safety import SHIPPED_LIGHT_LIMIT_S, SHIPPED_TOTAL_LIMIT_S, Assessment, FlashAcknowledgement
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
 
 
@@ -140,9 +141,27 @@ class RigSpec(Record):
         default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long"
     )
     light_exposure_limit_s: Positive = Field(
-        default=10.0, description="most level x on-time of one light, from the rig's photobiological assessment"
+        default=SHIPPED_LIGHT_LIMIT_S,
+        description="most level x on-time of one light; more than the default needs an assessment",
     )
-    total_exposure_limit_s: Positive = Field(default=100.0, description="most level x on-time of all lights together")
+    total_exposure_limit_s: Positive = Field(
+        default=SHIPPED_TOTAL_LIMIT_S,
+        description="most level x on-time of all lights together; more than the default needs an assessment",
+    )
+    assessment: Assessment | None = Field(
+        default=None,
+        description=(
+            "'who, when, file' of the photobiological assessment (IEC 62471) of these lights; needed for limits above"
+            " the defaults"
+        ),
+    )
+    flashes: FlashAcknowledgement | None = Field(
+        default=None,
+        description=(
+            "acknowledgement of more than three flashes a second: per_s, eye_cover, epilepsy_asked, by, at; not needed"
+            " where the dome is simulated"
+        ),
+    )
     simulation: SimulatedCameraSpec = SimulatedCameraSpec()
 
     @property
@@ -151,8 +170,10 @@ class RigSpec(Record):
         return self.dome == SIMULATED_DOME
 
 
-LIMITS_OF_A_RIG = frozenset({"dome", "watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s"})
-"""Options of a rig that change no frame: the address of its dome and its safety limits."""
+LOWERED_LIMITS = frozenset({"watchdog_s", "light_exposure_limit_s", "total_exposure_limit_s"})
+"""Limits of a rig that a server lowers to its own."""
+LIMITS_OF_A_RIG = LOWERED_LIMITS | {"dome", "assessment", "flashes"}
+"""Options of a rig that change no frame: the address of its dome, its safety limits, and what those are based on."""
 HELD_RANGES = MappingProxyType(
     {"sigma": (0.0, 1000.0), "alpha": (0.0, 1.0), "beta": (0.0, 1.0), "g1": (-1.0, 1.0), "g2": (-1.0, 1.0)}
 )

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Camera, Light, Record, Vector3
+from services.core.light.safety import FlashAcknowledgement
 from services.core.records import FolderCapture, Positive, Unit
 
 
@@ -206,6 +207,9 @@ class CaptureManifest(Record):
     sensor_noise_relative: float
     sensor_noise_floor: float
     fdi: tuple[int, ...]
+    flashes: tuple[FlashAcknowledgement, ...] = Field(
+        default=(), description="acknowledgements under which light went on more than three times a second"
+    )
 
 
 class PreparedManifest(Record):

@@ -9,11 +9,18 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
 
-from pydantic import Field, SecretStr, ValidationError
+from pydantic import Field, SecretStr, ValidationError, model_validator
 
 from services.core.errors import SettingsError
 from services.core.files.validation import remedied
 from services.core.geometry import Record
+from services.core.light.safety import (
+    FREE_FLASHES_PER_S,
+    SHIPPED_LIGHT_LIMIT_S,
+    SHIPPED_TOTAL_LIMIT_S,
+    Assessment,
+    unassessed,
+)
 from services.core.records import MAX_ON_TIME_S, SIMULATED_DOME, JobSpec
 
 DATABASE_FILE = "dentine.sqlite"
@@ -90,10 +97,27 @@ class DomeSettings(Record):
         default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long"
     )
     light_exposure_limit_s: float = Field(
-        default=10.0, gt=0, description="most level x on-time of one light, from the rig's photobiological assessment"
+        default=SHIPPED_LIGHT_LIMIT_S,
+        gt=0,
+        description="most level x on-time of one light; more than the default needs an assessment",
     )
     total_exposure_limit_s: float = Field(
-        default=100.0, gt=0, description="most level x on-time of all lights together"
+        default=SHIPPED_TOTAL_LIMIT_S,
+        gt=0,
+        description="most level x on-time of all lights together; more than the default needs an assessment",
+    )
+    assessment: Assessment | None = Field(
+        default=None,
+        description=(
+            "'who, when, file' of the photobiological assessment (IEC 62471) of these lights; needed for limits above"
+            " the defaults"
+        ),
+    )
+    max_flashes_per_s: float = Field(
+        default=10.0,
+        ge=FREE_FLASHES_PER_S,
+        le=100,
+        description="most flashes a second that a job or preflight with an acknowledgement may ask for; 3 for no more",
     )
     max_level: float = Field(default=1.0, gt=0, le=1, description="highest LED level, fraction of full scale")
     max_exposure_s: float = Field(
@@ -102,6 +126,13 @@ class DomeSettings(Record):
         le=MAX_ON_TIME_S,
         description="longest exposure, settling included: one light at full level then takes the whole default limit",
     )
+
+    @model_validator(mode="after")
+    def _assessed(self) -> DomeSettings:
+        limits = self.light_exposure_limit_s, self.total_exposure_limit_s
+        if lacking := unassessed(*limits, self.assessment):
+            raise ValueError(lacking)
+        return self
 
     @property
     def allowed_addresses(self) -> frozenset[str]:
@@ -234,7 +265,9 @@ def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> 
     except ValidationError as problem:
         first = problem.errors()[0]
         name = prefix + "__".join(str(part).upper() for part in first["loc"])
-        raise SettingsError(f"Setting {name}: {first['msg']}; correct or remove the variable.") from problem
+        told = first["msg"].removeprefix("Value error, ")
+        remedy = "" if "; " in told else "; correct or remove the variable"
+        raise SettingsError(f"Setting {name}: {told}{remedy}.") from problem
 
 
 def read_job(path: Path) -> JobSpec:

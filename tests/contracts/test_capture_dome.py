@@ -16,6 +16,8 @@ from services.capture.dome.registers import FULL_SCALE
 from services.capture.dome.simulator import simulated_dome
 from services.core.errors import ExposureLimitError, RigError
 
+pytestmark = pytest.mark.usefixtures("unhurried_flashes")
+
 LIGHTS = 50
 LEVEL = 0.5
 ON_S = 0.01

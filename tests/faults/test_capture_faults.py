@@ -19,6 +19,8 @@ from services.capture.dome.simulator import order_fault, serve_dome, simulated_d
 from services.core.errors import InterlockError, ReadbackError, RigError, RigUnreachableError
 from tests.support.dome_proxy import Proxy
 
+pytestmark = pytest.mark.usefixtures("unhurried_flashes")
+
 WATCHDOG_S = 1.0
 ALWAYS = 60_000
 Address = tuple[str, int]

@@ -27,6 +27,8 @@ from services.core.settings import DomeSettings
 from tests.support.dome_proxy import Proxy
 from tests.support.mouth import write_mouth
 
+pytestmark = pytest.mark.usefixtures("unhurried_flashes")
+
 LIGHTS = 4
 # The watchdog's period is much longer than the tests, so a light that goes dark was switched off.
 WATCHDOG_S = 30.0

@@ -45,7 +45,12 @@ class AuditEntry(Record):
     token: str | None = Field(description="public id of the token; claimed, not proven, where it was refused")
     address: str = Field(description="network address of the caller, or 'command line'")
     action: str = Field(description="method and route template, or command")
-    ids: dict[str, str] = Field(description="what the route's path names; 'made' is the address of what was created")
+    ids: dict[str, str] = Field(
+        description=(
+            "what the route's path names; 'made' is the address of what was created, 'flashes' the acknowledgement of"
+            " faster flashes"
+        )
+    )
     outcome: int = Field(description="HTTP status of the answer")
 
 

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from services.api.dome.process import DomeProcess
 from services.api.jobs.jobs import Jobs
-from services.api.jobs.light_limits import LightLimits
+from services.api.jobs.light_limits import LightLimits, require_recent
 from services.api.jobs.records import Job
 from services.client.errors import UnknownDomeError
 from services.core.dome import DomeAnswer, DomeStatus
@@ -32,8 +32,9 @@ PREFLIGHT_S = 300.0
 """Longest time in s that a preflight takes."""
 OFF_S = 5.0
 """Time in s after which a process that has not switched off is ended, and another one switches off."""
-BUSY_S = 1.0
-"""Time in s that a command by hand waits for another one to end before it is refused."""
+BUSY_S = 2.0
+"""Time in s that a command by hand waits for another one to end before it is refused; a light may wait for a second
+until it may go on."""
 LONGEST_LIGHT_S = 30.0
 """Longest time in s that a light can be switched on for by one request."""
 
@@ -159,7 +160,9 @@ class Dome:
         if "dome" in rig.model_fields_set and rig.dome != self._address:
             raise SettingsError(f"'dome': this server works the dome at {self._address} and no other; leave it out.")
         if self._address is not None:
-            self._limits.require(rig.model_copy(update={"dome": self._address}))
+            at_address = rig.model_copy(update={"dome": self._address})
+            self._limits.require(at_address)
+            require_recent(at_address)
         self._jobs.server_paths.require("mouth", rig.mouth)
         with self._manual_control(viewer):
             return PreflightResult(findings=self._ask(PREFLIGHT_S, do="preflight", rig=rig).findings)

@@ -18,7 +18,7 @@ from services.api.data_folder import keep_password_apart, require_own_folder
 from services.api.jobs.admission import Admission, Machine
 from services.api.jobs.erasure import erase, forget_listing
 from services.api.jobs.lifecycle import Instruction, JobState, Trigger
-from services.api.jobs.light_limits import LightLimits
+from services.api.jobs.light_limits import LightLimits, require_recent
 from services.api.jobs.records import Creation, Deletion, Job
 from services.api.jobs.repository import Repository
 from services.api.jobs.runner import RunJob, Runner
@@ -29,6 +29,8 @@ from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import DentineError, SettingsError
 from services.core.events import JobEvent
 from services.core.geometry import Record
+from services.core.light.flash_record import used_in
+from services.core.light.safety import FlashAcknowledgement
 from services.core.masks import is_stale
 from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.records import JobSpec
@@ -158,6 +160,7 @@ class Jobs:
         self._stores.require(spec)
         if spec.rig is not None:
             self._light_limits.require(spec.rig)
+            require_recent(spec.rig)
         if spec.rig is not None and not spec.is_demo and not is_uploaded(spec.rig.mouth):
             remedy = "upload it with dentine submit --upload, or try the demonstration with dentine demo"
             self.server_paths.require("rig.mouth", spec.rig.mouth, remedy)
@@ -194,17 +197,37 @@ class Jobs:
         except OSError as problem:  # the runner asks again in each of its rounds
             logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
 
-    def retry(self, job_id: str) -> Job:
+    def retry(self, job_id: str, flashes: FlashAcknowledgement | None = None) -> Job:
         """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from its
         published results that are still valid.
 
+        Args:
+            flashes: acknowledgement of faster flashes, in place of the job's own.
+
         Raises:
-            UnknownJobError: there is no such job. JobStateError: its state does not allow a retry.
+            UnknownJobError: there is no such job. JobStateError: its state does not allow a retry. SettingsError: the
+                acknowledgement is not allowed, or one is needed.
         """
+        spec = self._with_flashes(self.repository.get(job_id), flashes)
         is_revised = self.repository.get(job_id).state is JobState.SUCCEEDED and is_stale(self.folder(job_id))
-        self.repository.apply(job_id, Trigger.REVISE if is_revised else Trigger.RETRY)
+        self.repository.apply(job_id, Trigger.REVISE if is_revised else Trigger.RETRY, spec=spec)
         self._runner.wake()
         return self.repository.get(job_id)
+
+    def _with_flashes(self, job: Job, flashes: FlashAcknowledgement | None) -> JobSpec | None:
+        """Return the options of a retry where it brings an acknowledgement; None where they stay as they are."""
+        rig = job.spec.rig
+        if rig is None:
+            if flashes is not None:
+                raise SettingsError("'flashes': this job has no rig, so nothing flashes; leave it out.")
+            return None
+        rig = rig if flashes is None else rig.model_copy(update={"flashes": flashes})
+        flashes_again = job.state.is_final and not rig.is_simulated and self._awaiting_capture([job])
+        if rig.flashes is not None and flashes_again:
+            self._light_limits.require(rig)
+            rig.flashes.require_newer(used_in(self.folder(job.id)))
+            require_recent(rig)
+        return None if flashes is None else job.spec.model_copy(update={"rig": rig})
 
     def delete(self, job_id: str) -> Deletion:
         """Remove everything that is stored of a job that has ended, and give a receipt.

@@ -5,8 +5,10 @@ They hold whatever a job asks for, because a person's face is in the dome.
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
+
 from services.core.errors import ExposureLimitError, SettingsError
-from services.core.records import LIMITS_OF_A_RIG, JobSpec, RigSpec
+from services.core.records import LOWERED_LIMITS, JobSpec, RigSpec
 from services.core.settings import DomeSettings
 
 _PREFIX = "DENTINE__SERVER__DOME__"
@@ -22,8 +24,8 @@ class LightLimits:
         """Refuse a rig that the server does not allow, before anything is connected to or lit.
 
         Raises:
-            SettingsError: its dome, level or exposure is not allowed. ExposureLimitError: one of its exposures is over
-                the largest dose of one light.
+            SettingsError: its dome, level, exposure or rate of flashes is not allowed. ExposureLimitError: one of its
+                exposures is over the largest dose of one light.
         """
         settings = self._settings
         if rig.dome not in settings.allowed_addresses:
@@ -42,6 +44,12 @@ class LightLimits:
                 f" {settings.max_exposure_s:g} s"
             )
             raise SettingsError(f"{what} ({_PREFIX}MAX_EXPOSURE_S); shorten them.")
+        if rig.flashes is not None and rig.flashes.per_s > settings.max_flashes_per_s:
+            what = (
+                f"Option 'rig.flashes.per_s': {rig.flashes.per_s:g} flashes a second are more than this server's"
+                f" {settings.max_flashes_per_s:g} ({_PREFIX}MAX_FLASHES_PER_S)"
+            )
+            raise SettingsError(f"{what}; lower it.")
         dose_s, limit_s = rig.level * on_s, min(rig.light_exposure_limit_s, settings.light_exposure_limit_s)
         if dose_s > limit_s:
             what = (
@@ -59,7 +67,16 @@ class LightLimits:
         if spec.rig is None:
             return spec
         self.require(spec.rig)
-        limits = {
-            name: min(getattr(spec.rig, name), getattr(self._settings, name)) for name in LIMITS_OF_A_RIG - {"dome"}
-        }
+        limits = {name: min(getattr(spec.rig, name), getattr(self._settings, name)) for name in LOWERED_LIMITS}
+        limits["assessment"] = spec.rig.assessment or self._settings.assessment
         return spec.model_copy(update={"rig": spec.rig.model_copy(update=limits)})
+
+
+def require_recent(rig: RigSpec) -> None:
+    """Refuse a rig whose acknowledgement of faster flashes is older than a day now, before its job waits in vain.
+
+    Raises:
+        SettingsError: the acknowledgement does not hold.
+    """
+    if rig.flashes is not None and not rig.is_simulated:
+        rig.flashes.require_recent(datetime.now(UTC))

@@ -220,14 +220,21 @@ class Repository:
             connection.execute(lease_table.update().where(lease_table.c.job == lease.job.id).values(until_s=0.0))
             return self._apply(connection, lease.job.id, trigger, failure)
 
-    def apply(self, job_id: str, trigger: Trigger, failure: Failure | None = None) -> Transition:
-        """Apply a trigger to a job's state.
+    def apply(
+        self, job_id: str, trigger: Trigger, failure: Failure | None = None, spec: JobSpec | None = None
+    ) -> Transition:
+        """Apply a trigger to a job's state; ``spec`` replaces the job's options in the same transaction.
 
         Raises:
             UnknownJobError: there is no such job. JobStateError: its state does not take the trigger.
         """
         with writing(self.engine) as connection:
-            return self._apply(connection, job_id, trigger, failure)
+            transition = self._apply(connection, job_id, trigger, failure)
+            if spec is not None:
+                connection.execute(
+                    job_table.update().where(job_table.c.id == job_id).values(spec=spec.model_dump_json())
+                )
+            return transition
 
     def append_message(self, job_id: str, message: str) -> None:
         """Append a sentence to the events of a job, if the job still waits."""

@@ -26,6 +26,7 @@ from services.api.jobs.table import JobFilter
 from services.api.jobs.time_ranges import TimeRange
 from services.core.geometry import Record
 from services.core.job_kinds import foreign_options, job_kinds
+from services.core.light.safety import FlashAcknowledgement
 from services.core.owners import Viewer
 from services.core.records import JobName, JobSpec, KindName
 from services.pipeline.database import MAX_ID
@@ -64,6 +65,15 @@ class JobPage(Record):
 
     jobs: list[Job]
     next_before: int | None = Field(description="give as 'before' to get the next page; null on the last")
+
+
+class Retry(Record):
+    """What a retry may bring."""
+
+    flashes: FlashAcknowledgement | None = Field(
+        default=None,
+        description="acknowledgement of faster flashes, in place of the job's own; each attempt that lights needs one",
+    )
 
 
 class JobDetail(Job):
@@ -143,6 +153,8 @@ def build_router(
         """
         if submission.rig is not None and not submission.rig.is_simulated:
             require(request.scope.get("caller"), Scope.OPERATE_DOME)
+            if submission.rig.flashes is not None:
+                request.scope["audited"].ids["flashes"] = str(submission.rig.flashes)
         creation = jobs.submit(submission.spec(), idempotency_key, request.state.request_id, submission.name, viewer)
         response.status_code = 201 if creation.is_new else 200
         response.headers["Location"] = f"/v1/jobs/{creation.job.id}"
@@ -196,15 +208,19 @@ def build_router(
         return jobs.cancel(job_id)
 
     @router.post("/jobs/{job_id}/retry", status_code=202, tags=["jobs"], dependencies=[needs("submit")])
-    def retry(job_id: str, request: Request) -> Job:
+    def retry(job_id: str, request: Request, retried: ValidatedBody[Retry] | None = None) -> Job:
         """Queue a failed or cancelled job again, or one that succeeded before its masks were changed; it resumes from
         what it had published.
 
-        A job that has yet to capture needs scope operate-dome too, unless its dome is simulated.
+        A job that has yet to capture needs scope operate-dome too, unless its dome is simulated. If it has flashed
+        under an acknowledgement, it needs a newer one, in 'flashes'.
         """
+        flashes = None if retried is None else retried.flashes
+        if flashes is not None:
+            request.scope["audited"].ids["flashes"] = str(flashes)
         if jobs.lights_again(job_id):
             require(request.scope.get("caller"), Scope.OPERATE_DOME)
-        return jobs.retry(job_id)
+        return jobs.retry(job_id, flashes)
 
     @router.delete("/jobs/{job_id}", tags=["jobs"], dependencies=[needs("submit")])
     def delete(job_id: str) -> Deletion:

@@ -12,6 +12,7 @@ from pydantic import Field
 from services.api.captures.descriptions import Describe, describe, description_file
 from services.core.errors import DentineError
 from services.core.geometry import Record
+from services.core.light.safety import FREE_FLASHES_PER_S
 from services.core.records import JobSpec
 
 DEMO_VALUES = 16_896
@@ -55,9 +56,11 @@ def _sized(spec: JobSpec, values: int) -> JobSize:
 
 def method_of(spec: JobSpec) -> str:
     """Return a text that is the same for jobs of the same method."""
-    return json.dumps(
-        spec.model_dump(mode="json", include=set(_METHOD)) | {"captures": spec.rig is not None}, sort_keys=True
-    )
+    captures: bool | str = spec.rig is not None
+    if spec.rig is not None and not spec.rig.is_simulated:  # a real dome's flashes take most of its capture
+        per_s = FREE_FLASHES_PER_S if spec.rig.flashes is None else spec.rig.flashes.per_s
+        captures = f"{per_s:g} flashes a second"
+    return json.dumps(spec.model_dump(mode="json", include=set(_METHOD)) | {"captures": captures}, sort_keys=True)
 
 
 @lru_cache(maxsize=256)

@@ -4,6 +4,7 @@
   ``dark``.
 * The controller goes dark by itself when the keep-alive thread stops feeding its watchdog (a killed process), and when
   a light has been on for its strobe time (a process that hangs).
+* At most three lights go on in any second, or as many as a person has acknowledged (``flashes``).
 * Every commanded light is read back and compared, both the commanded levels and the emitted ones.
 * ``interrupt`` darkens the dome during an exposure, from another thread and over the keep-alive's connection; the
   driver switches on no light after it.
@@ -38,6 +39,7 @@ from services.capture.dome.controller import (
     read_status,
     require_dome,
 )
+from services.capture.dome.flashes import Flashes
 from services.capture.dome.keepalive import KeepAlive
 from services.capture.dome.modbus_link import LinkError, ModbusLink, NoReplyError, RefusedError, WrongReplyError
 from services.capture.dome.protocol import ExposureBudget, Rgb
@@ -51,10 +53,13 @@ HANG_MARGIN_S = 2.0
 class ModbusDome:
     """A ``Dome`` behind a Modbus TCP controller. Use it as a context manager; the module lists its guarantees."""
 
-    def __init__(self, host: str, port: int, budget: ExposureBudget, watchdog_s: float = 2.0) -> None:
+    def __init__(
+        self, host: str, port: int, budget: ExposureBudget, watchdog_s: float = 2.0, flashes: Flashes | None = None
+    ) -> None:
         self.address = f"{host}:{port}"
         self.watchdog_s = watchdog_s
         self._budget = budget
+        self._flashes = flashes or Flashes()
         self._link = ModbusLink(host, port, REPLY_TIMEOUT_S)
         self._keepalive = KeepAlive(ModbusLink(host, port, REPLY_TIMEOUT_S), watchdog_s)
         self._light_count = 0
@@ -74,6 +79,7 @@ class ModbusDome:
                 self._keepalive.start()
                 self._require_no_fault()
                 self.dark()
+                self._flashes.begin()
         except BaseException:
             self._keepalive.stop()
             self._link.close()
@@ -108,10 +114,16 @@ class ModbusDome:
         """Number of lights fitted."""
         return self._light_count
 
+    @property
+    def flash_interval_s(self) -> float:
+        """Shortest time in s between two lights."""
+        return self._flashes.interval_s
+
     def light(self, index: int | None, level: float, on_s: float) -> Rgb:
         """Switch one light on, or all for None; see ``Dome.light``."""
         lights = range(self._light_count) if index is None else range(index, index + 1)
         with self._dark_on_error():
+            was_lit = self._lit is not None
             self._record_dose()
             self._require_uninterrupted()
             if not lights or lights.stop > self._light_count or lights.start < 0:
@@ -120,6 +132,7 @@ class ModbusDome:
                     " plan."
                 )
             self._budget.require(lights, level, on_s)
+            self._await_flash(was_lit=was_lit)
             self._require_safe()
             self._keepalive.require_alive()
             strobe_ms = min(math.ceil(1000 * (on_s + HANG_MARGIN_S)), reg.FULL_SCALE)
@@ -129,8 +142,12 @@ class ModbusDome:
             with suppress(NoReplyError, WrongReplyError):
                 self._link.write(reg.KEEPALIVE, [1])
             # Send the order once. If its answer is lost or wrong, the read-back decides whether the light was set.
-            with suppress(NoReplyError, WrongReplyError):
+            try:
                 self._link.write(reg.STROBE_MS, [strobe_ms, active, *[reg.level_word(level)] * 3])
+            except (NoReplyError, WrongReplyError):
+                pass
+            finally:
+                self._flashes.count()
             self._require_uninterrupted()
             return self._confirmed()
 
@@ -229,6 +246,14 @@ class ModbusDome:
                     f"Dome failure: {problem}; lights were switched off, check the controller and its network."
                 ) from problem
             raise
+
+    def _await_flash(self, *, was_lit: bool) -> None:
+        """Wait until light may go on. A light that is on goes dark first, as its time is planned without the wait."""
+        self._flashes.require_allowed()
+        if was_lit and self._flashes.wait_s():
+            self.dark()
+        while wait_s := self._flashes.wait_s():
+            self.pause(wait_s)
 
     def _confirmed(self) -> Rgb:
         self._require_safe()

@@ -19,8 +19,14 @@ class Dome(Protocol):
     def light_count(self) -> int:
         """Number of lights fitted."""
 
+    @property
+    def flash_interval_s(self) -> float:
+        """Shortest time in s between two lights; 0 where the dome is simulated."""
+
     def light(self, index: int | None, level: float, on_s: float) -> Rgb:
         """Switch on one light, or all for None, and every other off; return the levels read back.
+
+        It waits, in the dark, until the light may go on without flashing too often.
 
         Args:
             index: index of the light; None for all lights.
@@ -28,7 +34,8 @@ class Dome(Protocol):
             on_s: planned on-time in seconds, counted against the exposure limits before anything is sent.
 
         Raises:
-            ExposureLimitError, InterlockError, ReadbackError, RigError.
+            ExposureLimitError, InterlockError, ReadbackError, RigError. SettingsError: the acknowledgement of a
+                higher rate of flashes is too old.
         """
 
     def confirm(self) -> Rgb:

@@ -14,6 +14,11 @@ from tests.support.captured_frames import LIGHTS, NOISELESS, Address
 from tests.support.mouth import write_mouth
 
 
+@pytest.fixture(autouse=True)
+def _unhurried(unhurried_flashes: None) -> None:
+    """No test of this folder waits for a flash."""
+
+
 @pytest.fixture(scope="module")
 def shared_dome() -> Iterator[Address]:
     with simulated_dome(LIGHTS) as address:

@@ -15,6 +15,11 @@ from tests.support.dome_by_hand import LIGHTS, WATCHDOG_S, Address, Jobs, lit, s
 from tests.support.live_server import serving
 
 
+@pytest.fixture(autouse=True)
+def _unhurried(unhurried_flashes: None) -> None:
+    """No test of this folder waits for a flash."""
+
+
 @pytest.fixture(scope="module")
 def shared_dome() -> Iterator[Address]:
     with simulated_dome(LIGHTS, WATCHDOG_S) as address:

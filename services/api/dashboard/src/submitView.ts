@@ -15,6 +15,7 @@ import {
   Unauthenticated,
 } from "./api";
 import { element } from "./element";
+import { FlashFields } from "./flashFields";
 import { bytes, when } from "./format";
 import { OptionField } from "./optionField";
 
@@ -61,6 +62,8 @@ const GROUPS: [string, string[]][] = [
   ["Solver", ["solver", "loss", "adam_steps", "adam_rate", "prior", "held"]],
 ];
 const RIG_FIRST = ["dome", "mouth", "level", "exposure_s"];
+/** Option of a rig that has fields of its own. */
+const FLASHES = "flashes";
 const LONGEST_NAME = "80";
 const DEFAULT_KIND = "tooth";
 const SLAB_KIND = "slab";
@@ -82,6 +85,7 @@ export class SubmitView {
   private readonly rigOptions = element("section", {}, element("h3", {}, "Rig"));
   private fields: OptionField[] = [];
   private rigFields: OptionField[] = [];
+  private readonly flashes = new FlashFields();
   private foreign: OptionsSchema["foreign_options"] = {};
   private presets: Preset[] = [];
   private demo: Preset["options"] = {};
@@ -143,10 +147,12 @@ export class SubmitView {
     const rig = schema.$defs["RigSpec"]?.properties ?? {};
     const inOrder = [
       ...RIG_FIRST,
-      ...Object.keys(rig).filter((name) => !RIG_FIRST.includes(name) && rig[name]?.["$ref"] === undefined),
+      ...Object.keys(rig).filter(
+        (name) => ![...RIG_FIRST, FLASHES].includes(name) && rig[name]?.["$ref"] === undefined,
+      ),
     ];
     this.rigFields = inOrder.map((name) => new OptionField(`rig.${name}`, rig[name] ?? {}, name === "mouth"));
-    this.rigOptions.append(element("div", { class: "options" }, ...this.rigFields.map((field) => field.root)));
+    this.rigOptions.append(element("div", { class: "options" }, ...this.rigFields.map((field) => field.root)), this.flashes.root);
 
     const grouped = new Set(GROUPS.flatMap(([, names]) => names));
     const others = Object.keys(schema.properties).filter((name) => !grouped.has(name) && !SOURCES.has(name));
@@ -295,9 +301,12 @@ export class SubmitView {
     if (this.isDemo) return { rig: this.demo["rig"] };
     if (this.source.value === "rig")
       return {
-        rig: Object.fromEntries(
-          Object.entries(values(this.rigFields)).map(([name, value]) => [name.slice("rig.".length), value]),
-        ),
+        rig: {
+          ...Object.fromEntries(
+            Object.entries(values(this.rigFields)).map(([name, value]) => [name.slice("rig.".length), value]),
+          ),
+          [FLASHES]: this.flashes.value(),
+        },
       };
     return { capture: `captures/${this.capture.value}` };
   }
