@@ -51,5 +51,5 @@ def test_every_route_with_a_body_in_json_bounds_it(tmp_path: Path) -> None:
             for context in iter_route_contexts(app.routes)
             if getattr(context.original_route, "body_field", None) is not None
         ]
-    assert len(found) == 10
+    assert len(found) == 11
     assert [route for route in found if not isinstance(route, BodyRoute)] == []
