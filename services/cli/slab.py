@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from services.core.errors import SettingsError
+from services.core.files.json_text import parse_json
 
 
 class SlabBoundary(StrEnum):
@@ -122,8 +123,8 @@ def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> t
         raise SettingsError(f"Option --layers describes the whole stack; leave out --{given[0]}.")
     else:
         try:
-            layers = json.loads(text)
-        except json.JSONDecodeError as problem:
+            layers = parse_json(text)
+        except ValueError as problem:
             raise SettingsError(
                 f'Option --layers is not JSON ({problem}); give a list such as \'[{{"sigma": 2, "alpha": 0.9,'
                 ' "thickness_mm": 1}]\'.'

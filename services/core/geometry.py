@@ -8,14 +8,15 @@ from __future__ import annotations
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
-from pydantic_core import PydanticCustomError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, field_validator
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from services.core.errors import MeshError
+from services.core.files.plain_numbers import with_plain_numbers
 
 Vector3 = tuple[float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
@@ -41,9 +42,19 @@ Name = Annotated[str, AfterValidator(_part_of_a_file_name)]
 
 
 class Record(BaseModel):
-    """Base of every record that crosses a process boundary: frozen, no unknown keys, no NaN."""
+    """Base of every record that crosses a process boundary: frozen, no unknown keys, no NaN, and a number is given as a
+    number: neither as a text nor as true or false, which would light at full level for ``"level": true``.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
+    numbers_from_text: ClassVar[bool] = False
+    """Whether texts such as "5" are numbers, as in the variables of an environment."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Build the validator of the record."""
+        schema = handler(source)
+        return schema if cls.numbers_from_text else with_plain_numbers(schema, cls)
 
 
 class Camera(Record):

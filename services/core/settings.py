@@ -27,7 +27,13 @@ DATABASE_FILE = "dentine.sqlite"
 """Name of the database in the data folder."""
 
 
-class RateSettings(Record):
+class SettingsRecord(Record):
+    """Base of settings, whose values are texts of an environment's variables."""
+
+    numbers_from_text = True
+
+
+class RateSettings(SettingsRecord):
     """How often one token, or one address without a token, may ask."""
 
     reads_per_10_s: int = Field(
@@ -41,7 +47,7 @@ class RateSettings(Record):
     )
 
 
-class UploadLimits(Record):
+class UploadLimits(SettingsRecord):
     """What captures may be uploaded. Sizes are checked when a capture is created, images when it is committed."""
 
     largest_file_bytes: int = Field(default=16 * 2**30, ge=1, description="largest file of a capture")
@@ -64,7 +70,7 @@ class UploadLimits(Record):
     )
 
 
-class ConnectionLimits(Record):
+class ConnectionLimits(SettingsRecord):
     """How many connections a server keeps, and how long each may wait for a request."""
 
     most: int = Field(
@@ -77,7 +83,7 @@ class ConnectionLimits(Record):
     )
 
 
-class DomeSettings(Record):
+class DomeSettings(SettingsRecord):
     """The dome that a server works by hand, and how far any of its jobs may go with a dome: a job may ask for less,
     never for more.
     """
@@ -141,7 +147,7 @@ class DomeSettings(Record):
         return frozenset(one for one in (SIMULATED_DOME, self.address, *further) if one)
 
 
-class ServerSettings(Record):
+class ServerSettings(SettingsRecord):
     """The API server."""
 
     host: str = Field(default="127.0.0.1", description="address to listen on")
@@ -224,13 +230,13 @@ class ServerSettings(Record):
             return self.host == "localhost"
 
 
-class ClientSettings(Record):
+class ClientSettings(SettingsRecord):
     """The command line as a client of a server."""
 
     token: SecretStr | None = Field(default=None, description="what `dentine token create` printed")
 
 
-class Settings(Record):
+class Settings(SettingsRecord):
     """Everything a deployment may set."""
 
     server: ServerSettings = ServerSettings()

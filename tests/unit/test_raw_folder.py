@@ -58,7 +58,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "exposure as a text": (
         lambda t: t["frame"][1].update(exposure_s="0.1"),
-        r"exposure_s: input should be a valid number",
+        r"exposure_s: give a number, neither a text nor true or false",
     ),
     "level above one": (lambda t: t["frame"][1].update(level=1.5), r"level: input should be less than or equal to 1"),
     "NaN": (lambda t: t["frame"][1].update(time_s=float("nan")), r"time_s: input should be a finite number"),

@@ -8,7 +8,6 @@ small.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any, TypeVar
 
@@ -22,6 +21,7 @@ from starlette.responses import Response
 
 from services.api.http.thread_pools import ThreadPool
 from services.core.errors import SettingsError
+from services.core.files.json_text import AmbiguousJsonError, parse_json
 
 MAX_FAULTS = 100
 """Largest number of faults that are listed, and of members of the object at the top of a body. More faults are only
@@ -59,7 +59,8 @@ def parse(body: bytes) -> Any:
     """Parse JSON in UTF-8.
 
     Raises:
-        SettingsError: the body has more values, or an object in it more members, than any route asks for.
+        SettingsError: the body has more values, or an object in it more members, than any route asks for; or an object
+            has equal keys, or a value is NaN.
         ValueError, RecursionError: the body is not JSON, or nested too deeply.
     """
     # Count an upper bound of the values: every value but the first of its list or object follows a comma.
@@ -69,16 +70,18 @@ def parse(body: bytes) -> Any:
             f"The body has up to {values} values and {most} are allowed in its {len(body)} bytes; send what the route"
             " asks for."
         )
-    return json.loads(body, object_pairs_hook=_limit_members)
+    try:
+        return parse_json(body, _limit_members)
+    except AmbiguousJsonError as problem:
+        raise SettingsError(f"The body is ambiguous: {problem}.") from problem
 
 
-def _limit_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
+def _limit_members(members: list[tuple[str, Any]]) -> None:
     if len(members) > MAX_MEMBERS:
         raise SettingsError(
             f"An object of the body has {len(members)} members and {MAX_MEMBERS} are allowed; send what the route asks"
             " for."
         )
-    return dict(members)
 
 
 class BodyRoute(APIRoute):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
+from services.core.files.json_text import parse_json
 from services.core.files.vtk_polydata import read_polydata
 from services.core.geometry import Mesh
 
@@ -80,7 +80,7 @@ def read_sidecar(path: Path) -> NDArray[np.float64]:
         raise CaptureInputError(f"Label file {path} does not exist; put it there or correct its name.")
     try:
         if path.suffix.lower() == ".json":
-            return np.asarray(json.loads(path.read_text())["labels"], dtype=np.float64).reshape(-1)
+            return _labels_of(parse_json(path.read_text()))
         if path.suffix.lower() == ".npy":
             return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64).reshape(-1)
         return np.array(path.read_text().replace(",", " ").split(), dtype=np.float64)
@@ -89,6 +89,13 @@ def read_sidecar(path: Path) -> NDArray[np.float64]:
             f"Label file {path} cannot be read ({problem}); give one number a line, an .npy array or a .json file with"
             " 'labels'."
         ) from problem
+
+
+def _labels_of(tree: dict[str, Any]) -> NDArray[np.float64]:
+    labels = np.asarray(tree["labels"])
+    if labels.dtype.kind not in "iuf":
+        raise ValueError("'labels' holds something else than numbers")
+    return labels.astype(np.float64).reshape(-1)
 
 
 def _declared_triangles(path: Path) -> int:

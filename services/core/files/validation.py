@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 from pydantic import BaseModel, ValidationError
 
 from services.core.errors import CaptureInputError
+from services.core.files.json_text import AmbiguousJsonError, parse_json
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -30,8 +31,15 @@ def parse_record(content: bytes, kind: type[R], origin: str) -> R:
         origin: the file's name, with which a message begins.
 
     Raises:
-        CaptureInputError: it is no JSON, or no record of this kind; the message names the first wrong field.
+        CaptureInputError: it is no JSON, has equal keys, or is no record of this kind; the message names the first
+            wrong field.
     """
+    try:
+        parse_json(content)
+    except AmbiguousJsonError as problem:
+        raise CaptureInputError(f"{origin}: {problem}.") from problem
+    except (ValueError, RecursionError):
+        pass  # said by the parser below, with the place
     try:
         return kind.model_validate_json(content)
     except ValidationError as problem:
