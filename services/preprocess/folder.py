@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from services.core.calibration.record import require_consistent
 from services.core.errors import CaptureInputError
 from services.core.files.arrays import as_float32, map_radiance
+from services.core.raw.fullness import piled_up
 from services.core.records import FolderCapture, ImageEntry, MaskBit
 from services.core.store import read_record
 from services.preprocess.source import Image, LightImage, Motions, View
@@ -112,7 +113,10 @@ class FolderSource:
         return None
 
     def images(self, view: View, lights: Sequence[int], motions: Motions) -> Iterator[tuple[int, LightImage]]:  # noqa: ARG002
-        """See ``Source``. A variance file holds the variances of the pixel values and is used unchanged."""
+        """See ``Source``. A variance file holds the variances of the pixel values and is used unchanged.
+
+        Many pixels of a tooth at the largest value of a channel are taken for full ones.
+        """
         for light in lights:
             yield light, self._image(self._entries[view.whole.name, self.description.lights[light].name], view)
 
@@ -131,6 +135,9 @@ class FolderSource:
                 bits[rows][lost] = MaskBit.NOT_FINITE
                 values[~finite] = 0
             peak = max(peak, float(np.abs(values).max(initial=0)))
+        for channel in range(radiance.shape[2]):
+            if (end := piled_up(radiance[..., channel][covered & (bits == 0)], np.inf)) is not None:
+                bits[radiance[..., channel] >= end] |= np.uint16(MaskBit.SATURATED)
         if broken > max(1, NOT_FINITE_LIMIT * int(np.count_nonzero(covered))):
             raise CaptureInputError(
                 f"Image file {self.root / entry.file} (camera {entry.camera}, light {entry.light}) is not finite at"
@@ -143,7 +150,7 @@ class FolderSource:
             # Flag pixels whose variance is zero or not finite, because their weight 1/variance is undefined
             usable = np.isfinite(spread) & (spread > 0)
             if not usable.all():
-                bits[rows][~usable.all(axis=-1)] = MaskBit.NOT_FINITE
+                bits[rows][~usable.all(axis=-1)] |= np.uint16(MaskBit.NOT_FINITE)
                 spread[~np.isfinite(spread)] = 0
         return LightImage(radiance, variance, bits)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.raw.frames import read_counts
+from services.core.raw.frames import read_counts, read_frame
 from services.core.raw.mosaic import binned
 from services.core.raw.records import RawFolder, RawFrame
 
@@ -93,8 +93,9 @@ class Photos:
     def channels(self, frame: RawFrame, part: Part = WHOLE) -> Channels:
         """Return the light by channel in a part of a photograph; a mosaic at half its size, without interpolation."""
         camera = self.folder.camera_named(frame.camera)
-        counts = read_counts(self.root, self.folder, frame)[part]
-        is_full = np.asarray(counts >= (np.inf if camera.full_counts is None else camera.full_counts))
+        read = read_frame(self.root, self.folder, frame)
+        counts = read.counts[part]
+        is_full = np.asarray(counts >= read.fullness.at(part))
         values = self._above_black(frame, counts)
         first = (part[1].start or 0, part[0].start or 0)
         if camera.mosaic == "none":

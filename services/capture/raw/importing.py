@@ -16,7 +16,8 @@ from services.capture.raw.names import NamedFrame, named_frame
 from services.core.calibration.record import Calibration
 from services.core.errors import CaptureInputError
 from services.core.files.scans import FORMATS
-from services.core.raw.decoding import CAMERA_RAW, Decoded, decode
+from services.core.raw.decoded import Decoded
+from services.core.raw.decoding import CAMERA_RAW, decode
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
 from services.core.raw.records import TARGET_KEYS, RawFolder
 from services.core.raw.toml_writing import description_toml, toml_value

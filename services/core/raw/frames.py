@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.core.raw.decoding import Decoded, decode
+from services.core.raw.decoded import Decoded
+from services.core.raw.decoding import decode
 from services.core.raw.folder import require_inside
-from services.core.raw.records import RawCamera, RawFolder, RawFrame
+from services.core.raw.fullness import Fullness, fullness_of
+from services.core.raw.records import DARK, RawCamera, RawFolder, RawFrame
 
 Counts = NDArray[np.uint16] | NDArray[np.float32]
 _LETTERS = {"red": "R", "green": "G", "blue": "B"}
@@ -26,11 +29,27 @@ MIN_GREEN_DIFFERENCE = 0.05
 real sensors differ by 1 or 2 %."""
 
 
-def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
-    """Read the counts of a frame, whole numbers as uint16 and others as float32.
+@dataclass(frozen=True)
+class Frame:
+    """One photograph as it was read.
 
-    Returns:
-        (H, W) for a camera with a mosaic; (H, W, C) for other cameras, in the order of ``folder.channels``.
+    Attributes:
+        counts: (H, W) for a camera with a mosaic, else (H, W, C), in the order of the folder's channels; whole numbers
+            as uint16 and others as float32.
+        fullness: from which count on its pixels are full.
+    """
+
+    counts: Counts
+    fullness: Fullness
+
+
+def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
+    """Read the counts of a frame; see ``read_frame``."""
+    return read_frame(root, folder, frame).counts
+
+
+def read_frame(root: Path, folder: RawFolder, frame: RawFrame) -> Frame:
+    """Read the counts of a frame, and from which count on its pixels are full.
 
     Raises:
         CaptureInputError: the file does not fit; the message names it, its camera and light, and what is wrong.
@@ -41,6 +60,7 @@ def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
     camera = folder.camera_named(frame.camera)
     try:
         decoded = decode(path)
+        _require_whole(decoded, frame, camera)
         counts = _significant_bits(_in_camera_shape(decoded, camera), camera)
         _require_pattern(decoded, counts, camera)
     except OSError as problem:
@@ -49,12 +69,25 @@ def read_counts(root: Path, folder: RawFolder, frame: RawFrame) -> Counts:
         ) from problem
     except ValueError as problem:
         raise CaptureInputError(f"{what} {problem}.") from problem
-    if camera.mosaic != "none":
-        return counts
-    order = [camera.channels.index(channel) for channel in folder.channels]
-    if order != sorted(order):
-        counts[:] = counts[..., order]
-    return counts
+    if camera.mosaic == "none":
+        order = [camera.channels.index(channel) for channel in folder.channels]
+        if order != sorted(order):
+            counts[:] = counts[..., order]
+    return Frame(counts, _fullness(decoded, counts, frame, camera))
+
+
+def _require_whole(decoded: Decoded, frame: RawFrame, camera: RawCamera) -> None:
+    if decoded.window is not None and (frame.kind in DARK or camera.mosaic != "none"):
+        raise ValueError("holds a part of its picture only; export it whole")
+
+
+def _fullness(decoded: Decoded, counts: Counts, frame: RawFrame, camera: RawCamera) -> Fullness:
+    if frame.kind in DARK:
+        sites = 4 if camera.mosaic != "none" else counts.shape[2]
+        stated = np.inf if camera.full_counts is None else camera.full_counts
+        return Fullness((stated,) * sites, counts.shape[:2], camera.mosaic != "none")
+    white = None if decoded.white is None else [level / 2**camera.shift for level in decoded.white]
+    return fullness_of(counts, camera, white, decoded.window)
 
 
 def _in_camera_shape(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]:
@@ -123,12 +156,10 @@ def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> Non
         if decoded.pattern is not None:
             raise ValueError(f"is a mosaic that begins {decoded.pattern}, but its camera has none; set mosaic")
         return
-    if decoded.pattern is not None:
-        if decoded.pattern != camera.mosaic:
-            raise ValueError(
-                f"is a mosaic that begins {decoded.pattern}, but its camera's begins {camera.mosaic}; correct mosaic"
-            )
-        return
+    if decoded.pattern is not None and decoded.pattern != camera.mosaic:
+        raise ValueError(
+            f"is a mosaic that begins {decoded.pattern}, but its camera's begins {camera.mosaic}; correct mosaic"
+        )
     if min(counts.shape) < 2:
         raise ValueError("is too small to hold a mosaic; correct mosaic")
     # Both green pixels of a cell see the same light. Where they differ in most cells and the other two agree, the
@@ -143,6 +174,7 @@ def _require_pattern(decoded: Decoded, counts: Counts, camera: RawCamera) -> Non
     # Medians are compared, because edges in the image make single cells differ in either direction.
     deviation, expected = (abs(float(np.median((a - b) / np.maximum(a + b, 1)))) for a, b in (greens, others))
     if len(greens[0]) >= MIN_CELLS and deviation > MAX_GREEN_RATIO * expected and deviation > MIN_GREEN_DIFFERENCE:
+        remedy = "correct mosaic" if decoded.pattern is None else "the file states a wrong pattern, so export it again"
         raise ValueError(
-            f"has green pixels that differ by {2 * deviation:.0%}, so it does not begin {camera.mosaic}; correct mosaic"
+            f"has green pixels that differ by {2 * deviation:.0%}, so it does not begin {camera.mosaic}; {remedy}"
         )

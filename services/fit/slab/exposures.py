@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.core.raw.frames import read_counts
+from services.core.raw.frames import Frame, read_frame
 from services.core.raw.merge import Exposure, merge
 from services.core.raw.noise import ROUNDING, LitPair, NoiseModel, read_noise, shot_noise
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
@@ -84,6 +84,10 @@ class _Stack:
 
     def counts(self, frame: SlabExposure) -> Counts:
         """Counts of a frame (rows, columns)."""
+        return self.read(frame).counts[..., 0].astype(np.float32)
+
+    def read(self, frame: SlabExposure) -> Frame:
+        """A frame's counts (rows, columns, 1), and from which count on they are full."""
         pixels = self.folder.pixels
         camera = RawCamera(
             name=frame.camera,
@@ -99,7 +103,7 @@ class _Stack:
             gain=frame.gain,
         )  # fmt: skip
         described = RawFolder(units="mm", camera=(camera,), light=lights, frame=(raw,))
-        return read_counts(self.root, described, raw)[..., 0].astype(np.float32)
+        return read_frame(self.root, described, raw)
 
     @property
     def known(self) -> CameraCounts:
@@ -121,12 +125,12 @@ class _Stack:
 
     def exposure(self, frame: SlabExposure, noise: NoiseModel) -> Exposure:
         """A frame's counts above black."""
-        counts, (black, averaged) = self.counts(frame), self.black(frame)
-        full = frame.saturation_counts if frame.bits is None else frame.saturation_counts or 2**frame.bits - 1
-        assert full is not None
+        read, (black, averaged) = self.read(frame), self.black(frame)
+        counts = read.counts[..., 0].astype(np.float32)
+        full = np.broadcast_to(read.fullness.at(), read.counts.shape)[..., 0]
         black_variance = float(noise.variance(np.zeros((), np.float32), frame.gain)) / averaged
         return Exposure(
-            counts - black, black_variance, np.float32(full) - counts, frame.exposure_s * frame.gain, frame.gain
+            counts - black, black_variance, full - counts, frame.exposure_s * frame.gain, frame.gain
         )  # fmt: skip
 
     def exposures_of(self, image: SlabImage, noise: NoiseModel) -> list[Exposure]:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from services.core.calibration.cameras_and_lights import CalibratedCamera
 from services.core.errors import CaptureInputError
 from services.core.geometry import Record
-from services.core.raw.frames import Counts, read_counts
+from services.core.raw.frames import Counts, Frame, read_counts, read_frame
+from services.core.raw.fullness import Fullness, Part
 from services.core.raw.merge import Exposure, merge
 from services.core.raw.mosaic import sites
 from services.core.raw.noise import LitPair, NoiseModel, read_noise, shot_noise
@@ -21,15 +22,13 @@ from services.core.raw.records import DARK, RawFolder, RawFrame
 from services.core.store import write_atomic
 from services.preprocess.raw.checks import require_like_exposures
 from services.preprocess.raw.demosaic import demosaic
+from services.preprocess.raw.ends import end_notes, ends_of
 from services.preprocess.raw.lens import Lens, fitted_vignetting
 from services.preprocess.raw.response import NEAR_FULL, Linearity, Series, measure_linearity
 from services.preprocess.scratch import cached_array
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
-Part = tuple[slice, slice] | tuple[NDArray[np.intp], ...]
-"""Rows and columns of a frame, in a form that can index an array."""
-
 MEASURES = "measures.json"
 """Name of the file in a camera's scratch folder that holds its ``Measures``."""
 FRAMES_MEASURED = 8
@@ -47,6 +46,7 @@ class Measures(Record):
         read_counts, counts_per_electron, relative: parameters of the ``NoiseModel``.
         curve: a, b of the ``Linearity``.
         vignetting: a, b, c of the ``Lens``.
+        full: gain, and the counts at which the pixels of its frames end, for each gain at which they do.
         notes: sentences about what was measured or assumed.
     """
 
@@ -55,6 +55,7 @@ class Measures(Record):
     relative: float
     curve: tuple[float, float]
     vignetting: tuple[float, float, float]
+    full: tuple[tuple[float, tuple[float, ...]], ...] = ()
     notes: tuple[str, ...]
 
 
@@ -92,6 +93,8 @@ class CameraFrames:
         self.raw = folder.camera_named(camera.name)
         self.notes: list[str] = []
         self._blacks: dict[tuple[float, float], Image] = {}
+        self._fullness: dict[str, Fullness] = {}
+        self._ends: dict[float, tuple[float, ...]] = {}
         self._ambient: Image | None = None
         self._full = np.float32(np.inf if self.raw.full_counts is None else self.raw.full_counts)
         self._black_frames = folder.frames_of(camera.name, "black")
@@ -108,6 +111,8 @@ class CameraFrames:
     def _measure(self, assumed_noise: tuple[float, float]) -> None:
         if not self._black_frames:
             self._require_black_of_calibration()
+        self._ends = ends_of(self._root, self._folder, self.raw)
+        self.notes += end_notes(self._folder, self.raw, self._ends)
         self.noise = self._measured_noise(*assumed_noise)
         self.linearity = self._measured_linearity()
         self.lens = self._measured_lens()
@@ -120,10 +125,12 @@ class CameraFrames:
             relative=noise.relative,
             curve=self.linearity.curve,
             vignetting=self.lens.vignetting,
+            full=tuple(self._ends.items()),
             notes=tuple(self.notes),
         )
 
     def _restore(self, measures: Measures) -> None:
+        self._ends = dict(measures.full)
         self.noise = NoiseModel(measures.read_counts, measures.counts_per_electron, measures.relative)
         # Leave the deviations of single blocks empty, because only the notes report them.
         self.linearity = Linearity(np.empty(0), measures.curve, float(self._full))
@@ -136,7 +143,7 @@ class CameraFrames:
         Raises:
             CaptureInputError: the frame cannot be read; the message names it.
         """
-        return self.exposure_of(frame, read_counts(self._root, self._folder, frame), (slice(None), slice(None)))
+        return self.exposure_of(frame, self._read(frame).counts, (slice(None), slice(None)))
 
     def counts(self, frame: RawFrame, region: Window) -> Counts:
         """Raw counts of a part of a frame, copied so that the whole frame is not kept in memory.
@@ -144,13 +151,20 @@ class CameraFrames:
         Raises:
             CaptureInputError: the frame cannot be read; the message names it.
         """
-        return read_counts(self._root, self._folder, frame)[region.rows, region.columns].copy()
+        return self._read(frame).counts[region.rows, region.columns].copy()
+
+    def _read(self, frame: RawFrame) -> Frame:
+        found = read_frame(self._root, self._folder, frame)
+        own = found.fullness
+        ends = self._ends.get(frame.gain) if frame.kind not in DARK else None
+        self._fullness[frame.file] = own if ends is None else own.limited(ends)
+        return found
 
     def exposure_of(self, frame: RawFrame, counts: Counts, part: Part) -> Exposure:
         """Convert a part of a frame's counts to an exposure.
 
         Args:
-            frame: description of the frame.
+            frame: description of the frame, whose counts this object has read.
             counts: raw counts of the part.
             part: rows and columns of the part in the frame.
         """
@@ -160,7 +174,7 @@ class CameraFrames:
         seconds = frame.exposure_s * frame.gain
         if self._ambient is not None and frame.kind not in DARK:
             signal = signal - self._ambient[part] * np.float32(seconds)
-        headroom = np.subtract(self._full, counts, dtype=np.float32)
+        headroom = np.subtract(self._fullness[frame.file].at(part), counts, dtype=np.float32)
         return Exposure(signal, variance, headroom, seconds * frame.level, frame.gain)
 
     def _black(self, frame: RawFrame) -> tuple[Image, float]:
