@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from services.capture.raw.listing import IMAGES, photographs_in, require_told_apart, unused_words
 from services.capture.raw.names import NamedFrame, named_frame
 from services.core.calibration.record import Calibration
 from services.core.errors import CaptureInputError
@@ -23,7 +24,6 @@ from services.core.raw.records import TARGET_KEYS, RawFolder
 from services.core.raw.toml_writing import description_toml, toml_value
 from services.core.store import read_record, write_atomic
 
-IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
 DEPTHS = (8, 10, 12, 14, 16)
 """Numbers of bits of cameras' analogue-to-digital converters."""
 FRAMES_READ = 8
@@ -72,7 +72,13 @@ class Imported:
     missing: tuple[str, ...]
 
 
-def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, calibration: Path | None) -> Imported:
+def import_folder(
+    root: Path,
+    exposure_s: float | None,
+    mosaic: str | None,
+    calibration: Path | None,
+    ignored: Collection[str] = (),
+) -> Imported:
     """Write ``root/raw.toml`` from the names of the files in the folder.
 
     Args:
@@ -80,23 +86,23 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         exposure_s: exposure of files whose names do not give one.
         mosaic: pattern of cameras whose files hold one number a pixel and do not state their pattern.
         calibration: calibration of the rig.
+        ignored: words of file names that have no meaning.
 
     Raises:
-        CaptureInputError: a description exists already, no file's name can be interpreted, an exposure is not given, or
-            a file or the calibration cannot be read; the message names the file.
+        CaptureInputError: a description exists already, no file's name can be interpreted, an exposure is not given,
+            two names differ only in a word without a meaning, or a file or the calibration cannot be read; the message
+            names the file.
     """
     if (root / DESCRIPTION).exists():
         raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")
-    files = sorted(
-        p.relative_to(root).as_posix() for p in root.rglob("*") if p.suffix.lower() in IMAGES and p.is_file()
-    )
-    if not files:
+    listing = photographs_in(root)
+    if not listing.photographs:
         raise CaptureInputError(
             f"{root} holds no photograph; put {', '.join(sorted(IMAGES - CAMERA_RAW))} or camera raw files there."
         )
     if calibration is not None:
         read_record(calibration, Calibration)
-    interpreted = {file: named_frame(file) for file in files}
+    interpreted = {file: named_frame(file, {word.lower() for word in ignored}) for file in listing.photographs}
     frames = [one for one in interpreted.values() if isinstance(one, NamedFrame)]
     unnamed = [
         f"File {file} {why}, so it is left out; rename it, such as left_L07_0.05s.tif."
@@ -105,6 +111,7 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
     ]
     if not frames:
         raise CaptureInputError(unnamed[0].replace(", so it is left out", ""))
+    require_told_apart(frames)
     if exposure_s is None and (incomplete := [one.file for one in frames if one.exposure_s is None]):
         which = (
             f"File {incomplete[0]} does"
@@ -129,7 +136,9 @@ def import_folder(root: Path, exposure_s: float | None, mosaic: str | None, cali
         " take the # away."
         for target in targets
     ]
-    return Imported(folder, (*unnamed, *target_notes, *_missing(root, folder, scans)))
+    return Imported(
+        folder, (*listing.notes, *unused_words(frames), *unnamed, *target_notes, *_missing(root, folder, scans))
+    )
 
 
 def _tree(

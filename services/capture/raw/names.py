@@ -1,7 +1,7 @@
 """Interpretation of a photograph's file name: camera, kind or light, exposure and gain.
 
-The parts of a path are separated by slashes, underscores and blanks. The first part without another meaning is the
-camera, the second one the light; numbers that follow count repetitions::
+The words of a path are separated by slashes, underscores and blanks. The first word without another meaning is the
+camera, the second one the light; numbers that follow count repetitions, and all other words are listed as unused::
 
     left_L07_0.05s.tif    left/black_50ms_2.png    right_tracking_003_1-20s.dng    left_flat_0.1s_gain4.npy
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from types import MappingProxyType
@@ -45,6 +46,12 @@ _SECONDS = re.compile(r"(?:(\d+)-(\d+)|(\d+(?:\.\d+)?))(s|ms|us)")
 _GAIN = re.compile(r"gain(\d+(?:\.\d+)?)")
 _NUMBER = re.compile(r"\d+")
 _DECIMAL = re.compile(r"\d*\.\d+")
+_MEANINGLESS = re.compile(
+    r"(?:19|20)\d{6}(?:[t-]?\d{4,6})?|(?:19|20)\d\d-\d\d-\d\d|\d\d-\d\d-\d\d|iso-?\d+|f\d+(?:\.\d+)?|\d+mm"
+)
+"""Dates, times of day, and what cameras write into names: sensitivities, apertures and focal lengths."""
+_NUMBERED = frozenset({"cam", "camera", "light", "led", "lamp", "l", "c", "source"})
+"""Words to whose names the number that follows belongs: cam 1 is another camera than cam 2."""
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 
@@ -60,17 +67,26 @@ class NamedFrame:
     gain: float
     place: str | None = None
     """Place of a board or sphere: the word and number in the name."""
+    unused: tuple[str, ...] = ()
+    """Words of the name that have no meaning here."""
 
 
-def named_frame(file: str) -> NamedFrame | str:
-    """Interpret a file name; if it lacks something, return a part of a sentence that says what."""
+def named_frame(file: str, ignored: AbstractSet[str] = frozenset()) -> NamedFrame | str:
+    """Interpret a file name; if it lacks something, return a part of a sentence that says what.
+
+    Args:
+        ignored: words, in lower case, that are left out.
+    """
     pure = PurePosixPath(file)
     parts = [part for whole in (*pure.parent.parts, pure.stem) for part in re.split(r"[_ ]+", whole) if part]
+    parts = [part for part in parts if part.lower() not in ignored]
     exposure_s, gain, kind, place = None, 1.0, None, None
-    words: list[str] = []
-    for part in parts:
+    words, unused = list[str](), list[str]()
+    for before, part in zip(["", *parts], parts, strict=False):
         word = part.lower()
-        if (seconds := _SECONDS.fullmatch(word)) is not None:
+        if _MEANINGLESS.fullmatch(word) is not None:
+            unused.append(part)
+        elif (seconds := _SECONDS.fullmatch(word)) is not None:
             over, under, whole, unit = seconds.groups()
             exposure_s = (float(over) / float(under) if over else float(whole)) * _UNITS[unit]
         elif (stated_gain := _GAIN.fullmatch(word)) is not None:
@@ -83,6 +99,10 @@ def named_frame(file: str) -> NamedFrame | str:
             place += word
         elif _NUMBER.fullmatch(word) is None or not words:
             words.append(part)
+        elif before == words[-1] and before.lower() in _NUMBERED:
+            words[-1] += part
+        elif before == words[-1] and kind is None and not any(letter.isdigit() for letter in before):
+            unused.append(part)  # it may count lights or repetitions
     if not words:
         return "does not name its camera"
     light = words[1] if len(words) > 1 else None
@@ -92,6 +112,6 @@ def named_frame(file: str) -> NamedFrame | str:
     if kind in LIT_BY_ONE and light is None:
         return f"is of kind {kind} and does not name its light"
     takes_light = kind in LIT_BY_ONE or kind in {"flat", "board", "chart"}
-    return NamedFrame(
-        file, words[0], kind, light if takes_light else None, exposure_s, gain, place if kind in PLACED else None
-    )
+    unused += words[2 if takes_light else 1 :]
+    light, place = light if takes_light else None, place if kind in PLACED else None
+    return NamedFrame(file, words[0], kind, light, exposure_s, gain, place, tuple(unused))

@@ -20,12 +20,15 @@ def import_command(
         str | None, typer.Option(help="Mosaic of cameras whose files hold one number a pixel: RGGB, BGGR, GRBG, GBRG.")
     ] = None,
     calibration: Annotated[Path | None, typer.Option(help="calibration.json of the rig.")] = None,
+    ignore: Annotated[
+        list[str] | None, typer.Option(metavar="WORD", help="Word of file names without a meaning; may be repeated.")
+    ] = None,
 ) -> None:
     """Write raw.toml for a folder of named photographs, and say what is missing."""
     from services.capture.raw.importing import import_folder
     from services.core.raw.folder import DESCRIPTION
 
-    imported = import_folder(folder, exposure_s, mosaic, calibration)
+    imported = import_folder(folder, exposure_s, mosaic, calibration, ignore or ())
     cameras, lights, frames = (
         len(one) for one in (imported.folder.camera, imported.folder.light, imported.folder.frame)
     )

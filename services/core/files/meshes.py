@@ -1,5 +1,5 @@
-"""Read and write meshes: the one place that chooses a mesh file format. trimesh does the parsing; ``scans`` reads
-labelled scans.
+"""Read and write meshes: the one place that chooses a mesh file format. ``surface_files`` does the parsing; ``scans``
+reads labelled scans.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, MeshError
+from services.core.files.surface_files import read_surface
 from services.core.geometry import Mesh, Tooth, teeth_folder
 
 FDI_NUMBERS = frozenset(
@@ -28,17 +29,17 @@ def read_mesh(path: Path) -> Mesh:
     Raises:
         CaptureInputError: the file is absent or no triangle mesh.
     """
-    import trimesh
-
     if not path.is_file():
         raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
     try:
-        loaded = trimesh.load_mesh(path, process=False)
-        vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int32)
+        surface = read_surface(path)
+        vertices, faces = surface.vertices, surface.faces
     except Exception as problem:
         raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
     if len(faces) == 0:
         raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise CaptureInputError(f"Mesh file {path} has a triangle of points that it does not hold; export it again.")
     welded, index = np.unique(vertices, axis=0, return_inverse=True)
     return Mesh(welded, index.reshape(-1)[faces].astype(np.int32))
 

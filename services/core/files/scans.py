@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.files.json_text import parse_json
+from services.core.files.surface_files import read_surface
 from services.core.files.vtk_polydata import read_polydata
 from services.core.geometry import Mesh
 
@@ -120,14 +121,10 @@ def _read_polydata(path: Path) -> ScanFile:
 
 
 def _read_by_trimesh(path: Path) -> ScanFile:
-    import trimesh
-
-    # Vertices keep the file's order, because a label file with one label per vertex relies on it.
-    options = {"skip_materials": True, "maintain_order": True} if path.suffix.lower() == ".obj" else {}
+    # Vertices and triangles keep the file's order, because a label file with one label for each relies on it.
     try:
-        loaded = trimesh.load_mesh(path, process=False, **options)
-        mesh = Mesh(np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces, dtype=np.int32))
-        raw = loaded.metadata.get("_ply_raw", {}) if path.suffix.lower() == ".ply" else {}
+        surface = read_surface(path)
+        mesh, raw = Mesh(surface.vertices, surface.faces), surface.elements
         triangles, vertices = (_properties(raw[what]["data"]) if what in raw else {} for what in ("face", "vertex"))
     except Exception as problem:
         raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
