@@ -20,7 +20,7 @@ PATIENCE_MS = 60_000
 """Time limit for a page to show what is expected, long enough for a busy machine; these tests do not judge speed."""
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def chromium() -> Iterator[Browser]:
     """A headless Chromium; the test is skipped where none is installed."""
     expect.set_options(timeout=PATIENCE_MS)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 import pytest
 from playwright.sync_api import Browser, Page
 
 from services.api.app import STATIC
+from tests.browser.chromium import PATIENCE_MS
 from tests.browser.contrast import contrast_failures
 
 WIDE, PHONE = (1440, 900), (390, 844)
-LOOKS = (("light", WIDE[0]), ("dark", PHONE[0]))
-"""Colour scheme and width of the two looks in which a page is tested: each scheme and each width once."""
+LOOKS: tuple[tuple[Literal["light", "dark"], int], ...] = (("light", WIDE[0]), ("dark", PHONE[0]))
+"""Colour scheme and width of the two looks in which what a page shows is tested: each scheme and each width once."""
 
 
 @contextmanager
@@ -44,10 +47,20 @@ def watched_page(
 
 
 def looked_at(page: Page, name: str) -> None:
-    """Assert that the shown page has enough contrast and is not too wide; store a screenshot in the folder that the
-    environment variable SCREENSHOTS names, if it is set.
+    """Assert that what the page shows has enough contrast and is not too wide in both looks, and return to the page's
+    own; store screenshots in the folder that the environment variable SCREENSHOTS names, if it is set.
     """
-    if folder := os.environ.get("SCREENSHOTS"):
-        page.screenshot(path=f"{folder}/{name}.png", full_page=True)
-    assert contrast_failures(page) == []
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    own = page.viewport_size
+    assert own is not None
+    for scheme, width in LOOKS:
+        page.emulate_media(color_scheme=scheme)
+        page.set_viewport_size({"width": width, "height": own["height"]})
+        if folder := os.environ.get("SCREENSHOTS"):
+            page.screenshot(path=f"{folder}/{name}-{scheme}-{width}.png", full_page=True)
+        assert contrast_failures(page) == [], (scheme, width)
+        deadline_s = time.monotonic() + PATIENCE_MS / 1000
+        while not page.evaluate("document.documentElement.scrollWidth <= innerWidth"):  # charts follow a new width late
+            assert time.monotonic() < deadline_s, f"the page is wider than {width} px"
+            page.wait_for_timeout(50)
+    page.emulate_media(color_scheme="null")
+    page.set_viewport_size(own)

@@ -21,6 +21,7 @@ from services.core.stage import StageEvent
 from services.pipeline.database import sqlite_url
 from services.pipeline.event_log import EventLog
 from tests.browser.contrast import contrast_failures
+from tests.browser.pages import looked_at
 from tests.browser.scripted_job import STEPS, ScriptedJob, expect_state, submit
 from tests.support.live_server import serving
 from tests.support.past_runs import remember_runs
@@ -35,14 +36,11 @@ def job() -> ScriptedJob:
 
 
 @pytest.fixture
-def page(chromium: Browser, tmp_path: Path, job: ScriptedJob, request: pytest.FixtureRequest) -> Iterator[Page]:
+def page(chromium: Browser, tmp_path: Path, job: ScriptedJob) -> Iterator[Page]:
     if not (STATIC / "app.js").exists():
         pytest.skip("the dashboard is not built; run make dashboard")
-    scheme = getattr(request, "param", "light")
     with serving(create_app(ServerSettings(data=tmp_path / "data"), job)) as client:
-        context = chromium.new_context(
-            base_url=str(client.base_url), color_scheme=scheme, viewport={"width": 1280, "height": 1000}
-        )
+        context = chromium.new_context(base_url=str(client.base_url), viewport={"width": 1280, "height": 1000})
         page = context.new_page()
         said: list[str] = []
         asked: list[str] = []
@@ -65,8 +63,7 @@ def test_an_address_that_names_nothing_says_so_until_a_job_is_chosen(page: Page)
     expect(page.get_by_role("alert")).to_have_count(0)
 
 
-@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
-def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, request: pytest.FixtureRequest) -> None:
+def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob) -> None:
     submit(page)
     page.goto("/")
     expect(page.locator(".job .badge")).to_have_text("running")
@@ -101,9 +98,7 @@ def test_a_job_is_followed_live_to_its_result(page: Page, job: ScriptedJob, requ
     expect(page.locator("tr", has_text="dentin.g1").first).to_contain_text("not determined")
     expect(page.get_by_role("link", name="report.html")).to_be_visible()
     expect(page.get_by_role("link", name="Open the report")).to_be_visible()
-    assert contrast_failures(page) == []
-    if folder := os.environ.get("SCREENSHOTS"):
-        page.screenshot(path=f"{folder}/dashboard-{request.node.callspec.params['page']}.png", full_page=True)
+    looked_at(page, "dashboard")
 
 
 def test_a_failure_says_what_to_do_and_can_be_retried_by_keyboard(page: Page, job: ScriptedJob) -> None:
@@ -202,10 +197,7 @@ def test_single_teeth_of_a_jaw_are_named_and_give_way_to_the_whole_jaw(
     repository.close()
 
 
-@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
-def test_a_job_fits_a_phone_however_long_its_names_are(
-    page: Page, job: ScriptedJob, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_a_job_fits_a_phone_however_long_its_names_are(page: Page, job: ScriptedJob, tmp_path: Path) -> None:
     page.set_viewport_size({"width": 375, "height": 800})
     name = "-".join(["incisor"] * 12)
     (tmp_path / name).mkdir()
@@ -229,7 +221,7 @@ def test_a_job_fits_a_phone_however_long_its_names_are(
     expect(page.get_by_role("alert")).to_be_visible()
     expect(page.locator(".files a", has_text=name)).to_be_visible()
     expect(page.locator(".chart canvas")).to_be_visible()
-    keep_picture(page, f"phone-{request.node.callspec.params['page']}")
+    keep_picture(page, "phone")
     assert page.evaluate("document.documentElement.scrollWidth") <= 375
 
 

@@ -18,10 +18,11 @@ from playwright.sync_api import Browser, Page, expect
 from services.api.app import create_app
 from services.core.records import JobSpec
 from services.core.settings import DomeSettings, ServerSettings
-from tests.browser.pages import LOOKS, looked_at, watched_page
+from tests.browser.pages import looked_at, watched_page
 from tests.support.calibration_jobs import publish_calibration
 from tests.support.guarded_server import run_nothing
-from tests.support.live_server import serving, toy_server
+from tests.support.live_server import serving
+from tests.support.toy_stages import run_here
 from tests.support.uploading import contents_of, upload_capture, write_capture
 
 pytestmark = pytest.mark.browser
@@ -38,24 +39,21 @@ def address_of(server: httpx.Client) -> str:
     return str(server.base_url).rstrip("/")
 
 
-@pytest.mark.parametrize(("scheme", "width"), [LOOKS[0], pytest.param(*LOOKS[1], marks=pytest.mark.slow)])
-def test_an_empty_page_leads_to_the_report_in_three_clicks(
-    chromium: Browser, tmp_path: Path, scheme: str, width: int
-) -> None:
+def test_an_empty_page_leads_to_the_report_in_three_clicks(chromium: Browser, tmp_path: Path) -> None:
     with (
-        toy_server(tmp_path / "data") as (server, _),
-        watched_page(chromium, address_of(server), scheme, width) as page,
+        serving(create_app(ServerSettings(data=tmp_path / "data"), run_here)) as server,
+        watched_page(chromium, address_of(server)) as page,
     ):
         page.goto("/")
         expect(page.get_by_role("heading", name="New job")).to_be_visible()
-        looked_at(page, f"empty-{scheme}-{width}")
+        looked_at(page, "empty")
         clicks = [page.get_by_role("button", name="Run the demo"), page.get_by_role("link", name="Open the report")]
         assert len(clicks) <= 3
         clicks[0].click()
         expect(page.locator(".job h2")).to_have_text("Job 1 · Demonstration")
         expect(page.locator(".stages li strong")).to_have_text(["phantom", "capture", "prepare", "fit", "export"])
         expect(page.locator(".job .badge")).to_have_text("succeeded")
-        looked_at(page, f"demo-{scheme}-{width}")
+        looked_at(page, "demo")
         with page.context.expect_page() as opened:
             clicks[1].click()
         expect(opened.value).to_have_title("report")
@@ -80,17 +78,14 @@ def test_what_the_demonstration_is_refused_for_is_told(chromium: Browser, server
 
 
 @pytest.mark.parametrize("server", ["simulated"], indirect=True)
-@pytest.mark.parametrize(("scheme", "width"), LOOKS)
-def test_a_rig_is_explained_and_its_dome_is_looked_at(
-    chromium: Browser, server: httpx.Client, scheme: str, width: int
-) -> None:
-    with watched_page(chromium, address_of(server), scheme, width) as page:
+def test_a_rig_is_explained_and_its_dome_is_looked_at(chromium: Browser, server: httpx.Client) -> None:
+    with watched_page(chromium, address_of(server)) as page:
         page.goto("/")
         page.get_by_role("link", name="Connect a rig").click()
         expect(page.locator(".rig [role=status]")).to_have_text(
             re.compile(r"The dome at simulated.* answers: 155 lights, firmware .+\.")
         )
-        looked_at(page, f"rig-{scheme}-{width}")
+        looked_at(page, "rig")
         page.get_by_role("link", name="Submit a job with a rig").click()
         expect(page.get_by_label("What is fitted from")).to_have_value("rig")
 
@@ -121,10 +116,7 @@ def test_calibrations_are_shown_with_their_state_and_offered_to_jobs(
         )
 
 
-@pytest.mark.parametrize(("scheme", "width"), LOOKS)
-def test_what_a_calibration_job_made_is_kept_from_its_page(
-    chromium: Browser, tmp_path: Path, scheme: str, width: int
-) -> None:
+def test_what_a_calibration_job_made_is_kept_from_its_page(chromium: Browser, tmp_path: Path) -> None:
     folder = write_capture(tmp_path / "session")
     tree = json.loads((folder / "capture.json").read_text())
     del tree["images"]
@@ -132,19 +124,19 @@ def test_what_a_calibration_job_made_is_kept_from_its_page(
     with serving(create_app(ServerSettings(data=tmp_path / "data"), publish_calibration)) as server:
         job = server.post("/v1/jobs", json={"kind": "calibration", "capture": str(folder)}).json()["id"]
         server.get(f"/v1/jobs/{job}/events")
-        with watched_page(chromium, address_of(server), scheme, width) as page:
+        with watched_page(chromium, address_of(server)) as page:
             page.goto(f"/#/{job}")
             page.get_by_role("button", name="Keep the calibration…").click()
             page.get_by_label("Its name").fill("rig 1")
             page.keyboard.press("Enter")
             assert server.get("/v1/calibrations").json() == [], "a blank is no part of a name"
             page.get_by_label("Its name").fill("rig-1")
-            looked_at(page, f"keep-calibration-{scheme}-{width}")
+            looked_at(page, "keep-calibration")
             page.keyboard.press("Enter")
             expect(page.locator(".actions [role=status]")).to_have_text(
                 "Jobs name it as calibrations/rig-1. Its state: not known."
             )
-            looked_at(page, f"kept-calibration-{scheme}-{width}")
+            looked_at(page, "kept-calibration")
         assert [one["name"] for one in server.get("/v1/calibrations").json()] == ["rig-1"]
 
 
@@ -160,12 +152,11 @@ def submitted(server: httpx.Client, page: Page) -> dict[str, Any]:
     return job
 
 
-@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 def test_the_form_is_the_schema_and_submits_what_was_changed(
-    chromium: Browser, server: httpx.Client, tmp_path: Path, scheme: str, width: int
+    chromium: Browser, server: httpx.Client, tmp_path: Path
 ) -> None:
     uploaded = upload_capture(server, contents_of(write_capture(tmp_path / "mine")))
-    with watched_page(chromium, address_of(server), scheme, width) as page:
+    with watched_page(chromium, address_of(server)) as page:
         page.goto(f"/#/submit/{uploaded}")
         expect(page.get_by_label("What is fitted from")).to_have_value("capture")
         expect(page.get_by_label("Capture", exact=True)).to_have_value(uploaded)
@@ -182,7 +173,7 @@ def test_the_form_is_the_schema_and_submits_what_was_changed(
         expect(page.locator("#option-pixel_step")).to_have_value("1")
         for group in page.locator("details").all():
             group.evaluate("group => group.open = true")
-        looked_at(page, f"form-{scheme}-{width}")
+        looked_at(page, "form")
         page.get_by_label("Name of the job").fill("Anna")
         page.get_by_label("Dentin").select_option("known")
         page.get_by_label("Lobes").select_option("2")

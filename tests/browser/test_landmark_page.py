@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from services.calibrate.clicking.page import write_clicking_page
 from services.core.errors import CaptureInputError
 from services.core.files.scans import read_scan_file
 from services.core.raw.folder import read_raw_folder
+from tests.support.command_line import dentine
 from tests.support.raw_folders import write_toml
 from tests.support.raw_mouth import RawMouth, write_raw_mouth
 
@@ -114,7 +113,6 @@ def test_a_folder_without_a_scan_is_refused(mouth: RawMouth) -> None:
 
 
 def test_the_command_says_what_to_open(mouth: RawMouth) -> None:
-    command = [sys.executable, "-m", "services", "landmarks", str(mouth.root)]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+    answer = dentine("landmarks", str(mouth.root))
     assert answer.returncode == 0, answer.stderr
     assert f"open {mouth.root / 'landmarks.html'} in a browser" in answer.stdout

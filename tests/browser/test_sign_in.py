@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,6 @@ from services.api.auth.sessions import COOKIE
 from services.api.auth.tokens import Scope
 from services.core.errors import CaptureInputError
 from services.core.records import JobSpec
-from tests.browser.contrast import contrast_failures
 from tests.browser.pages import looked_at
 from tests.support.guarded_server import Guarded, guarded
 
@@ -40,11 +38,8 @@ def server(tmp_path: Path) -> Iterator[Guarded]:
 
 
 @pytest.fixture
-def page(chromium: Browser, server: Guarded, request: pytest.FixtureRequest) -> Iterator[Page]:
-    scheme = getattr(request, "param", "light")
-    context = chromium.new_context(
-        base_url=str(server.client.base_url), color_scheme=scheme, viewport={"width": 1280, "height": 700}
-    )
+def page(chromium: Browser, server: Guarded) -> Iterator[Page]:
+    context = chromium.new_context(base_url=str(server.client.base_url), viewport={"width": 1280, "height": 700})
     page = context.new_page()
     broken: list[str] = []
     page.on("pageerror", lambda problem: broken.append(str(problem)))
@@ -61,10 +56,7 @@ def sign_in(page: Page, token: str) -> None:
     page.keyboard.press("Enter")
 
 
-@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
-def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(
-    page: Page, server: Guarded, request: pytest.FixtureRequest
-) -> None:
+def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(page: Page, server: Guarded) -> None:
     page.goto("/")
     expect(page.get_by_label("Token")).to_be_focused()
     expect(page.locator("#jobs")).to_be_hidden()
@@ -72,16 +64,12 @@ def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(
     expect(page.get_by_role("alert")).to_have_text(
         "This token is unknown, expired or revoked; ask an administrator for a new one."
     )
-    assert contrast_failures(page) == []
-    if folder := os.environ.get("SCREENSHOTS"):
-        page.screenshot(path=f"{folder}/sign-in-{request.node.callspec.params['page']}.png")
+    looked_at(page, "sign-in")
 
     sign_in(page, f" {server.tokens[Scope.SUBMIT]} ")
     expect(page.locator(".job .badge")).to_have_text("succeeded")
     expect(page.locator("#account")).to_contain_text("of-submit")
-    assert contrast_failures(page) == []
-    if folder:
-        page.screenshot(path=f"{folder}/signed-in-{request.node.callspec.params['page']}.png")
+    looked_at(page, "signed-in")
     assert page.evaluate("[document.cookie, localStorage.length, sessionStorage.length]") == ["", 0, 0]
     (cookie,) = page.context.cookies()
     assert (cookie["name"], cookie["httpOnly"], cookie["sameSite"]) == (COOKIE, True, "Strict")
@@ -93,10 +81,7 @@ def test_a_token_opens_the_page_and_leaves_nothing_that_scripts_can_read(
     assert page.context.cookies() == []
 
 
-@pytest.mark.parametrize("page", ["light", "dark"], indirect=True)
-def test_a_reader_is_shown_nothing_that_he_may_not_press(
-    page: Page, server: Guarded, request: pytest.FixtureRequest
-) -> None:
+def test_a_reader_is_shown_nothing_that_he_may_not_press(page: Page, server: Guarded) -> None:
     failed = server.ask("POST", "/v1/jobs", Scope.SUBMIT, json={"capture": "/", "seed": FAILING_SEED}).json()["id"]
     page.goto("/")
     sign_in(page, server.tokens[Scope.READ])
@@ -107,7 +92,7 @@ def test_a_reader_is_shown_nothing_that_he_may_not_press(
         expect(page.get_by_role("button", name=name)).to_have_count(0)
     for name in ("New job", "Dome"):
         expect(page.get_by_role("link", name=name)).to_have_count(0)
-    looked_at(page, f"reader-{request.node.callspec.params['page']}")
+    looked_at(page, "reader")
     for address, lacking in (
         ("#/new", "submit"),
         ("#/rig", "submit"),

@@ -18,7 +18,7 @@ from services.core.results import Estimate, FitReport
 from services.core.settings import ServerSettings
 from services.core.verdict import percent, verdict_of
 from services.fit.export.report import _spread
-from tests.browser.pages import LOOKS, looked_at, watched_page
+from tests.browser.pages import looked_at, watched_page
 from tests.browser.scripted_job import STEPS, ScriptedJob, expect_state, submit
 from tests.support.live_server import serving
 
@@ -67,16 +67,15 @@ def address_of(server: httpx.Client) -> str:
     return str(server.base_url).rstrip("/")
 
 
-@pytest.mark.parametrize(("scheme", "width"), LOOKS)
 @pytest.mark.parametrize("outcome", ["converged", "doubtful", "not converged"])
 def test_the_page_leads_with_the_reports_judgement(
-    chromium: Browser, server: httpx.Client, job: ScriptedJob, scheme: str, width: int, outcome: str
+    chromium: Browser, server: httpx.Client, job: ScriptedJob, outcome: str
 ) -> None:
     converged = outcome != "not converged"
     verdict = job.verdict = verdict_of(
         report(0.0741 if converged else 0.336, converged=converged, doubtful=outcome == "doubtful")
     )
-    with watched_page(chromium, address_of(server), scheme, width) as page:
+    with watched_page(chromium, address_of(server)) as page:
         submitted = submit(page)
         page.goto(f"/#/{submitted}")
         job.steps.release(STEPS)
@@ -103,7 +102,7 @@ def test_the_page_leads_with_the_reports_judgement(
             expect(alert).to_have_text(f"{verdict.headline} {verdict.advice}")
             above = "(one, other) => Boolean(one.compareDocumentPosition(other) & Node.DOCUMENT_POSITION_FOLLOWING)"
             assert alert.evaluate(above, page.locator(".stages").element_handle()), "what went wrong leads the view"
-        looked_at(page, f"verdict-{outcome.replace(' ', '-')}-{scheme}-{width}")
+        looked_at(page, f"verdict-{outcome.replace(' ', '-')}")
 
 
 def test_a_job_without_a_verdict_shows_none(chromium: Browser, server: httpx.Client, job: ScriptedJob) -> None:
