@@ -119,7 +119,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     # by a thread of their own. Reading the state of a dome and switching its lights have their own threads too.
     all_off_pool, dark_audit_pool = ThreadPool(ALL_OFF_THREADS), ThreadPool(1)
     cancel_pool, dome_pool = ThreadPool(CANCEL_THREADS), ThreadPool(DOME_THREADS)
-    broadcaster = EventBroadcaster(jobs.repository, database_pool.run)
+    broadcaster = EventBroadcaster(jobs.repository, database_pool.run, settings.connections)
     observation = Observation(
         jobs, settings, database_pool, file_pool, certificates, None if run else workers.condition
     )

@@ -81,6 +81,8 @@ class ConnectionLimits(SettingsRecord):
     header_s: float = Field(
         default=10.0, gt=0, description="a connection is closed if the head of a request is not whole by then"
     )
+    streams_per_token: int = Field(default=500, gt=0, description="event streams that one token may hold open")
+    streams_per_address: int = Field(default=1000, gt=0, description="event streams that one address may hold open")
 
 
 class DomeSettings(SettingsRecord):

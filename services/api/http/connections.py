@@ -2,7 +2,10 @@
 
 A client that opens connections and sends no complete request, by mistake or to keep others out, loses them: after
 ``header_s``, or at once when a new connection finds all places taken. Connections that have sent a request before are
-closed last. So there is always a place for ALL OFF.
+closed last.
+
+Requests that darken a dome have places of their own. A connection that finds all others at work gets one of these, and
+any other request on it is refused. So there is always a place for ALL OFF.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import re
 import resource
 from contextlib import suppress
 from functools import partial
@@ -18,6 +22,8 @@ from typing import Any, cast
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from services.api.http.problems import response_of
+from services.core.errors import PlatformError
 from services.core.settings import ConnectionLimits
 
 MAX_DESCRIPTORS = 65_536
@@ -30,6 +36,9 @@ MAX_BACKLOG = 256
 milliseconds."""
 WARNING_INTERVAL_S = 600.0
 """Time in s after which a warning is logged again if its cause persists."""
+DARKENING_PLACES = 32
+"""Number of places that only requests that darken a dome may use, beside those of all connections."""
+_DARKENING = re.compile(r"(POST /v1/dome/off|DELETE /v1/dome/light|POST /v1/jobs/[^/]+/cancel)")
 SHED_COUNT = 16
 """Number of connections without a request that are closed when file descriptors run out."""
 _OUT_OF_DESCRIPTORS = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
@@ -42,7 +51,10 @@ class ConnectionLimiter:
     """
 
     def __init__(self, limits: ConnectionLimits) -> None:
-        self.max_open, self.header_s = min(limits.most, round(MAX_SHARE * raise_descriptors())), limits.header_s
+        most = min(limits.most, round(MAX_SHARE * raise_descriptors()))
+        self.max_darkening = min(DARKENING_PLACES, most // 4)
+        self.max_open, self.header_s = min(limits.most, most - self.max_darkening), limits.header_s
+        self.darkening: dict[BoundedProtocol, None] = {}
         self.open: set[BoundedProtocol] = set()
         self.fresh: dict[BoundedProtocol, None] = {}
         self.served: dict[BoundedProtocol, None] = {}
@@ -50,15 +62,27 @@ class ConnectionLimiter:
 
     def admit(self, connection: BoundedProtocol) -> bool:
         """Admit a new connection. Where all places are taken, the connection that has waited longest without a request
-        is closed for it; returns False where all connections are at work.
+        is closed for it; where all connections are at work, it gets one of the places that are for darkening a dome.
+        Returns False where there is none of these either.
         """
         if len(self.open) >= self.max_open and not self.shed(1):
             self.warn(
                 "All %d connections are at work; further ones are refused. See DENTINE__SERVER__CONNECTIONS__MOST.",
                 self.max_open,
             )
-            return False
+            return self._admit_to_darken(connection)
         self.open.add(connection)
+        return True
+
+    def _admit_to_darken(self, connection: BoundedProtocol) -> bool:
+        if len(self.darkening) >= self.max_darkening:
+            waiting = next((one for one in self.darkening if not one.is_at_work), None)
+            if waiting is None:
+                return False
+            self.leave(waiting)
+            waiting.transport.abort()
+        self.darkening[connection] = None
+        connection.allow_only_darkening()
         return True
 
     def shed(self, count: int) -> int:
@@ -74,11 +98,13 @@ class ConnectionLimiter:
     def leave(self, connection: BoundedProtocol) -> None:
         """Remove a connection from the open and the waiting ones."""
         self.open.discard(connection)
+        self.darkening.pop(connection, None)
         self.end_wait(connection)
 
     def wait(self, connection: BoundedProtocol, *, is_fresh: bool) -> None:
         """Note that a connection waits for a request, and whether it has never sent one (``is_fresh``)."""
-        (self.fresh if is_fresh else self.served)[connection] = None
+        if connection not in self.darkening:
+            (self.fresh if is_fresh else self.served)[connection] = None
 
     def end_wait(self, connection: BoundedProtocol) -> None:
         """Note that a connection has a request, or is closed."""
@@ -125,6 +151,10 @@ class BoundedProtocol(H11Protocol):
         else:
             transport.abort()
 
+    def allow_only_darkening(self) -> None:
+        """Refuse every request on this connection but those that darken a dome."""
+        self.app = _OnlyDarkening(self.app)
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the connection, which is closed."""
         self._end_wait()
@@ -134,17 +164,18 @@ class BoundedProtocol(H11Protocol):
     def data_received(self, data: bytes) -> None:
         """Receive bytes. They do not prolong the wait for a request, which ends only with a complete head."""
         super().data_received(data)
-        if self._is_at_work:
+        if self.is_at_work:
             self._end_wait()
 
     def on_response_complete(self) -> None:
         """Wait for the next request once one was answered."""
         super().on_response_complete()
-        if not self._is_at_work and not self.transport.is_closing():
+        if not self.is_at_work and not self.transport.is_closing():
             self._await_request()
 
     @property
-    def _is_at_work(self) -> bool:
+    def is_at_work(self) -> bool:
+        """Whether a request on this connection is being answered."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def _await_request(self) -> None:
@@ -162,6 +193,23 @@ class BoundedProtocol(H11Protocol):
         if self.conn.trailing_data[0]:
             self.transport.write(_TOO_SLOW)
         self.transport.close()
+
+
+class _OnlyDarkening:
+    """An application that refuses every request but those that darken a dome."""
+
+    def __init__(self, app: Any) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "http" and not _DARKENING.fullmatch(f"{scope['method']} {scope['path']}"):
+            busy = PlatformError(
+                "All connections of this server are at work, the rest are for switching a dome off; ask again later."
+            )
+            headers = {"Connection": "close", "Retry-After": "10"}
+            await response_of(busy, scope["path"], headers)(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
 
 
 class BoundedServer(uvicorn.Server):

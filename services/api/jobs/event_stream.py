@@ -14,15 +14,21 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sql
 from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
+from services.api.http.problems import response_of
+from services.api.http.stream_places import StreamPlaces
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.repository import Repository
-from services.client.errors import UnknownJobError
+from services.client.errors import RateError, UnknownJobError
+from services.core.settings import ConnectionLimits
+
+if TYPE_CHECKING:
+    from starlette.types import Receive, Scope, Send
 
 PERIOD_S = 0.2
 """Time in s between two looks for new events."""
@@ -31,6 +37,8 @@ PING_S = 15.0
 still exists."""
 MAX_EVENTS = 1000
 """Largest number of events that are read and sent at once."""
+RETRY_AFTER_S = "10"
+"""Time in s after which a client that holds too many streams may ask again."""
 MAX_EPOCHS = 64
 """Number of epochs that are remembered. A stream that was stalled for longer reads its events again."""
 EVENT_ANSWERS: dict[int | str, dict[str, Any]] = {
@@ -57,6 +65,18 @@ class EventStream(StreamingResponse):
     """
 
     media_type = "text/event-stream"
+
+    def __init__(self, content: AsyncIterator[bytes], places: StreamPlaces) -> None:
+        super().__init__(content, headers=UNBUFFERED)
+        self._places = places
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the stream, or a refusal where the caller holds as many as it may."""
+        try:
+            with self._places.taken(scope):
+                await super().__call__(scope, receive, send)
+        except RateError as problem:
+            await response_of(problem, scope["path"], {"Retry-After": RETRY_AFTER_S})(scope, receive, send)
 
 
 @dataclass(frozen=True)
@@ -101,13 +121,16 @@ class EventBroadcaster:
 
     Args:
         run_in_thread: calls a function that reads the database in a thread.
+        limits: how many streams a caller may hold.
     """
 
     def __init__(
         self,
         repository: Repository,
         run_in_thread: Callable[[Callable[[], Any]], Coroutine[Any, Any, Any]] = asyncio.to_thread,
+        limits: ConnectionLimits | None = None,
     ) -> None:
+        self.places = StreamPlaces(limits or ConnectionLimits())
         self._repository, self._run_in_thread, self._newest = repository, run_in_thread, repository.newest_event()
         self._epochs = deque([Epoch(0)], MAX_EPOCHS)
 
@@ -138,7 +161,7 @@ class EventBroadcaster:
         batch = await self._read(epoch, job_id, after)
         if batch.final_state is not None:
             return Response(batch.text_with_end, headers=UNBUFFERED, media_type=EventStream.media_type)
-        return EventStream(self.follow(job_id, after, (epoch, batch)), headers=UNBUFFERED)
+        return EventStream(self.follow(job_id, after, (epoch, batch)), self.places)
 
     async def follow(
         self, job_id: str, after: int, first: tuple[Epoch, EventBatch] | None = None

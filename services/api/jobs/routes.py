@@ -18,7 +18,7 @@ from services.api.http.bodies import BodyRoute, ValidatedBody
 from services.api.http.json_responses import in_json
 from services.api.http.problems import refusals
 from services.api.http.thread_pools import ThreadPool
-from services.api.jobs.event_stream import EVENT_ANSWERS, UNBUFFERED, EventBroadcaster, EventStream, end_of
+from services.api.jobs.event_stream import EVENT_ANSWERS, EventBroadcaster, EventStream, end_of
 from services.api.jobs.jobs import Jobs, StageProgress
 from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Deletion, Job
@@ -267,7 +267,7 @@ def build_router(
             async for batch in broadcaster.follow_several({job_id: positions[job_id] for job_id in visible}):
                 yield batch
 
-        return EventStream(follow(), headers=UNBUFFERED)
+        return EventStream(follow(), broadcaster.places)
 
     @router.get("/jobs/{job_id}/artifacts", tags=["artifacts"], dependencies=[needs("read")])
     @file_pool.wrap_handler
