@@ -26,9 +26,13 @@ one."""
 data_folder_table = sql.Table("data_folder", metadata, sql.Column("id", sql.Text, primary_key=True))
 
 
-def require_own_folder(engine: sql.Engine, data: Path) -> None:
+def require_own_folder(engine: sql.Engine, data: Path, *, lies_in_folder: bool = False) -> None:
     """Refuse a database of another data folder and close it. A database that belongs to no folder is assigned to this
     one.
+
+    Args:
+        lies_in_folder: the database is the one in the data folder. It belongs to that folder, also where it was copied
+            there from another one.
 
     Raises:
         SettingsError: the database belongs to another folder.
@@ -39,6 +43,9 @@ def require_own_folder(engine: sql.Engine, data: Path) -> None:
     own = file.read_text().strip()
     with writing(engine) as connection:
         owner = connection.scalar(sql.select(data_folder_table.c.id))
+        if lies_in_folder and owner not in {None, own}:
+            connection.execute(data_folder_table.delete())
+            owner = None
         if owner is None:
             connection.execute(data_folder_table.insert().values(id=own))
     if owner not in {None, own}:

@@ -50,9 +50,12 @@ def test_whoever_has_lost_the_folder_goes_on_as_the_refusal_says(tmp_path: Path,
     start(tmp_path / "new", shared)
 
 
-def test_a_database_in_the_data_folder_needs_no_such_mark(tmp_path: Path) -> None:
+def test_a_database_that_was_copied_into_a_data_folder_belongs_to_it(tmp_path: Path) -> None:
     start(tmp_path / "a", None)
     (tmp_path / "b").mkdir()
     shutil.copy(tmp_path / "a" / "dentine.sqlite", tmp_path / "b")
     start(tmp_path / "b", None)
-    assert not (tmp_path / "b" / FILE).exists()
+    with pytest.raises(SettingsError, match="belongs to another data folder"):
+        start(tmp_path / "c", SecretStr(sqlite_url(tmp_path / "b" / "dentine.sqlite")))
+    start(tmp_path / "b", None)
+    start(tmp_path / "a", None)

@@ -72,8 +72,7 @@ class Jobs:
         self._data, self._keep_days = settings.data.resolve(), settings.keep_days
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(keep_password_apart(settings.database_url, self._data))
-        if settings.database is not None:
-            require_own_folder(self.repository.engine, self._data)
+        require_own_folder(self.repository.engine, self._data, lies_in_folder=settings.database is None)
         self.reader = SubprocessReader()
         self.captures = Captures(self.repository.engine, self._data, settings.uploads, reader=self.reader)
         self.calibrations = Calibrations(self._data)
