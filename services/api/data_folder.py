@@ -10,7 +10,7 @@ from pathlib import Path
 
 import sqlalchemy as sql
 
-from services.core.errors import SettingsError
+from services.core.errors import PlatformError, SettingsError
 from services.core.files.private import write_private
 from services.core.store import write_atomic
 from services.pipeline.database import metadata, parse_database_url, with_password_file, writing
@@ -55,6 +55,33 @@ def require_own_folder(engine: sql.Engine, data: Path, *, lies_in_folder: bool =
             f"{what}; give a database and the folder that belong together, or write {owner} into {file} if that folder"
             " is lost for good."
         )
+
+
+class OpenedFolder:
+    """The data folder that a server has opened, which may be moved or unmounted while it runs."""
+
+    def __init__(self, data: Path) -> None:
+        self._data, self._id = data, (data / FILE).read_text()
+
+    def require_present(self) -> None:
+        """Check that the folder is still where it was.
+
+        Raises:
+            PlatformError: it is absent, or another one lies there.
+        """
+        try:
+            if (self._data / FILE).read_text() == self._id:
+                return
+        except OSError as problem:
+            raise PlatformError(f"{self._lost} ({problem.strerror}); {_REMEDY}") from problem
+        raise PlatformError(f"{self._lost}, another one lies there; {_REMEDY}")
+
+    @property
+    def _lost(self) -> str:
+        return f"The data folder {self._data} is no longer the one that this server opened"
+
+
+_REMEDY = "put it back or mount it again, then ask again."
 
 
 def keep_password_apart(url: str, data: Path) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sql
+from pydantic import SecretStr
 
 from services.api.app import create_app
 from services.api.data_folder import FILE, data_folder_table
@@ -30,7 +31,7 @@ def test_a_second_server_is_refused_the_database_of_the_first(tmp_path: Path) ->
     serve(ServerSettings(data=first))
     url = f"sqlite:///{first / DATABASE_FILE}"
     with pytest.raises(SettingsError, match=f"belongs to another data folder than {second}"):
-        create_app(ServerSettings(data=second, database=url), run_nothing)
+        create_app(ServerSettings(data=second, database=SecretStr(url)), run_nothing)
     engine = open_database(url)
     with engine.connect() as connection:
         owners = connection.scalars(sql.select(data_folder_table.c.id)).all()

@@ -92,7 +92,7 @@ def build_observe_router(jobs: Jobs, database_pool: ThreadPool, file_pool: Threa
             raise UnknownJobError(
                 f"The job has no {picture} of preview {preview_id}; list its previews to see their ids."
             )
-        return artifact_response(request, open_artifact(jobs.folder(job_id), path))
+        return artifact_response(request, open_artifact(jobs.present_folder(job_id), path))
 
     @router.get(
         "/jobs/{job_id}/artifacts.zip",
@@ -104,7 +104,7 @@ def build_observe_router(jobs: Jobs, database_pool: ThreadPool, file_pool: Threa
     def archive(job_id: str) -> Response:
         """All artifacts as one zip file, made while it is sent."""
         job = jobs.repository.get(job_id)
-        root = jobs.folder(job.id)
+        root = jobs.present_folder(job.id)
         names = [artifact.path for artifact in list_artifacts(root)]
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.zip"', "Cache-Control": "no-store"}
         return StreamingResponse(stream_zip(root, names), headers=headers, media_type="application/zip")
@@ -122,7 +122,7 @@ def build_observe_router(jobs: Jobs, database_pool: ThreadPool, file_pool: Threa
         unit.
         """
         job = jobs.repository.get(job_id)
-        table = parameter_table(job.id, open_artifact(jobs.folder(job.id), PARAMETERS))
+        table = parameter_table(job.id, open_artifact(jobs.present_folder(job.id), PARAMETERS))
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.csv"', "Cache-Control": "no-store"}
         return Response(table, headers=headers, media_type="text/csv")
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from services.api.calibrations.calibrations import Calibrations, is_stored
 from services.api.captures.captures import Captures, is_uploaded
 from services.api.captures.reading import SubprocessReader
-from services.api.data_folder import keep_password_apart, require_own_folder
+from services.api.data_folder import OpenedFolder, keep_password_apart, require_own_folder
 from services.api.jobs.admission import Admission, Machine
 from services.api.jobs.erasure import erase, forget_listing
 from services.api.jobs.lifecycle import Instruction, JobState, Trigger
@@ -73,6 +73,7 @@ class Jobs:
         self._data.mkdir(parents=True, exist_ok=True)
         self.repository = Repository(keep_password_apart(settings.database_url, self._data))
         require_own_folder(self.repository.engine, self._data, lies_in_folder=settings.database is None)
+        self._opened = OpenedFolder(self._data)
         self.reader = SubprocessReader()
         self.captures = Captures(self.repository.engine, self._data, settings.uploads, reader=self.reader)
         self.calibrations = Calibrations(self._data)
@@ -128,6 +129,15 @@ class Jobs:
         """Return the folder of a job's stages and results."""
         return self._data / "jobs" / job_id
 
+    def present_folder(self, job_id: str) -> Path:
+        """Return the folder of a job's results, once it is certain that no other folder lies in its place.
+
+        Raises:
+            PlatformError: the data folder is not the one that was opened.
+        """
+        self._opened.require_present()
+        return self.folder(job_id)
+
     def locate(self, spec: JobSpec) -> JobSpec:
         """Return a job's options with the paths of the files that the server stores for it."""
         return self.calibrations.locate(self.captures.locate(spec))
@@ -149,6 +159,7 @@ class Jobs:
             ExposureLimitError: one exposure of its rig is over the largest dose of one light. JobStateError: the key
                 belongs to another job.
         """
+        self._opened.require_present()
         spec = self.calibrations.by_content(spec, viewer)
         if key is not None and (earlier := self.repository.submitted(spec, key, viewer)) is not None:
             return Creation(earlier, is_new=False)
@@ -207,6 +218,7 @@ class Jobs:
             UnknownJobError: there is no such job. JobStateError: its state does not allow a retry. SettingsError: the
                 acknowledgement is not allowed, or one is needed.
         """
+        self._opened.require_present()
         spec = self._with_flashes(self.repository.get(job_id), flashes)
         is_revised = self.repository.get(job_id).state is JobState.SUCCEEDED and is_stale(self.folder(job_id))
         self.repository.apply(job_id, Trigger.REVISE if is_revised else Trigger.RETRY, spec=spec)
@@ -235,11 +247,13 @@ class Jobs:
             UnknownJobError: there is no such job. JobStateError: it has not ended.
             StoreError: a file, or an object on an S3 server, could not be removed; delete the job again.
         """
+        self._opened.require_present()
         self.repository.apply(job_id, Trigger.DELETE)
         with self._deleting:
             with suppress(UnknownJobError):
                 return self.repository.deletion(job_id)  # a round of the runner has finished this deletion
             erased = erase(self.folder(job_id))
+            self._opened.require_present()  # no receipt for files that were moved away meanwhile
             receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest)
             forget_listing(self.folder(job_id))
             return receipt

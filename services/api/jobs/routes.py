@@ -274,7 +274,7 @@ def build_router(
     @in_json
     def artifacts(job_id: str) -> list[Artifact]:
         """List the job's files."""
-        return list_artifacts(jobs.folder(jobs.repository.get(job_id).id))
+        return list_artifacts(jobs.present_folder(jobs.repository.get(job_id).id))
 
     @router.get(
         "/jobs/{job_id}/artifacts/{path:path}",
@@ -286,7 +286,7 @@ def build_router(
     @file_pool.wrap_handler
     def artifact(job_id: str, path: str, request: Request) -> Response:
         """One file; takes Range and If-None-Match."""
-        return artifact_response(request, open_artifact(jobs.folder(jobs.repository.get(job_id).id), path))
+        return artifact_response(request, open_artifact(jobs.present_folder(jobs.repository.get(job_id).id), path))
 
     @router.get("/options", response_model=dict[str, Any], tags=["options"], dependencies=[needs("read")])
     async def options() -> Response:

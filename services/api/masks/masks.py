@@ -54,7 +54,7 @@ class Masks:
 
     def list(self, job: Job) -> MaskList:
         """Return a job's masks by hand."""
-        root = self._jobs.folder(job.id)
+        root = self._jobs.present_folder(job.id)
         masks = tuple(
             Mask(camera=camera, light=light, bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
             for (camera, light), content in read_masks(root).items()
@@ -67,7 +67,7 @@ class Masks:
         Raises:
             UnknownMaskError: there is none.
         """
-        path = mask_path(self._jobs.folder(job.id), camera, light)
+        path = mask_path(self._jobs.present_folder(job.id), camera, light)
         if len(path.name) > LONGEST_NAME or not path.is_file():
             raise UnknownMaskError(
                 f"The job has no mask by hand of camera {camera} and light {light}; list its masks to see which there"
@@ -84,7 +84,7 @@ class Masks:
         """
         require_mask(content, self._camera(job, camera, light))
         self._require_idle(job)
-        path = mask_path(self._jobs.folder(job.id), camera, light)
+        path = mask_path(self._jobs.present_folder(job.id), camera, light)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(path, plain_png(content))
 
@@ -104,7 +104,7 @@ class Masks:
             UnknownMaskError: nothing is prepared, or there is no such camera or light. MaskError: the camera has too
                 many pixels.
         """
-        root = self._jobs.folder(job.id)
+        root = self._jobs.present_folder(job.id)
         if not is_published(root, "prepared"):
             raise UnknownMaskError(f"Job {job.id} has prepared nothing yet; wait for its stage prepare.")
         folder, manifest = open_stage(root, "prepared", PreparedManifest, verify=False)
@@ -141,7 +141,7 @@ class Masks:
         return found
 
     def _calibration(self, job: Job) -> Calibration:
-        spec, root = self._jobs.locate(job.spec), self._jobs.folder(job.id)
+        spec, root = self._jobs.locate(job.spec), self._jobs.present_folder(job.id)
         if spec.capture is not None:
             return self._jobs.reader.describe(spec.capture).calibration
         assert spec.rig is not None
