@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.contracts.generated_requests import survey
 
 
+@pytest.mark.dear("Every operation gets valid and invalid requests; fewer would leave operations without an answer.")
 def test_generated_requests_do_no_harm(tmp_path: Path) -> None:
     outcome = survey(tmp_path, 300, 1)
     assert outcome.faults == []

@@ -97,6 +97,7 @@ def worker(address: str, folder: Path, env: dict[str, str], *options: str) -> An
     return process(folder / "worker.log", env, "worker", address, *local, *options)
 
 
+@pytest.mark.dear("Workers of every kind start as processes, each with its own check of the renderer.")
 def test_ready_counts_only_workers_that_can_work(system: tuple[httpx.Client, str, Path], tmp_path: Path) -> None:
     client, address, _ = system
     until(client, 503, "The scheduler has no workers")

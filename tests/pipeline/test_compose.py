@@ -218,6 +218,7 @@ def dentine(folder: Path, environment: Mapping[str, str], *arguments: str, ends_
     return done.stdout.strip()
 
 
+@pytest.mark.dear("Every service of the file starts as a process, and one real job runs through all.")
 def test_a_small_job_runs_through_what_the_file_starts(composition: Composition, tmp_path: Path) -> None:
     environment = composition.environment("api")
     with connect(composition.address) as client:
