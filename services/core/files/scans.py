@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.files.json_text import parse_json
 from services.core.files.surface_files import read_surface
+from services.core.files.tables import read_text
 from services.core.files.vtk_polydata import read_polydata
 from services.core.geometry import Mesh
 
@@ -81,10 +83,10 @@ def read_sidecar(path: Path) -> NDArray[np.float64]:
         raise CaptureInputError(f"Label file {path} does not exist; put it there or correct its name.")
     try:
         if path.suffix.lower() == ".json":
-            return _labels_of(parse_json(path.read_text()))
+            return _labels_of(parse_json(read_text(path, f"Label file {path}")))
         if path.suffix.lower() == ".npy":
             return np.asarray(np.load(path, allow_pickle=False), dtype=np.float64).reshape(-1)
-        return np.array(path.read_text().replace(",", " ").split(), dtype=np.float64)
+        return np.array(re.split(r"[\s,;]+", read_text(path, f"Label file {path}").strip()), dtype=np.float64)
     except (ValueError, KeyError, TypeError, EOFError) as problem:
         raise CaptureInputError(
             f"Label file {path} cannot be read ({problem}); give one number a line, an .npy array or a .json file with"

@@ -7,13 +7,13 @@ to a phase function.
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
+from services.core.files.tables import read_rows
 from services.fit.slab.dictionaries.chosen import ChosenDictionary, Sample
 from services.fit.slab.model.dictionary import ANGLES_RAD
 from services.fit.slab.solve.mixture import Mixtures, unit_atoms
@@ -63,23 +63,19 @@ def table_file(root: Path) -> Path:
 
 
 def _read_csv(path: Path) -> tuple[tuple[str, ...], Array]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            head, *rows = [row for row in csv.reader(stream) if row] or [[]]
-    except (UnicodeDecodeError, csv.Error) as problem:
-        raise CaptureInputError(f"{path} cannot be read ({problem}); save it as comma-separated text.") from problem
-    names = tuple(name.strip() for name in head)
+    found = read_rows(path, str(path))
+    names, rows = (found[0].cells, found[1:]) if found else ((), [])
     if not names or names[0] != FIRST_COLUMN:
         raise CaptureInputError(f"{path}: the first line must name the columns, the first of them {FIRST_COLUMN}.")
     values = np.zeros((len(rows), len(names)))
     for number, row in enumerate(rows):
-        if len(row) != len(names):
-            what = f"line {number + 2} has {len(row)} values and the first line {len(names)}"
+        if len(row.cells) != len(names):
+            what = f"line {row.line} has {len(row.cells)} values and the first line {len(names)}"
             raise CaptureInputError(f"{path}: {what}; give each angle one value of every atom.")
         try:
-            values[number] = [float(cell) for cell in row]
+            values[number] = [float(cell) for cell in row.cells]
         except ValueError as problem:
-            raise CaptureInputError(f"{path}: line {number + 2} holds what is no number ({problem}).") from problem
+            raise CaptureInputError(f"{path}: line {row.line} holds what is no number ({problem}).") from problem
     return names[1:], values
 
 

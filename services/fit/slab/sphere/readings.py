@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from services.core.errors import CaptureInputError
+from services.core.files.tables import read_text, require_points
 from services.core.geometry import Record
 from services.core.slab.folder import Cell, Glass, Positive
 from services.core.store import read_record
@@ -21,7 +22,8 @@ RXT_MARK = "IAD1"
 RXT_HEADER = 18
 """Count of numbers before the readings of an .rxt file."""
 MAX_RXT_COLUMNS = 5
-"""Largest number of readings in a line: M_R, M_T, M_U, and the wall's reflectance in either sphere."""
+"""Largest number of readings in a line: M_R, M_T, M_U, and the wall's reflectance in either sphere. A single wall
+reflectance is that of both spheres, as IAD takes it."""
 
 
 class Sphere(Record):
@@ -121,7 +123,11 @@ def _read_rxt(path: Path) -> SphereFile:
     rows = _numbers(path)
     header: list[float] = []
     while rows and len(header) < RXT_HEADER:
-        header += rows.pop(0)[1]
+        line, row = rows.pop(0)
+        needed = RXT_HEADER - len(header)
+        header += row[:needed]
+        if row[needed:]:  # the readings may follow in the same line
+            rows.insert(0, (line, row[needed:]))
     if len(header) != RXT_HEADER:
         raise CaptureInputError(
             f"{path}: {RXT_HEADER} numbers come before the readings, this file has {len(header)}; complete it."
@@ -143,7 +149,9 @@ def _read_rxt(path: Path) -> SphereFile:
         return SphereFile(
             kind="sphere", units="mm",
             cell=Cell(width_mm=width_mm, index=index, boundary="smooth", glass=Glass(**slide) if slide else None),
-            totals=tuple(_reading(path, line, row, columns) for line, row in rows),
+            totals=tuple(
+                _reading(path, line, one, columns) for line, row in rows for one in _single_readings(row, columns)
+            ),
             reflection_sphere=Sphere.model_validate(reflection) if reflection else None,
             transmission_sphere=Sphere.model_validate(transmission) if transmission else None,
             standard_reflectance=standard,
@@ -161,9 +169,16 @@ def _numbers(path: Path) -> list[tuple[int, list[float]]]:
         CaptureInputError: a line holds other text, or a number that is not finite.
     """
     rows = []
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_text(path, str(path))
     for number, line in enumerate(text.removeprefix(RXT_MARK).splitlines(), start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
+        words = line.partition("#")[0].split()
+        require_points(words, f"{path}, line {number}:")
+        words = " ".join(words).replace(",", " ").split()
+        if words and all(word.isalpha() and len(word) == 1 for word in words):
+            raise CaptureInputError(
+                f"{path}, line {number}: columns named by letters ({' '.join(words)}) are not understood; give the"
+                " count of readings a line there, with M_R and M_T first, then M_U and the wall."
+            )
         try:
             values = [float(word) for word in words]
         except ValueError as problem:
@@ -179,21 +194,42 @@ def _numbers(path: Path) -> list[tuple[int, list[float]]]:
     return rows
 
 
+def _single_readings(row: list[float], columns: int) -> list[list[float]]:
+    """Part a line that holds several readings, each with its wavelength where a number is above 1, as IAD does."""
+    if len(row) <= columns + 1:
+        return [row]
+    parts, rest = [], row
+    while rest:
+        length = columns + (rest[0] > 1)
+        parts.append(rest[:length])
+        rest = rest[length:]
+    return parts if len(parts[-1]) == columns + (parts[-1][0] > 1) else [row]
+
+
 def _reading(path: Path, line: int, row: list[float], columns: int) -> TotalsReading:
     if len(row) not in {columns, columns + 1}:
         raise CaptureInputError(
             f"{path}, line {line}: {len(row)} numbers where {columns} readings were announced; correct one of them."
         )
+    if len(row) > columns and row[0] <= 1:
+        raise CaptureInputError(
+            f"{path}, line {line}: the first of {len(row)} numbers is {row[0]:g}, which is no wavelength in nm; correct"
+            " the line, or the count of readings."
+        )
     values = row[-columns:]
     unscattered, reflection_wall, transmission_wall = (*values[2:], None, None, None)[:3]
-    return TotalsReading(
-        wavelength_nm=row[0] if len(row) > columns else None,
-        R=values[0],
-        T=values[1],
-        T_unscattered=unscattered or None,  # because 0 means "not measured" in IAD
-        reflection_wall=reflection_wall,
-        transmission_wall=transmission_wall,
-    )
+    try:
+        return TotalsReading(
+            wavelength_nm=row[0] if len(row) > columns else None,
+            R=values[0],
+            T=values[1],
+            T_unscattered=unscattered or None,  # because 0 means "not measured" in IAD
+            reflection_wall=reflection_wall,
+            transmission_wall=reflection_wall if transmission_wall is None else transmission_wall,
+        )
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        raise CaptureInputError(f"{path}, line {line}: {first['loc'][-1]}: {first['msg']}; correct it.") from problem
 
 
 def _sphere(numbers: list[float]) -> dict[str, float]:
