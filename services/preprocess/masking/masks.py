@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
+from services.core.mask_images import excluded_pixels
 from services.core.masks import ALL_LIGHTS, digest_of, mask_path, read_masks
 from services.core.records import FolderCapture, MaskBit
 
@@ -51,17 +52,14 @@ class HandMasks:
         bits = np.zeros(size[::-1], dtype=np.uint16)
         for of in ((camera, light), (camera, ALL_LIGHTS)):
             if (content := self._masks.get(of)) is not None:
-                bits[self._decode(mask_path(self._root, *of), content, size) > 0] = MaskBit.MANUAL
+                bits[self._excluded(mask_path(self._root, *of), content, size)] = MaskBit.MANUAL
         return bits
 
-    def _decode(self, path: Path, content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
-        import cv2
-
-        mask: NDArray[np.uint8] | None = (
-            cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
-        )
-        if mask is None or mask.shape != size[::-1]:
+    def _excluded(self, path: Path, content: bytes, size: tuple[int, int]) -> NDArray[np.bool_]:
+        try:
+            return excluded_pixels(content, size)
+        except ValueError as problem:
             raise CaptureInputError(
-                f"Mask {path} is no image of {size[0]} x {size[1]} pixels; draw it again, or remove it."
-            )
-        return mask
+                f"Mask {path} is no image of {size[0]} x {size[1]} pixels in plain grey: {problem}; save it with 0"
+                " where the fit may use the pixel and 255 elsewhere, or remove it."
+            ) from problem
