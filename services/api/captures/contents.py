@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import from_json
 
+from services.core.calibration.record import require_own_files
 from services.core.errors import CaptureInputError
 from services.core.files.image_headers import declared
 from services.core.files.image_metadata import metadata_fault
@@ -95,6 +96,7 @@ def _description_fault(
                 f"{name}: camera {camera.name} has {size} pixels, more than {limits.largest_image_bytes} bytes when"
                 " decoded; crop or bin its images."
             )
+    require_own_files(description, name)
     for image in description.images:
         for file in (image.file, image.variance_file):
             if file is not None and str(PurePosixPath(file)) not in names:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from pathlib import Path
+from datetime import UTC, datetime, timedelta
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from pydantic import Field
@@ -20,6 +22,8 @@ CALIBRATION_FILE = "calibration.json"
 """Name of the file of a calibration, also among the files of the job that made it."""
 RAW_DESCRIPTION = "raw.toml"
 """Name of the file that makes a folder of photographs a capture; see ``services.core.raw``."""
+EARLIEST = datetime(1990, 1, 1, tzinfo=UTC)
+"""Earliest date of a calibration; cameras wrote no numbers before."""
 MAX_LIGHTS = 1000
 """Largest number of lights: six times the lights of the largest dome known to this project."""
 MAX_PIXELS = 2**28
@@ -163,7 +167,59 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
             raise CaptureInputError(
                 f"{origin}: light {light.name} is more than {MAX_DISTANCE_MM:g} mm away; correct position_mm."
             )
+    if isinstance(description, FolderCapture):
+        require_own_files(description, origin)
+    elif description.made is not None:
+        require_date(description.made, origin, time.time())
     require_known_names(description.uncertainty, description.channels, description.cameras, description.lights, origin)
+
+
+def require_own_files(description: FolderCapture, origin: str) -> None:
+    """Refuse a capture that names one channel, or one image file, twice.
+
+    Raises:
+        CaptureInputError: one is named twice; the message names it, and the camera and light of the second.
+    """
+    if repeated := {name for name, count in Counter(description.channels).items() if count > 1}:
+        raise CaptureInputError(f"{origin} lists channel {min(repeated)} twice; give each its own name.")
+    taken: dict[PurePosixPath, str] = {}
+    for image in description.images:
+        use = f"camera {image.camera} under light {image.light}"
+        if (earlier := taken.setdefault(PurePosixPath(image.file), use)) != use:
+            raise CaptureInputError(
+                f"{origin} names file {image.file} for {earlier} and again for {use}; give each image a file of its"
+                " own."
+            )
+    for image in description.images:
+        if image.variance_file is not None and (shown := taken.get(PurePosixPath(image.variance_file))):
+            raise CaptureInputError(
+                f"{origin} names file {image.variance_file} as the image of {shown} and as a variance; give each a file"
+                " of its own."
+            )
+
+
+def require_date(made: str, origin: str, now_s: float) -> None:
+    """Refuse a date on which no calibration can have been made.
+
+    Args:
+        made: date and time, ISO 8601; without a zone it is taken for UTC.
+        now_s: Unix time.
+
+    Raises:
+        CaptureInputError: it is no date, or lies before 1990 or more than a day ahead.
+    """
+    try:
+        date = datetime.fromisoformat(made)
+    except ValueError as problem:
+        raise CaptureInputError(
+            f"{origin} says made = {made[:40]!r}, which is no date; give date and time as in 2026-01-31T12:00:00."
+        ) from problem
+    then = date if date.tzinfo else date.replace(tzinfo=UTC)
+    if not EARLIEST <= then <= datetime.fromtimestamp(now_s, UTC) + timedelta(days=1):
+        raise CaptureInputError(
+            f"{origin} says that it was made on {made[:40]}, which is before 1990 or still to come; correct the date,"
+            " and this machine's clock if that is wrong."
+        )
 
 
 def _require_each_channel(camera: CalibratedCamera, channels: int, origin: str) -> None:

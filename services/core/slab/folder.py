@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -179,6 +180,9 @@ class SlabFolder(Record):
                     " keep one"
                 )
             seen.add(key)
+        files = Counter(image.file for image in self.images)
+        if shared := [file for file, count in files.items() if count > 1]:
+            raise ValueError(f"file {shared[0]} is listed for two images; give each image a file of its own")
         return self
 
     def _known_black(self) -> frozenset[str]:
