@@ -1,4 +1,4 @@
-"""Masks drawn by hand as PNG files: what such a file must be, wherever it comes from, and its pixels.
+"""Masks drawn by hand as PNG files: what such a file must be, wherever it comes from.
 
 A mask is plain grey of 1 or 8 bits a pixel, and its pixels that are not 0 are excluded. In pictures with a palette,
 colours or transparency the ground may be white, black or transparent, so they are refused rather than guessed at.
@@ -10,13 +10,8 @@ import struct
 import zlib
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from services.core.files.image_headers import PNG_SIGNATURE, PngHeader, png_header
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 GREY = 0
 _DEPTHS = (1, 8)
@@ -43,22 +38,6 @@ def require_mask_png(content: bytes, size: tuple[int, int]) -> None:
         raise ValueError("it is cut off") from problem
     except zlib.error as problem:
         raise ValueError(str(problem)) from problem
-
-
-def excluded_pixels(content: bytes, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels (H, W) that a mask excludes.
-
-    Raises:
-        ValueError: the content is no mask of this size; the message is a part of a sentence that says why.
-    """
-    import cv2
-    import numpy as np
-
-    require_mask_png(content, size)
-    values = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if values is None or values.shape != size[::-1]:
-        raise ValueError("its pixels cannot be read")
-    return np.asarray(values > 0)
 
 
 def _require_header(header: PngHeader, size: tuple[int, int]) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.core.mask_images import excluded_pixels
+from services.core.mask_images import require_mask_png
 from services.core.masks import ALL_LIGHTS, digest_of, mask_path, read_masks
 from services.core.records import FolderCapture, MaskBit
 
@@ -57,9 +57,24 @@ class HandMasks:
 
     def _excluded(self, path: Path, content: bytes, size: tuple[int, int]) -> NDArray[np.bool_]:
         try:
-            return excluded_pixels(content, size)
+            return _pixels(content, size)
         except ValueError as problem:
             raise CaptureInputError(
                 f"Mask {path} is no image of {size[0]} x {size[1]} pixels in plain grey: {problem}; save it with 0"
                 " where the fit may use the pixel and 255 elsewhere, or remove it."
             ) from problem
+
+
+def _pixels(content: bytes, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Pixels (H, W) that a mask excludes.
+
+    Raises:
+        ValueError: the content is no mask of this size.
+    """
+    import cv2
+
+    require_mask_png(content, size)
+    values = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None or values.shape != size[::-1]:
+        raise ValueError("its pixels cannot be read")
+    return np.asarray(values > 0)
