@@ -34,6 +34,7 @@ import numpy as np
 from services.core.errors import InputError, PlatformError
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium
 from services.fit.plugin.channel_media import ToothOptics
+from services.fit.plugin.scene_checks import require_camera, require_lights, require_nested
 from services.fit.plugin.scene_path import ScenePaths
 from services.fit.plugin.scene_teeth import SceneTeeth, ToothShapes
 from services.fit.transport.scene.media import require_medium
@@ -181,7 +182,11 @@ def register_integrator() -> None:
             active: Any = True,
         ) -> Any:
             if self._teeth is None or not self._teeth.is_unchanged(scene):
-                self._teeth = SceneTeeth(scene, self.properties.shapes)
+                teeth = SceneTeeth(scene, self.properties.shapes)
+                require_nested(scene, teeth)
+                self._teeth = teeth
+            require_lights(scene, self._teeth)
+            require_camera(scene, self._teeth, ray)
             paths = ScenePaths(scene, self._teeth, self.properties.optics, self.properties.max_depth)
             radiance, valid = paths.radiance(sampler, ray, mi.Bool(active))
             return radiance, valid, []

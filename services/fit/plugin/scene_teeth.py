@@ -45,6 +45,7 @@ class SceneTeeth:
         self._state = _state(scene, shapes)
         by_id = {shape.id(): shape for shape in scene.shapes()}
         outer, inner = ([_solid(by_id[name]) for name in names] for names in (shapes.enamel, shapes.dentin))
+        self._dentin = dict(zip(shapes.dentin, inner, strict=True))
         self.centre = np.concatenate([mesh.vertices_mm for mesh in outer]).mean(axis=0)
 
         # A shape is known by its number among all objects of the renderer.
@@ -55,6 +56,10 @@ class SceneTeeth:
         self._parts = mi.UInt32(table)
         dr.eval(self._parts)
         self._clearance = _clearance(outer, inner, [shape.bbox() for shape in scene.shapes() if shape.id() not in part])
+
+    def dentin_vertices(self) -> list[tuple[str, NDArray[np.float64]]]:
+        """Ids of the dentin surfaces, and their vertices (V, 3)."""
+        return [(name, mesh.vertices_mm) for name, mesh in self._dentin.items()]
 
     def is_unchanged(self, scene: Any) -> bool:
         """Whether a scene is unchanged: its shapes are the same and none has moved."""
