@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from services.client.errors import MaskError
 from services.core.files.image_headers import PNG_SIGNATURE
+from services.core.files.mask_images import GREY, require_mask_png
 from services.core.geometry import Camera
-from services.core.mask_images import GREY, require_mask_png
 
 if TYPE_CHECKING:
     import numpy as np

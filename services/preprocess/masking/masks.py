@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.core.mask_images import require_mask_png
+from services.core.files.mask_images import require_mask_png
 from services.core.masks import ALL_LIGHTS, digest_of, mask_path, read_masks
 from services.core.records import FolderCapture, MaskBit
 
