@@ -69,9 +69,7 @@ def first_surface(scene: RayScene, camera: Camera, offset: tuple[float, float]) 
     return np.where(hits.hit, hits.mesh, -1).reshape(camera.size[::-1])
 
 
-@pytest.mark.dear(
-    "It waits for the jaw that the command writes: the engine renders fourteen teeth."
-)
+@pytest.mark.dear("It waits for the jaw that the command writes: the engine renders fourteen teeth.")
 def test_the_folder_says_what_it_shows(capture: Path) -> None:
     description = read_record(capture / "capture.json", FolderCapture)
     assert len(description.images) == 4
