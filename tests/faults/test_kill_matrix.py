@@ -31,6 +31,7 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SmallSystem]:
         yield running
 
 
+@pytest.mark.dear("A whole service is started, struck and started again.")
 @pytest.mark.parametrize(("fault", "stage", "point"), CELLS)
 def test_a_fault_loses_nothing(system: SmallSystem, fault: str, stage: str, point: str) -> None:
     assert run_cell(system, fault, stage, point).faults == ()

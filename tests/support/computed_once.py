@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -24,8 +25,9 @@ def folder_once(factory: pytest.TempPathFactory, name: str, fill: Callable[[Path
     folder, lock = (run_folder(factory) / f"{name}{suffix}" for suffix in ("", ".lock"))
     with lock.open("a") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        # The lock's file says that the folder is whole: a process that fails halfway leaves none that others trust.
-        if held.tell() == 0:
+        # The lock's file says that the folder is whole: a process that fails halfway leaves none that others trust. Its
+        # size is asked for now, as another process may have filled the folder since this one opened the file.
+        if os.fstat(held.fileno()).st_size == 0:
             folder.mkdir(exist_ok=True)
             fill(folder)
             held.write("filled\n")

@@ -76,6 +76,6 @@ def test_a_prepared_mask_of_too_many_pixels_is_refused_before_any_is_read(monkey
     monkeypatch.setattr(masks, "is_published", lambda *_: True)
     monkeypatch.setattr(masks, "open_stage", lambda *_, **__: (Path(), manifest))
     monkeypatch.setattr(masks, "StoredArray", lambda _: pytest.fail("it was opened"))
-    jobs, job = SimpleNamespace(folder=lambda _: Path()), SimpleNamespace(id="0123456789ab")
+    jobs, job = SimpleNamespace(present_folder=lambda _: Path()), SimpleNamespace(id="0123456789ab")
     with pytest.raises(MaskError, match=r"Camera c0 has 1000000 x 1000000 pixels, and .* bin its images\."):
         Masks(cast("Any", jobs)).prepared(cast("Any", job), "c0", "l0")
