@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
@@ -11,12 +13,19 @@ import tifffile
 from numpy.typing import NDArray
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera
+from services.core.geometry import Camera, Light
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.fullness import Fullness, piled_up
+from services.core.records import FolderCapture, ImageEntry, MaskBit
+from services.preprocess.folder import FolderSource
 from services.preprocess.raw.camera import CameraFrames
+from services.preprocess.window import Window
 from tests.support.dng_files import write_dng
 from tests.support.raw_folders import Tree, write_toml
 from tests.support.raw_sensor import Sensor
+
+if TYPE_CHECKING:
+    from services.preprocess.source import View
 
 SIZE = (96, 64)
 SENSOR = Sensor(bits=12, black=64, counts_per_electron=0.5)
@@ -145,3 +154,26 @@ def test_the_end_of_each_pixel_of_a_mosaic_and_of_a_window() -> None:
     assert np.isneginf(windowed[0]).all()
     assert np.isneginf(windowed[:, 2]).all()
     np.testing.assert_array_equal(windowed[1:, :2], np.broadcast_to([5, 6], (2, 2, 2)))
+
+
+def test_linear_images_that_were_cut_are_masked_too(tmp_path: Path) -> None:
+    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 100.0), (0.0, 0.0, 0.0, 1.0))
+    camera = Camera(name="c", size=SIZE, K=((100.0, 0.0, 48.0), (0.0, 100.0, 32.0), (0.0, 0.0, 1.0)),
+                    camera_from_world=pose)  # fmt: skip
+    light = Light(name="L", position_mm=(0.0, 0.0, -300.0), intensity=(1.0, 1.0, 1.0))
+    image = ImageEntry(camera="c", light="L", file="i.npy")
+    described = FolderCapture(
+        units="mm", channels=("red", "green", "blue"), cameras=(camera,), lights=(light,), images=(image,)
+    )
+    (tmp_path / "capture.json").write_text(described.model_dump_json())
+    clean = frames_of(SENSOR)[1].astype(np.float32) / 4000
+    np.save(tmp_path / "i.npy", np.minimum(clean, np.float32(0.75)))
+    covered = np.zeros(SIZE[::-1], dtype=bool)
+    covered[5:-5, 5:-5] = True
+    window = Window(0, SIZE[1], 0, SIZE[0])
+    view = SimpleNamespace(number=0, whole=camera, window=window, footprint=SimpleNamespace(covered=covered))
+    source = FolderSource(tmp_path, 0.01, 0.002)
+    ((_, found),) = source.images(cast("View", view), [0], {})
+    full = (found.bits & np.uint16(MaskBit.SATURATED)) > 0
+    np.testing.assert_array_equal(full, (clean >= 0.75).any(axis=-1))
+    assert full.any()
