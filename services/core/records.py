@@ -45,6 +45,7 @@ DictionaryName = Annotated[
 """Name of an entry of ``DICTIONARIES``."""
 Loss = Literal["l2", "relative_l2", "l1", "relative_l1", "robust"]
 Priority = Literal["low", "normal", "high"]
+Motion = Literal["auto", "tracking", "off"]
 
 
 class MaskBit(IntFlag):
@@ -272,6 +273,13 @@ class JobSpec(Record):
         default=False,
         description=(
             "leave out pixels that a camera's other lights show to lie in the shadow of lips, retractor or a hand"
+        ),
+    )
+    motion: Motion = Field(
+        default="auto",
+        description=(
+            "how the subject's motion is found: by tracking frames, or auto, which takes the edges of each light's own"
+            " image where there are fewer than two; off for what cannot move, such as an extracted tooth"
         ),
     )
     memory_gib: Number = Field(

@@ -42,11 +42,14 @@ def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
             spec.sensor_noise_floor,
             teeth_root(spec.capture, root),
             spec.memory_gib * GIB / local_threads(),
+            spec.motion,
         )
         return _calibrated(raw, raw.calibration, "of the raw folder" if spec.calibration is None else "", spec)
     published = (root, "capture") if spec.capture is None else published_capture(spec.capture)
     if published is not None:
-        source: FolderSource | RigSource = RigSource(*open_stage(*published, CaptureManifest, verify=verify))
+        source: FolderSource | RigSource = RigSource(
+            *open_stage(*published, CaptureManifest, verify=verify), spec.motion
+        )
     else:
         assert spec.capture is not None
         source = FolderSource(spec.capture, spec.sensor_noise_relative, spec.sensor_noise_floor)

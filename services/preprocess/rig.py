@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from services.core.calibration.record import require_consistent
 from services.core.errors import CaptureInputError
-from services.core.records import MaskBit
+from services.core.records import MaskBit, Motion
 from services.core.results import CaptureManifest, FrameRecord
 from services.core.store import MANIFEST, StoredArray
 from services.preprocess.radiometry import Merge, Radiometry
 from services.preprocess.scratch import cached_array
 from services.preprocess.source import Image, LightImage, Motions, View
 from services.preprocess.stabilisation.flow_comparison import FlowComparison
-from services.preprocess.stabilisation.motion import Displacement, ViewMotion, frames_to_match, jaws
+from services.preprocess.stabilisation.motion import Displacement, ViewMotion, frames_to_match, jaws, largest_error_px
 from services.preprocess.window import BORDER_TOLERANCE_PX, Window, bands
 
 # Largest median displacement, pixels, that is left in a frame, because resampling would blur more than it aligns
@@ -39,13 +39,14 @@ class RigSource:
     held_out: tuple[tuple[str, str], ...] = ()
     measures_motion = True
 
-    def __init__(self, root: Path, manifest: CaptureManifest) -> None:
+    def __init__(self, root: Path, manifest: CaptureManifest, motion: Motion = "auto") -> None:
         """Check the frame table.
 
         Raises:
             CaptureInputError: there is no black frame, or a light has no frame.
         """
         self.root, self._manifest, self.description = root, manifest, manifest.description
+        self._how: Motion = motion
         require_consistent(self.description, f"Capture {root}")
         self._black = [frame for frame in manifest.frames if frame.kind == "black"][:BLACK_FRAMES]
         if not self._black:
@@ -66,7 +67,7 @@ class RigSource:
             self._frames.append(own)
         tracking = sum(frame.kind == "tracking" for frame in manifest.frames)
         self.notes: tuple[str, ...] = ()
-        if tracking < MIN_TRACKING:
+        if tracking < MIN_TRACKING and motion != "off":
             note = (
                 f"Capture has {tracking} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to"
                 " 0.2 px; lower rig.tracking_every."
@@ -83,7 +84,7 @@ class RigSource:
 
     def matched_frames(self, camera: int) -> tuple[int, ...]:  # noqa: ARG002
         """See ``Source``."""
-        return tuple(frame.index for frame in frames_to_match(self._manifest.frames))
+        return tuple(frame.index for frame in frames_to_match(self._manifest.frames, self._how))
 
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """See ``Source``."""
@@ -126,7 +127,7 @@ class RigSource:
             yield light, _image(frames, moves, radiometry, motion, counts, view.window)
 
     def _motion(self, view: View) -> ViewMotion:
-        return ViewMotion(view, jaws(sorted(self._manifest.fdi)), self._manifest.frames)
+        return ViewMotion(view, jaws(sorted(self._manifest.fdi)), self._manifest.frames, self._how)
 
     def _black_image(self, view: View, array: StoredArray, window: Window) -> Image:
         """Mean (H, W, C) of the black frames, counts; computed once if the view has a scratch folder."""
@@ -173,10 +174,10 @@ def _image(
             lost &= ~beyond
             bits[rows][beyond] = MaskBit.MOTION
         bits[rows][lost] |= np.uint16(MaskBit.SATURATED)
-    if max(move.error_px for move in moves) > UNCERTAIN_PX:
+    error_px = largest_error_px(moves)
+    if error_px is not None and error_px > UNCERTAIN_PX:
         bits |= np.uint16(MaskBit.MOTION)
     farthest = max(moves, key=lambda move: move.median_px)
-    errors_px = [error for move in moves if (error := move.known_error_px) is not None]
     return LightImage(
         radiance,
         variance,
@@ -184,7 +185,7 @@ def _image(
         motion.stored_field(farthest),
         farthest.median_px,
         any(is_warped),
-        motion_error_px=max(errors_px, default=None),
+        motion_error_px=error_px,
     )
 
 

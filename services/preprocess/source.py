@@ -59,7 +59,7 @@ class LightImage:
             measured.
         motion_px: median displacement over the teeth; None where motion is not measured.
         motion_error_px: estimated error of the motion at the teeth, from its interpolation in time; None where it
-            cannot be estimated.
+            cannot be estimated, 0 where the subject is stated not to move.
         warped: whether the pixels were resampled.
         colour: ratio of red to blue, to check the order of channels; None where the source does not measure it.
     """
@@ -104,7 +104,7 @@ class Source(Protocol):
         """A text that changes whenever a file from which the images are made changes."""
 
     def matched_frames(self, camera: int) -> tuple[int, ...]:
-        """Numbers of the camera's frames whose motion must be measured; empty where motion is not measured."""
+        """Numbers of the camera's frames whose motion must be measured; empty where nothing is to be measured."""
 
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """Yield each frame's number and the coefficients (bodies, TERMS, 2) of its motion since the first frame.

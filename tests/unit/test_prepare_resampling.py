@@ -40,7 +40,7 @@ class Shifted:
         self._shift = np.array([x_px, y_px], dtype=np.float32)
 
     def move(self) -> Displacement:
-        return Displacement(np.zeros(0), float(np.linalg.norm(self._shift)), 0.0)
+        return Displacement(np.zeros(0), float(np.linalg.norm(self._shift)), None)
 
     def positions(self, _: Displacement, rows: slice) -> np.ndarray:
         y, x = np.mgrid[rows, : SHAPE[1]].astype(np.float32)

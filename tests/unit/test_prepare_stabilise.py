@@ -170,7 +170,7 @@ def test_each_jaw_gets_its_own_motion() -> None:
     for rows, shift in ((slice(0, 45), upper), (slice(45, 90), lower)):
         field = np.broadcast_to(-shift.astype(np.float32), (90, 120, 2))
         moved[rows] = warp(texture, field)[rows]
-    motion = ViewMotion(view_of(seen), [[0], [1]], frames(2))
+    motion = ViewMotion(view_of(seen), [[0], [1]], frames(2), "auto")
     found = motion.stored_field(
         motion.at(frames(2)[1], dict(motion.measure([0, 1], lambda frame: moved if frame.index else texture)))
     )
@@ -184,7 +184,7 @@ def test_too_much_motion_is_refused_by_name() -> None:
     seen = np.zeros((90, 120), dtype=bool)
     seen[20:70, 30:90] = True
     moved = warp(texture, np.broadcast_to(np.array([-11, 0], np.float32), (90, 120, 2)))
-    motion = ViewMotion(view_of(footprint(seen)), [[0]], frames(2))
+    motion = ViewMotion(view_of(footprint(seen)), [[0]], frames(2), "auto")
     with pytest.raises(
         CaptureInputError, match=r"moved 1\d\.\d px by frame 1 \(camera front, light all\).*head supported\.$"
     ):

@@ -228,7 +228,7 @@ def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[st
         if len(folder.frames_of(name, "tracking")) < MIN_TRACKING:
             yield (
                 f"Camera {name} has fewer than {MIN_TRACKING} tracking frames (all lights on), so motion is followed"
-                " less well."
+                " less well; for a subject that cannot move give motion = 'off' in the job."
             )
         elif _is_out_of_order(folder, name):
             yield (

@@ -12,6 +12,7 @@ from services.core.files.meshes import fdi_numbers
 from services.core.raw.description import described, read_calibration
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFrame
+from services.core.records import Motion
 from services.core.results import FrameRecord
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import missing_exposures
@@ -36,6 +37,7 @@ class RawSource:
         noise_floor: float,
         teeth_root: Path | None = None,
         memory_bytes: float = np.inf,
+        motion: Motion = "auto",
     ) -> None:
         """Read the description and the calibration; no pixel is read yet.
 
@@ -46,6 +48,7 @@ class RawSource:
             noise_floor: standard deviation as a fraction of full scale, assumed likewise.
             teeth_root: folder of the teeth; None for the raw folder.
             memory_bytes: largest memory that this process may use to make images.
+            motion: how the subject's motion is found.
 
         Raises:
             CaptureInputError: an entry is missing or contradicts another; the message names it.
@@ -53,6 +56,7 @@ class RawSource:
         self.root = teeth_root or frames_root
         self._frames_root, self._noise = frames_root, (noise_relative, noise_floor)
         self._memory_bytes = memory_bytes
+        self._how: Motion = motion
         self._measured: dict[str, CameraFrames] = {}
         self._folder = read_raw_folder(frames_root)
         self.calibration = read_calibration(frames_root, self._folder, calibration)
@@ -63,12 +67,13 @@ class RawSource:
         fewest = min(
             sum(frame.kind == "tracking" for frame in self._frames_of(camera.name)) for camera in self._folder.camera
         )
-        if fewest < MIN_TRACKING:
+        if fewest < MIN_TRACKING and motion != "off":
             shortage = (
                 f"A camera has {fewest} tracking frames, and {MIN_TRACKING} are needed to follow a smooth motion to"
                 " 0.2 px"
             )
-            self.notes += (f"{shortage}; take one with all lights on after every few lights.",)
+            remedy = "take one with all lights on after every few lights, or give motion = 'off' for what cannot move"
+            self.notes += (f"{shortage}; {remedy}.",)
 
     def lights_of(self, camera: int) -> tuple[int, ...]:
         """See ``Source``."""
@@ -85,7 +90,8 @@ class RawSource:
 
     def matched_frames(self, camera: int) -> tuple[int, ...]:
         """See ``Source``."""
-        return tuple(row.index for row in frames_to_match(self._table(self.description.cameras[camera].name)))
+        table = self._table(self.description.cameras[camera].name)
+        return tuple(row.index for row in frames_to_match(table, self._how))
 
     def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """See ``Source``."""
@@ -119,7 +125,7 @@ class RawSource:
                 self._frames_root, self._folder, self._cameras[name], self._noise, view.scratch
             )
             self.notes += tuple(self._measured[name].notes)
-        motion = ViewMotion(view, jaws(fdi_numbers(self.root)), self._table(name))
+        motion = ViewMotion(view, jaws(fdi_numbers(self.root)), self._table(name), self._how)
         return RawView(
             self._frames_root, self._measured[name], view, motion, self.description.channels, self._memory_bytes
         )

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import CaptureInputError
+from services.core.errors import CaptureInputError, SettingsError
+from services.core.records import Motion
 from services.core.results import FrameRecord
 from services.preprocess.projection import Footprint
 from services.preprocess.source import Motions, View
@@ -41,16 +42,27 @@ def jaws(fdi: Sequence[int]) -> list[list[int]]:
     return [group for group in (upper, [k for k in range(len(fdi)) if k not in upper]) if group]
 
 
-def frames_to_match(frames: Sequence[FrameRecord]) -> tuple[FrameRecord, ...]:
+def frames_to_match(frames: Sequence[FrameRecord], motion: Motion) -> tuple[FrameRecord, ...]:
     """Frames whose motion is measured: the tracking frames, which share one light, or else one frame for each light.
 
-    With fewer than two tracking frames every light is matched to the first frame by its edges. Of consecutive exposures
-    of one light the first represents all. A short exposure may be all noise and a long one saturated, so that neither
-    shows an edge, and the subject hardly moves between them.
+    With fewer than two tracking frames and ``auto`` every light is matched to the first frame by its edges. Of
+    consecutive exposures of one light the first represents all. A short exposure may be all noise and a long one
+    saturated, so that neither shows an edge, and the subject hardly moves between them. A subject that cannot move
+    needs no frame.
+
+    Raises:
+        SettingsError: motion is to be found by tracking frames, and there are fewer than two.
     """
+    if motion == "off":
+        return ()
     tracking = tuple(frame for frame in frames if frame.kind == "tracking")
     if len(tracking) >= 2:
         return tracking
+    if motion == "tracking":
+        raise SettingsError(
+            f"motion = 'tracking' needs two tracking frames of every camera, and one has {len(tracking)}; give 'off'"
+            " for a subject that cannot move, or 'auto'."
+        )
     return tuple(own[0] for own in group_exposures(frames) if own[0].kind == "light")
 
 
@@ -66,17 +78,18 @@ class Displacement:
     Attributes:
         coefficients: (bodies, TERMS, 2), pixels.
         median_px: median length over a jaw's teeth, of the jaw that moved most.
-        error_px: estimated error of the interpolation in time; 0 where it cannot be estimated.
+        error_px: estimated error of the interpolation in time; None where it cannot be estimated, 0 for a subject that
+            is stated not to move.
     """
 
     coefficients: FloatArray
     median_px: float
-    error_px: float
+    error_px: float | None
 
-    @property
-    def known_error_px(self) -> float | None:
-        """Estimated error in pixels; None where it cannot be estimated."""
-        return self.error_px or None
+
+def largest_error_px(moves: Iterable[Displacement]) -> float | None:
+    """Largest error that could be estimated of some displacements; None where none could."""
+    return max((move.error_px for move in moves if move.error_px is not None), default=None)
 
 
 class ViewMotion:
@@ -86,17 +99,20 @@ class ViewMotion:
     intervals and the number does not depend on the host's clock.
     """
 
-    def __init__(self, view: View, bodies: Sequence[Sequence[int]], frames: Sequence[FrameRecord]) -> None:
+    def __init__(
+        self, view: View, bodies: Sequence[Sequence[int]], frames: Sequence[FrameRecord], motion: Motion
+    ) -> None:
         """Prepare the possible displacements of each body.
 
         Args:
             view: window and footprint of the camera.
             bodies: mesh numbers in the footprint, for each rigid body.
             frames: all frames of the capture.
+            motion: how motion is found.
         """
         self._view = view
-        self._matched = frames_to_match(frames)
-        self._interpolated = self._matched[0].kind == "tracking"
+        self._matched = frames_to_match(frames, motion)
+        self._interpolated = bool(self._matched) and self._matched[0].kind == "tracking"
         self._representative = {frame.index: own[0].index for own in group_exposures(frames) for frame in own}
         visible = [np.isin(view.footprint.mesh, list(meshes)) for meshes in bodies]
         sides_px = [_shorter_side(one) for one in visible if one.any()]
@@ -158,6 +174,8 @@ class ViewMotion:
             frame: any frame of the capture.
             motions: coefficients of all ``frames_to_match``.
         """
+        if not self._matched:
+            return Displacement(np.zeros((len(self._bodies), TERMS, 2)), 0.0, 0.0)
         index = np.array([matched.index for matched in self._matched], dtype=np.float64)
         if self._interpolated:
             knots = np.stack([motions[matched.index] for matched in self._matched])
@@ -167,9 +185,8 @@ class ViewMotion:
             error = np.zeros_like(coefficients)
         medians = [self._median(body, c) for body, c in zip(self._bodies, coefficients, strict=True)]
         # Take the error of the shift as that of the field, because the other terms are small beside it
-        return Displacement(
-            coefficients, max(medians, default=0.0), float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
-        )
+        error_px = float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
+        return Displacement(coefficients, max(medians, default=0.0), error_px or None)
 
     def positions(self, displacement: Displacement, rows: slice) -> Image:
         """Positions in a frame of some rows of the view: x and y (2, rows, width) as indices into ``window``."""

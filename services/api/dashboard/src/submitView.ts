@@ -37,6 +37,7 @@ const GROUPS: [string, string[]][] = [
       "instrument",
       "highlights",
       "shadows",
+      "motion",
       "pixel_step",
       "sensor_noise_relative",
       "sensor_noise_floor",
