@@ -105,6 +105,7 @@ def test_two_fits_and_a_capture_run_side_by_side(jobs: HeldJobs) -> None:
     both_fit_and_a_capture_ends(jobs)
 
 
+@pytest.mark.dear("A server starts workers of its own, as processes that import the renderer.")
 def test_a_server_with_workers_of_its_own_keeps_one_for_captures(own_workers: HeldJobs) -> None:
     both_fit_and_a_capture_ends(own_workers)
 

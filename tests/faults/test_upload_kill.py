@@ -74,6 +74,7 @@ def send_until_killed(
     thread.join()
 
 
+@pytest.mark.dear("Servers are started, killed and started again.")
 def test_a_server_killed_in_mid_request_loses_at_most_what_it_had_not_acknowledged(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     folder = write_capture(tmp_path / "mine")

@@ -10,6 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from services.anatomy.dentin_shape import DentinShape
@@ -33,6 +34,7 @@ for all others, for which errors of a third would show."""
 FALSE_ALARM = 1e-3
 
 
+@pytest.mark.dear("Stock Mitsuba's adjoint kernels take seconds to compile where none are cached.")
 def test_gradients_agree_with_prbvolpath(tmp_path: Path) -> None:
     outer, core = ellipsoid(SEMI_AXES_MM), dentin_shape().vertices_mm((0.5, 0.4))
     dentin = DentinShape.known(type(outer)(core, outer.faces))

@@ -223,7 +223,7 @@ def test_a_wavelength_is_told_before_the_next_one_is_fitted(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = json.loads((folder / "slab.json").read_text())
-    others = [image | {"wavelength_nm": 635.0} for image in told["images"]]
+    others = [image | {"wavelength_nm": 635.0, "file": f"635_{image['file']}"} for image in told["images"]]
     root = write_folder(tmp_path / "cell", told | {"wavelengths_nm": [532.0, 635.0], "images": told["images"] + others})
     order: list[str] = []
 
