@@ -49,6 +49,7 @@ def on_the_photograph(page: Page, camera: int, xy_px: list[float], size: tuple[i
     return box["x"] + x, box["y"] + y
 
 
+@pytest.mark.dear("It is the first to ask for the mouth's photographs.")
 def test_what_is_clicked_is_saved_as_landmarks(chromium: Browser, mouth: RawMouth, tmp_path: Path) -> None:
     known = mouth.tree["landmark"]
     write_toml(mouth.root, mouth.tree | {"landmark": known[:1]})

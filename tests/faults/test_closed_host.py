@@ -89,6 +89,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Cli
         os.umask(before)
 
 
+@pytest.mark.dear("A service of several processes is started.")
 @pytest.mark.attack("Dask and files as another user", "files of the service and its workers")
 def test_what_the_service_and_its_workers_write_is_for_its_user_alone(
     served: tuple[httpx.Client, Path], tmp_path: Path

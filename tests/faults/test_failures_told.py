@@ -45,6 +45,7 @@ def failure_of(client: httpx.Client, capture: Path, call: str) -> dict[str, Any]
     return dict(told["failure"])
 
 
+@pytest.mark.dear("A worker grows until it is killed, again and again.")
 def test_a_memory_kill(client: httpx.Client, tmp_path: Path) -> None:
     failure = failure_of(client, tmp_path, "grow")
     assert failure["code"] == "memory-killed"
@@ -61,6 +62,7 @@ def test_a_crash_by_a_signal(client: httpx.Client, tmp_path: Path) -> None:
     assert failure["evidence"]["exit_status"] == -signal.SIGSEGV
 
 
+@pytest.mark.dear("A worker is killed until its task is given up.")
 def test_a_lost_worker(client: httpx.Client, tmp_path: Path) -> None:
     failure = failure_of(client, tmp_path, "lose")
     assert failure["code"] == "worker-lost"

@@ -137,6 +137,7 @@ def standard_error(values: NDArray[np.float64]) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
+@pytest.mark.dear("Differences of images need many paths.")
 @pytest.mark.parametrize(
     ("group", "boundary"),
     [

@@ -57,6 +57,7 @@ def test_a_scene_built_twice_gives_the_same_bits(boundary: Boundary) -> None:
     assert (one.orders.sum(axis=(1, 2)) > 0).all()
 
 
+@pytest.mark.dear("Engines in two more processes compile their own kernels.")
 @pytest.mark.parametrize("boundary", ["matched", pytest.param("thin", marks=pytest.mark.slow)])
 def test_processes_and_thread_counts_agree(boundary: Boundary) -> None:
     (two, one), (two_again, one_again) = (pictures_of_another_process(boundary, (2, 1)) for _ in range(2))

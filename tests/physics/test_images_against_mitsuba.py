@@ -58,6 +58,7 @@ def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, size: int, tmp_
     require_same_pictures(np.stack(scores), least=2 * size**2 - 12)
 
 
+@pytest.mark.dear("Stock Mitsuba renders a real scan as well.")
 @pytest.mark.parametrize(
     ("samples", "block", "least"),
     [

@@ -149,6 +149,7 @@ def test_no_part_of_a_mouth_with_gradual_borders_has_a_table() -> None:
         engine.images(tabulated, whole_view(camera_at((0, 1, 0))), samples=1, seed=1)
 
 
+@pytest.mark.dear("Each move of the border makes new distances.")
 @pytest.mark.parametrize("whole", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_mixture_changes_where_the_border_moves(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     # Albedos differ much and extinctions little, so nearly all of the derivative of the images' sum comes from the

@@ -31,6 +31,7 @@ def cameras(distance_mm: float | None) -> list[dict[str, Any]]:
     return [camera | lens for camera in told]
 
 
+@pytest.mark.dear("Two walks are compared in every pixel, and one of them is compiled first.")
 @pytest.mark.parametrize(
     "beam", [pytest.param(BEAMS[0], id="gaussian"), pytest.param(BEAMS[1], id="disc", marks=pytest.mark.slow)]
 )

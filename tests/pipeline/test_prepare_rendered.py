@@ -87,6 +87,7 @@ def moved(
     return root, rendered, run(JobSpec(capture=root), LocalContext(root, listener=events.append)), events
 
 
+@pytest.mark.dear("It is the first to ask for the rendered frames.")
 def test_residual_motion(
     moved: tuple[Path, Rendered, PreparedManifest, list[StageEvent]], renders: Mapping[str, Any]
 ) -> None:

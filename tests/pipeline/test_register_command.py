@@ -81,6 +81,7 @@ def _made(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.dear("A whole scan is registered in photographs.")
 def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     out, calibration = tmp_path / "registered", tmp_path / "calibration.json"
     known = json.loads((mouth.root / "calibration.json").read_text())
@@ -112,6 +113,7 @@ def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     read_mesh(out / "gums.ply").require_solid("gums.ply", (2.0, 200.0))
 
 
+@pytest.mark.dear("A whole scan is parted into teeth.")
 def test_a_scan_without_labels_is_parted_by_its_landmarks(tmp_path: Path) -> None:
     bare = write_raw_mouth(tmp_path, is_labelled=False)
     record = register_folder(tmp_path)
