@@ -19,7 +19,7 @@ from services.core.errors import SchedulerLostError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.pipeline.event_log import EventAddress
-from services.pipeline.workers import Workers
+from services.pipeline.workers import Workers, _freeze_loaded_objects_once
 from tests.support.live_server import serving
 from tests.support.uploading import write_capture
 
@@ -80,6 +80,8 @@ def test_a_scheduler_that_does_not_answer_leaves_nothing_behind_that_is_never_co
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("services.pipeline.workers.CONNECT_S", 0.1)
+    # Another test of this process may have been the first to connect, and a later one may have thawed what it froze.
+    _freeze_loaded_objects_once.cache_clear()
     workers, frozen = Workers("tcp://127.0.0.1:1"), []
     for _ in range(3):
         with pytest.raises(SchedulerLostError):
