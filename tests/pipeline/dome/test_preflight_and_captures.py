@@ -35,8 +35,8 @@ def test_a_preflight_tells_what_it_finds(
 
 def test_all_off_ends_a_preflight(client: httpx.Client, observer: DomeObserver, tmp_path: Path) -> None:
     answers: list[httpx.Response] = []
-    # The black and the lit frame take seconds each, twice as long as the light by hand below waits for the dome, so that
-    # the preflight is certainly still running.
+    # The black and the lit frame each take twice as long as the light by hand below waits for the dome, so that the
+    # preflight is certainly still running.
     wanted = rig(tmp_path, exposure_s=2 * LOCK_TIMEOUT_S, level=0.1)
     asking = threading.Thread(target=lambda: answers.append(client.post("/v1/dome/preflight", json=wanted)))
     asking.start()
