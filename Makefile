@@ -19,7 +19,7 @@ figures: setup ## the figures of teeth 2018 from fits of this project's own, in 
 	@$(BIN)/python -m services.bench.figures --out figures
 
 quick: setup ## what a change is tried with while it is made, a minute and a half on two cores
-	@$(PYTEST) -m "not slow and not dear" tests/unit
+	@$(PYTEST) -m "not slow" tests/unit
 
 test: ## all but the tests that take many minutes; what the machine cannot run is skipped with its reason
 	@deploy/setup.sh dashboard browser
