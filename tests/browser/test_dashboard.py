@@ -230,6 +230,7 @@ def keep_picture(page: Page, name: str) -> None:
         page.screenshot(path=f"{folder}/dashboard-{name}.png", full_page=True)
 
 
+@pytest.mark.dear("A thousand jobs are drawn without a graphics processor.")
 def test_a_thousand_jobs_and_five_hundred_steps_are_shown(page: Page, job: ScriptedJob, tmp_path: Path) -> None:
     repository = Repository(sqlite_url(tmp_path / "data" / "dentine.sqlite"))
     job.steps.release(STEPS)

@@ -35,6 +35,7 @@ def link(server: httpx.Client, tmp_path: Path) -> str:
     return f"/#/setup/{secret.get_secret_value()}"
 
 
+@pytest.mark.dear("It starts the browser and a server of its own.")
 def test_a_setup_link_works_once(chromium: Browser, server: httpx.Client, link: str) -> None:
     address = str(server.base_url).rstrip("/")
     with watched_page(chromium, address, *LOOKS[1]) as page:

@@ -52,6 +52,7 @@ def expect_uploaded(page: Page, server: httpx.Client, data: Path, contents: dict
     assert contents_of(data / "captures" / capture["id"]) == contents
 
 
+@pytest.mark.dear("The browser hands each block of 4 MiB to the test.")
 def test_a_folder_is_uploaded_and_its_job_submitted(
     chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path
 ) -> None:
@@ -130,6 +131,7 @@ def test_the_same_folder_goes_on_after_a_reload(
     ]  # the rest of the large file and the one after it; nothing was sent twice
 
 
+@pytest.mark.dear("The browser hands each block of 4 MiB to the test.")
 def test_a_dropped_folder_is_uploaded(chromium: Browser, server: httpx.Client, folder: Path, tmp_path: Path) -> None:
     with watched_page(chromium, str(server.base_url).rstrip("/")) as page:
         page.goto("/")

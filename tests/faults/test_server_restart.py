@@ -117,6 +117,7 @@ def test_a_killed_server_loses_neither_job_nor_history(server: Server) -> None:
     assert (folder / "fit" / "by.txt").read_text() == "2\n"
 
 
+@pytest.mark.dear("Two servers are started.")
 def test_stopping_the_server_darkens_the_dome_and_queues_the_job(server: Server) -> None:
     job, folder = submit(server.client, server.data, "hold-capture", rig={"mouth": "/"})
     event_ids(server.client, job, until='"stage":"capture","kind":"started"')

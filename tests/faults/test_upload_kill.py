@@ -101,6 +101,7 @@ def test_a_server_killed_in_mid_request_loses_at_most_what_it_had_not_acknowledg
     assert contents_of(tmp_path / "data" / "captures" / capture) == contents
 
 
+@pytest.mark.dear("A client is killed and another one started.")
 def test_a_killed_client_is_continued_by_another(tmp_path: Path) -> None:
     folder = write_capture(tmp_path / "mine")
     np.save(folder / "large.npy", np.random.default_rng(6).integers(0, 255, 60 * MIB, dtype=np.uint8))

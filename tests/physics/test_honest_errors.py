@@ -77,6 +77,7 @@ def require_honest(found: Intervals) -> None:
     assert found.covered(1.5).mean() > HIGHEST
 
 
+@pytest.mark.dear("Fifty-six renders are compared with a long one.")
 def test_errors_of_images_are_honest(engine: Engine) -> None:
     truth = engine.images(TISSUE, VIEW, samples=TRUTH_SAMPLES, seed=9000)
     runs = [engine.images(TISSUE, VIEW, samples=SAMPLES, seed=9001 + seed) for seed in range(SEEDS)]

@@ -30,6 +30,7 @@ from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera
 TISSUE = Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4.0, 0.85, 1.0, 0.5))
 
 
+@pytest.mark.dear("Stock Mitsuba renders the same scene.")
 @pytest.mark.parametrize("size", [8, pytest.param(16, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("boundary", ["matched", "thin"])
 def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, size: int, tmp_path: Path) -> None:

@@ -146,6 +146,7 @@ def begin(capture: Path, root: Path, attempt: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command)
 
 
+@pytest.mark.dear("A preparation is killed twice and goes on.")
 def test_killed_while_it_writes(server: S3Server, capture: Path, tmp_path: Path) -> None:
     """Attempts are killed by SIGKILL while they send a shard, before and after it is stored, until one ends. The store
     is then that of an undisturbed attempt.
