@@ -15,7 +15,7 @@ from services.core.files.arrays import as_float32, map_radiance
 from services.core.raw.fullness import piled_up
 from services.core.records import FolderCapture, ImageEntry, MaskBit
 from services.core.store import read_record
-from services.preprocess.source import Image, LightImage, Motions, View
+from services.preprocess.source import FootprintIn, Image, LightImage, MatchedFrame, Motions, View
 from services.preprocess.stabilisation.flow_comparison import FlowComparison
 from services.preprocess.window import bands
 
@@ -104,7 +104,12 @@ class FolderSource:
         """See ``Source``. Empty, because the images of a folder are assumed to show an unmoved subject."""
         return ()
 
-    def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:  # noqa: ARG002
+    def match(
+        self,
+        view: View,  # noqa: ARG002
+        frames: Sequence[int],  # noqa: ARG002
+        footprint_in: FootprintIn,  # noqa: ARG002
+    ) -> Iterator[tuple[int, MatchedFrame]]:
         """See ``Source``."""
         return iter(())
 

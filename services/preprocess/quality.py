@@ -11,7 +11,7 @@ from pydantic import Field
 
 from services.core.geometry import Record
 from services.core.records import MaskBit
-from services.preprocess.source import Image
+from services.preprocess.source import Image, MotionSource
 
 PICTURE_PX = 480
 """Longest side of a picture, pixels."""
@@ -39,7 +39,12 @@ class ImageQuality(Record):
     light: str
     motion_px: float | None = Field(description="median displacement removed; null where not measured")
     motion_error_px: float | None = Field(
-        default=None, description="estimated error of it; null where nothing tells, as without three tracking frames"
+        default=None,
+        description="standard error of either component of the motion, 0 where the subject is stated not to move; null"
+        " in stores of earlier versions where it was not estimated",
+    )
+    motion_source: MotionSource | None = Field(
+        default=None, description="what the motion is known from; null in stores of earlier versions"
     )
     tooth_pixels: int = Field(description="pixels whose whole footprint is to be fitted")
     valid_pixels: int
@@ -73,8 +78,7 @@ def assess(
     light: str,
     bits: NDArray[np.uint16],
     covered: NDArray[np.bool_],
-    motion_px: float | None,
-    motion_error_px: float | None = None,
+    motion: tuple[float | None, float | None, MotionSource | None],
     stops: tuple[tuple[int, ...], tuple[float | None, ...]] = ((0,) * STOPS, (None,) * STOPS),
 ) -> ImageQuality:
     """Count the masked pixels among an image's tooth pixels.
@@ -82,8 +86,7 @@ def assess(
     Args:
         bits: (H, W) mask bits; 0 is a valid pixel.
         covered: (H, W) tooth pixels.
-        motion_px: median displacement over the teeth.
-        motion_error_px: estimated error of the motion.
+        motion: median displacement over the teeth, its standard error, pixels, and what they are known from.
         stops: result of ``by_stop``.
     """
     pixels = int(np.count_nonzero(covered))
@@ -98,8 +101,9 @@ def assess(
     return ImageQuality(
         camera=camera,
         light=light,
-        motion_px=motion_px,
-        motion_error_px=motion_error_px,
+        motion_px=motion[0],
+        motion_error_px=motion[1],
+        motion_source=motion[2],
         tooth_pixels=pixels,
         valid_pixels=int(np.count_nonzero(bits == 0)),
         levels=stops[0],
@@ -146,6 +150,20 @@ def unusable_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:
         f"{sum(counts)} pixels of teeth in {np.count_nonzero(counts)} images have no finite value or no positive"
         f" variance and are left out, most of them ({max(counts)}) in camera {worst.camera} under light {worst.light};"
         " export these images again if they should count."
+    )
+    return (note,)
+
+
+def moved_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:
+    """A sentence about images that were moved by the outline of the teeth alone; empty if there are none."""
+    moved = [image for image in images if image.motion_source == "outline" and (image.motion_px or 0) > 0]
+    if not moved:
+        return ()
+    farthest = max(moved, key=lambda image: image.motion_px or 0)
+    note = (
+        f"{len(moved)} images were moved, as the outline of the teeth lies elsewhere in them than in the first ones:"
+        f" most of all, by {farthest.motion_px:.1f} px, in camera {farthest.camera} under light {farthest.light}; give"
+        " motion = 'off' if the subject cannot have moved."
     )
     return (note,)
 

@@ -24,7 +24,8 @@ class CameraPage:
     Attributes:
         name: name of the camera.
         images: quality of the camera's images.
-        motion: for each image the light, the displacement removed and its estimated error, pixels; None where unknown.
+        motion: for each image the light, the displacement removed, its standard error, pixels, and what they are known
+            from; None where unknown.
         coverage: for each tooth the FDI number and, for each image, its valid pixels as a share of those in the image
             that shows most of it.
         levels: for each stop below an image's brightest pixel the share of all tooth pixels, and the bar's height in
@@ -36,7 +37,7 @@ class CameraPage:
 
     name: str
     images: tuple[ImageQuality, ...]
-    motion: tuple[tuple[str, float | None, float | None], ...]
+    motion: tuple[tuple[str, float | None, float | None, str | None], ...]
     coverage: tuple[tuple[int, tuple[float, ...]], ...]
     levels: tuple[tuple[float, float], ...]
     flow: CameraFlow | None
@@ -74,7 +75,7 @@ def _page_of(name: str, images: Sequence[ImageQuality], flow: CameraFlow | None)
     return CameraPage(
         name=name,
         images=own,
-        motion=tuple((image.light, image.motion_px, image.motion_error_px) for image in own),
+        motion=tuple((image.light, image.motion_px, image.motion_error_px, image.motion_source) for image in own),
         coverage=tuple((fdi, _coverage(own, fdi)) for fdi in own[0].valid_by_tooth),
         flow=flow,
         levels=tuple((float(one), float(HEIGHT * one / max(share.max(), 1e-9))) for one in share),

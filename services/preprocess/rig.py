@@ -16,15 +16,21 @@ from services.core.results import CaptureManifest, FrameRecord
 from services.core.store import MANIFEST, StoredArray
 from services.preprocess.radiometry import Merge, Radiometry
 from services.preprocess.scratch import cached_array
-from services.preprocess.source import Image, LightImage, Motions, View
+from services.preprocess.source import FootprintIn, Image, LightImage, MatchedFrame, Motions, View
 from services.preprocess.stabilisation.flow_comparison import FlowComparison
-from services.preprocess.stabilisation.motion import Displacement, ViewMotion, frames_to_match, jaws, largest_error_px
+from services.preprocess.stabilisation.motion import (
+    Displacement,
+    Scene,
+    ViewMotion,
+    frames_to_match,
+    is_uncertain,
+    jaws,
+    largest_error_px,
+)
 from services.preprocess.window import BORDER_TOLERANCE_PX, Window, bands
 
 # Largest median displacement, pixels, that is left in a frame, because resampling would blur more than it aligns
 STILL_PX = 0.1
-# Largest estimated error of a frame's interpolated motion, pixels; an image made from a less certain frame is masked
-UNCERTAIN_PX = 0.5
 # Largest number of black frames that are averaged
 BLACK_FRAMES = 8
 # Smallest number of tracking frames: a cubic in time has four coefficients
@@ -86,7 +92,7 @@ class RigSource:
         """See ``Source``."""
         return tuple(frame.index for frame in frames_to_match(self._manifest.frames, self._how))
 
-    def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    def match(self, view: View, frames: Sequence[int], footprint_in: FootprintIn) -> Iterator[tuple[int, MatchedFrame]]:
         """See ``Source``."""
         motion = self._motion(view)
         array = StoredArray(self.root / "capture.zarr")
@@ -99,7 +105,7 @@ class RigSource:
         def picture(frame: FrameRecord) -> NDArray[np.uint16]:
             return array[view.number, frame.index, motion.window.rows, motion.window.columns]
 
-        return motion.measure(frames, picture, float(level))
+        return motion.measure(frames, picture, Scene(self.description.lights, footprint_in), float(level))
 
     def flow_comparison(self, view: View, motions: Motions) -> FlowComparison | None:
         """See ``Source``."""
@@ -174,8 +180,7 @@ def _image(
             lost &= ~beyond
             bits[rows][beyond] = MaskBit.MOTION
         bits[rows][lost] |= np.uint16(MaskBit.SATURATED)
-    error_px = largest_error_px(moves)
-    if error_px is not None and error_px > UNCERTAIN_PX:
+    if is_uncertain(moves):
         bits |= np.uint16(MaskBit.MOTION)
     farthest = max(moves, key=lambda move: move.median_px)
     return LightImage(
@@ -185,7 +190,8 @@ def _image(
         motion.stored_field(farthest),
         farthest.median_px,
         any(is_warped),
-        motion_error_px=error_px,
+        motion_error_px=largest_error_px(moves),
+        motion_source=motion.source,
     )
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,31 @@ from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
 Bits = NDArray[np.uint16]
-Motions = Mapping[int, NDArray[np.float64]]
-"""Frame number -> coefficients (bodies, TERMS, 2) of the frame's displacement, as ``stabilise`` defines them."""
+MotionSource = Literal["tracking", "outline", "stated still"]
+"""What an image's motion is known from: tracking frames, the outline of the teeth, or the statement that the subject
+did not move."""
+
+
+@dataclass(frozen=True)
+class MatchedFrame:
+    """What was measured of the motion of one frame.
+
+    Attributes:
+        coefficients: (bodies, TERMS, 2) of the frame's displacement, as ``stabilise`` defines them. By an outline, a
+            translation from where the scan is.
+        error_px: (bodies,) standard error of an outline's translation; empty for tracking frames.
+        arcs_px: (bodies, 2, 2) the same translation by odd and by even arcs of the outline; empty for tracking frames.
+    """
+
+    coefficients: NDArray[np.float64]
+    error_px: tuple[float, ...] = ()
+    arcs_px: tuple[tuple[tuple[float, float], tuple[float, float]], ...] = ()
+
+
+Motions = Mapping[int, MatchedFrame]
+"""Frame number -> what was measured of its motion."""
+FootprintIn = Callable[[Camera], Footprint]
+"""Gives the surfaces of the subject that a camera sees."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +81,9 @@ class LightImage:
         displacement: (h, w, 2), pixels, at every ``stored_step``-th pixel of the whole image; None where motion is not
             measured.
         motion_px: median displacement over the teeth; None where motion is not measured.
-        motion_error_px: estimated error of the motion at the teeth, from its interpolation in time; None where it
-            cannot be estimated, 0 where the subject is stated not to move.
+        motion_error_px: standard error of either component of the motion at the teeth; 0 where the subject is stated
+            not to move.
+        motion_source: what the motion is known from.
         warped: whether the pixels were resampled.
         colour: ratio of red to blue, to check the order of channels; None where the source does not measure it.
     """
@@ -71,7 +95,8 @@ class LightImage:
     motion_px: float | None = None
     warped: bool = False
     colour: FrameColour | None = None
-    motion_error_px: float | None = None
+    motion_error_px: float = 0.0
+    motion_source: MotionSource = "stated still"
 
 
 class Source(Protocol):
@@ -106,8 +131,12 @@ class Source(Protocol):
     def matched_frames(self, camera: int) -> tuple[int, ...]:
         """Numbers of the camera's frames whose motion must be measured; empty where nothing is to be measured."""
 
-    def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
-        """Yield each frame's number and the coefficients (bodies, TERMS, 2) of its motion since the first frame.
+    def match(self, view: View, frames: Sequence[int], footprint_in: FootprintIn) -> Iterator[tuple[int, MatchedFrame]]:
+        """Yield each frame's number and what was measured of its motion.
+
+        Args:
+            frames: some of ``matched_frames``.
+            footprint_in: gives the surfaces that a camera sees, for outlines.
 
         Raises:
             CaptureInputError: the subject moved too far to be aligned; the message names the frame and the camera.
@@ -120,7 +149,7 @@ class Source(Protocol):
         """Yield each light's index and image.
 
         Args:
-            motions: coefficients of all frames that ``matched_frames`` returns.
+            motions: what was measured of all frames that ``matched_frames`` returns.
 
         Raises:
             CaptureInputError: an image cannot be read; the message names the file or frame, camera and light.

@@ -41,7 +41,7 @@ CASES = {
 }
 
 
-def render(case: Case, folder: Path, samples: int) -> Path:
+def render(case: Case, folder: Path, samples: int, pixel_mm: float = PIXEL_MM) -> Path:
     """Render a case as a folder capture; returns its folder."""
     tooth = build_jaw(case.jaw).tooth(case.fdi)
     files = {"outer": tooth.outer, "dentin": tooth.dentin}
@@ -49,7 +49,7 @@ def render(case: Case, folder: Path, samples: int) -> Path:
         write_mesh(folder / f"{name}.ply", Mesh(tooth.frame.canonical_from_world(mesh.vertices_mm), mesh.faces))
     capture = folder / "capture"
     write_phantom(
-        capture, pixel_mm=PIXEL_MM, cameras=CAMERAS, lights=LIGHTS, samples=samples, seed=case.subject,
+        capture, pixel_mm=pixel_mm, cameras=CAMERAS, lights=LIGHTS, samples=samples, seed=case.subject,
         subject=case.subject, renderer="mitsuba", outer=folder / "outer.ply",
         dentin=folder / "dentin.ply" if case.dentin else None,
     )  # fmt: skip
@@ -61,12 +61,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--names", default=",".join(CASES), help="cases, separated by commas")
     parser.add_argument("--samples", type=int, default=SAMPLES, help="paths per pixel and light")
+    parser.add_argument("--pixel-mm", type=float, default=PIXEL_MM, help="size of a pixel on the tooth")
     parser.add_argument("--out", type=Path, default=FOLDER)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.names.split(","):
         with tempfile.TemporaryDirectory() as folder:
-            pack(render(CASES[name], Path(folder), arguments.samples), arguments.out / f"{name}.npz")
+            pack(
+                render(CASES[name], Path(folder), arguments.samples, arguments.pixel_mm), arguments.out / f"{name}.npz"
+            )
         print(name, (arguments.out / f"{name}.npz").stat().st_size)
 
 

@@ -74,9 +74,9 @@ def pack(capture: Path, stored: Path) -> None:
     np.savez_compressed(stored, allow_pickle=False, text=np.array(text), **arrays)
 
 
-def read(name: str) -> Truth:
+def read(name: str, folder: Path = FOLDER) -> Truth:
     """Read a stored truth."""
-    with np.load(FOLDER / f"{name}.npz") as stored:
+    with np.load(folder / f"{name}.npz") as stored:
         text = json.loads(str(stored["text"]))
         parts = [key.removesuffix("_faces") for key in stored if key.endswith("_faces")]
         meshes = {

@@ -145,15 +145,14 @@ def _flag(files: AttemptFiles, subject: Subject, view: View, camera: int, light:
     quality = done.quality
     picture = files.folder / "quality" / f"{quality.camera}_{quality.light}.png"
     write_picture(picture, _read(files, view, "radiance", light), bits)
-    covered, error_px = view.footprint.covered, quality.motion_error_px
+    covered, moved = view.footprint.covered, (quality.motion_px, quality.motion_error_px, quality.motion_source)
     changed = {
         "quality": assess(
             quality.camera,
             quality.light,
             bits,
             covered,
-            quality.motion_px,
-            error_px,
+            moved,
             (quality.levels, quality.noise),
         ),
         "tooth_pixels": tuple(subject.pixels_of_teeth(view.footprint, bits).tolist()),

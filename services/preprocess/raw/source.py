@@ -18,9 +18,9 @@ from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import missing_exposures
 from services.preprocess.raw.view import RawView
 from services.preprocess.rig import MIN_TRACKING
-from services.preprocess.source import LightImage, Motions, View
+from services.preprocess.source import FootprintIn, LightImage, MatchedFrame, Motions, View
 from services.preprocess.stabilisation.flow_comparison import FlowComparison
-from services.preprocess.stabilisation.motion import ViewMotion, frames_to_match, group_exposures, jaws
+from services.preprocess.stabilisation.motion import Scene, ViewMotion, frames_to_match, group_exposures, jaws
 
 
 class RawSource:
@@ -93,7 +93,7 @@ class RawSource:
         table = self._table(self.description.cameras[camera].name)
         return tuple(row.index for row in frames_to_match(table, self._how))
 
-    def match(self, view: View, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    def match(self, view: View, frames: Sequence[int], footprint_in: FootprintIn) -> Iterator[tuple[int, MatchedFrame]]:
         """See ``Source``."""
         raw, taken = self._raw_view(view), self._frames_of(view.whole.name)
         together = {own[0].index: own for own in group_exposures(self._table(view.whole.name)) if own[0].light}
@@ -101,7 +101,7 @@ class RawSource:
         def picture(row: FrameRecord) -> NDArray[np.float32]:
             return raw.brightness([taken[one.index] for one in together.get(row.index, (row,))])
 
-        return raw.motion.measure(frames, picture)
+        return raw.motion.measure(frames, picture, Scene(self.description.lights, footprint_in))
 
     def flow_comparison(self, view: View, motions: Motions) -> FlowComparison | None:
         """See ``Source``."""

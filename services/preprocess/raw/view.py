@@ -18,9 +18,9 @@ from services.preprocess.raw.checks import colour_of, require_like_exposures
 from services.preprocess.raw.demosaic import channel_means, demosaic, demosaic_variance, spoiled
 from services.preprocess.raw.lens import MOSAIC_PERIOD, Sampler
 from services.preprocess.raw.memory_budget import MemoryBudget, strips
-from services.preprocess.rig import STILL_PX, UNCERTAIN_PX
+from services.preprocess.rig import STILL_PX
 from services.preprocess.source import Image, LightImage, View
-from services.preprocess.stabilisation.motion import Displacement, ViewMotion, largest_error_px
+from services.preprocess.stabilisation.motion import Displacement, ViewMotion, is_uncertain, largest_error_px
 from services.preprocess.window import Window, bands_of
 
 BoolArray = NDArray[np.bool_]
@@ -143,14 +143,13 @@ class RawView:
             radiance[rows], variance[rows], lost, beyond = _joined(parts)
             bits[rows][lost & ~beyond] = np.uint16(MaskBit.SATURATED)
             bits[rows][beyond] |= np.uint16(MaskBit.MOTION)
-        error_px = largest_error_px(moves)
-        if error_px is not None and error_px > UNCERTAIN_PX:
+        if is_uncertain(moves):
             bits |= np.uint16(MaskBit.MOTION)
         usable = (bits == 0) & self._view.footprint.covered
         colour = colour_of(frames[0], self._channels, radiance[usable])
         farthest = max(moves, key=lambda move: move.median_px)
         moved = self.motion.stored_field(farthest), farthest.median_px, any(is_warped)
-        return LightImage(radiance, variance, bits, *moved, colour, error_px)
+        return LightImage(radiance, variance, bits, *moved, colour, largest_error_px(moves), self.motion.source)
 
     def _groups(self, shots: Sequence[Shot]) -> list[list[Shot]]:
         """Group exposures that show the subject at the same place: all of them, or each on its own."""

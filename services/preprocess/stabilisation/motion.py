@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, SettingsError
+from services.core.geometry import Light
 from services.core.records import Motion
 from services.core.results import FrameRecord
 from services.preprocess.projection import Footprint
-from services.preprocess.source import Motions, View
+from services.preprocess.source import FootprintIn, MatchedFrame, Motions, MotionSource, View
 from services.preprocess.stabilisation.flow_comparison import FlowComparison, compare_flow
-from services.preprocess.stabilisation.stabilise import TERMS, Aligner, Feature, FloatArray, SurfaceFlow, interpolate
+from services.preprocess.stabilisation.null_hypothesis import decided
+from services.preprocess.stabilisation.outline import OutlineMatcher
+from services.preprocess.stabilisation.stabilise import TERMS, Aligner, FloatArray, SurfaceFlow, interpolate
 from services.preprocess.window import Window
 
 Image = NDArray[np.float32]
@@ -25,10 +28,21 @@ LIMIT_OF_EXTENT = 1 / 6
 # Margin around the view for the largest accepted motion, as a multiple of that limit and in pixels. It exceeds the
 # limit, because the limit holds for the median displacement and not for the maximum
 REACH_OF_LIMIT, REACH_PX = 1.25, 8
+# Smallest reach of the search for an outline, pixels: small teeth are sought for at least as far as a subject moves
+MIN_REACH_PX = 4.0
 # Largest number of pixels at which a displacement field is stored
 STORED_PIXELS = 250_000
 # Approximate number of pixels from which the median displacement is computed
 MEDIAN_PIXELS = 20_000
+# Smallest standard error of a motion by tracking frames, pixels: what known warps of real photographs leave
+TRACKING_ERROR_PX = 0.03
+# Largest estimated error of a motion interpolated between three tracking frames or more, pixels; an image made from a
+# less certain frame is masked
+UNCERTAIN_PX = 0.5
+# Share of a camera's images beyond which they are most of them
+MOST = 0.5
+# Least number of tracking frames whose interpolation has an error estimate good enough to mask images by
+JUDGED_KNOTS = 3
 
 
 def stored_step(shape: tuple[int, int]) -> int:
@@ -45,9 +59,9 @@ def jaws(fdi: Sequence[int]) -> list[list[int]]:
 def frames_to_match(frames: Sequence[FrameRecord], motion: Motion) -> tuple[FrameRecord, ...]:
     """Frames whose motion is measured: the tracking frames, which share one light, or else one frame for each light.
 
-    With fewer than two tracking frames and ``auto`` every light is matched to the first frame by its edges. Of
+    With fewer than two tracking frames and ``auto`` the outline of the teeth is looked for under every light. Of
     consecutive exposures of one light the first represents all. A short exposure may be all noise and a long one
-    saturated, so that neither shows an edge, and the subject hardly moves between them. A subject that cannot move
+    saturated, so that neither shows an outline, and the subject hardly moves between them. A subject that cannot move
     needs no frame.
 
     Raises:
@@ -78,25 +92,45 @@ class Displacement:
     Attributes:
         coefficients: (bodies, TERMS, 2), pixels.
         median_px: median length over a jaw's teeth, of the jaw that moved most.
-        error_px: estimated error of the interpolation in time; None where it cannot be estimated, 0 for a subject that
-            is stated not to move.
+        error_px: standard error of either component; 0 for a subject that is stated not to move.
+        uncertain: whether an image with this motion is to be masked.
     """
 
     coefficients: FloatArray
     median_px: float
-    error_px: float | None
+    error_px: float
+    uncertain: bool = False
 
 
-def largest_error_px(moves: Iterable[Displacement]) -> float | None:
-    """Largest error that could be estimated of some displacements; None where none could."""
-    return max((move.error_px for move in moves if move.error_px is not None), default=None)
+@dataclass(frozen=True)
+class Scene:
+    """What an outline is compared with.
+
+    Attributes:
+        lights: lights of the capture.
+        footprint_in: gives the surfaces that a camera sees.
+    """
+
+    lights: Sequence[Light]
+    footprint_in: FootprintIn
+
+
+def largest_error_px(moves: Sequence[Displacement]) -> float:
+    """Largest standard error of some displacements."""
+    return max(move.error_px for move in moves)
+
+
+def is_uncertain(moves: Sequence[Displacement]) -> bool:
+    """Whether an image made from frames with these displacements is to be masked."""
+    return any(move.uncertain for move in moves)
 
 
 class ViewMotion:
     """Motion of the subject relative to the first frame, for every light frame.
 
     It is measured between tracking frames and interpolated over the frame number, because frames are triggered at even
-    intervals and the number does not depend on the host's clock.
+    intervals and the number does not depend on the host's clock. Without tracking frames a light's images stay where
+    they are unless the outline of the teeth tells otherwise.
     """
 
     def __init__(
@@ -113,6 +147,9 @@ class ViewMotion:
         self._view = view
         self._matched = frames_to_match(frames, motion)
         self._interpolated = bool(self._matched) and self._matched[0].kind == "tracking"
+        measured: MotionSource = "tracking" if self._interpolated else "outline"
+        self.source: MotionSource = measured if self._matched else "stated still"
+        """What the motion is known from."""
         self._representative = {frame.index: own[0].index for own in group_exposures(frames) for frame in own}
         visible = [np.isin(view.footprint.mesh, list(meshes)) for meshes in bodies]
         sides_px = [_shorter_side(one) for one in visible if one.any()]
@@ -123,6 +160,8 @@ class ViewMotion:
         embedded = _embedded(view.footprint, self.window.shape, self._inner)
         flows = [SurfaceFlow(embedded, meshes, view.scratch_file(f"relief-{k}")) for k, meshes in enumerate(bodies)]
         self._bodies = [body for body in flows if body.visible.any()]
+        self._meshes = [meshes for body, meshes in zip(flows, bodies, strict=True) if body.visible.any()]
+        self._reach_px = max(REACH_OF_LIMIT * LIMIT_OF_EXTENT * max(sides_px, default=0), MIN_REACH_PX)
         # Compute medians from evenly strided pixels only
         self._step = max(1, int(np.sqrt(np.prod(view.window.shape) / MEDIAN_PIXELS)))
 
@@ -130,14 +169,16 @@ class ViewMotion:
         self,
         frames: Sequence[int],
         picture: Callable[[FrameRecord], NDArray[np.generic]],
+        scene: Scene,
         level: float = 0.0,
-    ) -> Iterator[tuple[int, FloatArray]]:
-        """Yield each frame's number and the coefficients (bodies, TERMS, 2) of its displacement.
+    ) -> Iterator[tuple[int, MatchedFrame]]:
+        """Yield each frame's number and what was measured of its motion.
 
         Args:
             frames: numbers of some of ``frames_to_match``.
             picture: gives the values (H, W) or (H, W, C) of a frame, or of the frames that it represents, in
                 ``window``; they are linear in light above ``level``.
+            scene: what outlines are compared with.
             level: value of a pixel without light.
 
         Raises:
@@ -145,15 +186,17 @@ class ViewMotion:
         """
         if not frames:
             return
+        if not self._interpolated:
+            yield from self._outlines(frames, picture, scene, level)
+            return
         first = self._matched[0]
-        feature: Feature = "texture" if self._interpolated else "edges"
         reference = picture(first)
-        aligners = [Aligner(body, reference, feature, level) for body in self._bodies]
+        aligners = [Aligner(body, reference, level) for body in self._bodies]
         for frame in self._matched:
             if frame.index not in frames:
                 continue
             if frame.index == first.index:
-                yield frame.index, np.zeros((len(self._bodies), TERMS, 2))
+                yield frame.index, MatchedFrame(np.zeros((len(self._bodies), TERMS, 2)))
                 continue
             image = picture(frame)
             found = np.asarray([aligner.solve(image) for aligner in aligners]).reshape(-1, TERMS, 2)
@@ -165,28 +208,70 @@ class ViewMotion:
                         f"light {frame.light or 'all'}), more than the {limit:.1f} px that can be aligned; "
                         "capture again with the head supported."
                     )
-            yield frame.index, found
+            yield frame.index, MatchedFrame(found)
+
+    def _outlines(
+        self,
+        frames: Sequence[int],
+        picture: Callable[[FrameRecord], NDArray[np.generic]],
+        scene: Scene,
+        level: float,
+    ) -> Iterator[tuple[int, MatchedFrame]]:
+        camera, place_mm = self.window.cropped(self._view.whole), {one.name: one.position_mm for one in scene.lights}
+        matchers = [
+            OutlineMatcher(camera, meshes, body.visible, self._reach_px, scene.footprint_in)
+            for body, meshes in zip(self._bodies, self._meshes, strict=True)
+        ]
+        for frame in self._matched:
+            if frame.index not in frames:
+                continue
+            assert frame.light is not None
+            image = picture(frame)
+            found = [matcher.match(image, place_mm[frame.light], level) for matcher in matchers]
+            coefficients = np.zeros((len(self._bodies), TERMS, 2))
+            coefficients[:, 0] = np.reshape([one.shift_px for one in found], (-1, 2))
+            errors_px, arcs_px = tuple(one.error_px for one in found), tuple(one.arcs_px for one in found)
+            yield frame.index, MatchedFrame(coefficients, errors_px, arcs_px)
 
     def at(self, frame: FrameRecord, motions: Motions) -> Displacement:
         """Displacement of one frame.
 
         Args:
             frame: any frame of the capture.
-            motions: coefficients of all ``frames_to_match``.
+            motions: what was measured of all ``frames_to_match``.
         """
         if not self._matched:
             return Displacement(np.zeros((len(self._bodies), TERMS, 2)), 0.0, 0.0)
+        if not self._interpolated:
+            return self._by_outline(frame, motions)
         index = np.array([matched.index for matched in self._matched], dtype=np.float64)
-        if self._interpolated:
-            knots = np.stack([motions[matched.index] for matched in self._matched])
-            coefficients, error = interpolate(index, knots, float(frame.index))
-        else:
-            coefficients = motions[self._representative[frame.index]]
-            error = np.zeros_like(coefficients)
+        knots = np.stack([motions[matched.index].coefficients for matched in self._matched])
+        coefficients, error = interpolate(index, knots, float(frame.index))
         medians = [self._median(body, c) for body, c in zip(self._bodies, coefficients, strict=True)]
         # Take the error of the shift as that of the field, because the other terms are small beside it
-        error_px = float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
-        return Displacement(coefficients, max(medians, default=0.0), error_px or None)
+        interpolation_px = float(np.linalg.norm(error[:, 0], axis=-1).max(initial=0.0))
+        error_px = float(np.hypot(interpolation_px, TRACKING_ERROR_PX))
+        uncertain = len(knots) >= JUDGED_KNOTS and interpolation_px > UNCERTAIN_PX
+        return Displacement(coefficients, max(medians, default=0.0), error_px, uncertain)
+
+    def _by_outline(self, frame: FrameRecord, motions: Motions) -> Displacement:
+        own = [matched.index for matched in self._matched].index(self._representative[frame.index])
+        coefficients, errors, uncertain = np.zeros((len(self._bodies), TERMS, 2)), [0.0], False
+        for number in range(len(self._bodies)):
+            found = [motions[matched.index] for matched in self._matched]
+            measured_px = np.array([one.error_px[number] for one in found])
+            shifts, error_px = decided(
+                np.array([one.coefficients[number, 0] for one in found]),
+                measured_px,
+                np.array([one.arcs_px[number] for one in found]),
+            )
+            # An image without the outline that most others show is masked. Where most show none, nothing tells a motion
+            is_known = np.isfinite(measured_px)
+            uncertain |= bool(not is_known[own] and is_known.mean() > MOST)
+            coefficients[number, 0] = shifts[own]
+            errors.append(float(error_px[own]))
+        medians = np.linalg.norm(coefficients[:, 0], axis=-1)
+        return Displacement(coefficients, float(medians.max(initial=0.0)), max(errors), uncertain)
 
     def positions(self, displacement: Displacement, rows: slice) -> Image:
         """Positions in a frame of some rows of the view: x and y (2, rows, width) as indices into ``window``."""
@@ -205,7 +290,7 @@ class ViewMotion:
 
         Args:
             picture: gives the values of a frame in ``window``.
-            motions: coefficients of all ``frames_to_match``.
+            motions: what was measured of all ``frames_to_match``.
         """
         if not self._interpolated or len(self._matched) < 2 or not self._bodies:
             return None

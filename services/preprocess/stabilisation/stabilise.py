@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,16 +27,12 @@ FloatArray = NDArray[np.float64]
 
 # Number of terms of a displacement field: 1, x, y, relief, x², xy, y²
 TERMS = 7
-Feature = Literal["texture", "edges"]
-# Prior standard deviations of the terms after the shift, between frames under the same light, as fractions of the
-# body's shorter side; the shift has no prior. A nod or turn by a few degrees moves a tooth's outline by this much.
+# Prior standard deviations of the terms after the shift, as fractions of the body's shorter side; the shift has no
+# prior. A nod or turn by a few degrees moves a tooth's outline by this much.
 PRIOR_SHARE = (0.02, 0.02, 0.02, 0.007, 0.007, 0.007)
 # Number of pixels that count as one observation. Features are made with Gaussians of 2 px, so that residuals of about
 # 4π 2² pixels are correlated
 CORRELATED_PX = 50.0
-# Ridge of each term between frames under different lights, relative to the mean curvature of the cost. Only edges of
-# the lit side remain then, so all terms but the shift are held near zero
-EDGE_RIDGE = (0, 10, 10, 100, 100, 100, 100)
 # Largest number of pixels of a frame that is reduced for matching: those of 20 megapixels at the fit's 1/5 resolution
 SOLVE_PIXELS = 800_000
 # Largest number of evenly strided pixels that are matched at each level: a few coefficients need no more
@@ -148,19 +143,17 @@ class Aligner:
 
     Args:
         flow: the body's possible displacements.
-        reference: (H, W) or (H, W, C), the reference frame, linear in light.
-        feature: ``texture`` between frames under the same light, ``edges`` between different lights.
+        reference: (H, W) or (H, W, C), the reference frame, linear in light, under the light of all frames.
         level: value of a pixel without light.
     """
 
-    def __init__(self, flow: SurfaceFlow, reference: NDArray[np.generic], feature: Feature, level: float = 0.0) -> None:
-        self._feature: Feature = feature
+    def __init__(self, flow: SurfaceFlow, reference: NDArray[np.generic], level: float = 0.0) -> None:
         self._zero = level
         self._extent_px = flow.extent_px
         self._factor = int(np.ceil(np.sqrt(reference.shape[0] * reference.shape[1] / SOLVE_PIXELS)))
         region, terms = flow.reduced(self._factor)
         self._levels = []
-        for number, image in enumerate(_pyramid(reduce_grey(reference, self._factor, level), feature)):
+        for number, image in enumerate(_pyramid(reduce_grey(reference, self._factor, level))):
             if number:
                 region, terms = (
                     _halve(region.astype(np.float32)) > 0.5,
@@ -181,7 +174,7 @@ class Aligner:
 
         coefficients = np.zeros((TERMS, 2))
         grey = reduce_grey(frame, self._factor, self._zero)
-        for level, moving in reversed(list(zip(self._levels, _pyramid(grey, self._feature), strict=True))):
+        for level, moving in reversed(list(zip(self._levels, _pyramid(grey), strict=True))):
             y, x = np.mgrid[0 : moving.shape[0], 0 : moving.shape[1]].astype(np.float32)
             basis = level.terms.reshape(-1, TERMS)[level.matched] / level.pixel_px
             fixed_x, fixed_y = _gradient(level.feature)
@@ -201,7 +194,7 @@ class Aligner:
                 weight = 1 / (1 + (residual / scale) ** 2) ** 2
                 jacobian = np.concatenate([slope[:, :1] * basis, slope[:, 1:] * basis], axis=1).astype(np.float64)
                 hessian = (jacobian * weight[:, None]).T @ jacobian
-                damping = self._damping(scale, hessian)
+                damping = self._damping(scale)
                 gradient = (jacobian * weight[:, None]).T @ residual + damping * coefficients.T.ravel()
                 update = -np.linalg.solve(hessian + np.diag(damping), gradient).reshape(2, TERMS).T
                 coefficients = coefficients + update
@@ -209,14 +202,12 @@ class Aligner:
                     break
         return coefficients
 
-    def _damping(self, scale: float, hessian: FloatArray) -> FloatArray:
+    def _damping(self, scale: float) -> FloatArray:
         """Diagonal (2 TERMS,) added to the cost's Hessian, which pulls each term towards zero, in ``scale``² per px².
 
-        Between frames of one light the result is the maximum a posteriori estimate: residuals have the standard
-        deviation ``scale``, and terms that the image does not determine stay near zero.
+        The result is the maximum a posteriori estimate: residuals have the standard deviation ``scale``, and terms that
+        the image does not determine stay near zero.
         """
-        if self._feature == "edges":
-            return np.asarray(np.tile(EDGE_RIDGE, 2) * np.trace(hessian) / (2 * TERMS) + 1e-12)
         precision = np.concatenate([[0], (self._extent_px * np.asarray(PRIOR_SHARE)) ** -2.0])
         return np.asarray(CORRELATED_PX * scale**2 * np.tile(precision, 2) + 1e-12)
 
@@ -225,7 +216,8 @@ def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[Flo
     """Interpolate values at ``time`` by the cubic through the four nearest knots, and estimate the error.
 
     The error estimate is the difference to the parabola through the three nearest knots, which is larger than the
-    cubic's own error where motion is smooth. With fewer than three knots it is zero, because nothing is known.
+    cubic's own error where motion is smooth. With fewer knots both curves are of a lower degree, and for a single knot
+    the error is zero.
 
     Args:
         times: (K,) distinct knots. values: (K, ...). time: time of the result.
@@ -235,7 +227,7 @@ def interpolate(times: FloatArray, values: FloatArray, time: float) -> tuple[Flo
     """
     nearest = np.argsort(np.abs(times - time), kind="stable")[:4]
     full = _lagrange(times[nearest], values[nearest], time)
-    if len(nearest) < 3:
+    if len(nearest) < 2:
         return full, np.zeros_like(full)
     return full, np.abs(full - _lagrange(times[nearest[:-1]], values[nearest[:-1]], time))
 
@@ -261,19 +253,13 @@ def warp(image: NDArray[np.generic], displacement: Image) -> Image:
     ).reshape(image.shape)
 
 
-def _features(image: Image, feature: Feature) -> Image:
-    """Features (H, W) of an image that do not depend on the change of light between the compared frames.
-
-    ``texture``: local mean and contrast are removed, so that slow shading has little weight, and outlines and stains
-    have equal weight. ``edges``: gradient magnitude relative to its neighbourhood, so that neither the sign nor the
-    size of an edge matters.
+def _features(image: Image) -> Image:
+    """Features (H, W) of an image: local mean and contrast are removed, so that slow shading has little weight, and
+    outlines and stains have equal weight.
     """
     import cv2
 
     peak = float(image.max()) or 1.0
-    if feature == "edges":
-        slope = np.hypot(*_gradient(cv2.GaussianBlur(image, (0, 0), 1)))
-        return np.asarray(slope / (cv2.GaussianBlur(slope, (0, 0), 3) + 2.5e-4 * peak), dtype=np.float32)
     detail = image - cv2.GaussianBlur(image, (0, 0), 2)
     contrast = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), 2) + (0.02 * peak) ** 2)
     return np.asarray(detail / contrast, dtype=np.float32)
@@ -297,9 +283,9 @@ def reduce_grey(image: NDArray[np.generic], factor: int, level: float = 0.0) -> 
     return grey
 
 
-def _pyramid(image: Image, feature: Feature) -> list[Image]:
+def _pyramid(image: Image) -> list[Image]:
     """Pyramid of the image's features, halved while their shorter side has at least 40 pixels."""
-    levels = [_features(image, feature)]
+    levels = [_features(image)]
     while min(levels[-1].shape) >= 40:
         levels.append(_halve(levels[-1]))
     return levels

@@ -148,7 +148,7 @@ class AttemptFiles:
     def motions(self, camera: int, frames: tuple[int, ...]) -> Motions:
         """Motions of those of the given frames for which they have been written."""
         found = {frame: _read(self.scratch(camera) / f"motion-{frame}.json", FrameMotion) for frame in frames}
-        return {frame: np.asarray(one.coefficients) for frame, one in found.items() if one is not None}
+        return {frame: one.matched() for frame, one in found.items() if one is not None}
 
     def put_flow(self, camera: int, done: FlowDone) -> None:
         """Record that a camera's optical flow was computed and its pictures are written."""

@@ -82,9 +82,8 @@ class Block:
         view = self.files.view(self.camera, source.description.cameras[self.camera])
         assert view is not None, "blocks that need a view wait for it"
         if self.step == "match":
-            for frame, coefficients in source.match(view, self.items):
-                motion = FrameMotion(coefficients=coefficients.tolist())
-                self.files.put_motion(self.camera, frame, motion)
+            for frame, matched in source.match(view, self.items, subject.footprint_in):
+                self.files.put_motion(self.camera, frame, FrameMotion.of(matched))
                 context.raise_if_cancelled()
             return
         if self.step == "shade":
@@ -188,9 +187,9 @@ class ImageWriter:
         write_picture(picture, image.radiance, bits)
         has_value = footprint.covered & (bits & NO_VALUE == 0)
         stops = by_stop(image.radiance, image.variance, has_value)
-        moved = image.motion_px, image.motion_error_px
+        moved = image.motion_px, image.motion_error_px, image.motion_source
         return ImageDone(
-            quality=assess(camera.name, lamp.name, bits, footprint.covered, *moved, stops),
+            quality=assess(camera.name, lamp.name, bits, footprint.covered, moved, stops),
             tooth_pixels=tuple(self.subject.pixels_of_teeth(footprint, bits).tolist()),
             light=image_light,
             colour=image.colour,

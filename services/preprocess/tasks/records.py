@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 from pydantic import Field
 
 from services.core.files.object_store import StoredObject
@@ -9,6 +12,7 @@ from services.core.geometry import Record
 from services.preprocess.brightness import ImageLight
 from services.preprocess.colours import FrameColour
 from services.preprocess.quality import CameraFlow, ImageQuality
+from services.preprocess.source import MatchedFrame
 from services.preprocess.window import Window
 
 
@@ -26,8 +30,25 @@ class FrameMotion(Record):
     """Record of one frame's measured motion."""
 
     coefficients: tuple[tuple[tuple[float, float], ...], ...] = Field(
-        description="(bodies, terms, 2) of the displacement in pixels since the first frame"
+        description="(bodies, terms, 2) of the displacement in pixels"
     )
+    error_px: tuple[float | None, ...] = Field(
+        default=(), description="standard error of an outline's translation, by body; null where nothing is known"
+    )
+    arcs_px: tuple[tuple[tuple[float, float], tuple[float, float]], ...] = Field(
+        default=(), description="an outline's translation by its odd and its even arcs, by body"
+    )
+
+    @classmethod
+    def of(cls, matched: MatchedFrame) -> FrameMotion:
+        """Record what was measured."""
+        errors_px = tuple(error if math.isfinite(error) else None for error in matched.error_px)
+        return cls(coefficients=matched.coefficients.tolist(), error_px=errors_px, arcs_px=matched.arcs_px)
+
+    def matched(self) -> MatchedFrame:
+        """Return what was measured."""
+        errors_px = tuple(math.inf if error is None else error for error in self.error_px)
+        return MatchedFrame(np.asarray(self.coefficients), errors_px, self.arcs_px)
 
 
 class FlowDone(Record):

@@ -14,7 +14,7 @@ from services.core.stage import StageContext, StageEvent
 from services.core.store import write_record
 from services.preprocess.brightness import Brightness
 from services.preprocess.colours import require_like_colours
-from services.preprocess.quality import QualityReport, unusable_note
+from services.preprocess.quality import QualityReport, moved_note, unusable_note
 from services.preprocess.quality_page import write_page
 from services.preprocess.source import Source
 from services.preprocess.subject import Subject
@@ -76,7 +76,7 @@ def summarise(
     fdi = tuple(tooth.fdi for tooth in subject.teeth)
     # Collect the notes that sources made while they read, each once
     source_notes = dict.fromkeys([*source.notes, *(note for done in images for note in done.notes)])
-    notes = [*source_notes, *brightness.notes(), *unusable_note(reports)]
+    notes = [*source_notes, *brightness.notes(), *unusable_note(reports), *moved_note(reports)]
     if hidden := [str(number) for number, count in zip(fdi, tooth_pixels, strict=True) if count == 0]:
         notes.append(f"No image has a valid pixel of tooth {', '.join(hidden)}; nothing will be known of it.")
     if subject.surroundings:

@@ -73,7 +73,7 @@ def test_colour_counts_of_three_exposures_become_radiance_with_its_variance(text
     subject = read_subject(source.root, whole=False)
     for k, camera in enumerate(source.description.cameras):
         view = subject.view_of(k, camera)
-        motions = dict(source.match(view, source.matched_frames(k)))
+        motions = dict(source.match(view, source.matched_frames(k), subject.footprint_in))
         for j, image in source.images(view, source.lights_of(k), motions):
             truth = np.load(textured / f"c{k}_l{j}.npy")[view.window.rows, view.window.columns]
             assert image.motion_px is not None
@@ -99,11 +99,12 @@ def test_exposures_that_show_nothing_move_no_subject(
     for name, exposures_s in (("one", (0.05,)), ("several", tuple(sorted((0.05, *others_s))))):
         write_raw_capture(tmp_path / name, textured, Sensor(), exposures_s, tracking=0)
         source = RawSource(tmp_path / name, None, 0.01, 0.002)
-        view = read_subject(source.root, whole=False).view_of(0, source.description.cameras[0])
-        motions = dict(source.match(view, source.matched_frames(0)))
+        subject = read_subject(source.root, whole=False)
+        view = subject.view_of(0, source.description.cameras[0])
+        motions = dict(source.match(view, source.matched_frames(0), subject.footprint_in))
         assert len(motions) == 3
         assert all(image.motion_px is not None for _, image in source.images(view, (0, 1, 2), motions))
-        found.append([coefficients[:, 0] for coefficients in motions.values()])
+        found.append([matched.coefficients[:, 0] for matched in motions.values()])
     one, several = found
     assert np.abs(np.subtract(one, several)).max() < 0.1
 
