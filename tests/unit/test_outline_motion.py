@@ -98,6 +98,14 @@ def test_where_no_image_shows_an_outline_nothing_moves_or_is_masked() -> None:
     assert all(move.median_px == 0 and not move.uncertain and move.error_px >= MOVED_PX for move in displacements(flat))
 
 
+def test_a_body_of_a_few_pixels_tells_nothing() -> None:
+    camera = first_camera()
+    visible = np.zeros(camera.size[::-1], dtype=bool)
+    visible[10:14, 10:15] = True
+    matcher = OutlineMatcher(camera, [0], visible, MIN_REACH_PX, surfaces)
+    assert matcher.match(canine().mean["c0"][0], lights()[0].position_mm).error_px == np.inf
+
+
 def test_gain_and_black_level_do_not_matter() -> None:
     image = canine().mean["c0"][1]
     camera = first_camera()

@@ -40,7 +40,7 @@ TRACKING_ERROR_PX = 0.03
 # less certain frame is masked
 UNCERTAIN_PX = 0.5
 # Share of a camera's images beyond which they are most of them
-MOST = 0.5
+MAJORITY = 0.5
 # Least number of tracking frames whose interpolation has an error estimate good enough to mask images by
 JUDGED_KNOTS = 3
 
@@ -267,7 +267,7 @@ class ViewMotion:
             )
             # An image without the outline that most others show is masked. Where most show none, nothing tells a motion
             is_known = np.isfinite(measured_px)
-            uncertain |= bool(not is_known[own] and is_known.mean() > MOST)
+            uncertain |= bool(not is_known[own] and is_known.mean() > MAJORITY)
             coefficients[number, 0] = shifts[own]
             errors.append(float(error_px[own]))
         medians = np.linalg.norm(coefficients[:, 0], axis=-1)

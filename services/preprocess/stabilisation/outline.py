@@ -41,7 +41,7 @@ SEARCH_STEP_PX = 2
 """Distance between the translations that are tried first, pixels of the coarsest image: less than the basin of the
 right one, which is about as wide as the band."""
 SEARCHED_OF = 3
-"""Every which pixel counts in the search: two images of a tooth differ at hundreds of them."""
+"""One pixel in so many counts in the search: two images of a tooth differ at hundreds of pixels."""
 ITERATIONS = 12
 """Largest number of steps in one image; three to five are taken."""
 DIFFERENCE_PX = 0.25
@@ -59,6 +59,8 @@ MIN_ERROR_PX = 0.1
 MAX_UNEXPLAINED = 0.25
 """Largest mean square that the outline leaves, as a share of what a cubic polynomial of the place leaves, which knows
 of no outline. With more there is none to be seen where it is looked for. Teeth before a dark ground leave 0.01."""
+MIN_BODY_PX = 8
+"""Smallest longer side of a body whose outline is looked for."""
 MIN_PIXELS_PER_TERM = 6
 """Smallest number of compared pixels for each term; an image with fewer tells no translation. Some teeth that are 10
 pixels wide have 4, and one image in twenty is then a pixel off."""
@@ -77,6 +79,9 @@ class OutlineShift:
     """Standard error of either component; infinite where no outline is to be seen within reach."""
     arcs_px: tuple[tuple[float, float], tuple[float, float]]
     """The same translation by the odd and by the even arcs alone."""
+
+
+NOT_SEEN = OutlineShift(np.zeros(2), np.inf, ((0.0, 0.0), (0.0, 0.0)))
 
 
 class OutlineMatcher:
@@ -100,6 +105,9 @@ class OutlineMatcher:
     ) -> None:
         """Sample the surface for each reduced image."""
         extent_px = float(max(np.ptp(np.flatnonzero(visible.any(axis=axis))) + 1 for axis in (0, 1)))
+        self._templates: list[_Template] = []
+        if extent_px < MIN_BODY_PX:
+            return
         finest = max(1, int(np.ceil(extent_px / FINEST_PX)))
         factors = [finest]
         while extent_px / factors[0] >= COARSEST_PX:
@@ -121,6 +129,8 @@ class OutlineMatcher:
             light_mm: position of the only light.
             level: value of a pixel without light.
         """
+        if not self._templates:
+            return NOT_SEEN
         shift_px = np.zeros(2)
         own = image[self._part.rows, self._part.columns]
         for template in self._templates:
@@ -254,7 +264,7 @@ class _LitTemplate:
         is_seen = left < MAX_UNEXPLAINED * _left_without_outline(grey, pixels)
         is_within = np.abs(shift).max() < self._template.reach - 1
         if not (is_seen and is_within) or len(design) < MIN_PIXELS_PER_TERM * design.shape[1]:
-            return OutlineShift(np.zeros(2), np.inf, ((0.0, 0.0), (0.0, 0.0)))
+            return NOT_SEEN
         arcs = (float(odd[0]), float(odd[1])), (float(even[0]), float(even[1]))
         return OutlineShift(shift * factor, error * factor, arcs)
 
