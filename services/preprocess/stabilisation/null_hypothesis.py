@@ -31,12 +31,13 @@ def decided(shifts_px: FloatArray, errors_px: FloatArray, arcs_px: FloatArray) -
 
     Returns:
         Displacements (L, 2), zero for all images that are taken for still, and standard errors (L,) by component. An
-        image of which nothing is known keeps its place with an error of ``MOVED_PX``.
+        image of which little or nothing is known keeps its place with an error of ``MOVED_PX``.
     """
     known = np.isfinite(errors_px)
     errors = np.where(known, errors_px, MOVED_PX)
-    # The place of the still images is that of the first known one, and then the mean of all that are near it
-    first = int(np.argmax(known))
+    # The place of the still images is that of the first well known one, and then the mean of all that are near it
+    is_certain = errors <= np.maximum(MOVED_PX, np.where(known, errors, np.inf).min())
+    first = int(np.argmax(known & is_certain))
     place, place_error = shifts_px[first], float(errors[first])
     for _ in range(2):
         near = known & ~_is_far(shifts_px - place, np.hypot(errors, place_error))
@@ -44,10 +45,12 @@ def decided(shifts_px: FloatArray, errors_px: FloatArray, arcs_px: FloatArray) -
         weight = errors[near] ** -2.0
         place, place_error = weight @ shifts_px[near] / weight.sum(), float(weight.sum() ** -0.5)
     total, displacement = np.hypot(errors, place_error), shifts_px - place
-    moved = known & _is_far(displacement, total) & _do_arcs_agree(displacement, arcs_px - place)
-    moved[first] = False
+    is_far = known & _is_far(displacement, total)
+    is_far[first] = False
+    moved = is_far & _do_arcs_agree(displacement, arcs_px - place)
+    total = np.where(moved, total, np.minimum(total, MOVED_PX))
     # Where both halves of an outline do not agree on a motion, the image stays and its error tells the doubt
-    doubt = np.where(known & ~moved, np.linalg.norm(displacement, axis=-1) / MOVED_ERRORS, 0.0)
+    doubt = np.where(is_far & ~moved, np.linalg.norm(displacement, axis=-1) / MOVED_ERRORS, 0.0)
     return np.where(moved[:, None], displacement, 0.0), np.maximum(total, doubt)
 
 

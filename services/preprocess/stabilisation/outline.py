@@ -51,9 +51,15 @@ CONVERGED_PX = 0.01
 RIDGE = 1e-3
 """Prior standard deviation of a term's coefficient is the image's size over this; it keeps terms that hardly differ
 near the outline from cancelling each other."""
-ERROR_OF_RESIDUAL = 3.0
+ERROR_OF_RESIDUAL = 4.0
 """Standard error of the translation over that by the residuals. What the terms do not describe shifts all of an outline
-alike and so leaves less residual than error: over static images by another renderer the ratio is 2 to 3.4."""
+alike and so leaves less residual than error: over static images by another renderer the ratio of their rms is 2 to 3.4,
+and single opaque teeth in a hundred lie 4 residual errors off."""
+MIN_LIT_SHARE = 1 / 6
+"""Smallest share of the visible surface that a light from behind has to reach for the outline to tell a translation.
+With less an opaque tooth is a bright crescent, whose width its gloss sets: such images lie up to 1.7 px off."""
+UNLIT_ERROR_PX = 1e3
+"""Standard error of an outline that its light does not reach: it tells nothing, but it is no sign of a fault either."""
 MIN_ERROR_PX = 0.1
 """Smallest standard error, pixels of the last reduced image: the errors that opaque static subjects leave."""
 MAX_UNEXPLAINED = 0.25
@@ -76,7 +82,7 @@ class OutlineShift:
     shift_px: FloatArray
     """x and y (2,), pixels."""
     error_px: float
-    """Standard error of either component; infinite where no outline is to be seen within reach."""
+    """Standard error of either component; infinite where a lit outline is not to be seen within reach."""
     arcs_px: tuple[tuple[float, float], tuple[float, float]]
     """The same translation by the odd and by the even arcs alone."""
 
@@ -193,22 +199,23 @@ class _Template:
     def under(self, light_mm: tuple[float, float, float]) -> _LitTemplate:
         """Terms of an image under one light."""
         irradiance = expected_irradiance(self._points_mm, self._normal, light_mm, None)
+        lit_share = float((irradiance[self._body] > 0).mean())
         irradiance /= max(float(irradiance.max()), 1e-30)
         body, other = self._body[..., None].astype(np.float32), self._other[..., None].astype(np.float32)
         linear = np.stack([np.ones_like(irradiance), *self._place], axis=-1)
         parts = [body * self._shading * irradiance[..., None], body * self._shading, (1 - body - other) * linear]
         if self._other.any():
             parts += [other * linear, other * irradiance[..., None]]
-        return _LitTemplate(self, np.concatenate(parts, axis=-1))
+        return _LitTemplate(self, np.concatenate(parts, axis=-1), lit_share)
 
 
 class _LitTemplate:
     """Terms of a reduced image under one light, each the mean over a pixel at any translation."""
 
-    def __init__(self, template: _Template, terms: NDArray[np.float32]) -> None:
+    def __init__(self, template: _Template, terms: NDArray[np.float32], lit_share: float) -> None:
         import cv2
 
-        self._template = template
+        self._template, self._lit_share = template, lit_share
         side = (template.samples, template.samples)
         # Each sample holds the mean over the pixel that begins there
         means = [cv2.blur(np.ascontiguousarray(term), side, anchor=(0, 0)) for term in np.moveaxis(terms, -1, 0)]
@@ -263,6 +270,8 @@ class _LitTemplate:
         error = max(ERROR_OF_RESIDUAL * float(np.sqrt(np.trace(covariance) / 2)), MIN_ERROR_PX)
         is_seen = left < MAX_UNEXPLAINED * _left_without_outline(grey, pixels)
         is_within = np.abs(shift).max() < self._template.reach - 1
+        if self._lit_share < MIN_LIT_SHARE:
+            return OutlineShift(np.zeros(2), UNLIT_ERROR_PX, NOT_SEEN.arcs_px)
         if not (is_seen and is_within) or len(design) < MIN_PIXELS_PER_TERM * design.shape[1]:
             return NOT_SEEN
         arcs = (float(odd[0]), float(odd[1])), (float(even[0]), float(even[1]))
