@@ -92,6 +92,7 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
             is_logged=True,
             before=lambda: jobs.require_slot(events.job),
             phantoms=phantoms,
+            is_cancelled=lambda: jobs.is_cancelled(events.job),
         )
 
     def run_with_dome(spec: JobSpec, folder: Path, events: EventAddress) -> None:

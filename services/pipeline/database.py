@@ -42,6 +42,9 @@ password is part of the URL."""
 PATIENCE_S = 600.0
 """Longest time, s, that a process at work on a job waits for a database that does not answer."""
 
+DISK_FULL = "53100"
+"""Postgres' code of the error that says that its disk is full."""
+
 T = TypeVar("T")
 metadata = sql.MetaData()
 
@@ -143,6 +146,12 @@ def retry_while_lost(call: Callable[[], T], seconds: float = PATIENCE_S) -> T:
         )
 
     return stamina.RetryingCaller(attempts=None, timeout=seconds, wait_initial=0.1, wait_max=2.0)(is_lost, call)
+
+
+def is_full(problem: BaseException) -> bool:
+    """Whether a database has refused a write because its disk is full."""
+    cause = getattr(problem, "orig", None)
+    return getattr(cause, "sqlite_errorname", None) == "SQLITE_FULL" or getattr(cause, "sqlstate", None) == DISK_FULL
 
 
 class Query:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from services.core.errors import JobCancelledError, WorkerLostError
@@ -15,6 +14,7 @@ from services.core.stage import CANCEL_FLAG
 from services.pipeline.database import retry_while_lost
 from services.pipeline.event_log import EventLog
 from services.pipeline.stage_task import StageTask
+from services.pipeline.stopping import stop_tasks
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -27,8 +27,8 @@ POLL_S = 0.25
 RESTART_INTERVAL_S = 10.0
 """Interval, s, at which workers that Dask has given up are started again."""
 GRACE_S = 5.0
-"""Time, s, within which a cancelled stage must stop before its worker is stopped. The end of a capture is always
-awaited, because the capture darkens the dome."""
+"""Time, s, within which a cancelled stage must stop before its tasks are stopped, and after which this is repeated. The
+end of a capture is always awaited, because the capture darkens the dome."""
 
 
 class Watch:
@@ -46,11 +46,23 @@ class Watch:
             self._after = new[-1].id
 
 
-def follow_stage(client: Client, restart_lost_workers: Callable[[], None], task: StageTask, watch: Watch) -> None:
+def never() -> bool:
+    """Say that no cancel waits for disk."""
+    return False
+
+
+def follow_stage(
+    client: Client,
+    restart_lost_workers: Callable[[], None],
+    task: StageTask,
+    watch: Watch,
+    is_cancelled: Callable[[], bool] = never,
+) -> None:
     """Submit a stage, pass on its events until it has ended, and raise the error that it raises.
 
     Args:
         restart_lost_workers: called from time to time; starts workers again that Dask has given up.
+        is_cancelled: whether the job was cancelled, though the flag in its folder may be missing for lack of disk.
 
     Raises:
         JobCancelledError: the stage was cancelled and did not stop in time. WorkerLostError: every worker that took on
@@ -71,16 +83,17 @@ def follow_stage(client: Client, restart_lost_workers: Callable[[], None], task:
             if time.monotonic() > restart_at:
                 restart_lost_workers()
                 restart_at = time.monotonic() + RESTART_INTERVAL_S
-            if give_up_at is None and flag.exists():
+            if give_up_at is None and (flag.exists() or is_cancelled()):
                 give_up_at = time.monotonic() + GRACE_S
             # The task decides and not its last event, because a task that no worker takes on has no events, and the
             # capture before it has ended.
             is_grace_over = give_up_at is not None and time.monotonic() > give_up_at and task.stage != "capture"
             if final_status is None and is_grace_over:
-                _stop_workers_of(client, key)
-                raise JobCancelledError(
-                    "The job was cancelled on request; its workers were stopped, and what it had published is kept."
-                )
+                if stop_tasks(client, key, GRACE_S):
+                    raise JobCancelledError(
+                        "The job was cancelled on request; its tasks were stopped, and what it had published is kept."
+                    )
+                give_up_at = time.monotonic() + GRACE_S
         # The status at the task's end decides and not the present one, because a result may be lost with its worker
         # afterwards, and the task then runs again.
         if final_status != "finished":
@@ -111,11 +124,3 @@ def _final_status(stage: Future) -> str | None:
     except TimeoutError:
         return None
     return status if status in FINAL_STATUSES else None
-
-
-def _stop_workers_of(client: Client, stage: str) -> None:
-    # Restart each worker that holds the stage, or a task that the stage has made, whose key begins with the stage's
-    # own. Tasks of other jobs on these workers run again.
-    busy = [worker for worker, keys in client.processing().items() if any(str(key).startswith(stage) for key in keys)]
-    with suppress(TimeoutError):
-        client.restart_workers(busy, timeout=GRACE_S)

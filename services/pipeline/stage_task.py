@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
+
+from sqlalchemy.exc import DBAPIError
 
 from services.core.errors import PlatformError
 from services.core.records import JobSpec
@@ -16,6 +19,7 @@ from services.pipeline.database import retry_while_lost
 from services.pipeline.event_log import EventAddress
 from services.pipeline.machine_class import machine_class
 
+T = TypeVar("T")
 PUBLISHED_AS = {
     "phantom": "phantom",
     "capture": "capture",
@@ -56,12 +60,12 @@ class StageTask:
         with self.events.open() as log:
             lease = self.root / f"{folder}.lease"
             known, machine = int(lease.read_text()) if lease.exists() else 0, machine_class()
-            attempt = retry_while_lost(lambda: log.begin_stage(self.stage, known, machine))
+            attempt = self._record(lambda: log.begin_stage(self.stage, known, machine))
             reported_kinds: set[str] = set()
 
             def report(event: StageEvent) -> None:
                 if event.kind != "started":  # begin_stage has recorded it
-                    retry_while_lost(lambda: log.append(attempt, event))
+                    self._record(lambda: log.append(attempt, event))
                 reported_kinds.add(event.kind)
                 write_line(event)
 
@@ -74,6 +78,18 @@ class StageTask:
                 if "finished" not in reported_kinds:
                     report(StageEvent(stage=self.stage, kind="finished", done=1.0))
         return self.stage
+
+    def _record(self, write: Callable[[], T]) -> T:
+        """Write to the event table, and wait while it takes no writes, unless the job is cancelled meanwhile."""
+
+        def write_unless_cancelled() -> T:
+            try:
+                return write()
+            except DBAPIError:
+                LocalContext(self.root, 0).raise_if_cancelled()
+                raise
+
+        return retry_while_lost(write_unless_cancelled)
 
     def _logs(self, attempt: int) -> AbstractContextManager[Callable[[StageEvent], None]]:
         """A context that logs the stage's events in the worker, or does nothing."""

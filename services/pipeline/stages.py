@@ -48,11 +48,13 @@ from services.core.store import (
     write_record,
 )
 from services.pipeline.event_log import EventAddress, folder_events
-from services.pipeline.following import Listener, Watch, follow_stage
+from services.pipeline.following import Listener, Watch, follow_stage, never
 from services.pipeline.stage_task import PUBLISHED_AS, StageTask
 from services.pipeline.workers import Workers
 
 JOB_FILE = "job.json"
+CANCEL_RESERVE = ".cancel"
+"""Name of an empty file in a job's folder, which becomes the flag of a cancel where the disk is full."""
 DAMAGE_FLAG = ".damaged"
 """Name of a file in a job's folder. It says that a stage has found published files of another stage damaged, so that
 the next run looks for stages that it must run again."""
@@ -89,6 +91,7 @@ def run_job(
     is_logged: bool = False,
     before: Callable[[], None] | None = None,
     phantoms: Path | None = None,
+    is_cancelled: Callable[[], bool] = never,
 ) -> AssetManifest:
     """Run a job to its asset; needs no server.
 
@@ -103,6 +106,7 @@ def run_job(
         before: called before each stage but a capture; an error that it raises ends the run.
         phantoms: folder, accessible to the workers, in which the demonstration's mouth is kept from job to job; None to
             render it anew for each job.
+        is_cancelled: whether the job was cancelled, though the flag in its folder may be missing for lack of disk.
 
     Raises:
         DentineError: whatever a stage raised; JobCancelledError after ``request_cancel(root)``.
@@ -119,6 +123,7 @@ def run_job(
         is_logged=is_logged,
         before=before,
         phantoms=phantoms,
+        is_cancelled=is_cancelled,
     )
     return open_stage(root, "asset", AssetManifest, verify=False)[1]
 
@@ -137,6 +142,7 @@ def run_stages(
     is_logged: bool = False,
     before: Callable[[], None] | None = None,
     phantoms: Path | None = None,
+    is_cancelled: Callable[[], bool] = never,
 ) -> None:
     """Run some stages of a job in order; see ``run_job``. With ``again``, published stages run too."""
     root = root.resolve()
@@ -167,7 +173,7 @@ def run_stages(
                     for stage in remaining
                 ]
                 with _flag_damage(root), nullcontext(cluster) if cluster is not None else Workers() as processes:
-                    _run_tasks(processes, workers or spec.workers, tasks, watch, before or _do_nothing)
+                    _run_tasks(processes, workers or spec.workers, tasks, watch, before or _do_nothing, is_cancelled)
             watch.pass_on_events()
 
 
@@ -190,13 +196,25 @@ def _options_for(stage: StageName, spec: JobSpec, root: Path, phantoms: Path | N
 
 
 def request_cancel(root: Path) -> None:
-    """Ask the process that runs the job in this folder to stop between two frames or steps."""
-    (root / CANCEL_FLAG).touch()
+    """Ask the process that runs the job in this folder to stop between two frames or steps.
+
+    Raises:
+        OSError: the folder takes no file, and there is no reserve.
+    """
+    try:
+        (root / CANCEL_FLAG).touch()
+    except OSError:
+        # A full disk may have no room for a file, but it has one that can be renamed.
+        if not (root / CANCEL_RESERVE).exists():
+            raise
+        (root / CANCEL_RESERVE).replace(root / CANCEL_FLAG)
 
 
 def withdraw_cancel(root: Path) -> None:
-    """Remove an earlier request to cancel; call before a job is started again."""
+    """Remove an earlier request to cancel, and make the reserve for the next; call before a job is started."""
     (root / CANCEL_FLAG).unlink(missing_ok=True)
+    if root.is_dir():
+        (root / CANCEL_RESERVE).touch()
 
 
 def _do_nothing() -> None:
@@ -204,7 +222,12 @@ def _do_nothing() -> None:
 
 
 def _run_tasks(
-    processes: Workers, count: int, tasks: list[StageTask], watch: Watch, before: Callable[[], None]
+    processes: Workers,
+    count: int,
+    tasks: list[StageTask],
+    watch: Watch,
+    before: Callable[[], None],
+    is_cancelled: Callable[[], bool],
 ) -> None:
     """Submit each stage once the stage before has ended, follow its events, and raise the error that it raises."""
     from distributed.comm import CommClosedError
@@ -214,7 +237,7 @@ def _run_tasks(
             for task in tasks:
                 if task.stage != "capture":
                     before()
-                follow_stage(client, processes.restart_lost, task, watch)
+                follow_stage(client, processes.restart_lost, task, watch, is_cancelled)
     except (CancelledError, CommClosedError) as problem:
         raise SchedulerLostError(
             "The workers' scheduler went away; the job goes on from what it had published once it answers again."

@@ -71,7 +71,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
 
     lights = [source.lights_of(k) for k in range(len(cameras))]
     progress = Progress(context, sum(len(own) for own in lights), len(cameras))
-    with open_executor(spec.priority) as executor:
+    with open_executor(spec.priority, context.raise_if_cancelled) as executor:
         unlocated = [k for k, camera in enumerate(cameras) if files.view(k, camera) is None]
         for _ in executor.run([Block(spec, files, "locate", k) for k in unlocated]):
             context.raise_if_cancelled()

@@ -43,7 +43,9 @@ def follow(monkeypatch: pytest.MonkeyPatch, folder: Path, task: Task, stage: Sta
 
     monkeypatch.setattr("distributed.wait", wait)
     monkeypatch.setattr("services.pipeline.following.GRACE_S", 0.0)
-    client: Any = SimpleNamespace(submit=lambda *_, **__: task, processing=dict, restart_workers=lambda *_, **__: None)
+    client: Any = SimpleNamespace(
+        submit=lambda *_, **__: task, processing=dict, has_what=dict, restart_workers=lambda *_, **__: None
+    )
     watch: Any = SimpleNamespace(pass_on_events=lambda: None)
     described = StageTask(stage, "door", SPEC, folder, EventAddress("sqlite://", "job"))
     follow_stage(client, lambda: None, described, watch)

@@ -48,6 +48,7 @@ from services.core.errors import (
 from services.core.files.validation import remedied
 from services.core.geometry import Record
 from services.core.redaction import redacted
+from services.pipeline.database import is_full
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -213,7 +214,10 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(NoConnectionError)
     @app.exception_handler(DBAPIError)
-    def _database(request: Request, _problem: DBAPIError | NoConnectionError) -> Response:
+    def _database(request: Request, problem: DBAPIError | NoConnectionError) -> Response:
+        if is_full(problem):
+            detail = "The disk of the database is full, so nothing was recorded; free some space, then ask again."
+            return answer(request, HTTPStatus.INSUFFICIENT_STORAGE, DiskFullError.code, detail)
         return database_lost(request.scope["path"])
 
     @app.exception_handler(RequestValidationError)

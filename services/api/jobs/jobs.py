@@ -39,7 +39,7 @@ from services.core.stage import StageName
 from services.core.store import is_published
 from services.pipeline.event_log import EventAddress
 from services.pipeline.machine_class import machine_class
-from services.pipeline.stages import request_cancel, stages_of
+from services.pipeline.stages import stages_of
 
 DAY_S = 86400.0
 MAX_RUNNING = 1000
@@ -190,22 +190,22 @@ class Jobs:
     def cancel(self, job_id: str) -> Job:
         """Cancel a job; a running one stops between two frames or steps, or in mid-kernel.
 
+        A cancel that is recorded is carried out, also where the disk of the job's folder is full.
+
         Raises:
             UnknownJobError: there is no such job. JobStateError: it has ended.
         """
         if self.repository.get(job_id).state is JobState.RUNNING:
             # Darken before the cancellation is recorded: reading the database never waits, writing to it may take
             # seconds.
-            self._request_stop(job_id)
+            self._runner.tell_to_stop(job_id)
         if self.repository.apply(job_id, Trigger.CANCEL).instruction is Instruction.STOP:
-            self._request_stop(job_id)  # again, as a job that has just begun withdraws an earlier request
+            self._runner.tell_to_stop(job_id)  # again, as a job that has just begun withdraws an earlier request
         return self.repository.get(job_id)
 
-    def _request_stop(self, job_id: str) -> None:
-        try:
-            request_cancel(self.folder(job_id))
-        except OSError as problem:  # the runner asks again in each of its rounds
-            logging.getLogger(__name__).warning("job %s cannot be told yet that it is cancelled: %s", job_id, problem)
+    def is_cancelled(self, job_id: str) -> bool:
+        """Whether a job is to stop, and its folder takes no flag that says so; see ``Runner.is_cancelled``."""
+        return self._runner.is_cancelled(job_id)
 
     def retry(self, job_id: str, flashes: FlashAcknowledgement | None = None) -> Job:
         """Queue a failed or cancelled job again, or a succeeded one whose masks were changed; it resumes from its
@@ -279,7 +279,7 @@ class Jobs:
         """Cancel every job that captures or will capture next; returns these jobs in their state before."""
         cancelled, capturing = [], self.capturing()
         for job in capturing:  # all before the first is recorded, as each may have a dome of its own
-            self._request_stop(job.id)
+            self._runner.tell_to_stop(job.id)
         for job in self._awaiting_capture(self.repository.queued()) + capturing:
             with suppress(JobStateError):
                 self.cancel(job.id)
@@ -287,7 +287,9 @@ class Jobs:
         return cancelled
 
     def waits_for(self, job: Job) -> str | None:
-        """Why a queued job does not start, or a running one does not go on; None if nothing keeps it."""
+        """Why a queued job does not start, or a running one does not go on or stop; None if nothing keeps it."""
+        if job.state in {JobState.RUNNING, JobState.CANCELLING} and (full := self._runner.waits_for_disk(job.id)):
+            return full
         if job.state not in {JobState.RUNNING, JobState.QUEUED}:
             return None
         # Ask only for the obstacle of the state that was read: a job that was read as running may have been paused

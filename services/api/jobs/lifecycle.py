@@ -8,7 +8,7 @@ state       cancel                 start               succeed             fail 
 SUBMITTED   CANCELLED              -                   -                   FAILED                 QUEUED, launch
 QUEUED      CANCELLED              RUNNING             -                   FAILED                 QUEUED, launch
 RUNNING     CANCELLING, stop       -                   SUCCEEDED           FAILED                 QUEUED, launch
-CANCELLING  CANCELLING             -                   SUCCEEDED           FAILED                 CANCELLED
+CANCELLING  CANCELLING             -                   CANCELLED           FAILED                 CANCELLED
 DELETING    -                      -                   -                   -                      DELETING, erase
 ==========  =====================  ==================  ==================  =====================  =================
 
@@ -19,8 +19,8 @@ the erasure itself may have been interrupted.
 
 ``lose`` says that no process works on the job any more, as after a crash: a job that ran is queued again and resumes
 from its published results. ``pause`` says that the job cannot go on for now, for lack of a place, disk, a writable
-store or workers. A job that ends before it notices a cancel has succeeded: the state tells what happened, not what was
-wished.
+store or workers. A cancel that was recorded is carried out: a job that ends before it notices it is CANCELLED, and a
+retry finds its results published.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ TABLE: Mapping[tuple[JobState, Trigger], Transition] = MappingProxyType(
         (JobState.RUNNING, Trigger.PAUSE): _QUEUED,
         (JobState.CANCELLING, Trigger.CANCEL): Transition(JobState.CANCELLING),
         (JobState.CANCELLING, Trigger.STOPPED): Transition(JobState.CANCELLED),
-        (JobState.CANCELLING, Trigger.SUCCEED): Transition(JobState.SUCCEEDED),
+        (JobState.CANCELLING, Trigger.SUCCEED): Transition(JobState.CANCELLED),
         (JobState.CANCELLING, Trigger.FAIL): Transition(JobState.FAILED),
         (JobState.CANCELLING, Trigger.LOSE): Transition(JobState.CANCELLED),
         (JobState.CANCELLING, Trigger.PAUSE): Transition(JobState.CANCELLED),

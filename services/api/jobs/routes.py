@@ -81,7 +81,7 @@ class JobDetail(Job):
 
     stages: list[StageProgress]
     waits_for: str | None = Field(
-        description="why a queued job does not start, or a running one does not go on; null if nothing keeps it"
+        description="why a queued job does not start, or a running one does not go on or stop; null if nothing keeps it"
     )
     remaining: TimeRange | None = Field(
         description="how long until it ends, waiting in the queue included; null unless it waits or runs"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import secrets
 import socket
@@ -9,8 +10,10 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from sqlalchemy.exc import DBAPIError
+
 from services.api.jobs.admission import Admission, queue_order
-from services.api.jobs.lifecycle import JobState, Trigger
+from services.api.jobs.lifecycle import JobState, Transition, Trigger
 from services.api.jobs.records import Failure, Job, Lease
 from services.api.jobs.repository import Repository
 from services.client.errors import JobStateError
@@ -25,7 +28,7 @@ from services.core.errors import (
 from services.core.records import JobSpec
 from services.core.stage import StageName
 from services.core.store import translate_disk_errors
-from services.pipeline.database import retry_while_lost
+from services.pipeline.database import is_full, retry_while_lost
 from services.pipeline.event_log import EventAddress
 from services.pipeline.logs import log_context
 from services.pipeline.stages import first_stage, request_cancel, withdraw_cancel
@@ -39,6 +42,8 @@ LEASE_S = 60.0
 ROUND_S = 10.0
 """Time in s between two rounds, in which leases are renewed, lost ones are found and waiting jobs are looked at
 again."""
+STOPS_WITHOUT_DISK = "Waits for disk: it is full, so the job's tasks are stopped one by one; free some space."
+"""Sentence on a job whose folder takes no file that tells it to stop."""
 
 
 class NoFreeSlotError(Exception):
@@ -81,6 +86,8 @@ class Runner:
         self._wake, self._closing, self._lock = threading.Event(), threading.Event(), threading.Lock()
         self._running: dict[str, tuple[Lease, threading.Thread]] = {}
         self._reported_obstacles: dict[str, str | None] = {}
+        self._untold: dict[str, str | None] = {}
+        self._unrecorded: set[str] = set()
         loops = {"jobs": self._start_jobs, "leases": self._maintain_leases, "rounds": self._make_rounds}
         self._threads = [threading.Thread(target=loop, name=name) for name, loop in loops.items()]
 
@@ -101,10 +108,7 @@ class Runner:
         self._closing.set()
         self._wake.set()
         for lease in self._leases():
-            try:
-                request_cancel(self._folder(lease.job.id))
-            except OSError as problem:  # a fault of one folder must not keep others from going dark
-                logging.getLogger(__name__).warning("job %s cannot be told to stop: %s", lease.job.id, problem)
+            self.tell_to_stop(lease.job.id)  # a fault of one folder must not keep others from going dark
 
     def close(self) -> None:
         """Stop the running jobs cooperatively, and wait for their end."""
@@ -115,6 +119,32 @@ class Runner:
         # A job that was started meanwhile has asked for its own end; see _prepare.
         for _, thread in self._running_jobs():
             thread.join()
+
+    def tell_to_stop(self, job_id: str) -> None:
+        """Ask a job to stop. Where its folder takes no file, the job is remembered, and ``is_cancelled`` says it."""
+        try:
+            request_cancel(self._folder(job_id))
+        except OSError as problem:
+            if job_id not in self._untold:
+                logging.getLogger(__name__).warning("job %s cannot be told yet to stop: %s", job_id, problem)
+            if job_id in self._running:
+                is_full = problem.errno in {errno.ENOSPC, errno.EDQUOT}
+                self._untold[job_id] = STOPS_WITHOUT_DISK if is_full else None
+        else:
+            self._untold.pop(job_id, None)
+
+    def is_cancelled(self, job_id: str) -> bool:
+        """Whether a job is to stop and its folder took no file that says so; tries again to write that file."""
+        if job_id not in self._untold:
+            return False
+        self.tell_to_stop(job_id)
+        return True
+
+    def waits_for_disk(self, job_id: str) -> str | None:
+        """Why a job of this server does not stop, or its end is not recorded, for lack of disk; None if it does."""
+        if job_id in self._unrecorded:
+            return "Waits for disk: that of the database is full, so the job's end is not recorded; free some space."
+        return self._untold.get(job_id)
 
     def wake(self) -> None:
         """Wake the thread that starts jobs."""
@@ -197,6 +227,8 @@ class Runner:
         finally:
             with self._lock:
                 del self._running[job.id]
+            self._untold.pop(job.id, None)
+            self._unrecorded.discard(job.id)
             self._admission.end(job.id)
             self._wake.set()
 
@@ -213,14 +245,14 @@ class Runner:
     def _renew_leases(self) -> None:
         log = logging.getLogger(__name__)
         leases = self._leases()
+        for lease in leases:  # first, because a full disk takes no renewals
+            if self._is_cancelled(lease):
+                self.tell_to_stop(lease.job.id)
         for lease in leases:
             if not self._repository.renew(lease, LEASE_S):
                 log.warning("job %s was taken over by another server", lease.job.id)
         for job_id in self._repository.lose_expired(leases, LEASE_S):
             log.warning("job %s was lost by its server and is queued again", job_id)
-        for lease in leases:
-            if self._is_cancelled(lease):
-                request_cancel(self._folder(lease.job.id))
 
     def _make_rounds(self) -> None:
         # The rounds have a thread of their own, because a deletion of many files takes longer than a lease lasts.
@@ -267,7 +299,7 @@ class Runner:
 
     def _settle(self, lease: Lease, trigger: Trigger, failure: Failure | None) -> None:
         try:
-            transition = retry_while_lost(lambda: self._repository.settle(lease, trigger, failure))
+            transition = retry_while_lost(lambda: self._record_end(lease, trigger, failure))
         except FencedError as problem:
             logging.getLogger(__name__).warning("job %s: %s", lease.job.id, problem)
             return
@@ -276,6 +308,14 @@ class Runner:
         )
         if transition.state is JobState.SUCCEEDED:
             self._on_success(lease.job, self._admission.mean_sharing(lease.job.id))
+
+    def _record_end(self, lease: Lease, trigger: Trigger, failure: Failure | None) -> Transition:
+        try:
+            return self._repository.settle(lease, trigger, failure)
+        except DBAPIError as problem:
+            if is_full(problem):
+                self._unrecorded.add(lease.job.id)
+            raise
 
     def _prepare(self, lease: Lease, folder: Path) -> None:
         with translate_disk_errors(folder):

@@ -17,13 +17,14 @@ import subprocess
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, Protocol
 
-from services.core.errors import JobCancelledError, ResourceError, WorkerLostError
+from services.core.errors import JobCancelledError, WorkerLostError
 from services.fit.execution.blocks import StoredFile, read_recipe
 from services.fit.execution.engine_process import EngineProcess
 
@@ -102,22 +103,20 @@ class ChildHost:
     def call_until(
         self, is_cancelled: Callable[[], bool], method: str, recipe: StoredFile, *args: Any, **options: Any
     ) -> Any:
-        """Like ``call``, but once ``is_cancelled()`` the child is ended even while a kernel runs."""
+        """Like ``call``, but once ``is_cancelled()`` the child is ended even while a kernel runs.
+
+        A call that still waits for the kernel of another job ends too, and leaves that kernel alone.
+        """
         request = pickle.dumps((method, recipe, args, options))
-        with self._lock:
+        with self._turn(is_cancelled):
             for is_last in (False, True):
-                if is_cancelled():
-                    raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
+                _raise_if(is_cancelled)
                 self._require_open()
                 self._process = process = self._process or self._start()
                 try:
                     process.pipe.send_bytes(request)
                     while not process.pipe.poll(WATCH_S):
-                        if is_cancelled():
-                            self._end()
-                            raise JobCancelledError(
-                                "The job was cancelled on request while it rendered; what it had published is kept."
-                            )
+                        _raise_if(is_cancelled)
                         self._require_open()
                         process.check_memory()
                     succeeded, value = pickle.loads(process.pipe.recv_bytes())  # noqa: S301 - from our own child over our own pipe
@@ -127,8 +126,8 @@ class ChildHost:
                     if is_last or process.was_out_of_memory:
                         raise process.exit_error() from None
                     continue
-                except ResourceError:
-                    self._end()
+                except BaseException:
+                    self._end()  # the answer to this call must not become that to the next
                     raise
                 if succeeded:
                     return value
@@ -143,6 +142,16 @@ class ChildHost:
         self._is_closed.set()
         with self._lock:
             self._end()
+
+    @contextmanager
+    def _turn(self, is_cancelled: Callable[[], bool]) -> Iterator[None]:
+        """Have the child for one call, once no other call has it."""
+        while not self._lock.acquire(timeout=WATCH_S):
+            _raise_if(is_cancelled)
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def _require_open(self) -> None:
         if self._is_closed.is_set():
@@ -161,6 +170,11 @@ class ChildHost:
         if self._process is not None:
             self._process.end()
             self._process = None
+
+
+def _raise_if(is_cancelled: Callable[[], bool]) -> None:
+    if is_cancelled():
+        raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,23 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from distributed import WorkerPlugin
 
-from services.fit.execution.engine_host import ENGINE, CancellableHost, ChildHost, EngineHost, InProcessHost
+from services.core.errors import JobCancelledError
+from services.fit.execution.engine_host import (
+    ENGINE,
+    WATCH_S,
+    CancellableHost,
+    ChildHost,
+    EngineHost,
+    InProcessHost,
+)
 from services.fit.execution.fair_shares import PublishedLevels, Share
 
 Task = Callable[..., Any]
@@ -95,15 +103,12 @@ class DaskExecutor:
         resources: Mapping[str, float] | None = None,
         share: Share | None = None,
     ) -> None:
-        from distributed import as_completed
-
         self._client, self._factory, self._prefix, self._submitted = client, factory, prefix, itertools.count()
         self._flag, self._resources, self._share = flag, dict(resources or {}), share or Share()
         self._levels = PublishedLevels(client, prefix, self._share)
         self._levels.join()
         self._waiting: deque[_Planned] = deque()
         self._running: dict[Any, _Planned] = {}
-        self._ended = as_completed(loop=client.loop)
 
     def submit(self, key: str, task: Task, *args: Any) -> _Planned:
         """See Executor. Every task gets a key of its own, because Dask returns the old result for a key that it still
@@ -134,7 +139,7 @@ class DaskExecutor:
             while self._waiting and len(self._running) < most:
                 self._send(self._waiting.popleft())
             self._levels.publish()
-            for future in self._ended.next_batch():
+            for future in self._next_ended():
                 planned = self._running.pop(future)
                 if future.status != "finished":
                     future.result()  # raises
@@ -143,6 +148,25 @@ class DaskExecutor:
                     planned.timed = future.result()
                     self._share.end(planned.timed.seconds, planned.timed.tasks)
                     yield planned
+
+    def _next_ended(self) -> Iterable[Any]:
+        """Wait until at least one task has ended, and return those that have.
+
+        Raises:
+            JobCancelledError: the job was cancelled. Its tasks may wait behind long ones of other jobs, so they are
+                given up here and do not begin any more.
+        """
+        from distributed import wait
+
+        while True:
+            try:
+                _raise_if_cancelled(self._flag)
+            except JobCancelledError:
+                self._client.cancel(list(self._running))
+                raise
+            with suppress(TimeoutError):
+                ended: Iterable[Any] = wait(list(self._running), WATCH_S, return_when="FIRST_COMPLETED").done
+                return ended
 
     def close(self) -> None:
         """Release this fit's place among those that share the workers."""
@@ -155,7 +179,6 @@ class DaskExecutor:
         planned.future = self._client.submit(run_on_worker, self._factory, self._flag, planned.task, *args, **options)
         planned.args = ()
         self._running[planned.future] = planned
-        self._ended.add(planned.future)
 
     def threads(self, expected: int = 1) -> int:
         """See Executor."""
@@ -215,11 +238,17 @@ async def _prepare_worker(worker: Any, factory: str) -> _EnginePlugin:
     return plugin
 
 
+def _raise_if_cancelled(flag: Path) -> None:
+    if flag.exists():
+        raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
+
+
 def run_on_worker(factory: str, flag: Path, task: Task, *args: Any) -> Timed:
     """Run a task with its worker's child process, until ``flag`` exists."""
     from distributed import get_worker
     from distributed.utils import sync
 
+    _raise_if_cancelled(flag)
     worker = get_worker()
     plugin: _EnginePlugin = sync(worker.loop, _prepare_worker, worker, factory)
     began_s, earlier = time.monotonic(), [arg for arg in args if isinstance(arg, Timed)]

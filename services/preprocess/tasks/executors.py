@@ -5,11 +5,14 @@ this process, one block after the other.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TypeVar
 
 from services.core.placement import rank
 from services.core.records import Priority
+
+WATCH_S = 0.25
+"""Interval in s at which a preparation that waits for its blocks looks for a cancel."""
 
 B = TypeVar("B", bound=Callable[[], Any])
 
@@ -47,11 +50,20 @@ class DaskExecutor:
         key: key of the surrounding task; the blocks' keys begin with it, which shows to which task they belong.
         resources: Dask resources that a worker must have to run the blocks.
         priority: priority of the job.
+        raise_if_cancelled: raises an error once the job was cancelled. It is called while blocks are awaited, because
+            they may wait behind long tasks of other jobs.
     """
 
-    def __init__(self, client: Any, key: str, resources: dict[str, float], priority: Priority) -> None:
+    def __init__(
+        self,
+        client: Any,
+        key: str,
+        resources: dict[str, float],
+        priority: Priority,
+        raise_if_cancelled: Callable[[], None],
+    ) -> None:
         self._client, self._key, self._resources, self._priority = client, key, resources, -rank(priority)
-        self._submitted = 0
+        self._submitted, self._raise_if_cancelled = 0, raise_if_cancelled
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         thread_counts = [
             int(worker["nthreads"])
@@ -62,7 +74,7 @@ class DaskExecutor:
 
     def run(self, blocks: Sequence[B]) -> Iterator[B]:
         """See ``Executor``. A block whose worker dies runs again on another worker."""
-        from distributed import as_completed
+        from distributed import wait
 
         pending = {}
         for block in blocks:
@@ -76,9 +88,14 @@ class DaskExecutor:
             )
             pending[future] = block
         try:
-            for future in as_completed(list(pending), loop=self._client.loop):
-                future.result()
-                yield pending.pop(future)
+            while pending:
+                self._raise_if_cancelled()
+                ended = ()
+                with suppress(TimeoutError):
+                    ended = wait(list(pending), WATCH_S, return_when="FIRST_COMPLETED").done
+                for future in ended:
+                    future.result()
+                    yield pending.pop(future)
         finally:
             if pending:
                 self._client.cancel(list(pending))
@@ -95,7 +112,7 @@ def local_threads() -> int:
 
 
 @contextmanager
-def open_executor(priority: Priority) -> Iterator[Executor]:
+def open_executor(priority: Priority, raise_if_cancelled: Callable[[], None]) -> Iterator[Executor]:
     """Give the executor for blocks: inside a Dask task its cluster, elsewhere this process.
 
     The Dask task occupies no worker thread while it waits for its blocks.
@@ -110,4 +127,4 @@ def open_executor(priority: Priority) -> Iterator[Executor]:
     key = worker.get_current_task()
     resources = dict(worker.state.tasks[key].resource_restrictions or {})
     with worker_client() as client:
-        yield DaskExecutor(client, str(key), resources, priority)
+        yield DaskExecutor(client, str(key), resources, priority, raise_if_cancelled)
