@@ -9,6 +9,7 @@ import json
 import runpy
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -30,6 +31,13 @@ def render(folder: Path, camera: str, light: str, spp: int, seed: int = 0, varia
     return np.stack(planes, axis=-1)
 
 
+def write_image(image: np.ndarray, path: Path) -> None:
+    """Write linear radiance, shape (height, width, channels), as EXR."""
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)  # Mitsuba's writer waits for another thread, for ever where there is none
+    mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)).write(str(path))
+
+
 def main() -> None:
     """Read the command line, render, write an image."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -41,7 +49,7 @@ def main() -> None:
     folder = Path(__file__).resolve().parent
     rig = json.loads((folder / "rig.json").read_text())
     image = render(folder, options.camera or rig["cameras"][0], options.light or next(iter(rig["lights"])), options.spp)
-    mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)).write(str(options.out))
+    write_image(image, options.out)
 
 
 if __name__ == "__main__":
