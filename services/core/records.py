@@ -14,7 +14,14 @@ from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.files.store_url import StoreUrl
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
-from services.core.light.safety import SHIPPED_LIGHT_LIMIT_S, SHIPPED_TOTAL_LIMIT_S, Assessment, FlashAcknowledgement
+from services.core.light.safety import (
+    SHIPPED_LIGHT_LIMIT_S,
+    SHIPPED_TOTAL_LIMIT_S,
+    AssessmentOfLights,
+    DoseOfAllLights,
+    DoseOfOneLight,
+    FlashAcknowledgement,
+)
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
 
 
@@ -141,21 +148,9 @@ class RigSpec(Record):
     watchdog_s: Number = Field(
         default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long"
     )
-    light_exposure_limit_s: Positive = Field(
-        default=SHIPPED_LIGHT_LIMIT_S,
-        description="most level x on-time of one light; more than the default needs an assessment",
-    )
-    total_exposure_limit_s: Positive = Field(
-        default=SHIPPED_TOTAL_LIMIT_S,
-        description="most level x on-time of all lights together; more than the default needs an assessment",
-    )
-    assessment: Assessment | None = Field(
-        default=None,
-        description=(
-            "'who, when, file' of the photobiological assessment (IEC 62471) of these lights; needed for limits above"
-            " the defaults"
-        ),
-    )
+    light_exposure_limit_s: DoseOfOneLight[Positive] = SHIPPED_LIGHT_LIMIT_S
+    total_exposure_limit_s: DoseOfAllLights[Positive] = SHIPPED_TOTAL_LIMIT_S
+    assessment: AssessmentOfLights = None
     flashes: FlashAcknowledgement | None = Field(
         default=None,
         description=(

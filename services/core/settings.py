@@ -18,7 +18,9 @@ from services.core.light.safety import (
     FREE_FLASHES_PER_S,
     SHIPPED_LIGHT_LIMIT_S,
     SHIPPED_TOTAL_LIMIT_S,
-    Assessment,
+    AssessmentOfLights,
+    DoseOfAllLights,
+    DoseOfOneLight,
     unassessed,
 )
 from services.core.records import MAX_ON_TIME_S, SIMULATED_DOME, JobSpec
@@ -104,23 +106,9 @@ class DomeSettings(SettingsRecord):
     watchdog_s: float = Field(
         default=2.0, gt=0, le=60, description="the dome goes dark by itself when not fed for this long"
     )
-    light_exposure_limit_s: float = Field(
-        default=SHIPPED_LIGHT_LIMIT_S,
-        gt=0,
-        description="most level x on-time of one light; more than the default needs an assessment",
-    )
-    total_exposure_limit_s: float = Field(
-        default=SHIPPED_TOTAL_LIMIT_S,
-        gt=0,
-        description="most level x on-time of all lights together; more than the default needs an assessment",
-    )
-    assessment: Assessment | None = Field(
-        default=None,
-        description=(
-            "'who, when, file' of the photobiological assessment (IEC 62471) of these lights; needed for limits above"
-            " the defaults"
-        ),
-    )
+    light_exposure_limit_s: DoseOfOneLight[float] = Field(default=SHIPPED_LIGHT_LIMIT_S, gt=0)
+    total_exposure_limit_s: DoseOfAllLights[float] = Field(default=SHIPPED_TOTAL_LIMIT_S, gt=0)
+    assessment: AssessmentOfLights = None
     max_flashes_per_s: float = Field(
         default=10.0,
         ge=FREE_FLASHES_PER_S,

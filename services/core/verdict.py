@@ -72,7 +72,8 @@ def mean_figure(errors: Mapping[str, float], ses: Mapping[str, float]) -> Figure
 
 def percent(figure: Figure) -> str:
     """A figure in percent, rounded to two significant digits of its standard error, with one to three decimals; an
-    error without one that is zero is what is left of a difference smaller than its noise.
+    error without one that is zero is what is left of a difference smaller than its noise. Below its standard error it
+    is told as an upper limit, two standard errors above it.
     """
     if figure.se is None and figure.value == 0:
         return "below the noise"
@@ -80,4 +81,6 @@ def percent(figure: Figure) -> str:
         return f"{100 * figure.value:.1f} %" if figure.value >= 0.01 else f"{100 * figure.value:.2f} %"
     se = 100 * figure.se
     decimals = min(max(1 - math.floor(math.log10(se)), 1), 3) if se > 0 else 2
+    if 0 <= figure.value < figure.se:
+        return f"at most {100 * figure.value + 2 * se:.{decimals}f} % (two standard errors)"
     return f"{100 * figure.value:.{decimals}f} ± {se:.{decimals}f} %"

@@ -12,8 +12,7 @@ import pytest
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
 from services.fit.export.mitsuba_scene import load_scene, nested_scene
-from services.fit.transport.platform import prepare_device
-from tests.physics.test_integrator import CAMERA, CORE, LAMP, OUTER, TISSUE, properties, sentence
+from tests.physics.test_integrator import CAMERA, CORE, LAMP, OUTER, TISSUE, properties, sentence, write_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at
 
 SceneDict = dict[str, Any]
@@ -22,13 +21,7 @@ SceneDict = dict[str, Any]
 @pytest.fixture(scope="module")
 def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the small tooth's surfaces, and with dentin that leaves it; the plug-in is registered."""
-    prepare_device()
-    from services.fit.plugin.integrator import register_integrator
-
-    register_integrator()
-    folder = tmp_path_factory.mktemp("tooth")
-    write_mesh(folder / "outer.ply", OUTER)
-    write_mesh(folder / "dentin.ply", CORE)
+    folder = write_tooth(tmp_path_factory.mktemp("tooth"))
     write_mesh(folder / "beside.ply", Mesh(CORE.vertices_mm + np.array([1.2 * SEMI_AXES_MM[0], 0, 0]), CORE.faces))
     write_mesh(folder / "larger.ply", Mesh(1.05 * OUTER.vertices_mm, OUTER.faces))
     return folder

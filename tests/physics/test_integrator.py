@@ -53,17 +53,21 @@ def table(height_mm: float, reflectance: float | SceneDict) -> SceneDict:
     return {"type": "rectangle", "to_world": place, "bsdf": {"type": "diffuse", "reflectance": reflectance}}
 
 
-@pytest.fixture(scope="module")
-def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the small tooth's two surfaces; the plug-in is registered."""
+def write_tooth(folder: Path) -> Path:
+    """Write the small tooth's two surfaces into a folder, and register the plug-in."""
     prepare_device()
     from services.fit.plugin.integrator import register_integrator
 
     register_integrator()
-    folder = tmp_path_factory.mktemp("tooth")
     write_mesh(folder / "outer.ply", OUTER)
     write_mesh(folder / "dentin.ply", CORE)
     return folder
+
+
+@pytest.fixture(scope="module")
+def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the small tooth's two surfaces; the plug-in is registered."""
+    return write_tooth(tmp_path_factory.mktemp("tooth"))
 
 
 @contextmanager

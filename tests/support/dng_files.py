@@ -17,6 +17,7 @@ def write_dng(
     repeat: tuple[int, int] = (2, 2),
     planes: tuple[int, ...] = (0, 1, 2),
     white: int = 4095,
+    tile: tuple[int, int] | None = None,
 ) -> None:
     """Write counts (H, W) as a DNG.
 
@@ -25,6 +26,7 @@ def write_dng(
         repeat: rows and columns of the repeat.
         planes: colour of each plane: 0 to 6 are red, green, blue, cyan, magenta, yellow, white.
         white: count from which a pixel is full.
+        tile: rows and columns of the tiles that the counts are stored in; None for strips.
     """
     matrix = [_ONE if k % 3 == k // 3 else _ZERO for k in range(3 * len(planes))]
     tags: tuple[tuple[str, str, int, Any], ...] = (
@@ -44,4 +46,4 @@ def write_dng(
         ("AsShotNeutral", "2I", len(planes), _ONE * len(planes)),
     )
     extra = [(name, kind, count, value, True) for name, kind, count, value in tags]
-    tifffile.imwrite(path, values, photometric="cfa", extratags=extra)
+    tifffile.imwrite(path, values, photometric="cfa", tile=tile, extratags=extra)

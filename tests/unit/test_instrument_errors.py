@@ -201,7 +201,8 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     assert "1 % for the gain, 1 % for each light, 0.3 % for flare, 0.05 mm and 0.1° for where the scan lies" in assumed
     _, fault = instrument_sentences(spec, errors, {"green": (Fault(2, -0.05, -4.2),)}, kinds)
     assert fault.startswith(
-        "In green the images put light_gain.b off by -5.0 %, 4.2 times what their own error and its ± of 1 %"
+        "In green the images put light_gain.b off by -5.0 %, 4.2 times what their own error and its standard error of"
+        " 1 %"
     )
     assert "check that light, its cable and its name" in fault
     assert set(REMEDY) == set(FAULT_Z)

@@ -157,7 +157,7 @@ def test_what_is_asked_is_judged_figure_by_figure() -> None:
     kept = {what: is_kept for what, (_, _, is_kept) in asked.items()}
     assert not kept["held-out error over that with perfect calibration and pose"]
     assert sum(kept.values()) == 8
-    assert asked["enamel.sigma_a: distance from the truth in ±"][0] == pytest.approx(2.5)
+    assert asked["enamel.sigma_a: distance from the truth in standard errors"][0] == pytest.approx(2.5)
     assert asked["dentin.sigma_a: ± over that with perfect calibration and pose"][0] == pytest.approx(2.0)
 
 

@@ -17,6 +17,7 @@ from services.core.errors import CaptureInputError
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.frames import read_counts
 from services.core.raw.mosaic import binned, site_channels, sites
+from tests.support.dng_files import write_dng
 from tests.support.raw_folders import SIZE, Tree, counts, write_raw_folder, write_toml
 
 Write = Callable[[Path, Any], object]
@@ -30,28 +31,6 @@ def write_exr(path: Path, values: Any) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": values.astype(np.float32)}) as file:
         file.write(str(path))
-
-
-def write_dng(path: Path, values: Any, pattern: tuple[int, ...] = (0, 1, 1, 2)) -> None:
-    """Writes a DNG independently of the reader: Adobe's tags (DNG 1.4, chapter 4) in a TIFF by tifffile."""
-    one, zero = (1, 1), (0, 1)
-    identity = (*one, *zero, *zero, *zero, *one, *zero, *zero, *zero, *one)
-    tags = (
-        ("CFARepeatPatternDim", "H", 2, (2, 2)),
-        ("CFAPattern", "B", 4, bytes(pattern)),
-        ("DNGVersion", "B", 4, bytes((1, 4, 0, 0))),
-        ("DNGBackwardVersion", "B", 4, bytes((1, 2, 0, 0))),
-        ("Make", "s", 0, "Maker"),
-        ("Model", "s", 0, "Model"),
-        ("UniqueCameraModel", "s", 0, "Maker Model"),
-        ("BlackLevel", "I", 1, 64),
-        ("WhiteLevel", "I", 1, 4095),
-        ("ColorMatrix1", "2i", 9, identity),
-        ("CalibrationIlluminant1", "H", 1, 21),
-        ("AsShotNeutral", "2I", 3, one * 3),
-    )
-    extra = [(name, kind, count, value, True) for name, kind, count, value in tags]
-    tifffile.imwrite(path, values, photometric="cfa", tile=(48, 64), extratags=extra)
 
 
 WRITERS: dict[str, tuple[str, Write]] = {
@@ -105,7 +84,9 @@ def test_a_camera_raw_file_by_another_writer_has_its_counts(
     mosaic: str, pattern: tuple[int, ...], tmp_path: Path
 ) -> None:
     values = np.random.default_rng(5).integers(64, 4096, (48, 64)).astype(np.uint16)
-    tree = folder_with(tmp_path, "x.dng", lambda path, image: write_dng(path, image, pattern), values, mosaic=mosaic)
+    tree = folder_with(
+        tmp_path, "x.dng", lambda path, image: write_dng(path, image, pattern, tile=(48, 64)), values, mosaic=mosaic
+    )
     tree["camera"][0]["size"] = [64, 48]
     write_toml(tmp_path, tree)
     folder = read_raw_folder(tmp_path)

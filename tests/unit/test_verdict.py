@@ -99,6 +99,8 @@ def test_a_report_of_an_earlier_version_is_judged_without_standard_errors() -> N
     [
         (0.204, 0.204, "20.4 ± 20.4 %"),
         (0.0741, 0.0042, "7.41 ± 0.42 %"),
+        (0.0, 0.026, "at most 5.2 % (two standard errors)"),
+        (0.011, 0.017, "at most 4.5 % (two standard errors)"),
         (0.05, 0.0, "5.00 ± 0.00 %"),
         (0.074, None, "7.4 %"),
         (0.004, None, "0.40 %"),

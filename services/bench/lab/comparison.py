@@ -122,7 +122,7 @@ def verdict(chain: Outcome, perfect: Outcome) -> dict[str, tuple[float, float, b
         )
     }
     for name in QUANTITIES:
-        found[f"{name}: distance from the truth in ±"] = (abs(chain.media[name].z), MAX_Z)
+        found[f"{name}: distance from the truth in standard errors"] = (abs(chain.media[name].z), MAX_Z)
         found[f"{name}: ± over that with perfect calibration and pose"] = (
             chain.media[name].se / perfect.media[name].se,
             MAX_SE_RATIO,

@@ -58,7 +58,7 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
 
 def _row(name: str, one: Mapping[str, Any]) -> dict[str, Any]:
     media = [
-        f"{own['value']:.4g} ± {own['se']:.2g}, truth {own['truth']:.4g} ({own['z']:+.1f} ±)"
+        f"{own['value']:.4g} ± {own['se']:.2g}, truth {own['truth']:.4g} ({own['z']:+.1f} standard errors)"
         for own in one["media"].values()
     ]
     return {

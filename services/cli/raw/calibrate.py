@@ -56,7 +56,7 @@ def _print_drift(session: Session, earlier: Calibration, against: Path | None) -
     for one in clear:
         print(f"  {one.sentence}")
     if not clear:
-        print("  The largest changes over their ±:")
+        print("  The largest changes over their standard errors:")
         for one in found[:LARGEST_CHANGES]:
             print(f"  {one.sentence}")
 

@@ -5,7 +5,7 @@ the assessment of the lights.
 from __future__ import annotations
 
 from datetime import datetime, timedelta
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, AwareDatetime, BeforeValidator, Field, Strict, StringConstraints
 from pydantic_core import PydanticCustomError
@@ -55,6 +55,25 @@ Affirmed = Annotated[Literal[True], BeforeValidator(_affirmed)]
 """Something that a person affirms: it is true, or the record is refused."""
 Assessment = Annotated[_Line, Field(max_length=500), AfterValidator(_three_parts)]
 """Who assessed the lights of a rig, when, and the file that says so."""
+AssessmentOfLights = Annotated[
+    Assessment | None,
+    Field(
+        description=(
+            "'who, when, file' of the photobiological assessment (IEC 62471) of these lights; needed for limits above"
+            " the defaults"
+        )
+    ),
+]
+"""The assessment as an option of a rig and of a server's dome."""
+T = TypeVar("T")
+DoseOfOneLight = Annotated[
+    T, Field(description="most level x on-time of one light; more than the default needs an assessment")
+]
+"""The limit of the dose of one light, as an option of a rig and of a server's dome, in level-seconds."""
+DoseOfAllLights = Annotated[
+    T, Field(description="most level x on-time of all lights together; more than the default needs an assessment")
+]
+"""The same limit for all lights together."""
 
 
 class FlashAcknowledgement(Record):

@@ -68,7 +68,7 @@ FIRST_VERSION_OPTIONS = frozenset(
 default, so it must not be added here: fits that were begun before the option existed then continue."""
 DOUBTFUL_ERROR = 0.05
 """Held-out error above which a converged fit is reported as doubtful. Fits of three virtual mouths with 3.1 to 4.3 %
-were at most 3.1 of their ± off, and three with 6.6 to 6.8 % between 6 and 11."""
+were at most 3.1 standard errors off, and three with 6.6 to 6.8 % between 6 and 11."""
 STEPS_PER_PREVIEW = 3
 """Number of steps between two previews; the first follows the first step."""
 
@@ -198,8 +198,8 @@ def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> Assessment:
     ]
     doubts = [
         f"{c}: unseen images are {100 * error:.1f} % off beside their noise, so the model leaves out more than the ±"
-        " contain. In virtual mouths with such errors, whose enamel scatters little, coefficients were up to 11 of"
-        " their ± off."
+        " contain. In virtual mouths with such errors, whose enamel scatters little, coefficients were up to 11"
+        " standard errors off."
         for c, fit in fits.items()
         if c not in unexplained and (error := _doubtful_error(fit)) is not None
     ]

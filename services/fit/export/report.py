@@ -219,7 +219,7 @@ def _stages(history: list[dict[str, Any]]) -> list[dict[str, str]]:
     rows = []
     for (channel, stage), entry in last.items():
         error, se = entry.get("held_out_error"), entry.get("held_out_se")
-        error_text = "" if error is None else _percent(error) if se is None else f"{100 * error:.1f} ± {100 * se:.1f} %"
+        error_text = "" if error is None else percent(Figure(value=error, se=se))
         rows.append(
             {
                 "channel": channel,
@@ -324,13 +324,19 @@ def _label(name: str) -> str:
 
 
 def cell(estimate: Estimate | None) -> dict[str, str]:
-    """Cells of a number in the report's tables: value, standard error and flag."""
+    """Cells of a number in the report's tables: value, standard error and flag.
+
+    A coefficient is not negative, so one below its standard error is told as an upper limit.
+    """
     if estimate is None:
         return {"value": "", "se": "", "flag": ""}
     if estimate.se is None:
         return {"value": f"{estimate.value:.4g}", "se": "", "flag": "" if estimate.determined else "not fitted"}
     digits = _decimals(estimate.se)
     flag = "" if estimate.determined else "not determined"
+    if estimate.unit == "1/mm" and 0 <= estimate.value < estimate.se:
+        limit = f"at most {estimate.value + 2 * estimate.se:.{digits}f} (two standard errors)"
+        return {"value": limit, "se": "", "flag": flag}
     return {"value": f"{estimate.value:.{digits}f}", "se": f"{estimate.se:.{digits}f}", "flag": flag}
 
 

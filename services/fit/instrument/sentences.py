@@ -145,6 +145,6 @@ def _faults(
             name, before = errors[channel].names[fault.index], errors[channel].se[fault.index]
             yield (
                 f"In {channel} the images put {name} off by {100 * fault.size:+.1f} %, {abs(fault.z):.1f} times what "
-                f"their own error and its ± of {100 * before:.2g} % allow together: the calibration seems at fault; "
-                f"{REMEDY[kind_of_error(name)]}."
+                f"their own error and its standard error of {100 * before:.2g} % allow together: the calibration seems"
+                f" at fault; {REMEDY[kind_of_error(name)]}."
             )

@@ -20,6 +20,9 @@ export function valueOf(estimate: Estimate): string {
   // A value that was given and not fitted has a standard error of zero.
   if (!estimate.se) return significant(estimate.value);
   const decimals = decimalsFor(estimate.se);
+  // A coefficient is not negative, so below its standard error the images give an upper limit.
+  if (unitOf(estimate) === "mm⁻¹" && estimate.value >= 0 && estimate.value < estimate.se)
+    return `at most ${(estimate.value + 2 * estimate.se).toFixed(decimals)} (two standard errors)`;
   return `${estimate.value.toFixed(decimals)} ± ${estimate.se.toFixed(decimals)}`;
 }
 
@@ -55,7 +58,13 @@ export function figureOf(figure: Figure): string {
   if (figure.se === null) return `${(100 * figure.value).toFixed(figure.value >= 0.01 ? 1 : 2)} %`;
   const se = 100 * figure.se;
   const decimals = se > 0 ? Math.min(Math.max(1 - Math.floor(Math.log10(se)), 1), 3) : 2;
-  return `${(100 * figure.value).toFixed(decimals)} ± ${se.toFixed(decimals)} %`;
+  return relative(figure.value, figure.se, decimals);
+}
+
+/** Format a relative error; one below its standard error as an upper limit, two standard errors above it. */
+function relative(value: number, se: number, decimals: number): string {
+  if (value >= 0 && value < se) return `at most ${(100 * (value + 2 * se)).toFixed(decimals)} % (two standard errors)`;
+  return `${(100 * value).toFixed(decimals)} ± ${(100 * se).toFixed(decimals)} %`;
 }
 
 /** Format a length as the head of the report does: to a hundredth of a millimetre. */
@@ -64,7 +73,7 @@ export function lengthOf(estimate: Estimate): string {
 }
 
 export function percent(fraction: number, se: number | null = null): string {
-  return `${(100 * fraction).toFixed(1)}${se === null ? "" : ` ± ${(100 * se).toFixed(1)}`} %`;
+  return se === null ? `${(100 * fraction).toFixed(1)} %` : relative(fraction, se, 1);
 }
 
 export function bytes(count: number): string {

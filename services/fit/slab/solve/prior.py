@@ -31,7 +31,7 @@ for a measurement."""
 BENDS_RAD = math.radians(5)
 """Standard deviation of the angles over which the bends of ln f are averaged where they widen the prior. By single
 knots, each bend made room for itself alone: fits had corners, and one of two lobes a notch 27 % deep at 89 degrees that
-was told as determined, 3.4 of its ± off."""
+was told as determined, 3.4 standard errors off."""
 POLE_SCALE = 100.0
 """Scale at a pole, falling away from it as ``SHARPEST`` does, that the evidence may choose. HG 0.8 bends by 60 at its
 peak and by 3 beyond 20 degrees: one scale for all angles pulled the peak down by 1.4 of its standard errors and let the
