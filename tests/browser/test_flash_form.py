@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, expect
 from services.api.app import create_app
 from services.core.records import JobSpec
 from services.core.settings import DomeSettings, ServerSettings
-from tests.browser.pages import watched_page
+from tests.browser.pages import looked_at, watched_page
 from tests.support.guarded_server import run_nothing
 from tests.support.live_server import serving
 
@@ -35,9 +35,11 @@ def test_a_faster_plan_is_acknowledged_in_the_form(chromium: Browser, server: ht
         page.locator("#option-rig-dome").fill(DOME)
         page.locator("summary", has_text="Flashes").click()
         expect(page.get_by_text("can trigger epileptic seizures")).to_be_visible()
+        expect(page.get_by_text("goes dark by itself when not fed for this long; above 0, at most 60.")).to_be_visible()
+        looked_at(page, "flashes")
         page.get_by_label("Flashes a second").fill("8")
         page.get_by_label("The eyes are covered").check()
-        page.get_by_label("Name of who did so").fill("B. Roe")
+        page.get_by_label("Name of who covered and asked").fill("B. Roe")
         page.get_by_role("button", name="Submit the job").click()
         expect(page.locator(".submit > .failure")).to_contain_text("rig.flashes.epilepsy_asked")
         page.get_by_label("Epilepsy was asked about").check()

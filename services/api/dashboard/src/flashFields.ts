@@ -28,7 +28,7 @@ export class FlashFields {
       labelled("Flashes a second", this.perS),
       labelled("The eyes are covered", this.covered),
       labelled("Epilepsy was asked about", this.asked),
-      labelled("Name of who did so", this.by),
+      labelled("Name of who covered and asked", this.by),
     ),
   );
 

@@ -138,7 +138,7 @@ export class OptionField {
         : minimum !== undefined
           ? `${minimum} or more`
           : exclusiveMinimum !== undefined
-            ? `above ${exclusiveMinimum}`
+            ? `above ${exclusiveMinimum}${maximum === undefined ? "" : `, at most ${maximum}`}`
             : "";
     const form = type === "array" ? "names, separated by commas" : type === "object" ? "one a line" : "";
     const meaning = this.schema.description ?? "";
