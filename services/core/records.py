@@ -273,8 +273,8 @@ class JobSpec(Record):
     motion: Motion = Field(
         default="auto",
         description=(
-            "how the subject's motion is found: by tracking frames, or auto, which takes the edges of each light's own"
-            " image where there are fewer than two; off for what cannot move, such as an extracted tooth"
+            "how the subject's motion is found: by tracking frames, or auto, which takes the outline of the teeth under"
+            " each light where there are fewer than two; off for what cannot move, such as an extracted tooth"
         ),
     )
     memory_gib: Number = Field(
