@@ -104,3 +104,19 @@ def turned(mesh: Mesh) -> Mesh:
 def test_points_that_cannot_be_used_are_named(mesh: Mesh, points_mm: dict[int, np.ndarray], sentence: str) -> None:
     with pytest.raises(CaptureInputError, match=sentence):
         segment_by_landmarks(mesh, points_mm, "the scan")
+
+
+def joined(one: Mesh, other: Mesh) -> Mesh:
+    return Mesh(
+        np.concatenate([one.vertices_mm, other.vertices_mm]),
+        np.concatenate([one.faces, other.faces + len(one.vertices_mm)]).astype(np.int32),
+    )
+
+
+def test_a_landmark_on_another_piece_of_the_scan_is_named() -> None:
+    piece = bumps({23: (20.0, -12.0)}).mesh
+    apart = joined(FOUR.mesh, Mesh(piece.vertices_mm + [12.0, 0.0, 0.0], piece.faces))
+    points_mm = TOPS | {23: np.array([[32.0, -12.0, CROWN_MM]])}
+    sentence = "landmark of tooth 23 lies on a piece of the scan that does not hang together .* one connected surface"
+    with pytest.raises(CaptureInputError, match=sentence):
+        segment_by_landmarks(apart, points_mm, "the scan")

@@ -110,8 +110,9 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
         what: the scan's name for messages.
 
     Raises:
-        CaptureInputError: fewer than two teeth have points, a point is not on the scan, points of two teeth coincide,
-            the teeth point into the gums, or no crown is found at a tooth's points.
+        CaptureInputError: fewer than two teeth have points, a point is not on the scan or on a piece apart from the
+            largest one, points of two teeth coincide, the teeth point into the gums, or no crown is found at a tooth's
+            points.
     """
     teeth = tuple(sorted(points_mm))
     opening = vector_area_mm2(mesh)
@@ -119,8 +120,9 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
     _require_points(mesh, points_mm, teeth, tops, what)
     is_kept = manifold_piece(mesh)
     surface = compact(Mesh(mesh.vertices_mm, mesh.faces[is_kept]))
+    _require_connected(surface, points_mm, what)
     middles = surface.vertices_mm[surface.faces].mean(axis=1)
-    is_core, outside_mm = _fitted_crowns(surface, middles, teeth, tops)
+    is_core, outside_mm = _fitted_crowns(surface, middles, teeth, tops, what)
     pairs = _face_pairs(surface, middles)
     likely = np.clip((outside_mm - GUMS_MM[0]) / (GUMS_MM[1] - GUMS_MM[0]), 0, 1)
     is_tooth = _minimal_cut(pairs, np.asarray(is_core.any(axis=1)), likely, GUMS_PER_MM * areas_mm2(surface))
@@ -129,12 +131,16 @@ def segment_by_landmarks(mesh: Mesh, points_mm: Mapping[int, Array], what: str) 
     labels = np.full(len(mesh.faces), GINGIVA, dtype=np.int64)
     labels[is_kept] = without_specks(surface, smooth_labels(surface.faces, own))
     for fdi in teeth:
-        if not (labels == fdi).any():
-            raise CaptureInputError(
-                f"No crown is found about the landmarks of tooth {fdi} in {what}; click the middle of its edge or"
-                " chewing surface."
-            )
+        _require_crown(bool((labels == fdi).any()), fdi, what)
     return labels
+
+
+def _require_crown(is_found: bool, fdi: int, what: str) -> None:
+    if not is_found:
+        raise CaptureInputError(
+            f"No crown is found about the landmarks of tooth {fdi} in {what}; click the middle of its edge or"
+            " chewing surface."
+        )
 
 
 def _top(points_mm: Array, opening: Array) -> Array:
@@ -179,8 +185,23 @@ def _require_points(mesh: Mesh, points_mm: Mapping[int, Array], teeth: tuple[int
         )
 
 
+def _require_connected(surface: Mesh, points_mm: Mapping[int, Array], what: str) -> None:
+    # Refuse points that lie on another piece of the scan than its largest one, which alone is segmented.
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(surface.vertices_mm)
+    for fdi in sorted(points_mm):
+        apart_mm = float(tree.query(points_mm[fdi])[0].max())
+        if apart_mm > FARTHEST_MM:
+            raise CaptureInputError(
+                f"A landmark of tooth {fdi} lies on a piece of {what} that does not hang together with the largest"
+                f" piece, {apart_mm:.3g} mm away; export the jaw with its gums as one connected surface, or remove the"
+                " landmark if the piece is no tooth of this jaw."
+            )
+
+
 def _fitted_crowns(
-    surface: Mesh, middles: Array, teeth: tuple[int, ...], tops: Array
+    surface: Mesh, middles: Array, teeth: tuple[int, ...], tops: Array, what: str
 ) -> tuple[NDArray[np.bool_], Array]:
     # Faces (F, T) that surely belong to each tooth, and distance (F,) of each face from the boxes of all teeth.
     from scipy.spatial import cKDTree
@@ -191,6 +212,7 @@ def _fitted_crowns(
     for k, (fdi, axes) in enumerate(zip(teeth, _axes(surface, teeth, tops), strict=True)):
         from_top = middles - tops[k]
         near = (np.linalg.norm(from_top, axis=1) < PATCH_MM) & (from_top @ axes[2] > -PATCH_DEPTH_MM)
+        _require_crown(bool(near.any()), fdi, what)
         match = CrownMatch(fdi, compact(Mesh(surface.vertices_mm, surface.faces[near])))
         found = _fitted(match, axes, tops[k])
         half = match.half_size_mm * found.scales[0]
