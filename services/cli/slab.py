@@ -112,6 +112,7 @@ def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> t
     """
     from pydantic import TypeAdapter, ValidationError
 
+    from services.core.files.validation import remedied
     from services.fit.slab.simulate import Layer
 
     given = [name for name, value in slab.items() if value is not None]
@@ -134,7 +135,7 @@ def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> t
     except ValidationError as problem:
         first = problem.errors()[0]
         raise SettingsError(
-            f"Option --layers, {'.'.join(str(part) for part in first['loc']) or 'value'}: {first['msg']}; correct it."
+            f"Option --layers, {'.'.join(str(part) for part in first['loc']) or 'value'}: {remedied(first)}."
         ) from problem
 
 

@@ -12,6 +12,7 @@ from urllib.parse import quote
 from pydantic import Field, SecretStr, ValidationError, model_validator
 
 from services.core.errors import SettingsError
+from services.core.files.fault_words import words_of
 from services.core.files.validation import remedied
 from services.core.geometry import Record
 from services.core.light.safety import (
@@ -261,7 +262,7 @@ def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> 
     except ValidationError as problem:
         first = problem.errors()[0]
         name = prefix + "__".join(str(part).upper() for part in first["loc"])
-        told = first["msg"].removeprefix("Value error, ")
+        told = words_of(first)
         remedy = "" if "; " in told else "; correct or remove the variable"
         raise SettingsError(f"Setting {name}: {told}{remedy}.") from problem
 
@@ -300,7 +301,7 @@ def job_from_tree(tree: Mapping[str, Any], base: Path, origin: str) -> JobSpec:
             known = ", ".join(sorted(JobSpec.model_fields))
             raise SettingsError(f"{origin}: unknown option '{option}'; known options are {known}.") from problem
         what = f"option '{option}': " if option else ""
-        raise SettingsError(f"{origin}: {what}{remedied(first['msg'])}.") from problem
+        raise SettingsError(f"{origin}: {what}{remedied(first)}.") from problem
     for option, path in {
         "capture": spec.capture,
         "calibration": spec.calibration,

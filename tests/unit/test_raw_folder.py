@@ -54,24 +54,24 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "exposure of zero": (
         lambda t: t["frame"][1].update(exposure_s=0.0),
-        r"frame 2 \(left_L1\.npy\): exposure_s: input should be greater than 0",
+        r"frame 2 \(left_L1\.npy\): exposure_s: must be greater than 0; correct it",
     ),
     "exposure as a text": (
         lambda t: t["frame"][1].update(exposure_s="0.1"),
         r"exposure_s: give a number, neither a text nor true or false",
     ),
-    "level above one": (lambda t: t["frame"][1].update(level=1.5), r"level: input should be less than or equal to 1"),
-    "NaN": (lambda t: t["frame"][1].update(time_s=float("nan")), r"time_s: input should be a finite number"),
+    "level above one": (lambda t: t["frame"][1].update(level=1.5), r"level: must be 1 or less; correct it"),
+    "NaN": (lambda t: t["frame"][1].update(time_s=float("nan")), r"time_s: must be a finite number"),
     "pixel without y": (
         lambda t: t["frame"][-1]["corners_px"][2].pop(),
         r"frame 10 \(chart\.npy\): corners_px\[2\]\[1\]: ",
     ),
     "unknown kind": (
         lambda t: t["frame"][1].update(kind="lit"),
-        r"frame 2 \(left_L1\.npy\): kind: input should be 'black'",
+        r"frame 2 \(left_L1\.npy\): kind: must be 'black'",
     ),
-    "no frame": (lambda t: t.update(frame=[]), r"'frame' is missing|frame: tuple should have at least 1"),
-    "units in cm": (lambda t: t.update(units="cm"), r"units: input should be 'mm'"),
+    "no frame": (lambda t: t.update(frame=[]), r"'frame' is missing|frame: has 0 entries and needs at least 1"),
+    "units in cm": (lambda t: t.update(units="cm"), r"units: must be 'mm'"),
     "a camera twice": (lambda t: t["camera"].append(t["camera"][0]), r"camera left is listed twice"),
     "a light twice": (lambda t: t["light"].append(t["light"][0]), r"light L1 is listed twice"),
     "a file twice": (lambda t: t["frame"].append(t["frame"][1]), r"file left_L1\.npy is listed in two frames"),
@@ -131,7 +131,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "unknown mosaic": (
         lambda t: t["camera"][0].update(mosaic="RGBG"),
-        r"camera 1 \(left\): mosaic: input should be 'none'",
+        r"camera 1 \(left\): mosaic: must be 'none'",
     ),
     "cameras of other channels": (
         lambda t: t["camera"][1].update(channels=["green"]),
@@ -139,7 +139,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "no tooth's number": (
         lambda t: t["landmark"][0].update(tooth=9),
-        r"landmark 1 \(9\): tooth: input should be greater",
+        r"landmark 1 \(9\): tooth: must be 11 or more",
     ),
     "a landmark twice": (
         lambda t: t["landmark"].append(t["landmark"][0]),

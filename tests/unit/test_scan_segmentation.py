@@ -114,8 +114,8 @@ def joined(one: Mesh, other: Mesh) -> Mesh:
 
 
 def test_a_landmark_on_another_piece_of_the_scan_is_named() -> None:
-    piece = bumps({23: (20.0, -12.0)}).mesh
-    apart = joined(FOUR.mesh, Mesh(piece.vertices_mm + [12.0, 0.0, 0.0], piece.faces))
+    piece = bumps({23: (32.0, -12.0)}).mesh
+    apart = joined(FOUR.mesh, piece)
     points_mm = TOPS | {23: np.array([[32.0, -12.0, CROWN_MM]])}
     sentence = "landmark of tooth 23 lies on a piece of the scan that does not hang together .* one connected surface"
     with pytest.raises(CaptureInputError, match=sentence):

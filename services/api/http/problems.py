@@ -250,4 +250,4 @@ def _sentence(errors: Sequence[Any]) -> str:
     name = ".".join(str(part) for part in first["loc"][1:]) or str(first["loc"][0])
     if first["type"] == "extra_forbidden":
         return f"Unknown option '{name}'; GET /v1/options lists the known ones."
-    return f"'{name}': {remedied(first['msg'])}."
+    return f"'{name}': {remedied(first)}."

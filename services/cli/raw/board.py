@@ -33,7 +33,7 @@ def board_command(
     except ValidationError as problem:
         first = problem.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the board"
-        raise SettingsError(f"Option for {where}: {remedied(first['msg'])}.") from None
+        raise SettingsError(f"Option for {where}: {remedied(first)}.") from None
     write_atomic(out, board_pdf(board))
     print(f"{out}: print it at 100 %, and check that its ruler is 100 mm long. Its entry in raw.toml:")
     print("[[board]]")

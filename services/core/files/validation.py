@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 from pydantic import BaseModel, ValidationError
 
 from services.core.errors import CaptureInputError
+from services.core.files.fault_words import words_of
 from services.core.files.json_text import AmbiguousJsonError, parse_json
 
 if TYPE_CHECKING:
@@ -16,11 +17,9 @@ if TYPE_CHECKING:
 R = TypeVar("R", bound=BaseModel)
 
 
-def remedied(message: str) -> str:
-    """Pydantic's message without its prefix, and with a remedy where it has none: one of our own has, after a
-    semicolon.
-    """
-    told = message.removeprefix("Value error, ")
+def remedied(error: ErrorDetails) -> str:
+    """What is wrong with a value, with a remedy after a semicolon."""
+    told = words_of(error)
     return told if "; " in told else f"{told}; correct it"
 
 
@@ -68,7 +67,7 @@ def fault_text(error: ErrorDetails, kind: type[BaseModel], key: str, place: str 
         return f"{place}unknown key '{key}'; known keys are {', '.join(sorted(kind.model_fields))}"
     if error["type"] == "missing" and not key.isdecimal():
         return f"{place}'{key}' is missing; add it"
-    message = remedied(error["msg"])
+    message = remedied(error)
     return f"{place}{value}{message[:1].lower()}{message[1:]}"
 
 

@@ -13,8 +13,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from services.core.geometry import Name, Record, Vector3
-from services.core.raw.targets import Board, CalibrationFile, Chart, Label, Landmark, Pixel, ScanFile, Sphere
+from services.core.geometry import Record, Vector3
+from services.core.raw.targets import Board, CalibrationFile, Chart, Label, Landmark, Pixel, RawName, ScanFile, Sphere
 from services.core.records import FileName, Number, Positive, Unit, Whole
 
 Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
@@ -37,7 +37,7 @@ MAX_BITS = 16
 class RawCamera(Record):
     """A camera, and the format of its files."""
 
-    name: Name
+    name: RawName
     size: tuple[Annotated[Whole, Field(gt=0, le=65536)], Annotated[Whole, Field(gt=0, le=65536)]] = Field(
         description="width, height in pixels"
     )
@@ -48,7 +48,7 @@ class RawCamera(Record):
         default=0, description="how many bits the files move counts up: 4 for 12 bits in the high bits of 16"
     )
     mosaic: Mosaic = Field(default="none", description="colours of the 2 x 2 pixels at the upper left, row by row")
-    channels: tuple[Name, ...] = Field(
+    channels: tuple[RawName, ...] = Field(
         default=MOSAIC_CHANNELS, min_length=1, max_length=16, description="order in the files where mosaic is none"
     )
     saturation_counts: Positive | None = Field(
@@ -82,7 +82,7 @@ class RawCamera(Record):
 class RawLight(Record):
     """A light of the rig."""
 
-    name: Name
+    name: RawName
     address: Whole | None = Field(default=None, ge=0, description="at the dome's controller")
     position_mm: Vector3 | None = Field(
         default=None, description="a guess or a measured list in any one frame: it is aligned rigidly"
@@ -93,10 +93,10 @@ class RawLight(Record):
 class RawFrame(Record):
     """One photograph of one camera."""
 
-    camera: Name
+    camera: RawName
     file: FileName = Field(min_length=1, description="relative to raw.toml")
     kind: FrameKind
-    light: Name | None = Field(default=None, description="null: all lights on, or none where the kind is a dark one")
+    light: RawName | None = Field(default=None, description="null: all lights on, or none where the kind is a dark one")
     level: Unit = Field(default=1.0, description="of the lights, as a fraction of full; their intensity scales with it")
     exposure_s: Positive
     gain: Positive = Field(default=1.0, description="linear factor from light to counts, beside the exposure")
@@ -105,9 +105,9 @@ class RawFrame(Record):
     place: Label | None = Field(
         default=None, description="frames of one kind and place see the thing unmoved, from all cameras"
     )
-    board: Name | None = None
-    sphere: Name | None = None
-    chart: Name | None = None
+    board: RawName | None = None
+    sphere: RawName | None = None
+    chart: RawName | None = None
     corners_px: tuple[Pixel, Pixel, Pixel, Pixel] | None = Field(
         default=None, description="of a chart: centres of its patches 1, 6, 24, 19; searched where it is null"
     )

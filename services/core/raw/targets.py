@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from services.core.geometry import Name, Record, Vector3
 from services.core.records import FileName, Number, Positive, Unit, Whole
@@ -15,13 +15,23 @@ Pixel = tuple[Number, Number]
 """Position in an image, x then y, pixels; the first pixel's centre is (0.5, 0.5)."""
 Fdi = Annotated[Whole, Field(ge=11, le=85)]
 """Number of a tooth in the notation of the FDI."""
-Label = Annotated[str, Field(min_length=1, max_length=64)]
+
+
+def _written_out(given: object) -> object:
+    """A name that is given as a number, such as place = 1, as text; everything else unchanged."""
+    return str(given) if isinstance(given, int | float) and not isinstance(given, bool) else given
+
+
+Label = Annotated[str, Field(min_length=1, max_length=64), BeforeValidator(_written_out)]
+"""Word of a description, such as a place; a number is one too."""
+RawName = Annotated[Name, BeforeValidator(_written_out)]
+"""Name of a thing in ``raw.toml``; a number is one too."""
 
 
 class Board(Record):
     """A flat board of squares, whose points lie where OpenCV places them."""
 
-    name: Name
+    name: RawName
     type: Literal["charuco", "chessboard", "aruco"]
     squares: tuple[Annotated[Whole, Field(ge=1, le=200)], Annotated[Whole, Field(ge=1, le=200)]] = Field(
         description="columns, rows of squares, not of inner corners; of an aruco board, of markers"
@@ -53,7 +63,7 @@ class Board(Record):
 class Sphere(Record):
     """A sphere by which lights are measured: a mirror sphere for their positions, a white one for their intensities."""
 
-    name: Name
+    name: RawName
     kind: Literal["mirror", "white"]
     radius_mm: Positive
     reflectance: tuple[Unit, ...] | None = Field(
@@ -75,7 +85,7 @@ class Sphere(Record):
 class Chart(Record):
     """A colour chart of 24 patches."""
 
-    name: Name
+    name: RawName
     type: Literal["colorchecker-24"]
     reference: FileName = Field(
         description=(
@@ -111,7 +121,7 @@ class ScanFile(Record):
 class SeenPoint(Record):
     """Where one camera sees a landmark."""
 
-    camera: Name
+    camera: RawName
     xy_px: Pixel
 
 

@@ -10,6 +10,7 @@ import typer
 from pydantic import ValidationError
 
 from services.core.errors import DentineError, SettingsError
+from services.core.files.validation import remedied
 from services.core.results import Figure
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES
 from services.core.verdict import NOT_CONVERGED_STATUS, percent
@@ -39,7 +40,7 @@ def main(
                 particle_absorption=particle_absorption,
             )
         except ValidationError as problem:
-            raise SettingsError(f"{problem.errors()[0]['msg'].removeprefix('Value error, ')}.") from problem
+            raise SettingsError(f"{remedied(problem.errors()[0])}.") from problem
         fits = fit_slab(folder, options)
     except DentineError as error:
         print(error, file=sys.stderr)

@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from services.core.errors import CaptureInputError
 from services.core.files.tables import read_text, require_points
+from services.core.files.validation import remedied
 from services.core.geometry import Record
 from services.core.slab.folder import Cell, Glass, Positive
 from services.core.store import read_record
@@ -159,7 +160,7 @@ def _read_rxt(path: Path) -> SphereFile:
     except ValidationError as problem:
         first = problem.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise CaptureInputError(f"{path}: {place}: {first['msg']}; correct it.") from problem
+        raise CaptureInputError(f"{path}: {place}: {remedied(first)}.") from problem
 
 
 def _numbers(path: Path) -> list[tuple[int, list[float]]]:
@@ -229,7 +230,7 @@ def _reading(path: Path, line: int, row: list[float], columns: int) -> TotalsRea
         )
     except ValidationError as problem:
         first = problem.errors()[0]
-        raise CaptureInputError(f"{path}, line {line}: {first['loc'][-1]}: {first['msg']}; correct it.") from problem
+        raise CaptureInputError(f"{path}, line {line}: {first['loc'][-1]}: {remedied(first)}.") from problem
 
 
 def _sphere(numbers: list[float]) -> dict[str, float]:
