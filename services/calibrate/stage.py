@@ -40,6 +40,8 @@ def run(spec: JobSpec, context: StageContext) -> Registration:
     for step in record.steps:
         for sentence in step.left_out:
             context.report(StageEvent(stage="register", kind="log", message=f"Left out by {step.name}: {sentence}."))
+    for sentence in record.warnings:
+        context.report(StageEvent(stage="register", kind="log", message=sentence))
     context.raise_if_cancelled()
     writer.publish(record)
     shutil.rmtree(refused, ignore_errors=True)

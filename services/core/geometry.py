@@ -6,7 +6,7 @@ Lengths are millimetres, camera axes follow OpenCV (x right, y down, z forward).
 from __future__ import annotations
 
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -108,6 +108,8 @@ class Mesh:
 
     vertices_mm: NDArray[np.float64]
     faces: NDArray[np.int32]
+    dropped_vertices: int = field(default=0, compare=False)
+    """Number of the file's vertices that no face uses, which were dropped as it was read."""
 
     def edge_counts(self) -> NDArray[np.int64]:
         """Number of faces that share each undirected edge, (E,)."""

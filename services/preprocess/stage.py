@@ -8,7 +8,7 @@ from services.core.errors import SettingsError
 from services.core.installed import require_packages
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
-from services.core.stage import StageContext
+from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter
 
 PACKAGES = ("cv2", "imagecodecs", "jinja2", "rtree", "tifffile")
@@ -62,6 +62,8 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     masks = HandMasks(context.root, source.description)
     subject = read_subject(source.root, spec.kind == "jaw", spec.fdi, spec.surroundings)
     require_plausible_scale(cameras, source.description.lights, subject.teeth)
+    if subject.note is not None:
+        context.report(StageEvent(stage="prepare", kind="log", message=subject.note))
 
     files = AttemptFiles(StageWriter(context.root, STAGE, context.attempt))
     digest = digest_of_inputs(spec, source, masks)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
-from services.core.files.meshes import read_mesh, read_teeth
+from services.core.files.meshes import note_on_dropped, read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.raw.registration import REGISTRATION
 from services.preprocess.projection import Footprint, project
@@ -60,6 +60,14 @@ class Subject:
         """Surfaces that are fitted, and that a camera's window must contain."""
         around = [mesh for mesh in (self.gums, self.cavity) if mesh is not None and self.whole]
         return [tooth.outer for tooth in self.teeth] + around
+
+    @property
+    def note(self) -> str | None:
+        """A sentence on vertices of the files that were left out; None where there are none."""
+        named = {f"teeth/{tooth.fdi}/outer.ply": tooth.outer for tooth in (*self.teeth, *self.others)}
+        named |= {f"teeth/{tooth.fdi}/dentin.ply": tooth.dentin for tooth in self.teeth if tooth.dentin is not None}
+        around = {"gums.ply": self.gums, "cavity.ply": self.cavity}
+        return note_on_dropped(named | {name: mesh for name, mesh in around.items() if mesh is not None})
 
     def rendered_meshes(self) -> list[Mesh]:
         """Surfaces whose shadows the fit renders."""

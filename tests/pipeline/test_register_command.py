@@ -63,17 +63,20 @@ def test_a_whole_arch_meets_the_target(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
-def test_another_persons_scan_is_refused_and_ones_own_is_not(tmp_path: Path, seed: int) -> None:
+def test_another_persons_scan_is_refused_or_doubted_and_ones_own_is_not(tmp_path: Path, seed: int) -> None:
     # No threshold was chosen with these subjects. The operator clicks the same points on another person's teeth.
     own = write_raw_mouth(_made(tmp_path / "own"), 300 + seed, seed, places=7)
     other = write_raw_mouth(_made(tmp_path / "other"), 400 + seed, 50 + seed, places=7)
-    register_folder(own.root)
+    assert register_folder(own.root).warnings == ()
     points = {(one["tooth"], one["point"]): one["xyz_mm"] for one in other.tree["landmark"]}
     exchanged = [one | {"xyz_mm": points[one["tooth"], one["point"]]} for one in own.tree["landmark"]]
     shutil.copy(other.root / "scan.ply", own.root / "scan.ply")
     root = altered(own, tmp_path / "wrong", {"landmark": exchanged})
-    with pytest.raises(CaptureInputError, match=r"refused_c0\.png"):
-        register_folder(root)
+    try:
+        told = register_folder(root).warnings[0]
+    except CaptureInputError as refused:
+        told = refused.message
+    assert "refused_c0.png" in told or "see in the overlay pictures whether the scan is of this person" in told
 
 
 def _made(folder: Path) -> Path:

@@ -138,7 +138,7 @@ def test_an_exposure_that_nothing_says(photographs: Path) -> None:
 
 
 def test_a_folder_without_photographs(tmp_path: Path) -> None:
-    with pytest.raises(CaptureInputError, match="holds no photograph; put"):
+    with pytest.raises(CaptureInputError, match="holds no photograph of counts; put"):
         import_folder(tmp_path, None, None, None)
 
 

@@ -33,6 +33,8 @@ def photographs(root: Path, *files: str) -> Path:
         ("left_L07_upper_f8_0.05s.npy", ("left", "L07"), ("f8", "upper")),
         ("left_ring_07_0.05s.npy", ("left", "ring"), ("07",)),
         ("left_L07_0.05s_3.npy", ("left", "L07"), ()),
+        ("left_L07_450nm_0.05s.npy", ("left", "L07-450nm"), ()),
+        ("left_650nm_0.05s.npy", ("left", "650nm"), ()),
     ],
 )
 def test_words_of_a_name(file: str, told: tuple[str, str], unused: tuple[str, ...]) -> None:
@@ -89,3 +91,10 @@ def test_copies_and_the_files_of_systems_are_left_out_and_said(tmp_path: Path) -
     for file in (".Trash/left_L2_5ms.npy", "__MACOSX/left_L3_5ms.npy", "@eaDir/left_L4_5ms.npy", "._left_L5_5ms.npy"):
         assert file in hidden
     assert "1 of .jpg, 1 of .xmp, 1 of no suffix" in others
+
+
+def test_bands_of_one_lamp_are_lights_of_their_own(tmp_path: Path) -> None:
+    bands = ("450nm_5ms", "550nm_20ms", "650nm_80ms")
+    photographs(tmp_path, *(f"left_lamp_{band}.npy" for band in bands))
+    folder = import_folder(tmp_path, None, "RGGB", None).folder
+    assert [one.name for one in folder.light] == ["lamp-450nm", "lamp-550nm", "lamp-650nm"]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.scans.order import require_order
-from services.anatomy.scans.patches import middle_mm
+from services.anatomy.scans.patches import compact, middle_mm
 from services.anatomy.scans.segmentation import GINGIVA, segment_by_landmarks
 from services.anatomy.scans.units import MM_PER_UNIT, Unit, require_anatomical_scale
 from services.anatomy.templates.average_arch import is_upper
@@ -44,6 +44,8 @@ class LabelledScan:
     """FDI number (F,) of each face; 0 for gingiva."""
     doubled_vertices: int = 0
     """Number of vertices of the file that were copies of others and were joined with them."""
+    unused_vertices: int = 0
+    """Number of vertices that no triangle uses and that were dropped."""
     is_labelled: bool = True
     """Whether the numbers are labels of the file; otherwise they follow from points on the teeth."""
 
@@ -96,13 +98,14 @@ def read_scan(
     is_labelled = labels is not None or _array(file, LABEL) is not None
     values = _triangle_labels(file, path, labels or LABEL) if is_labelled else None
     mesh, doubled = _welded(file.mesh)
+    whole, mesh = len(mesh.vertices_mm), compact(mesh)
     mesh = Mesh(MM_PER_UNIT[units] * mesh.vertices_mm, mesh.faces)
     if values is None:
         mesh.require_surface(f"of scan {path}", EXTENT_MM)
         fdi = segment_by_landmarks(mesh, points_mm or {}, f"scan {path}")
     else:
         fdi = _fdi_numbers(values, numbering, path)
-    scan = LabelledScan(mesh, fdi, doubled, is_labelled)
+    scan = LabelledScan(mesh, fdi, doubled, whole - len(mesh.vertices_mm), is_labelled)
     _require_one_jaw(scan, path, jaw)
     if np.isfinite(mesh.vertices_mm).all():
         middles = [middle_mm(Mesh(mesh.vertices_mm, mesh.faces[scan.fdi == number])) for number in scan.teeth]

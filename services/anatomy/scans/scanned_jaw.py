@@ -47,6 +47,8 @@ class Repairs:
 
     doubled_vertices: int
     """Number of vertices that were joined with others at the same place."""
+    unused_vertices: int
+    """Number of vertices that no triangle used and that were left out."""
     removed_triangles: int
     """Number of removed triangles: degenerate, duplicate, at an edge with more than two, or apart from the jaw."""
     holes_mm: tuple[float, ...]
@@ -54,12 +56,13 @@ class Repairs:
 
     def sentence(self) -> str:
         """Describe the repairs in one sentence for a report."""
+        unused = f"{self.unused_vertices} vertices that no triangle uses left out, " if self.unused_vertices else ""
         holes = f"{len(self.holes_mm)} holes closed" + (
             f" (the longest {self.holes_mm[0]:.1f} mm around)" if self.holes_mm else ""
         )
         return (
-            f"{self.doubled_vertices} doubled vertices joined, {self.removed_triangles} triangles removed that did not "
-            f"belong to one plain surface, {holes}."
+            f"{self.doubled_vertices} doubled vertices joined, {unused}{self.removed_triangles} triangles removed that"
+            f" did not belong to one plain surface, {holes}."
         )
 
 
@@ -164,7 +167,7 @@ def _clean(scan: LabelledScan) -> tuple[Mesh, NDArray[np.int64], Repairs]:
     holes_mm = sorted(
         (_length_mm(surface.vertices_mm[loop]) for loop in boundary_loops(surface.faces)[1:]), reverse=True
     )
-    repairs = Repairs(scan.doubled_vertices, int(np.count_nonzero(~kept)), tuple(holes_mm))
+    repairs = Repairs(scan.doubled_vertices, scan.unused_vertices, int(np.count_nonzero(~kept)), tuple(holes_mm))
     surface, sources = fill_holes(surface)
     labels = np.concatenate([labels, labels[sources]])
     labels = without_specks(surface, smooth_labels(surface.faces, labels))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -18,7 +18,7 @@ from services.core.calibration.record import Calibration
 from services.core.errors import CaptureInputError
 from services.core.files.scans import FORMATS
 from services.core.raw.decoded import Decoded
-from services.core.raw.decoding import CAMERA_RAW, decode
+from services.core.raw.decoding import CAMERA_RAW, JPEG, decode, is_jpeg, read_jpeg
 from services.core.raw.folder import DESCRIPTION, parse_raw_folder
 from services.core.raw.records import TARGET_KEYS, RawFolder
 from services.core.raw.toml_writing import description_toml, toml_value
@@ -97,9 +97,9 @@ def import_folder(
         raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")
     listing = photographs_in(root)
     if not listing.photographs:
-        raise CaptureInputError(
-            f"{root} holds no photograph; put {', '.join(sorted(IMAGES - CAMERA_RAW))} or camera raw files there."
-        )
+        told = f"put {', '.join(sorted(IMAGES - CAMERA_RAW))} or camera raw files there"
+        seen = "".join(f" ({note[:-1]})" for note in listing.notes)
+        raise CaptureInputError(f"{root} holds no photograph of counts{seen}; {told}.")
     if calibration is not None:
         read_record(calibration, Calibration)
     interpreted = {file: named_frame(file, {word.lower() for word in ignored}) for file in listing.photographs}
@@ -112,6 +112,7 @@ def import_folder(
     if not frames:
         raise CaptureInputError(unnamed[0].replace(", so it is left out", ""))
     require_told_apart(frames)
+    frames = [replace(one, exposure_s=1.0) if _needs_no_exposure(one) else one for one in frames]
     if exposure_s is None and (incomplete := [one.file for one in frames if one.exposure_s is None]):
         which = (
             f"File {incomplete[0]} does"
@@ -139,6 +140,11 @@ def import_folder(
     return Imported(
         folder, (*listing.notes, *unused_words(frames), *unnamed, *target_notes, *_missing(root, folder, scans))
     )
+
+
+def _needs_no_exposure(one: NamedFrame) -> bool:
+    """Whether a photograph lacks an exposure that nothing uses: a JPEG of a board."""
+    return one.exposure_s is None and Path(one.file).suffix.lower() in JPEG
 
 
 def _tree(
@@ -170,7 +176,8 @@ def _frame(one: NamedFrame, exposure_s: float | None) -> Entry:
 def _camera(root: Path, name: str, frames: Sequence[NamedFrame], mosaic: str | None) -> Entry:
     """Entry of a camera with its size, bits, mosaic and channels, from some of its files."""
     # Read the frames with the most light, because they use the most bits.
-    bright = sorted(frames, key=lambda one: (one.kind == "black", -(one.exposure_s or 0) * one.gain))[:FRAMES_READ]
+    of_counts = [one for one in frames if Path(one.file).suffix.lower() not in JPEG] or list(frames)
+    bright = sorted(of_counts, key=lambda one: (one.kind == "black", -(one.exposure_s or 0) * one.gain))[:FRAMES_READ]
     decoded = [_decoded(root, one) for one in bright]
     first = decoded[0]
     height, width = first.values.shape[:2]
@@ -187,7 +194,8 @@ def _camera(root: Path, name: str, frames: Sequence[NamedFrame], mosaic: str | N
 
 def _decoded(root: Path, frame: NamedFrame) -> Decoded:
     try:
-        return decode(root / frame.file)
+        path = root / frame.file
+        return read_jpeg(path) if frame.kind == "board" and is_jpeg(path) else decode(path)
     except ValueError as problem:
         raise CaptureInputError(f"File {root / frame.file} {problem}.") from problem
 

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from services.capture.raw.names import NamedFrame
+from services.capture.raw.names import NamedFrame, named_frame
 from services.core.errors import CaptureInputError
 from services.core.files.scans import FORMATS
-from services.core.raw.decoding import CAMERA_RAW
+from services.core.raw.decoding import CAMERA_RAW, JPEG
 
 IMAGES = frozenset({".png", ".tif", ".tiff", ".npy", ".exr", *CAMERA_RAW})
 _USED_OTHERWISE = frozenset({*FORMATS, ".toml", ".json", ".csv"})
@@ -43,11 +43,16 @@ def photographs_in(root: Path) -> Listing:
         suffix = pure.suffix.lower()
         if any(part.startswith(".") or part.lower() in _KEPT_BY_PROGRAMS for part in pure.parts):
             hidden.append(str(pure))
-        elif suffix in IMAGES:
+        elif suffix in IMAGES or (suffix in JPEG and _is_of_board(str(pure))):
             (copies if _COPY.fullmatch(pure.stem) else kept).append(str(pure))
         elif suffix not in _USED_OTHERWISE:
             others[suffix or "no suffix"] += 1
     return Listing(tuple(kept), tuple(_left_out(copies, hidden, others)))
+
+
+def _is_of_board(file: str) -> bool:
+    named = named_frame(file)
+    return isinstance(named, NamedFrame) and named.kind == "board"
 
 
 def _left_out(copies: Sequence[str], hidden: Sequence[str], others: Mapping[str, int]) -> Iterator[str]:
@@ -57,7 +62,11 @@ def _left_out(copies: Sequence[str], hidden: Sequence[str], others: Mapping[str,
         yield f"Files that a system keeps are left out: {_listed(hidden)}; move photographs among them elsewhere."
     if others:
         kinds = ", ".join(f"{count} of {kind}" for kind, count in sorted(others.items()))
-        yield f"Files that are no photographs of counts are passed over: {kinds}; export photographs among them anew."
+        of_boards = "; JPEGs may only show boards, named such as left_board1.jpg" if JPEG & set(others) else ""
+        yield (
+            f"Files that are no photographs of counts are passed over: {kinds}; export photographs among them anew"
+            f"{of_boards}."
+        )
 
 
 def require_told_apart(frames: Sequence[NamedFrame]) -> None:

@@ -1,7 +1,8 @@
 """Interpretation of a photograph's file name: camera, kind or light, exposure and gain.
 
 The words of a path are separated by slashes, underscores and blanks. The first word without another meaning is the
-camera, the second one the light; numbers that follow count repetitions, and all other words are listed as unused::
+camera, the second one the light, to whose name a wavelength such as 450nm is added; numbers that follow count
+repetitions, and all other words are listed as unused::
 
     left_L07_0.05s.tif    left/black_50ms_2.png    right_tracking_003_1-20s.dng    left_flat_0.1s_gain4.npy
 """
@@ -44,6 +45,8 @@ PLACED: frozenset[FrameKind] = frozenset({"board", "mirror-sphere", "white-spher
 """Kinds of photographs of a target that is moved from place to place."""
 _SECONDS = re.compile(r"(?:(\d+)-(\d+)|(\d+(?:\.\d+)?))(s|ms|us)")
 _GAIN = re.compile(r"gain(\d+(?:\.\d+)?)")
+_BAND = re.compile(r"\d{3,4}nm")
+"""A wavelength: photographs of one lamp through other filters are lit by other light."""
 _NUMBER = re.compile(r"\d+")
 _DECIMAL = re.compile(r"\d*\.\d+")
 _MEANINGLESS = re.compile(
@@ -80,7 +83,7 @@ def named_frame(file: str, ignored: AbstractSet[str] = frozenset()) -> NamedFram
     pure = PurePosixPath(file)
     parts = [part for whole in (*pure.parent.parts, pure.stem) for part in re.split(r"[_ ]+", whole) if part]
     parts = [part for part in parts if part.lower() not in ignored]
-    exposure_s, gain, kind, place = None, 1.0, None, None
+    exposure_s, gain, kind, place, band = None, 1.0, None, None, None
     words, unused = list[str](), list[str]()
     for before, part in zip(["", *parts], parts, strict=False):
         word = part.lower()
@@ -91,6 +94,8 @@ def named_frame(file: str, ignored: AbstractSet[str] = frozenset()) -> NamedFram
             exposure_s = (float(over) / float(under) if over else float(whole)) * _UNITS[unit]
         elif (stated_gain := _GAIN.fullmatch(word)) is not None:
             gain = float(stated_gain[1])
+        elif _BAND.fullmatch(word) is not None and band is None:
+            band = part
         elif _DECIMAL.fullmatch(word) is not None:
             return f"says {part} without a unit, such as {part}s"
         elif (found := KINDS.get(word.rstrip("0123456789").rstrip("-"))) is not None and kind is None:
@@ -105,7 +110,7 @@ def named_frame(file: str, ignored: AbstractSet[str] = frozenset()) -> NamedFram
             unused.append(part)  # it may count lights or repetitions
     if not words:
         return "does not name its camera"
-    light = words[1] if len(words) > 1 else None
+    light = "-".join(part for part in (*words[1:2], band) if part is not None) or None
     kind = kind or ("light" if light is not None else None)
     if kind is None:
         return f"names camera {words[0]}, and neither a light nor a kind such as black, flat or tracking"

@@ -25,9 +25,7 @@ def register(
         float | None,
         typer.Option(
             min=0.0,
-            help=(
-                "Median distance of outlines beyond which the scan is refused, mm; default: 0.1, for a calibrated rig."
-            ),
+            help=("Median distance of outlines beyond which the scan is refused, mm; default: 0.32."),
         ),
     ] = None,
 ) -> None:

@@ -4,6 +4,7 @@ reads labelled scans.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ MIN_SPACING_MM = 2.0
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a PLY, OBJ or STL file in mm; vertices at the same place are merged, and no face is flipped.
+    """Read a PLY, OBJ or STL file in mm; vertices at the same place are merged, vertices that no face uses are dropped,
+    and no face is flipped.
 
     Raises:
         CaptureInputError: the file is absent or no triangle mesh.
@@ -40,8 +42,18 @@ def read_mesh(path: Path) -> Mesh:
         raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise CaptureInputError(f"Mesh file {path} has a triangle of points that it does not hold; export it again.")
-    welded, index = np.unique(vertices, axis=0, return_inverse=True)
-    return Mesh(welded, index.reshape(-1)[faces].astype(np.int32))
+    used, corner = np.unique(faces, return_inverse=True)
+    welded, index = np.unique(vertices[used], axis=0, return_inverse=True)
+    return Mesh(welded, index.reshape(-1)[corner.reshape(-1, 3)].astype(np.int32), len(vertices) - len(used))
+
+
+def note_on_dropped(meshes: Mapping[str, Mesh]) -> str | None:
+    """A sentence on vertices that no face uses and that were dropped, by the meshes' names; None where all are used."""
+    dropped = {name: mesh.dropped_vertices for name, mesh in meshes.items() if mesh.dropped_vertices}
+    if not dropped:
+        return None
+    told = ", ".join(f"{count} of {name}" for name, count in dropped.items())
+    return f"Vertices that no triangle uses are left out: {told}."
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:

@@ -25,11 +25,36 @@ CAMERA_RAW = frozenset(
 _SIGNATURES: Mapping[str, bytes] = MappingProxyType(
     {".png": b"\x89PNG\r\n\x1a\n", ".npy": b"\x93NUMPY", ".exr": b"v/1\x01"}
 )
+JPEG = frozenset({".jpg", ".jpeg"})
+"""Suffixes of JPEG files, which may be photographs of boards, as those need no counts."""
 _JPEG = b"\xff\xd8\xff"
 
 
+def is_jpeg(path: Path) -> bool:
+    """Whether a file is a JPEG by its name or by its first bytes."""
+    if path.suffix.lower() in JPEG:
+        return True
+    with path.open("rb") as stream:
+        return stream.read(len(_JPEG)) == _JPEG
+
+
+def read_jpeg(path: Path) -> Decoded:
+    """Read a JPEG as its sensor's rows and columns; its values are no counts, but show where things are.
+
+    Raises:
+        ValueError: the file cannot be read; the message is the part of a sentence that says why.
+    """
+    import cv2
+
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    values = cv2.imdecode(np.frombuffer(path.read_bytes() or b"0", dtype=np.uint8), flags)
+    if values is None:
+        raise ValueError("cannot be read as a JPEG; it may be truncated, so copy or export it again")
+    return Decoded(values if values.ndim == 2 else values[..., ::-1])
+
+
 def decode(path: Path) -> Decoded:
-    """Read an image file.
+    """Read an image file of counts.
 
     Raises:
         ValueError: the file cannot be read; the message is the part of a sentence that says why.
@@ -38,9 +63,10 @@ def decode(path: Path) -> Decoded:
     suffix = path.suffix.lower()
     with path.open("rb") as stream:
         head = stream.read(16)
-    if suffix in {".jpg", ".jpeg"} or head.startswith(_JPEG):
+    if suffix in JPEG or head.startswith(_JPEG):
         raise ValueError(
-            "is a JPEG, whose values are no counts; export the camera's raw file, or a PNG or TIFF of counts"
+            "is a JPEG, whose values are no counts and which only a frame of kind board may be; export the camera's raw"
+            " file, or a PNG or TIFF of counts"
         )
     if suffix not in _DECODERS:
         known = ", ".join(sorted({*_DECODERS, "camera raw"} - CAMERA_RAW))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.raw.decoded import Decoded
-from services.core.raw.decoding import decode
+from services.core.raw.decoding import decode, is_jpeg, read_jpeg
 from services.core.raw.folder import require_inside
 from services.core.raw.fullness import Fullness, fullness_of
 from services.core.raw.records import DARK, RawCamera, RawFolder, RawFrame
@@ -35,7 +35,7 @@ class Frame:
 
     Attributes:
         counts: (H, W) for a camera with a mosaic, else (H, W, C), in the order of the folder's channels; whole numbers
-            as uint16 and others as float32.
+            as uint16 and others as float32. Of a JPEG of a board, its values (H, W, C) in its own order.
         fullness: from which count on its pixels are full.
     """
 
@@ -59,6 +59,8 @@ def read_frame(root: Path, folder: RawFolder, frame: RawFrame) -> Frame:
     path = require_inside(root, frame.file, what)
     camera = folder.camera_named(frame.camera)
     try:
+        if frame.kind == "board" and is_jpeg(path):
+            return _picture(read_jpeg(path), camera)
         decoded = decode(path)
         _require_whole(decoded, frame, camera)
         counts = _significant_bits(_in_camera_shape(decoded, camera), camera)
@@ -74,6 +76,24 @@ def read_frame(root: Path, folder: RawFolder, frame: RawFrame) -> Frame:
         if order != sorted(order):
             counts[:] = counts[..., order]
     return Frame(counts, _fullness(decoded, counts, frame, camera))
+
+
+def _picture(decoded: Decoded, camera: RawCamera) -> Frame:
+    # A JPEG of a board: of the camera's size, with any number of channels and 8 bits whatever the camera's counts have.
+    values = decoded.values
+    _require_size(values, camera)
+    values = values[..., None] if values.ndim == 2 else values
+    return Frame(values.astype(np.uint16), Fullness((np.inf,) * values.shape[2], values.shape[:2], False))
+
+
+def _require_size(values: NDArray[np.generic], camera: RawCamera) -> None:
+    width, height = camera.size
+    if values.ndim not in {2, 3} or values.shape[:2] != (height, width):
+        size = " x ".join(map(str, (values.shape[1::-1] if values.ndim in {2, 3} else values.shape)))
+        turned = " (turned by 90 degrees?)" if values.shape[:2] == (width, height) else ""
+        raise ValueError(
+            f"has {size} pixels{turned}, but its camera has {width} x {height}; export it at the camera's size"
+        )
 
 
 def _require_whole(decoded: Decoded, frame: RawFrame, camera: RawCamera) -> None:
@@ -102,20 +122,18 @@ def _in_camera_shape(decoded: Decoded, camera: RawCamera) -> NDArray[np.generic]
         values = values[..., [names.index(letter) for letter in letters]] if len(names) > 1 else values
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
+    _require_size(values, camera)
     width, height = camera.size
-    if values.ndim not in {2, 3} or values.shape[:2] != (height, width):
-        size = " x ".join(map(str, (values.shape[1::-1] if values.ndim in {2, 3} else values.shape)))
-        turned = " (turned by 90 degrees?)" if values.shape[:2] == (width, height) else ""
-        raise ValueError(
-            f"has {size} pixels{turned}, but its camera has {width} x {height}; export it at the camera's size"
-        )
     in_file = 1 if values.ndim == 2 else values.shape[2]
     if camera.mosaic != "none" and in_file != 1:
         raise ValueError(f'has {in_file} channels, but its camera\'s files hold a mosaic of one; set mosaic = "none"')
     if camera.mosaic == "none" and in_file != len(camera.channels):
-        hint = "name its mosaic" if in_file == 1 else "correct the camera's channels"
         raise ValueError(
-            f"has {in_file} channels, but its camera has {len(camera.channels)}; {hint}, or export it again"
+            'has one number a pixel, but its camera is described with colours; give the camera channels = ["grey"], or'
+            " its mosaic where its pixels lie behind colour filters"
+            if in_file == 1
+            else f"has {in_file} channels, but its camera has {len(camera.channels)}; correct the camera's channels, or"
+            " export it again"
         )
     return values if camera.mosaic != "none" else values.reshape(height, width, in_file)
 

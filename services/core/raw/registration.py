@@ -55,7 +55,7 @@ class Registration(Record):
     repairs: str = Field(description="what was mended in the scan, in words")
     inputs: dict[str, str] = Field(description="SHA-256 of the scan and of the calibration, by file name")
     pictures: tuple[str, ...] = Field(description="overlays, one a camera")
-    warnings: tuple[str, ...] = Field(default=(), description="on the calibration that it rests on, in sentences")
+    warnings: tuple[str, ...] = Field(default=(), description="on its calibration and its misfit, in sentences")
 
 
 def lacks_pose(capture: Path) -> bool:

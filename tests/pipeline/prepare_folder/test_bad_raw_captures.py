@@ -153,7 +153,10 @@ BAD: dict[str, tuple[Damage, str]] = {
     ),
     "another size": (values(lambda v: v[:, 1:]), rf"{HERE} has 39 x 32 pixels, but its camera has 40 x 32"),
     "turned": (values(lambda v: v.swapaxes(0, 1)), rf"{HERE} has 32 x 40 pixels \(turned by 90 degrees\?\)"),
-    "grey for colour": (values(lambda v: v[..., 1]), rf"{HERE} has 1 channels, but its camera has 3; name its mosaic"),
+    "grey for colour": (
+        values(lambda v: v[..., 1]),
+        rf"{HERE} has one number a pixel, but its camera is described with colours; give the camera channels",
+    ),
     "NaN": (
         values(lambda v: np.where(v > 900, np.nan, v).astype(np.float32)),
         rf"{HERE} has \d+ values that are no finite",

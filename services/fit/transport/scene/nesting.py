@@ -32,9 +32,11 @@ def require_nested(outer: Mesh, dentin: Mesh, gap_mm: float) -> None:
     suspects = suspects[np.argsort(distance[suspects])[::-1][:MAX_CHECKED]]
     outside = suspects[winding_number(outer, points[suspects]) < 0.5]
     if len(outside):
+        worst_mm = float(distance[outside].max())
         raise MeshError(
-            f"The dentin surface passes through the outer surface, at its worst {distance[outside].max():.3g} mm beyond"
-            f" it; move it at least {gap_mm:.2g} mm inside."
+            f"The dentin surface passes through the outer surface, at its worst {worst_mm:.3g} mm beyond it; see"
+            " whether both are in the same coordinates and of the same tooth, and move the dentin by"
+            f" {worst_mm + gap_mm:.3g} mm inwards there."
         )
     touching = int(np.count_nonzero(distance < gap_mm))
     if touching:
