@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from services.calibrate.cameras.boards import detect
 from services.calibrate.cameras.bundle import BundleFit, fit_bundle
 from services.calibrate.cameras.models import MODEL_FOR_OUTLIERS, ModelChoice, choose_lens
+from services.calibrate.cameras.second_look import detect_again
 from services.calibrate.cameras.sightings import View
-from services.calibrate.cameras.start import first_rig, usable
+from services.calibrate.cameras.start import MIN_CORNERS, first_rig, usable
 from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.session.missed import why_missed
-from services.calibrate.session.photos import Photos, to_eight_bit
+from services.calibrate.session.photos import Photos, plain_copies, to_eight_bit
 from services.core.errors import CaptureInputError
 from services.core.raw.records import RawFrame
 
@@ -70,11 +71,10 @@ def calibrate_cameras(photos: Photos) -> CamerasStep:
         CaptureInputError: there are too few boards, or a camera shares no board with the others.
     """
     folder = photos.folder
-    names = tuple(camera.name for camera in folder.camera)
     frames = [frame for frame in folder.frame if frame.kind == "board"]
     if not frames:
         raise CaptureInputError("raw.toml lists no frame of kind board; photograph a board in at least ten places.")
-    views, missed = _find(photos, frames, names)
+    views, missed = boards_in(photos)
     return adjust_cameras(views, {camera.name: camera.size for camera in folder.camera}, _place(frames[0]), missed)
 
 
@@ -111,15 +111,25 @@ def adjust_cameras(
     return CamerasStep(names, fit, choices, tuple(good), missed)
 
 
-def _find(
-    photos: Photos, frames: Sequence[RawFrame], names: Sequence[str]
-) -> tuple[list[View], tuple[tuple[str, str], ...]]:
+def boards_in(photos: Photos) -> tuple[list[View], tuple[tuple[str, str], ...]]:
+    """Find the boards of a folder's photographs.
+
+    A board that is missed is looked for in other copies of its photograph and by second detectors.
+
+    Returns:
+        The views, and the files in which no board was found, each with the reason.
+    """
+    names = [camera.name for camera in photos.folder.camera]
+    frames = [frame for frame in photos.folder.frame if frame.kind == "board"]
     boards = {board.name: board for board in photos.folder.board}
     places = list(dict.fromkeys(_place(frame) for frame in frames))
     views, missed = [], []
     for frame in frames:
-        image, board = to_eight_bit(photos.grey(frame)), boards[str(frame.board)]
+        grey, board = photos.grey(frame), boards[str(frame.board)]
+        image = to_eight_bit(grey)
         found = detect(image, board)
+        if len(found.ids) < MIN_CORNERS:
+            found = detect_again((image, *plain_copies(grey)), board, MIN_CORNERS) or found
         camera, place = names.index(frame.camera), places.index(_place(frame))
         view = View(camera, place, found.corners_mm, found.pixels, found.ids, frame.file)
         if usable([view]):

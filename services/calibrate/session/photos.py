@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,6 +130,15 @@ def black_of(frames: Iterable[NDArray[np.generic]]) -> Black:
         squares = squares + off * (counts - mean)
     variance = float(np.var(mean)) if count == 1 else float(np.mean(squares)) / (count - 1)
     return Black(float(np.mean(mean)), max(variance - ROUNDING, 0.0) ** 0.5)
+
+
+def plain_copies(grey: Image) -> Iterator[NDArray[np.uint8]]:
+    """Yield a photograph (H, W) in 8 bits without the stretch of its range: as the file has it, from black to its
+    largest value, and with the square root of its light, as screens show it.
+    """
+    share = np.clip(grey / max(float(grey.max()), 1e-12), 0, 1)
+    yield np.asarray((255 * share).astype(np.uint8))
+    yield np.asarray((255 * np.sqrt(share)).astype(np.uint8))
 
 
 def to_eight_bit(grey: Image) -> NDArray[np.uint8]:
