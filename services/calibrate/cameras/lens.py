@@ -14,6 +14,9 @@ k3, then k4, k5, k6."""
 HALF_PIXEL = 0.5
 """Offset in px from OpenCV's pixel coordinates to those of this project: pixel centres lie at half-integers here and at
 integers in OpenCV."""
+FARTHEST, RADII = 3.0, 1000
+"""Largest direction that is followed to find what a lens draws at its image's farthest corner, as a multiple of that
+corner's own without distortion, and the number of directions up to it."""
 UNDISTORTION_STEPS = 40
 UNDISTORTION_PRECISION = 1e-11
 """Largest number of iterations of OpenCV's inversion of the distortion, and the error at which it ends."""
@@ -46,6 +49,26 @@ class Lens:
     def model(self) -> str:
         """Name of the distortion model."""
         return next(name for name, count in MODELS.items() if count == len(self.values) - 4)
+
+    @property
+    def keeps_order(self) -> bool:
+        """Whether points farther from the principal point's axis are drawn farther from it, out to the image's farthest
+        corner: where a distortion polynomial turns back, it draws two directions at one pixel.
+        """
+        fx, fy, cx, cy = self.values[:4]
+        corners = np.array([[x, y] for x in (0, self.size[0]) for y in (0, self.size[1])])
+        reach = float(np.linalg.norm((corners - [cx, cy]) / [fx, fy], axis=1).max())
+        coefficients = np.zeros(8)
+        coefficients[: len(self.distortion)] = self.distortion
+        k1, k2, _, _, k3, k4, k5, k6 = coefficients
+        squares = np.linspace(0, FARTHEST * reach, RADII) ** 2
+        below = 1 + squares * (k4 + squares * (k5 + squares * k6))
+        drawn = np.sqrt(squares) * (1 + squares * (k1 + squares * (k2 + squares * k3))) / below
+        beyond = np.flatnonzero(drawn >= reach)
+        if len(beyond) == 0:
+            return False
+        shown = slice(0, beyond[0] + 1)
+        return bool((below[shown] > 0).all() and (np.diff(drawn[shown]) > 0).all())
 
     def project(self, points_mm: Floats) -> Floats:
         """Return the pixels (N, 2) of points (N, 3) in the camera's axes, in mm."""

@@ -14,6 +14,9 @@ from services.calibrate.cameras.sightings import View
 from services.calibrate.cameras.start import board_pose, first_lens, first_rig, lens_and_scatter, usable
 
 Floats = NDArray[np.float64]
+BETTER = 2.0
+"""Standard errors by which a richer model must be better on held-out boards; of two equal models one is so once in 40
+times."""
 FOLDS = 5
 """Number of folds of the cross-validation."""
 MODEL_FOR_OUTLIERS = "radial-tangential-5"
@@ -34,11 +37,13 @@ class ModelChoice:
         sigma_px: standard deviation of one coordinate of the corners in a fit of this camera alone.
         held_out_px: rms reprojection error of the corners of held-out boards, by model; empty where there were too few
             boards.
+        folding: models that were left out, as they draw two directions at one pixel of the image.
     """
 
     lens: Lens
     sigma_px: float
     held_out_px: dict[str, float]
+    folding: tuple[str, ...] = ()
 
 
 def fit_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str) -> BundleFit:
@@ -50,8 +55,8 @@ def fit_lens(views: Sequence[View], size: tuple[int, int], model: str, name: str
 def choose_lens(
     views: Sequence[View], size: tuple[int, int], name: str, models: Sequence[str] = tuple(MODELS), folds: int = FOLDS
 ) -> ModelChoice:
-    """Choose the simplest distortion model that no other model beats on held-out boards by more than one standard
-    error.
+    """Choose the simplest distortion model that no richer model beats on held-out boards by more than ``BETTER``
+    standard errors; models that fold the image are left out.
 
     Outliers are left out first. Each fold then holds every ``folds``-th board out, fits the lens to the others, and
     measures its reprojection error on the held-out boards, each with its best pose. The difference of two models is the
@@ -66,9 +71,16 @@ def choose_lens(
         return ModelChoice(fit.rig.lenses[0], float(fit.sigma_px[0]), {})
     good = without_outliers(of_one_camera(usable(views)), fit_lens(views, size, MODEL_FOR_OUTLIERS, name))
     errors = {model: _cross_validated(good, size, model, name, min(folds, len(good) // 2)) for model in models}
-    chosen = next(model for model in errors if not any(_beats(other, errors[model]) for other in errors.values()))
+    fitted = {model: lens_and_scatter(good, size, model, name) for model in models}
+    folding = tuple(model for model, (lens, _) in fitted.items() if not lens.keeps_order)
+    able = [model for model in models if model not in folding] or [models[0]]
+    chosen = next(
+        model
+        for number, model in enumerate(able)
+        if not any(_beats(errors[richer], errors[model]) for richer in able[number + 1 :])
+    )
     rms_px = {model: float(np.sqrt(np.mean(squares))) for model, squares in errors.items()}
-    return ModelChoice(*lens_and_scatter(good, size, chosen, name), held_out_px=rms_px)
+    return ModelChoice(*fitted[chosen], held_out_px=rms_px, folding=folding)
 
 
 def without_outliers(views: Sequence[View], fit: BundleFit) -> list[View]:
@@ -98,4 +110,4 @@ def _cross_validated(views: Sequence[View], size: tuple[int, int], model: str, n
 
 def _beats(challenger: Floats, holder: Floats) -> bool:
     better = holder - challenger
-    return bool(better.mean() > better.std(ddof=1) / np.sqrt(len(better)))
+    return bool(better.mean() > BETTER * better.std(ddof=1) / np.sqrt(len(better)))

@@ -45,12 +45,16 @@ def detect_again(pictures: Iterable[Picture], board: Board, least: int) -> Detec
             return found
         tried.append(picture)
     for picture in tried:
-        found = _by_markers(picture, board) if board.type == "charuco" else None
-        if board.type == "chessboard":
-            found = _chessboard(picture, board)
-        if found is not None and len(found.ids) >= least:
-            return found
+        other = _second(picture, board)
+        if other is not None and len(other.ids) >= least:
+            return other
     return None
+
+
+def _second(picture: Picture, board: Board) -> Detection | None:
+    if board.type == "chessboard":
+        return _chessboard(picture, board)
+    return _by_markers(picture, board) if board.type == "charuco" else None
 
 
 def _by_markers(picture: Picture, board: Board) -> Detection:

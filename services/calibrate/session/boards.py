@@ -158,4 +158,5 @@ def describe_model(choice: ModelChoice) -> str:
         return f"{choice.lens.model}, held, as there are too few boards to leave any out"
     errors = ", ".join(f"{name} {value:.3f} px" for name, value in choice.held_out_px.items())
     plain = " (OpenCV's default)" if choice.lens.model == MODEL_FOR_OUTLIERS else ""
-    return f"{choice.lens.model}{plain}; on boards that were left out: {errors}"
+    folding = f"; left out, as they fold the image: {', '.join(choice.folding)}" if choice.folding else ""
+    return f"{choice.lens.model}{plain}; on boards that were left out: {errors}{folding}"

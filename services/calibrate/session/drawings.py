@@ -20,6 +20,9 @@ WIDTH = 360.0
 ARROW_PX = 12.0
 """Length in the drawing of the arrow of a residual of 3 σ; arrows longer than twice this are shortened to it."""
 GRID = (16, 12)
+MAX_SHARE = 0.05
+"""Standard error in pixels, as a share of the image's width, from which on it is only said that a value is not known:
+linear propagation of errors holds for small ones."""
 SRGB_FROM_XYZ_D50 = np.array(
     [[3.1338561, -1.6168667, -0.4906146], [-0.9787684, 1.9161415, 0.0334540], [0.0719453, -0.2289914, 1.4052427]]
 )
@@ -47,18 +50,20 @@ def uncertainty_drawing(fit: BundleFit, camera: int, distance_mm: float) -> tupl
     """Draw the uncertainty of projection over the image.
 
     Returns:
-        The drawing, transparent at 0 and opaque at the largest uncertainty, and this largest uncertainty in px.
+        The drawing, transparent at 0 and opaque at the largest uncertainty that is known, and this uncertainty in px. A
+        cell whose uncertainty is a large part of the image is marked as not known.
     """
     lens = fit.rig.lenses[camera]
     scale = WIDTH / lens.size[0]
     sigma = projection_sigma(fit, camera, image_grid(lens.size, *GRID), distance_mm)
-    largest, (columns, rows) = float(sigma.max()), GRID
+    is_known, (columns, rows) = sigma < MAX_SHARE * lens.size[0], GRID
+    largest = float(sigma[is_known].max(initial=0.0))
     width, height = WIDTH / columns, lens.size[1] * scale / rows
     shapes = [
         f'<rect x="{(n % columns) * width:.1f}" y="{(n // columns) * height:.1f}" width="{width:.1f}"'
-        f' height="{height:.1f}" class="share" fill-opacity="{value / largest:.3f}"><title>{value:.3f}'
-        " px</title></rect>"
-        for n, value in enumerate(sigma)
+        f' height="{height:.1f}" class="share" fill-opacity="{value / largest if known else 1:.3f}">'
+        f"<title>{f'{value:.3f} px' if known else 'not known'}</title></rect>"
+        for n, (value, known) in enumerate(zip(sigma, is_known, strict=True))
     ]
     return _svg(shapes, WIDTH, lens.size[1] * scale), largest
 

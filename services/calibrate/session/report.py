@@ -11,6 +11,7 @@ import numpy as np
 from services.calibrate.session.boards import describe_model
 from services.calibrate.session.drawings import (
     ARROW_PX,
+    MAX_SHARE,
     chart_drawing,
     corners_drawing,
     lights_drawing,
@@ -60,10 +61,11 @@ def _camera(session: Session, number: int) -> dict[str, Any]:
     fit, name = session.cameras.fit, session.cameras.names[number]
     mine = fit.corners.camera == number
     drawing, largest = uncertainty_drawing(fit, number, session.cameras.distance_mm)
+    size = fit.rig.lenses[number].size
     posed, se = session.posed_cameras[number], _standard_errors(session.record)
     values = posed.lens.values[:4].tolist()
     intrinsics = {
-        key: f"{value:.2f} ± {unit * se.get(f'camera.{name}.{key}', np.nan):.2f}"
+        key: f"{value:.2f} ± {_known(unit * se.get(f'camera.{name}.{key}', np.nan), MAX_SHARE * size[0])}"
         for key, value, unit in zip(("fx", "fy", "cx", "cy"), values, (values[0], values[1], 1.0, 1.0), strict=True)
     }
     return {
@@ -78,8 +80,13 @@ def _camera(session: Session, number: int) -> dict[str, Any]:
         "sigma": f"{fit.sigma_px[number]:.3f}",
         "residuals": _markup(corners_drawing(fit, number)),
         "uncertainty": _markup(drawing),
-        "largest": f"{largest:.3f}",
+        "largest": f"{largest:.3f} px" if largest else "not known",
     }
+
+
+def _known(error: float, largest: float) -> str:
+    """Return a standard error in words; one above the largest that says anything is not known."""
+    return f"{error:.2f}" if error < largest else "not known"
 
 
 def _standard_errors(record: Calibration) -> dict[str, float]:
