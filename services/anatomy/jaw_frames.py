@@ -18,7 +18,6 @@ from services.anatomy.frame import ToothFrame
 from services.anatomy.scans.matching import CrownMatch
 from services.anatomy.scans.patches import middle_mm
 from services.anatomy.templates.average_arch import arch_from_middles, is_upper, nominal_positions
-from services.anatomy.templates.dimensions import upper_tooth
 from services.core.geometry import Tooth
 
 Array = NDArray[np.float64]
@@ -46,14 +45,6 @@ FREE_DRIFT_DEG = 15.0
 of teeth in an arch."""
 DRIFT_MM_PER_DEG = 1 / 30
 """Misfit added for each degree beyond ``FREE_DRIFT_DEG``, mm."""
-SUSPICIOUS_MISFIT_MM, MAX_MISFIT_RATIO = 0.8, 0.5
-"""Misfit in mm, summed over both directions, above which a tooth's number is doubted; and the largest ratio to it of
-the misfit of another kind that is reported. Phantom teeth have 0.3 mm with their own kind and 1.1 to 1.5 mm with
-another family. Real bare crowns have 1.6 mm with any kind, so nothing can be said about them."""
-KINDS = (1, 3, 4, 6)
-"""Positions from the midline of the teeth that represent their families."""
-REFINED_ROTATIONS_OF_KIND = 8
-"""Number of the best rotations that are matched closely for the test of a tooth's number."""
 MAX_DEVIATION_FROM_ARCH_DEG = 40.0
 """Largest angle between a tooth's own match and the arch. Upper incisors lean by 20 degrees and last molars by 30; a
 match that deviates more is replaced by the arch's axes."""
@@ -76,30 +67,6 @@ def tooth_frame(tooth: Tooth, viewpoints_mm: Array) -> ToothFrame:
     close = match.register(coarse.axes[np.argsort(coarse.misfits_mm)[:REFINED_ROTATIONS]], *CLOSE)
     misfits = close.misfits_mm + match.reverse_misfits_mm(close) + VIEW_MM * (1 - close.axes[:, 1] @ view) / 2
     return ToothFrame.centred(close.axes[misfits.argmin()], tooth.outer)
-
-
-def fdi_mismatch_note(tooth: Tooth) -> str:
-    """A sentence if a tooth clearly has the shape of another kind than its FDI number says; else an empty text."""
-    own_mm = _misfit_mm(tooth, tooth.fdi)
-    if own_mm < SUSPICIOUS_MISFIT_MM:
-        return ""
-    position = tooth.fdi % 10
-    misfits_mm = {other: _misfit_mm(tooth, tooth.fdi - position + other) for other in KINDS if other != position}
-    best_kind = min(misfits_mm, key=lambda other: misfits_mm[other])
-    if misfits_mm[best_kind] > MAX_MISFIT_RATIO * own_mm:
-        return ""
-    shape, named = upper_tooth(best_kind).name, upper_tooth(position).name
-    return (
-        f"Tooth {tooth.fdi} is shaped like a {shape} and not like a {named}; give its right FDI number, as dentin's"
-        " shape follows from it."
-    )
-
-
-def _misfit_mm(tooth: Tooth, fdi: int) -> float:
-    match = CrownMatch(fdi, tooth.outer)
-    coarse = match.register(_even_rotations(START_ROTATIONS), *COARSE)
-    close = match.register(coarse.axes[np.argsort(coarse.misfits_mm)[:REFINED_ROTATIONS_OF_KIND]], *CLOSE)
-    return float((close.misfits_mm + match.reverse_misfits_mm(close)).min())
 
 
 def jaw_frames(teeth: Sequence[Tooth], viewpoints_mm: Array) -> tuple[ToothFrame, ...]:

@@ -62,8 +62,6 @@ class FitDriver:
         (tooth,) = observations.teeth
         dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
         neighbours = neighbour_surfaces(tooth, observations.neighbours, observations.manifest.cameras, spec)
-        if numbering_fault := _numbering_fault(tooth, spec):
-            attempt.log(numbering_fault)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
         layout = (
@@ -116,14 +114,6 @@ class FitDriver:
         report = self._publish(
             observations, dentin, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun
         )
-        if numbering_fault:
-            report = report.model_copy(
-                update={
-                    "converged": False,
-                    "advice": f"{numbering_fault} {report.advice}".strip(),
-                    "told": NOT_EXPLAINED,
-                }
-            )
         where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
         return report.model_copy(update={"next_capture": "" if report.doubtful else where + next_capture})
 
@@ -220,12 +210,6 @@ class FitDriver:
             else None
         )
         return estimates(fit.tissue, parts, uncertainty, fitted_shape)
-
-
-def _numbering_fault(tooth: Tooth, spec: JobSpec) -> str:
-    from services.anatomy.jaw_frames import fdi_mismatch_note
-
-    return fdi_mismatch_note(tooth) if spec.dentin == "fit" else ""
 
 
 def _displaced_scene(folder: Path, recipe: StoredFile, frame: ToothFrame, fdi: int, tissue: Tissue) -> DisplacedScene:
