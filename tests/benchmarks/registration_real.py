@@ -18,8 +18,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from services.anatomy.scans.scan import read_scan
+from services.calibrate.registration.contours import tooth_contours
 from services.calibrate.registration.register import MAX_MISFIT_MM
+from services.core.files.meshes import read_mesh, read_teeth
 from services.core.raw.registration import REGISTRATION
 from tests.support.command_line import dentine
 from tests.support.patient_folders import (
@@ -30,6 +34,7 @@ from tests.support.patient_folders import (
     patients_scan,
     write_patient_folder,
 )
+from tests.support.patient_photos import FOCAL_PX, camera, distance_to_edges_px
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 NO_LIMIT_MM = "9"
@@ -55,7 +60,14 @@ def registered(
         ended = dentine("register", str(folder), "--max-misfit-mm", NO_LIMIT_MM)
         if ended.returncode:
             return ended.stderr.strip().replace(f"{folder}/", "")
-        return round(float(json.loads((folder / REGISTRATION).read_text())["misfit_mm"]), 3)
+        misfit_mm = round(float(json.loads((folder / REGISTRATION).read_text())["misfit_mm"]), 3)
+        if whose == "own" and view in FOCAL_PX:
+            # Outlines of the command's teeth against the hand-labelled edges, at a width of 800 pixels.
+            teeth = [tooth.outer for tooth in read_teeth(folder, verify=False)]
+            contour, _ = tooth_contours(camera(view), teeth, [read_mesh(folder / "gums.ply")])
+            off_px = distance_to_edges_px(shared / "intraoral-photos", view, contour.pixels)
+            print(f"{jaw} jaw, {view}: {np.median(off_px):.2f} px from the labelled edges in the median", flush=True)
+        return misfit_mm
 
 
 def main() -> None:
@@ -63,12 +75,13 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--shared", type=Path, default=SHARED)
     parser.add_argument("--draws", type=int, default=1)
+    parser.add_argument("--own-alone", action="store_true", help="leave out the pairs of other teeth")
     given = parser.parse_args()
     known, rows = scans(given.shared), []
     for draw in range(given.draws):
         for number, (jaw, view) in enumerate(CAMERA_FROM_JAW):
             for whose in ("own", "mirrored", "other"):
-                if (whose, jaw) not in known:
+                if (whose, jaw) not in known or (given.own_alone and whose != "own"):
                     continue
                 found = registered(given.shared, known, whose, jaw, view, 1000 * draw + number)
                 rows.append({"whose": whose, "jaw": jaw, "photograph": view, "draw": draw, "misfit_mm": found})

@@ -81,7 +81,7 @@ def photograph(root: Path, view: str) -> View:
     import cv2
 
     image = cv2.imread(str(root / "image" / f"0-{NUMBER[view]}.png"))[..., ::-1]
-    return View(camera(view), cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA).astype(np.float32))
+    return View(camera(view), cv2.resize(image.astype(np.float32), SIZE, interpolation=cv2.INTER_AREA))
 
 
 def distance_to_edges_px(root: Path, view: str, pixels: NDArray[np.float64]) -> NDArray[np.float64]:

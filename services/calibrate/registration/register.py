@@ -46,7 +46,7 @@ own teeth have up to 0.29 mm in photographs from the front and along the teeth, 
 (docs/measured/registration.md)."""
 DOUBTFUL_MISFIT_MM = 0.10
 """Median distance above which an accepted scan is doubted in a warning. In a calibrated rig phantoms' own scans have
-0.05 mm, those of other phantoms 0.13 mm and more."""
+0.05 mm, those of other phantoms 0.11 mm and more."""
 
 
 @dataclass(frozen=True)
