@@ -62,6 +62,12 @@ def test_a_jpeg_of_a_board_is_read(folder: RawFolder, tmp_path: Path) -> None:
     assert grey[:8, 12:18].min() > 200
 
 
+def test_a_jpeg_that_is_none_is_refused(folder: RawFolder, tmp_path: Path) -> None:
+    (tmp_path / "one.jpg").write_bytes(b"no picture")
+    with pytest.raises(CaptureInputError, match="cannot be read as a JPEG; it may be truncated"):
+        read_counts(tmp_path, folder, folder.frame[0])
+
+
 def test_a_jpeg_of_teeth_is_refused(folder: RawFolder, tmp_path: Path) -> None:
     with pytest.raises(CaptureInputError, match=r"is a JPEG, .* which only a frame of kind board may be; export"):
         read_counts(tmp_path, folder, folder.frame[1])

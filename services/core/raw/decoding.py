@@ -44,13 +44,12 @@ def read_jpeg(path: Path) -> Decoded:
     Raises:
         ValueError: the file cannot be read; the message is the part of a sentence that says why.
     """
-    import cv2
+    import imagecodecs
 
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    values = cv2.imdecode(np.frombuffer(path.read_bytes() or b"0", dtype=np.uint8), flags)
-    if values is None:
-        raise ValueError("cannot be read as a JPEG; it may be truncated, so copy or export it again")
-    return Decoded(values if values.ndim == 2 else values[..., ::-1])
+    try:
+        return Decoded(np.asarray(imagecodecs.jpeg8_decode(path.read_bytes())))
+    except Exception as problem:  # the library has errors of its own
+        raise ValueError("cannot be read as a JPEG; it may be truncated, so copy or export it again") from problem
 
 
 def decode(path: Path) -> Decoded:
