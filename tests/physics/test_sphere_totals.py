@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from services.core.slab.folder import Cell, Glass
 from services.fit.slab.model.interface import Interface
 from services.fit.slab.sphere.instrument import expected
 from services.fit.slab.sphere.invert import interface_of
-from services.fit.slab.sphere.readings import Sphere, SphereFile, TotalsReading
+from services.fit.slab.sphere.records import Sphere, SphereFile, TotalsReading
 from services.fit.slab.sphere.totals import Optics, Totals, slab_totals
 from tests.support.slab_tables import total_cases
 
@@ -92,6 +93,29 @@ def test_unscattered_light_is_what_is_left_without_scattering() -> None:
     # By hand, without multiple reflections: light passes both slides once.
     passes = interface_of(GLASS).transmittance(0)
     assert clear.transmittance == pytest.approx(passes**2 * math.exp(-1.4), rel=2e-3)
+
+
+def test_slanted_beams_make_up_diffuse_light() -> None:
+    """Diffuse light is made of beams: the mean of their totals over 2 cos d(cos) is its own."""
+    optics, interface = Optics(0.1, 2, 0.7), interface_of(GLASS)
+    places, shares = np.polynomial.legendre.leggauss(12)
+    cosines = (places + 1) / 2
+    slanted = [slab_totals(optics, 1, interface, incidence_deg=math.degrees(math.acos(cosine))) for cosine in cosines]
+    mean = [
+        float(np.sum(shares * cosines * [getattr(totals, name) for totals in slanted]))
+        for name in ("reflectance", "transmittance")
+    ]
+    # Fresnel's laws at grazing incidence leave 12 nodes an error of 1e-4.
+    assert mean == pytest.approx([slanted[0].reflectance_diffuse, slanted[0].transmittance_diffuse], abs=3e-4)
+
+
+def test_a_slanted_beam_has_a_longer_path() -> None:
+    clear = slab_totals(Optics(0.7, 0, 0), 2, interface_of(GLASS), incidence_deg=60)
+    sine = math.sin(math.radians(60)) / 1.34
+    passes = interface_of(GLASS).transmittance(sine)
+    assert clear.transmittance == pytest.approx(clear.transmittance_unscattered, abs=1e-9)
+    # By hand, without multiple reflections.
+    assert clear.transmittance == pytest.approx(passes**2 * math.exp(-1.4 / math.sqrt(1 - sine**2)), rel=2e-3)
 
 
 def file_of(sphere: Sphere | None, **changes: object) -> SphereFile:

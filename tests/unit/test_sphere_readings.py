@@ -14,7 +14,9 @@ from services.cli.sphere import sphere_command
 from services.core.errors import CaptureInputError, SettingsError
 from services.fit.slab.sphere.instrument import expected
 from services.fit.slab.sphere.invert import Fitted, fit_readings, interface_of
-from services.fit.slab.sphere.readings import SphereFile, read_readings
+from services.fit.slab.sphere.readings import read_readings
+from services.fit.slab.sphere.records import SphereFile
+from services.fit.slab.sphere.results import SphereQuantity
 from services.fit.slab.sphere.totals import Optics, slab_totals
 from services.fit.slab.sphere.translucency import lab_of, over_backing, translucency_of
 from tests.support.shared_data import shared_path
@@ -55,6 +57,13 @@ def rxt(folder: Path, rows: str, spheres: float = 0, columns: float = 3) -> Path
     path = folder / "readings.rxt"
     path.write_text(RXT.format(spheres=spheres, columns=columns) + rows)
     return path
+
+
+def known(quantity: SphereQuantity) -> tuple[float, float]:
+    """Value and standard error of a quantity that is shown."""
+    assert quantity.value is not None
+    assert quantity.se is not None
+    return quantity.value, quantity.se
 
 
 def test_calculated_readings_give_their_coefficients_back(tmp_path: Path) -> None:
@@ -122,9 +131,8 @@ def test_standard_errors_are_those_of_repeated_readings() -> None:
         step = getattr(first, f"{name}_se")
         changed = first.model_copy(update={name: getattr(first, name) + step})
         (other,) = fit_readings(file.model_copy(update={"totals": (changed,)}), FEW)
-        moved.append(
-            [other.fit.sigma_a.value - fit.sigma_a.value, other.fit.sigma_s_reduced.value - fit.sigma_s_reduced.value]
-        )
+        pairs = ((other.fit.sigma_a, fit.sigma_a), (other.fit.sigma_s_reduced, fit.sigma_s_reduced))
+        moved.append([known(one)[0] - known(two)[0] for one, two in pairs])
     expected_se = np.sqrt(np.square(moved).sum(axis=0))
     # Readings are changed by one standard error, over which the coefficients are linear to 3 %.
     assert [fit.sigma_a.se, fit.sigma_s_reduced.se] == pytest.approx(expected_se, rel=3e-2)
@@ -142,11 +150,12 @@ def test_an_error_of_the_collimated_reading_reaches_g() -> None:
     assert plain.g.value == pytest.approx(0.7, abs=1e-5)
     assert plain.sigma_t is not None
     assert other.sigma_t is not None
-    assert plain.sigma_t.se == pytest.approx(plain.sigma_t.value - other.sigma_t.value, rel=3e-2)
+    assert known(plain.sigma_t)[1] == pytest.approx(known(plain.sigma_t)[0] - known(other.sigma_t)[0], rel=3e-2)
     from_readings = fit_readings(
         file.model_copy(update={"totals": (readings[0].model_copy(update={"T_unscattered_se": 1e-9}),)}), FEW
-    )[0].fit.g.se
-    assert plain.g.se**2 - from_readings**2 == pytest.approx((other.g.value - plain.g.value) ** 2, rel=6e-2)
+    )[0].fit.g
+    g, g_se = known(plain.g)
+    assert g_se**2 - known(from_readings)[1] ** 2 == pytest.approx((known(other.g)[0] - g) ** 2, rel=6e-2)
 
 
 def test_readings_of_no_slab_are_told_and_not_believed(tmp_path: Path) -> None:
@@ -189,8 +198,8 @@ def test_a_wrong_file_gets_a_sentence(name: str, tmp_path: Path) -> None:
         (ROWS, {"spheres": float("inf")}, "line 5: inf holds a number that is not finite"),
         ("0.1", {}, "line 9: 1 numbers where 3 readings"),
         (ROWS, {"spheres": 2}, "2 spheres at once"),
-        (ROWS, {"columns": 1}, "1 readings a line"),
-        ("", {}, "totals"),
+        (ROWS, {"columns": 8}, "8 readings a line"),
+        ("", {}, "no readings behind its legend"),
     ],
 )
 def test_a_wrong_rxt_file_gets_a_sentence(rows: str, header: dict[str, float], words: str, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from services.fit.slab.sphere.readings import Sphere, SphereFile, TotalsReading
+from services.fit.slab.sphere.records import Sphere, SphereFile, TotalsReading
 from services.fit.slab.sphere.totals import Totals
 
 
@@ -25,15 +25,22 @@ class Readings:
 
 
 def expected(totals: Totals, file: SphereFile, reading: TotalsReading) -> Readings:
-    """The readings that the instrument gives for a slab."""
+    """The readings that the instrument gives for a slab.
+
+    Args:
+        totals: of the slab.
+        file: the instrument, with what the reading has of its own (``SphereFile.of``).
+        reading: which readings are meant.
+    """
     diffuse = reading.source == "diffuse"
     r = totals.reflectance_diffuse if diffuse else totals.reflectance
     t = totals.transmittance_diffuse if diffuse else totals.transmittance
     alone_r, alone_t = (0.0, 0.0) if diffuse else (totals.reflectance_unscattered, totals.transmittance_unscattered)
-    mirror, through = (alone_r if file.specular_included else 0.0), (alone_t if file.unscattered_included else 0.0)
+    mirror = alone_r * _share(reading.specular_share, file.specular_included)
+    through = _share(reading.unscattered_share, file.unscattered_included)
     return Readings(
         R=_reflection(file, reading, r - alone_r, mirror, totals.reflectance_diffuse),
-        T=_transmission(file, reading, t - alone_t, through, totals.reflectance_diffuse),
+        T=_transmission(file, reading, t - alone_t, alone_t, through, totals.reflectance_diffuse),
         T_unscattered=totals.transmittance_unscattered,
     )
 
@@ -50,16 +57,23 @@ def _reflection(file: SphereFile, reading: TotalsReading, scattered: float, mirr
     return (scattered + mirror / wall_share) * _gain(sphere, sample) / _gain(sphere, file.standard_reflectance)
 
 
-def _transmission(file: SphereFile, reading: TotalsReading, scattered: float, through: float, sample: float) -> float:
-    """Transmittance reading relative to the beam with no sample; the third port, where the beam ends, holds a white
-    cap.
+def _transmission(
+    file: SphereFile, reading: TotalsReading, scattered: float, alone: float, share: float, sample: float
+) -> float:
+    """Transmittance reading relative to the beam with no sample. The third port, where the beam ends, holds a white
+    cap, or is no port (0 mm): then the beam ends at the wall, as IAD takes it.
     """
     if (sphere := _with_wall(file.transmission_sphere, reading.transmission_wall)) is None:
-        return scattered + through
-    cap = 1.0 if file.unscattered_included else 0.0
+        return scattered + share * alone
+    standard = file.transmission_standard if sphere.third_port_mm else sphere.wall_reflectance
+    cap = standard if share > 0 or not sphere.third_port_mm else 0.0
     third = _area(sphere, sphere.third_port_mm)
     first = sphere.wall_reflectance * (1 - third) + third * cap if sphere.baffle else 1.0
-    return (first * scattered + cap * through) * _gain(sphere, sample, cap) / _gain(sphere, 0.0, 1.0)
+    return (first * scattered + cap * share * alone) * _gain(sphere, sample, cap) / _gain(sphere, 0.0, standard)
+
+
+def _share(own: float | None, is_included: bool) -> float:
+    return float(is_included) if own is None else own
 
 
 def _gain(sphere: Sphere, sample: float, third: float = 0.0) -> float:

@@ -57,7 +57,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class Totals:
-    """Shares of the incident power for a collimated beam along the normal, and for diffuse light of equal radiance."""
+    """Shares of the incident power for a collimated beam, and for diffuse light of equal radiance."""
 
     reflectance: float
     """Reflectance of the beam, the mirror reflection of the faces included."""
@@ -81,20 +81,24 @@ class _Quadrature:
     """Share of diffuse light from outside that arrives at each node, before the face reflects its part."""
 
 
-def slab_totals(optics: Optics, width_mm: float, interface: Interface, nodes: int = NODES) -> Totals:
+def slab_totals(
+    optics: Optics, width_mm: float, interface: Interface, nodes: int = NODES, incidence_deg: float = 0.0
+) -> Totals:
     """Totals of a slab with the same interface at both faces; ``width_mm`` may be infinite.
 
     Args:
         nodes: number of nodes in each of the two ranges of cosines, inside and outside total reflection; more are more
             accurate.
+        incidence_deg: angle of the beam in air from the normal; totals do not depend on its azimuth.
     """
-    quadrature = _quadrature(interface, nodes)
+    quadrature = _quadrature(interface, nodes, incidence_deg)
     beam = np.zeros_like(quadrature.cosines)
     beam[-1] = 1
     incident = np.stack([beam, quadrature.diffuse], axis=1)
     out, back = _exits(optics, width_mm, quadrature, incident, nodes)
     mirror = (1 - quadrature.transmittances) @ incident
-    alone_r, alone_t = _unscattered(optics.extinction_per_mm * width_mm, float(quadrature.transmittances[-1]))
+    path_mm = width_mm / float(quadrature.cosines[-1])
+    alone_r, alone_t = _unscattered(optics.extinction_per_mm * path_mm, float(quadrature.transmittances[-1]))
     return Totals(
         reflectance=float(back[0] + mirror[0]),
         transmittance=float(out[0]),
@@ -106,7 +110,7 @@ def slab_totals(optics: Optics, width_mm: float, interface: Interface, nodes: in
 
 
 @lru_cache(maxsize=8)
-def _quadrature(interface: Interface, nodes: int) -> _Quadrature:
+def _quadrature(interface: Interface, nodes: int, incidence_deg: float) -> _Quadrature:
     """Gauss-Legendre nodes in the cosine in the medium where all light is reflected, and in the cosine outside
     elsewhere.
 
@@ -119,7 +123,8 @@ def _quadrature(interface: Interface, nodes: int) -> _Quadrature:
     unit, weight = (places + 1) / 2, shares / 2
     inner = np.sqrt(1 - (1 - unit**2) / index**2)
     trapped = edge > 0
-    cosines = np.concatenate([edge * unit if trapped else [], inner, [1.0]])
+    beam = math.sqrt(1 - interface.inside_sine(incidence_deg) ** 2)
+    cosines = np.concatenate([edge * unit if trapped else [], inner, [beam]])
     weights = np.concatenate([edge * weight if trapped else [], weight * unit / (index**2 * inner), [BEAM_WEIGHT]])
     diffuse = np.concatenate([np.zeros(nodes if trapped else 0), 2 * unit * weight, [0.0]])
     sines = np.sqrt(np.maximum(1 - cosines**2, 0))
@@ -179,7 +184,9 @@ def _admittances(optics: Optics, width_mm: float, quadrature: _Quadrature, nodes
 
 
 def _unscattered(thickness: float, passes: float) -> tuple[float, float]:
-    """Reflectance and transmittance of light along the normal that is never scattered, all reflections summed."""
+    """Reflectance and transmittance of a beam that is never scattered, all reflections summed; ``thickness`` is that
+    along its path.
+    """
     through, mirror = math.exp(-thickness), 1 - passes
     once = passes**2 / (1 - (mirror * through) ** 2)
     return mirror + once * mirror * through**2, once * through

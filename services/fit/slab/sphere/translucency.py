@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Record
-from services.fit.slab.sphere.invert import DIFFERENCE, Fitted, interface_of
-from services.fit.slab.sphere.readings import SphereFile
+from services.core.slab.folder import Cell
+from services.fit.slab.sphere.invert import MIN_STEP, Fitted, interface_of
+from services.fit.slab.sphere.records import SphereFile
+from services.fit.slab.sphere.search import DIFFERENCE
 from services.fit.slab.sphere.totals import Optics, Totals, slab_totals
 
 Array = NDArray[np.float64]
@@ -95,33 +97,34 @@ def translucency_of(file: SphereFile, fits: list[Fitted], black: float, white: f
 
 def _spectrum(file: SphereFile, fits: list[Fitted], backings: tuple[float, float]) -> _Spectrum | None:
     known = [
-        (reading.wavelength_nm, fitted)
+        (reading.wavelength_nm, reading.cell or file.cell, fitted)
         for reading, fitted in zip(file.totals, fits, strict=True)
         if reading.wavelength_nm
     ]
-    known.sort(key=lambda pair: pair[0])
-    nm = np.array([wavelength for wavelength, _ in known])
-    if len(nm) < 2 or nm[0] > FIRST_NM or nm[-1] < LAST_NM:
-        return None
+    known.sort(key=lambda one: one[0])
+    nm = np.array([wavelength for wavelength, _, _ in known])
+    if len(nm) < 2 or nm[0] > FIRST_NM or nm[-1] < LAST_NM or not np.diff(nm).all():
+        return None  # a wavelength that comes twice is of another sample
     within = nm[(nm >= 400) & (nm <= 700)]
     if len(within) < 2 or np.diff(within).max() > MAX_GAP_NM:
         return None
 
-    def reflectances(optics: Optics) -> Array:
-        totals = slab_totals(optics, file.cell.width_mm, interface_of(file.cell))
+    def reflectances(cell: Cell, optics: Optics) -> Array:
+        totals = slab_totals(optics, cell.width_mm, interface_of(cell))
         return np.array([over_backing(totals, backing) for backing in backings])
 
     values, covariances = [], []
-    for _, fitted in known:
+    for _, cell, fitted in known:
         optics = fitted.optics
-        value = reflectances(optics)
+        value = reflectances(cell, optics)
         slopes = np.zeros((2, 2))
-        steps = DIFFERENCE * np.array([optics.absorption_per_mm, optics.scattering_per_mm * (1 - optics.g)])
+        sizes = np.array([optics.absorption_per_mm, optics.scattering_per_mm * (1 - optics.g)])
+        steps = DIFFERENCE * np.maximum(sizes, MIN_STEP / cell.width_mm)
         for column, (absorbing, scattering) in enumerate(np.diag(steps)):
             moved = Optics(
                 optics.absorption_per_mm + absorbing, optics.scattering_per_mm + scattering / (1 - optics.g), optics.g
             )
-            slopes[:, column] = (reflectances(moved) - value) / steps[column]
+            slopes[:, column] = (reflectances(cell, moved) - value) / steps[column]
         values.append(value)
         covariances.append(slopes @ fitted.covariance @ slopes.T)
     return _Spectrum(nm, np.array(values).T, np.array(covariances))

@@ -9,7 +9,7 @@ from services.core.store import write_atomic
 from services.fit.slab.sphere.invert import Fitted
 from services.fit.slab.sphere.translucency import Translucency
 
-PARAMETERS = ("sigma_a", "sigma_s_reduced", "g", "sigma_s", "sigma_t")
+PARAMETERS = ("sigma_a", "sigma_s_reduced", "g", "sigma_s", "sigma_t", "absorption_ratio")
 
 
 def write_sphere(out: Path, fits: list[Fitted], translucency: Translucency | None) -> None:
