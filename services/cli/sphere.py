@@ -97,7 +97,13 @@ def _line(fitted: Fitted) -> str:
     if fit.absorption_ratio is not None:
         quantities.append(("σa/σs′", fit.absorption_ratio))
     values = [f"{label} {_value(one)}" for label, one in quantities]
-    return f"{fit.name}: {', '.join(values)}{'' if fit.converged else ', which does not give the readings'}"
+    return f"{fit.name}: {', '.join(values)}{'' if fit.converged else _off(fit)}"
+
+
+def _off(fit: SphereFit) -> str:
+    pairs = [("R", fit.R_fitted, fit.R), ("T", fit.T_fitted, fit.T)]
+    told = [f"{name} {own:.4f} and not {one:.4f}" for name, own, one in pairs if own is not None and one is not None]
+    return f", which would read {', '.join(told)}"
 
 
 def _value(one: SphereQuantity) -> str:

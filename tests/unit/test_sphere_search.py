@@ -101,7 +101,7 @@ def test_noise_beyond_the_range_of_slabs_is_no_failure() -> None:
     (fitted,) = fit_readings(SphereFile.model_validate(PLAIN | {"totals": [{"R": 0.7, "T": 0.302}]}))
     assert fitted.fit.converged
     assert 0 < fitted.fit.distance_se < 1
-    assert "which noise explains" in fitted.fit.notes[0]
+    assert "noise explains it" in fitted.fit.notes[0]
 
 
 def told(tmp_path: Path, totals: list[dict[str, float]]) -> Path:
@@ -118,7 +118,8 @@ def test_the_command_ends_with_a_status_where_no_slab_is_found(
     assert ended.value.exit_code == NOT_CONVERGED_STATUS
     output = capsys.readouterr()
     assert "No slab was found for 1 of 2 readings: 2." in output.err
-    assert "2: No slab of this width and index reads R = 0.02, T = 0.5" in output.out
+    assert "2: No slab of this width and index reads so" in output.out
+    assert "which would read R 0.0508 and not 0.0200, T 0.4987 and not 0.5000" in output.out
     parameters = json.loads((tmp_path / "out" / "parameters.json").read_text())
     assert not parameters["2"]["sigma_a"]["determined"]
 
@@ -143,7 +144,9 @@ def test_progress_is_told_every_few_seconds(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_a_note_stands_once_with_the_readings_that_have_it() -> None:
-    file = SphereFile.model_validate(PLAIN | {"totals": [{"R": 0.3, "T": 0.4}, {"R": 0.3, "T": 0}]})
-    notes = notes_once([fitted.fit for fitted in fit_readings(file)])
+    totals = [{"R": 0.3, "T": 0.4}, {"R": 0.3, "T": 0}, {"R": 0.02, "T": 0.5}, {"R": 0.02, "T": 0.6}]
+    notes = notes_once([fitted.fit for fitted in fit_readings(SphereFile.model_validate(PLAIN | {"totals": totals}))])
+    assert sum("No slab" in note for note in notes) == 1
+    assert any(note.startswith("3, 4: No slab") for note in notes)
     assert sum("without a standard error" in note for note in notes) == 1
     assert any(note.startswith("2: No light comes through") for note in notes)

@@ -270,16 +270,17 @@ class _Problem:
     def _notes(
         self, found: Found, distance: float, absorption: float, reduced: float, extinction: float | None
     ) -> tuple[str, ...]:
-        notes, reading, least = [], self.reading, 2 * MIN_THICKNESS / self.file.cell.width_mm
-        if not found.is_solution:
-            measured = f"R = {reading.R:g}, T = {reading.T or 0:g}"
-            nearest = f"the nearest one reads {found.readings[0]:.4f}, {found.readings[1]:.4f}"
-            told = (
-                f", {distance:.1f} of their ± away, which noise explains."
-                if distance <= MAX_DISTANCE
-                else ": check index, glass, standard and what R includes."
+        notes, least = [], 2 * MIN_THICKNESS / self.file.cell.width_mm
+        if not found.is_solution and distance <= MAX_DISTANCE:
+            notes.append(
+                "No slab of this width and index reads exactly so; the nearest one is given, which is off by less than"
+                f" {MAX_DISTANCE:g} of the readings' ±, so noise explains it."
             )
-            notes.append(f"No slab of this width and index reads {measured}; {nearest}{told}")
+        elif not found.is_solution:
+            notes.append(
+                "No slab of this width and index reads so, and the nearest one is given: check index, glass, standard"
+                " and what R includes."
+            )
         if absorption < least:
             notes.append("The readings tell no absorption: what is lost is below what they resolve.")
         if reduced < least:
