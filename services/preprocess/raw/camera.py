@@ -289,12 +289,9 @@ class CameraFrames:
         found = measure_linearity(list(self._series()), float(self._full)) if is_known else self.linearity
         if found.ratios.size:
             low, middle, high = np.percentile(found.ratios, (5, 50, 95))
-            sentence = (
-                f"Camera {name}: longer exposures are {middle:.3f} times as bright as their times say (5 to 95 %:"
-                f" {low:.3f} to {high:.3f})"
-            )
             self.notes.append(
-                f"{sentence}{'' if found.is_linear else '; its counts are linearised by a curve fitted to that'}."
+                f"Camera {name}: longer exposures are {middle:.3f} times as bright as their times say (5 to 95 %:"
+                f" {low:.3f} to {high:.3f}); {found.verdict()}."
             )
         return found
 
@@ -305,12 +302,18 @@ class CameraFrames:
             brackets = [
                 own for own in _exposure_brackets(self._folder.frames_of(self.raw.name, "light")) if len(own) > 1
             ]
-        pairs = [pair for own in brackets for pair in pairwise(own)]
-        # Choose pairs evenly from all series, because some lights are brighter than others
-        for pair in pairs[:: max(1, len(pairs) // FRAMES_MEASURED)]:
+        empty: list[RawFrame] = []
+        for pair in _even_choice([pair for own in brackets for pair in pairwise(own)], FRAMES_MEASURED):
             shorter, longer = (self.exposure(frame) for frame in pair)
-            require_like_exposures(self._root, pair, (shorter, longer), self._folder.channels)
-            yield Series(self._by_colour(shorter), self._by_colour(longer), longer.factor / shorter.factor)
+            empty += require_like_exposures(self._root, pair, (shorter, longer), self._folder.channels)
+            step = shorter.factor, longer.factor
+            yield Series(self._by_colour(shorter), self._by_colour(longer), longer.factor / shorter.factor, step)
+        if empty:
+            names = ", ".join(dict.fromkeys(one.file for one in empty))
+            self.notes.append(
+                f"Camera {self.raw.name}: {names} are empty: they count nothing above their black, because their"
+                " exposure is too short for this light."
+            )
 
     def _by_colour(self, exposure: Exposure) -> Image:
         """Counts above black with the four pixels of a mosaic's pattern as channels; NaN where nearly saturated."""
@@ -369,6 +372,17 @@ def _exposure_brackets(frames: Iterable[RawFrame]) -> list[list[RawFrame]]:
     for frame in frames:
         groups[_scene(frame)].setdefault(frame.exposure_s * frame.gain * frame.level, frame)
     return [[own[key] for key in sorted(own)] for own in groups.values()]
+
+
+def _even_choice(pairs: Sequence[tuple[RawFrame, RawFrame]], count: int) -> list[tuple[RawFrame, RawFrame]]:
+    """About ``count`` pairs of exposures, evenly of all steps of exposures, and within a step of all lights, because
+    some lights are brighter than others.
+    """
+    steps: dict[tuple[float, ...], list[tuple[RawFrame, RawFrame]]] = defaultdict(list)
+    for pair in pairs:
+        steps[tuple(frame.exposure_s * frame.gain * frame.level for frame in pair)].append(pair)
+    each = max(1, -(-count // len(steps))) if steps else 1
+    return [own[k * len(own) // min(each, len(own))] for own in steps.values() for k in range(min(each, len(own)))]
 
 
 def _scene(frame: RawFrame) -> tuple[str | None, ...]:

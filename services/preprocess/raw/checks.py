@@ -22,6 +22,15 @@ CLIP_SHARE = 0.8
 """Fraction of full scale at which counts are clipped for this comparison, because sensors are not linear above it."""
 MIN_MEAN_SHARE = 0.01
 """Smallest mean, as a fraction of full scale, of a frame that is compared; a darker one does not show its exposure."""
+COUNTED = 3.0
+"""Smallest mean of a block above black, in counts, that counts as light. Black that is cut at zero leaves a mean of
+half the noise, and rounding is half a count."""
+COUNTED_SHARE = 0.012
+"""The same as a fraction of full scale, for files whose full scale is small: 3 counts of 8 bits."""
+COUNTED_BLOCK = 8
+"""Side in pixels of such a block."""
+SURELY_COUNTED = 2.0
+"""Factor above ``COUNTED`` at which a frame should have counted the light that another one tells."""
 MIN_CONTRAST = 0.2
 """Smallest ratio of a picture's standard deviation to its mean at which it is compared with another exposure."""
 MIN_CORRELATION = 0.5
@@ -60,8 +69,9 @@ def colour_of(frame: RawFrame, channels: tuple[str, ...], radiance: NDArray[np.f
 
 def require_like_exposures(
     root: Path, frames: Sequence[RawFrame], exposures: Sequence[Exposure], channels: tuple[str, ...]
-) -> None:
-    """Refuse exposures of one light that contradict each other in any channel.
+) -> list[RawFrame]:
+    """Refuse exposures of one light that contradict each other in any channel. They are compared only where both
+    counted light.
 
     Args:
         root: the raw folder.
@@ -69,12 +79,20 @@ def require_like_exposures(
         exposures: exposures of the frames, (H, W) of a mosaic or (H, W, C) in the order of ``channels``.
         channels: names of the channels.
 
+    Returns:
+        Frames whose exposure is too short to count anything.
+
     Raises:
-        CaptureInputError: two exposures contradict each other; the message names the longer exposure's frame.
+        CaptureInputError: two exposures contradict each other; the message names the longer exposure's frame, or the
+            one that is empty.
     """
+    empty: list[RawFrame] = []
     order = sorted(zip(frames, exposures, strict=True), key=lambda one: one[1].factor)
     for (shorter, first), (longer, second) in pairwise(order):
         what = f"Frame {root / longer.file} ({longer.label})"
+        if _is_empty(root, (shorter, longer), (first, second)):
+            empty.append(shorter)
+            continue
         log_ratio = _log_brightness_ratio(first, second.signal, second.headroom, second.factor)
         if log_ratio is None:
             continue
@@ -102,13 +120,49 @@ def require_like_exposures(
             f"{what} is clearly {found} than {shorter.file} lets expect from exposure_s, gain and level; correct these,"
             " or the order of its bytes, bits or channels."
         )
+    return empty
+
+
+def _is_empty(root: Path, frames: tuple[RawFrame, RawFrame], exposures: tuple[Exposure, Exposure]) -> bool:
+    """Whether the shorter one of two exposures counts nothing, because it is too short.
+
+    Raises:
+        CaptureInputError: an exposure counts nothing where the other one tells that it should.
+    """
+    first, second = exposures
+    least = _least_counts(first)
+    blocks = [_block_means(one.signal) for one in exposures]
+    expected = [blocks[1] * first.factor / second.factor, blocks[0] * second.factor / first.factor]
+    for own, told, frame, other in zip(blocks, expected, frames, reversed(frames), strict=True):
+        if own.max() < least and told.max() >= SURELY_COUNTED * least:
+            raise CaptureInputError(
+                f"Frame {root / frame.file} ({frame.label}) is empty: it counts nothing above its black, where"
+                f" {other.file} lets expect {told.max():.3g} counts; take it again with the light on, or correct its"
+                " kind, exposure_s, gain or level."
+            )
+    return bool(blocks[0].max() < least)
+
+
+def _least_counts(exposure: Exposure) -> float:
+    full = float(np.max(exposure.headroom + exposure.signal))
+    return min(COUNTED, COUNTED_SHARE * full) if np.isfinite(full) else COUNTED
+
+
+def _block_means(signal: Image) -> NDArray[np.float64]:
+    """Means of blocks of an image, (h, w, C)."""
+    image = np.atleast_3d(signal)
+    side = max(1, min(COUNTED_BLOCK, *image.shape[:2]))
+    height, width = (length // side for length in image.shape[:2])
+    cut = image[: height * side, : width * side].reshape(height, side, width, side, -1)
+    return np.asarray(cut.mean(axis=(1, 3), dtype=np.float64))
 
 
 def _log_brightness_ratio(first: Exposure, signal: Image, headroom: Image, factor: float) -> NDArray[np.float64] | None:
     """Logarithm (C,) of the ratio of a longer exposure's mean to the mean expected from a shorter one, by channel.
 
-    It is None if the frames are too dark or full scale is unknown. Both exposures are clipped below full scale, so that
-    pixels which are saturated in the longer one, or would be, agree.
+    It is None if the frames are too dark or full scale is unknown. Blocks where one of them counts nothing are left
+    out, because black that is cut at zero would look like light there. Both exposures are clipped below full scale, so
+    that pixels which are saturated in the longer one, or would be, agree.
 
     Args:
         first: the shorter exposure.
@@ -119,13 +173,14 @@ def _log_brightness_ratio(first: Exposure, signal: Image, headroom: Image, facto
         return None
     clip_counts = np.float32(CLIP_SHARE * full)
     expected = np.minimum(first.signal * np.float32(factor / first.factor), clip_counts)
-    means = [
-        np.atleast_1d(np.mean(one, axis=(0, 1), dtype=np.float64))
-        for one in (expected, np.minimum(signal, clip_counts))
-    ]
-    if min(mean.min() for mean in means) < MIN_MEAN_SHARE * full:
+    told, seen = _block_means(expected), _block_means(np.minimum(signal, clip_counts))
+    if min(one.mean(axis=(0, 1)).min() for one in (told, seen)) < MIN_MEAN_SHARE * full:
         return None
-    return np.asarray(np.log(means[1] / means[0]))
+    least = _least_counts(first)
+    counted = (_block_means(first.signal) >= least) & (_block_means(signal) >= least)
+    if not counted.any(axis=(0, 1)).all():
+        return None
+    return np.asarray(np.log((seen * counted).sum(axis=(0, 1)) / (told * counted).sum(axis=(0, 1))))
 
 
 def _is_correlated(first: Exposure, second: Exposure) -> bool:
