@@ -95,7 +95,10 @@ class Linearity:
         """What is done to the counts, and why."""
         told = self.left_out
         if told is None:
-            return "its counts are taken as they are, as two steps of exposures of enough light would tell a curve"
+            return (
+                "its counts are taken as they are, as no curve can be tested on these frames; two steps of exposures of"
+                " enough light would allow it"
+            )
         change = f"from {told.plain:.2%} to {told.curved:.2%} off"
         if self.is_linear:
             return (
