@@ -2,7 +2,7 @@
 
 python -m tests.benchmarks.sphere_slabs --slabs 2000 --seed 1 --json sphere_slabs.json
 
-Six minutes of one core with 2,000 slabs. Readings are those of the forward model, so each slab lies in its range.
+Seven minutes of one core with 2,000 slabs. Readings are those of the forward model, so each slab lies in its range.
 Whether the readings determine a slab is computed at the truth, without the search. Of those that they determine,
 ``missed`` and ``open`` must be none but where another slab reads the same (``ambiguous``). Of all others, each one must
 be ``open``. The command ends with status 1 where one is not as it must be.
