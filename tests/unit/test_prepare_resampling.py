@@ -35,12 +35,13 @@ class Shifted:
     """Replaces a measured motion: every pixel is moved by the same vector."""
 
     window = WINDOW
+    source = "tracking"
 
     def __init__(self, x_px: float, y_px: float) -> None:
         self._shift = np.array([x_px, y_px], dtype=np.float32)
 
     def move(self) -> Displacement:
-        return Displacement(np.zeros(0), float(np.linalg.norm(self._shift)), None)
+        return Displacement(np.zeros(0), float(np.linalg.norm(self._shift)), 0.0)
 
     def positions(self, _: Displacement, rows: slice) -> np.ndarray:
         y, x = np.mgrid[rows, : SHAPE[1]].astype(np.float32)

@@ -13,7 +13,7 @@ from services.core.errors import SettingsError
 from services.core.raw.records import RawCamera
 from services.preprocess.raw.memory_budget import GIB, PROCESS_BYTES, MemoryBudget, strips
 from services.preprocess.raw.source import RawSource
-from services.preprocess.source import LightImage
+from services.preprocess.source import LightImage, MatchedFrame
 from services.preprocess.stabilisation.stabilise import TERMS
 from services.preprocess.subject import read_subject
 from services.preprocess.window import Window
@@ -65,11 +65,15 @@ def raw_folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPath
     return root / "raw"
 
 
-def moved(source: RawSource, *, apart: bool) -> dict[int, np.ndarray]:
-    """Motion of the frames: none, or a shift and a turn by a hundredth from one exposure to the next."""
-    turned = np.zeros((1, TERMS, 2))
-    turned[0, :3] = (1.3, 0.7), (0.0, 2.0), (-2.0, 0.0)
-    return {frame: turned * (place if apart else 0) for place, frame in enumerate(source.matched_frames(0))}
+def moved(source: RawSource, *, apart: bool) -> dict[int, MatchedFrame]:
+    """Motion of the frames by their outline: none, or a shift from one exposure to the next."""
+    found = {}
+    for place, frame in enumerate(source.matched_frames(0)):
+        shift = (1.3 * place, 0.7 * place) if apart else (0.0, 0.0)
+        coefficients = np.zeros((1, TERMS, 2))
+        coefficients[0, 0] = shift
+        found[frame] = MatchedFrame(coefficients, (0.1,), ((shift, shift),))
+    return found
 
 
 def image_within(root: Path, *, apart: bool) -> LightImage:

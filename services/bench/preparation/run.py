@@ -108,7 +108,7 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
     view = files.view(0, camera)
     assert view is not None
     frames = source.matched_frames(0)
-    motions = dict(source.match(view, frames))
+    motions = dict(source.match(view, frames, subject.footprint_in))
     writer = ImageWriter(files, source, subject, HandMasks(scene.root, source.description), view)
     images = source.images(view, (LIGHT,) * (TURNS + 1), motions)
     _, image = next(images)
@@ -130,7 +130,7 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
             lambda: _store(writer, image, bits),
             BareStore(scene.root, image.radiance, image.variance, bits),
         ),
-        "flow": (lambda: dict(source.match(view, frames[1:2])), BareFlow(*pair)),
+        "flow": (lambda: dict(source.match(view, frames[1:2], subject.footprint_in)), BareFlow(*pair)),
     }, peak_gib
 
 

@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from services.core.errors import CaptureInputError
 from services.core.files.tables import read_text, require_points
+from services.core.files.validation import remedied
 from services.core.slab.folder import Cell, Glass
 from services.fit.slab.sphere.records import Sphere, SphereFile, TotalsReading
 
@@ -242,7 +243,6 @@ def _checked(path: Path, place: str, make: Callable[[], T]) -> T:
     except ValidationError as problem:
         first = problem.errors()[0]
         name = ".".join(str(part) for part in first["loc"]) or "the file"
-        told = first["msg"].removeprefix("Value error, ")
-        raise CaptureInputError(f"{path}{place}: {name}: {told}; correct it.") from problem
+        raise CaptureInputError(f"{path}{place}: {name}: {remedied(first)}.") from problem
     except ValueError as problem:
         raise CaptureInputError(f"{path}{place}: {problem}.") from problem
