@@ -121,7 +121,7 @@ def test_both_halves_of_an_outline_have_to_agree() -> None:
     arcs = np.array([AGREED, ((2.0, 0), (1.8, 0)), ((3.9, 0), (0.1, 0))])
     found, error = decided(shifts, errors, arcs)
     assert found.tolist() == [[0, 0], [2, 0], [0, 0]]
-    assert error[2] == pytest.approx(2 / 3)
+    assert error[2] == pytest.approx(np.sqrt(2 + 0.1**2 + 0.1**2 / 2), rel=0.01)
 
 
 def test_a_motion_within_its_errors_is_none_and_widens_no_error() -> None:

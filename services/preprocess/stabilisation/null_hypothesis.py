@@ -48,10 +48,10 @@ def decided(shifts_px: FloatArray, errors_px: FloatArray, arcs_px: FloatArray) -
     is_far = known & _is_far(displacement, total)
     is_far[first] = False
     moved = is_far & _do_arcs_agree(displacement, arcs_px - place)
-    total = np.where(moved, total, np.minimum(total, MOVED_PX))
-    # Where both halves of an outline do not agree on a motion, the image stays and its error tells the doubt
-    doubt = np.where(is_far & ~moved, np.linalg.norm(displacement, axis=-1) / MOVED_ERRORS, 0.0)
-    return np.where(moved[:, None], displacement, 0.0), np.maximum(total, doubt)
+    # An image that stays may have moved as far as its outline says, also where both halves of it disagree
+    left = np.linalg.norm(np.where(moved[:, None], 0.0, displacement), axis=-1) / np.sqrt(2)
+    error = np.hypot(total, left)
+    return np.where(moved[:, None], displacement, 0.0), np.where(is_far, error, np.minimum(error, MOVED_PX))
 
 
 def _is_far(displacement: FloatArray, error: FloatArray) -> NDArray[np.bool_]:
