@@ -25,9 +25,9 @@ class Estimate(Record):
         default={},
         description=(
             "what the standard error is made of, largest first; the squares add up to its square. photographs: their"
-            " noise; rendering: that of renders; gain, light_gain, flare, teeth, dome: the calibration's; prior: that"
-            " of media and shapes; mean_cosine: one that is held; shape: the dentin's, as far as it is held or no blend"
-            " shape follows it; unfinished: the step that was left"
+            " noise; rendering: that of renders; gain, light_gain, flare, teeth, dome: the calibration's; shift: that"
+            " of the photographs' motion; prior: that of media and shapes; mean_cosine: one that is held; shape: the"
+            " dentin's, as far as it is held or no blend shape follows it; unfinished: the step that was left"
         ),
     )
 

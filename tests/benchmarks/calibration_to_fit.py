@@ -45,7 +45,7 @@ from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.instrument.errors import DEFAULT_MOVE_SE, DEFAULT_SE
-from services.fit.instrument.moves import rigid
+from services.fit.instrument.pose import rigid
 from services.fit.stage import run
 from services.fit.transport.platform import prepare_device
 from tests.benchmarks.calibrate_sessions import COUNTS, N_PLACES, found_rig, photographed_spheres, posed_cameras_of

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
 from services.fit.instrument.errors import DEFAULT_MOVE_SE
-from services.fit.instrument.moves import rigid
+from services.fit.instrument.pose import rigid
 from services.fit.optics.parameters import Medium, Tissue
 from tests.benchmarks.instrument_errors import SUBJECT
 from tests.support.truths import SIDE_LIGHTS, Truth, read

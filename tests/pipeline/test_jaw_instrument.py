@@ -14,7 +14,8 @@ import pytest
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
-from services.fit.inputs.observations import Observations, ViewStack, read_channel
+from services.fit.inputs.observations import Observations, read_channel
+from services.fit.inputs.view_stack import ViewStack
 from services.fit.stage import export, run
 from tests.support.small_jaw import jaw_spec, write_prepared_jaw
 

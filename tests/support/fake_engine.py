@@ -152,9 +152,9 @@ class FakeEngine:
 
     def _geometry(self, view: View) -> Geometry:
         # The part of the formula that does not depend on the tissue, once for each view.
-        key = view.pixels.tobytes()
+        key = view.pixels.tobytes() + np.asarray(view.camera.camera_from_world).tobytes()
         if key not in self._geometries:
-            x, y = view.pixels.T.astype(float)
+            x, y = self._places(view)
             thickness = 0.3 + 0.9 * y / 34.0
             if self.recipe.teeth[0].dentin is None:
                 thickness = thickness + 50.0
@@ -165,6 +165,24 @@ class FakeEngine:
             own, shared = (pixel + np.uint64(2**40) * place for place in (lights, np.full_like(lights, 1000)))
             self._geometries[key] = Geometry(x, thickness, cosine, np.sqrt(cosine), cosine**2, own, shared)
         return self._geometries[key]
+
+    def _places(self, view: View) -> tuple[Array, Array]:
+        # Coordinates of the pixels. Where the camera stands beside its place, which lies on a grid of 10 mm along the
+        # world's axes, they are those that the same points of a ball around the tooth have from that place.
+        pose, x, y = np.asarray(view.camera.camera_from_world), *view.pixels.T.astype(float)
+        place = np.column_stack([pose[:, :3].round(), 10 * (pose[:, 3] / 10).round()])
+        place[3] = 0.0, 0.0, 0.0, 1.0
+        if np.array_equal(place, pose) or np.abs(place - pose)[:3, :3].max() > 0.1:
+            return x, y
+        vertices = self.recipe.teeth[0].outer.vertices_mm
+        centre = vertices.mean(axis=0)
+        origin, ways = view.camera.rays(x + 0.5, y + 0.5)
+        along = ways @ (centre - origin)
+        inside = np.linalg.norm(vertices - centre, axis=1).max() ** 2 - ((centre - origin) ** 2).sum() + along**2
+        points = origin + (along - np.sqrt(np.maximum(inside, 0.0)))[:, None] * ways
+        unmoved = view.camera.model_copy(update={"camera_from_world": tuple(map(tuple, place.tolist()))})
+        seen_x, seen_y = unmoved.project(points)[0].T - 0.5
+        return seen_x, seen_y
 
     def _normal(self, view: View, seed: int, stream: int) -> Array:
         # Counter-based random numbers per (seed, stream, light, pixel), so that blocks and order do not matter.

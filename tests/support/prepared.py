@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
+from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh
 from services.core.records import MaskBit
@@ -57,6 +58,7 @@ def write_prepared(
     seed: int = 5,
     engine: type[FakeEngine] = FakeEngine,
     notes: tuple[str, ...] = (),
+    scan_se: tuple[float, float] | None = None,
 ) -> PreparedManifest:
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
@@ -71,6 +73,7 @@ def write_prepared(
             either.
         stain_uv: texture coordinates of the outer surface, for a truth with stains.
         engine: fake engine whose formula the photographs follow.
+        scan_se: stated standard errors of the scan's pose, rad and mm; None where nothing is stated.
     """
     writer = StageWriter(root, "prepared", 1)
     cameras, all_lights, rng = (camera("c0"), camera("c1")), lights(light_count), np.random.default_rng(seed)
@@ -111,6 +114,12 @@ def write_prepared(
     manifest = PreparedManifest(
         channels=channels, cameras=cameras, lights=all_lights, held_out=held_out, fdi=(11,), dentin_known=(11,),
         median_motion_px=None, notes=notes, valid_fraction=0.9,
+        uncertainty=None if scan_se is None else _of_the_scan(*scan_se),
     )  # fmt: skip
     writer.publish(manifest)
     return manifest
+
+
+def _of_the_scan(turn_rad: float, shift_mm: float) -> CalibrationUncertainty:
+    rows = np.diag([turn_rad**2] * 3 + [shift_mm**2] * 3).tolist()
+    return CalibrationUncertainty(names=tuple(f"teeth.{axis}" for axis in TWIST), covariance=tuple(map(tuple, rows)))

@@ -15,7 +15,8 @@ from services.core.store import create_array
 from services.fit.checks.alignment import Offset, clearest_offset, offset_sentences
 from services.fit.checks.evaluate import ErrorSums, Evaluation
 from services.fit.execution.blocks import PixelParts
-from services.fit.inputs.observations import Observations, ViewStack
+from services.fit.inputs.observations import Observations
+from services.fit.inputs.view_stack import ViewStack
 from tests.support.prepared import lights, sphere
 
 SIZE, PIXEL_MM, RADIUS_PX = 40, 0.4, 10

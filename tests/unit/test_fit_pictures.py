@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.fit.export.previews import pictures_of, spacing
-from services.fit.inputs.observations import ViewStack
+from services.fit.inputs.view_stack import ViewStack
 from tests.support.prepared import camera, lights
 
 

@@ -20,9 +20,10 @@ from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
 from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
 from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
-from services.fit.instrument.errors import DEFAULT_SE, FAULT_Z, InstrumentErrors, errors_of, have_common_cause
-from services.fit.instrument.moves import by_scene, move_covariance, rigid, write_moves
+from services.fit.instrument.errors import COMMON_KINDS, DEFAULT_SE, InstrumentErrors, errors_of, have_common_cause
+from services.fit.instrument.moves import by_scene, move_covariance, write_moves
 from services.fit.instrument.photographs import error_derivatives, photographed
+from services.fit.instrument.pose import rigid
 from services.fit.instrument.sentences import REMEDY, assumed_names, instrument_sentences
 from services.fit.optics.domain import Coordinate, Domain
 from services.fit.optics.parameters import Medium, Tissue
@@ -205,7 +206,7 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
         " 1 %"
     )
     assert "check that light, its cable and its name" in fault
-    assert set(REMEDY) == set(FAULT_Z)
+    assert set(REMEDY) == set(COMMON_KINDS[0])
     assert "Images hardly show a gain that is farther off" in assumed
     off = spec.model_copy(update={"instrument": "off"})
     assert instrument_sentences(off, {"green": InstrumentErrors()}, {}, ())[0].startswith(

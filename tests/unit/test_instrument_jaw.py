@@ -124,5 +124,5 @@ def test_a_jaw_under_many_lights_knows_their_common_gain_alone_and_says_so() -> 
         assert ("single lights for as bright" in said) is told
     tooth = instrument_of(manifest(count), spec.model_copy(update={"kind": "tooth"}), np.zeros(3))
     assert tooth is not None
-    assert len(tooth.errors("green", ("c0",), np.ones(count, dtype=bool)).names) == count + 2
+    assert len(tooth.errors("green", ("c0",), np.ones(count, dtype=bool)).names) == count + 2 + 6
     assert instrument_of(manifest(2), spec.model_copy(update={"instrument": "off"}), np.zeros(3)) is None

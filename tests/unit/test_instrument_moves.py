@@ -16,7 +16,8 @@ from services.core.results import PreparedManifest
 from services.fit.execution.blocks import read_recipe
 from services.fit.instrument.capture import instrument_of
 from services.fit.instrument.errors import DEFAULT_MOVE_SE
-from services.fit.instrument.moves import move_covariance, rigid
+from services.fit.instrument.moves import move_covariance
+from services.fit.instrument.pose import rigid
 from services.fit.transport.scene.recipe import single_tooth
 from tests.support.prepared import camera, sphere
 

@@ -22,7 +22,8 @@ from services.fit.export.asset import mouth_of
 from services.fit.export.pictures import Picture
 from services.fit.export.stains import read_stains
 from services.fit.inputs.dentin import dentin_shape, known_dentins
-from services.fit.inputs.observations import Observations, ViewStack, channel_scene, read_channel, read_observations
+from services.fit.inputs.observations import Observations, channel_scene, read_channel, read_observations
+from services.fit.inputs.view_stack import ViewStack
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.stage import fitted_teeth
 from services.fit.transport.engine import Engine

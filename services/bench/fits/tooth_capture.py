@@ -15,7 +15,8 @@ from services.core.records import JobSpec
 from services.core.stage import LocalContext
 from services.core.store import is_published
 from services.fit.checks.evaluate import ErrorSums, error_sums
-from services.fit.inputs.observations import Observations, ViewStack, read_channel, read_observations
+from services.fit.inputs.observations import Observations, read_channel, read_observations
+from services.fit.inputs.view_stack import ViewStack
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.fit.transport.engine import Engine
 from services.fit.transport.scene.recipe import View, single_tooth

@@ -17,7 +17,8 @@ from services.core.records import MaskBit
 from services.fit.checks.evaluate import Evaluation
 from services.fit.checks.offset import Comparison, FoundOffset, ShiftedRender, best_offset
 from services.fit.inputs.levels import LevelReader, whole_squares
-from services.fit.inputs.observations import Observations, ViewStack
+from services.fit.inputs.observations import Observations
+from services.fit.inputs.view_stack import ViewStack
 
 TESTED_ERROR = 0.05
 """Relative image error above which a fit is tested for an offset: below it, a shift does not matter."""

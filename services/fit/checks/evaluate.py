@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.execution.blocks import BlockTask, read_block
+from services.fit.execution.blocks import BlockTask
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import Passes, TraceRow, trace_row
-from services.fit.instrument.photographs import photographed
+from services.fit.instrument.photographs import block_of, photographed
 from services.fit.optics.parameters import Mouth, Tissue
 
 Array = NDArray[np.float64]
@@ -198,7 +198,7 @@ def evaluate_task(
     host: EngineHost, task: BlockTask, seeds: tuple[int, int], shown: Shown, by_frame: bool = False
 ) -> BlockErrors:
     """Evaluate one block, with the instrument's errors applied to the renders."""
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
     used[[light for name, light in shown if name == block.view.camera.name]] = True
     stacks = [

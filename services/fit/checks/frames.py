@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.checks.evaluate import Evaluation, FrameSums
-from services.fit.inputs.observations import Observations, ViewStack
+from services.fit.inputs.observations import Observations
+from services.fit.inputs.view_stack import ViewStack
 
 Array = NDArray[np.float64]
 

@@ -29,6 +29,7 @@ WORDS = {
     "flare": "Measuring the flare",
     "teeth": "Registering the scan",
     "dome": "Measuring where the dome stands",
+    "shift": "Measuring how the subject moves, by tracking frames,",
 }
 
 
@@ -66,11 +67,11 @@ def covariance_if_known(uncertainty: Uncertainty, kind: str) -> Array:
     """Covariance (F, F) of a fit whose calibration knew a kind of error ``SE_DIVISOR`` times as precisely; the
     remaining step of the fit stays in it.
     """
-    if kind in MOVING_BODIES:
+    own = [k for k, name in enumerate(uncertainty.domain.errors.names) if kind_of_error(name) == kind]
+    if not own:
         return np.asarray(uncertainty.covariance - (1 - SE_DIVISOR**-2) * uncertainty.parts[kind])
     assert uncertainty.sandwich is not None
     domain = uncertainty.domain
-    own = [k for k, name in enumerate(domain.errors.names) if kind_of_error(name) == kind]
     chosen = [domain.tissue_count + k for k in own]
     # Add information that divides the kind's own covariance, whatever its correlations with other kinds.
     added = np.zeros_like(uncertainty.covariance)
@@ -83,7 +84,7 @@ def covariance_if_known(uncertainty: Uncertainty, kind: str) -> Array:
 
 
 def _target_precision(uncertainty: Uncertainty, kind: str) -> str:
-    if kind in MOVING_BODIES:
+    if kind in {*MOVING_BODIES, "shift"}:
         return "twice as well"
     errors = uncertainty.domain.errors
     se = min(se for name, se in zip(errors.names, errors.se.tolist(), strict=True) if kind_of_error(name) == kind)

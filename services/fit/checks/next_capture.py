@@ -20,7 +20,6 @@ from services.fit.execution.blocks import (
     BlockInstrument,
     BlockTask,
     StoredFile,
-    read_block,
     read_recipe,
     write_block,
     write_recipe,
@@ -29,8 +28,8 @@ from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.instrument.errors import DEFAULT_SE
-from services.fit.instrument.moves import rigid
-from services.fit.instrument.photographs import error_derivatives
+from services.fit.instrument.photographs import block_of, error_derivatives
+from services.fit.instrument.pose import rigid
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import estimates
@@ -300,7 +299,7 @@ def advice_task(
     weight: float,
 ) -> tuple[dict[str, tuple[AddedInformation, AddedInformation]], TraceRow]:
     """Information that one view adds, by candidate, from its even and its odd pixels, and the task's trace."""
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     view, half = block.fitted_view, max(task.samples // 2, 1)
     images = [
         np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64)

@@ -28,7 +28,8 @@ from services.fit.execution.passes import Passes, TraceRow
 from services.fit.execution.seeds import Seeds
 from services.fit.execution.step_report import StepReport, history_key, message_prefix
 from services.fit.export.previews import write_pictures, write_preview
-from services.fit.inputs.observations import ChannelFiles, Observations, ViewStack
+from services.fit.inputs.observations import ChannelFiles, Observations
+from services.fit.inputs.view_stack import ViewStack
 
 CHECKPOINT = "fit-checkpoint"
 """Folder, in the job's folder, of the journal and of the input files of the fit's tasks."""

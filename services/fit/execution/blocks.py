@@ -98,6 +98,35 @@ class BlockInstrument:
     flare: str
     brightest: float
     """Largest radiance among the camera's valid pixels in this channel; a flare is given as a share of it."""
+    shifts: tuple[str, ...] = ()
+    """Name of the shift of each light's photograph, '' where it stands still; empty where all do."""
+
+
+@dataclass(frozen=True)
+class BlockMotion:
+    """How photographs change where the scan moves, or where a photograph itself is shifted."""
+
+    slopes: Array
+    """Slopes (2, L, N) of the photographs along x and y, per pixel."""
+    slope_noise: Array
+    """Variance (2, L, N) of each slope, in variances of the photograph."""
+    displacement: Array
+    """Displacement (6, 2, N), in px, of what each pixel shows by each coordinate of the scan's pose, per rad and per
+    mm (``instrument.pose``)."""
+    brightening: Array
+    """Relative change (6, L, N) of the irradiance by each coordinate."""
+    centre_mm: Array
+    """Point (3,) about which the scan turns."""
+
+    def of(self, lights: NDArray[np.bool_], pixels: NDArray[Any]) -> BlockMotion:
+        """The changes of some pixels, by index or mask, under the lights of a mask (L,)."""
+        return BlockMotion(
+            self.slopes[:, lights][:, :, pixels],
+            self.slope_noise[:, lights][:, :, pixels],
+            self.displacement[:, :, pixels],
+            self.brightening[:, lights][:, :, pixels],
+            self.centre_mm,
+        )
 
 
 @dataclass(frozen=True)
@@ -118,6 +147,8 @@ class Block:
     alone."""
     instrument: BlockInstrument | None = None
     """The instrument's errors; None where the instrument counts as exact."""
+    motion: BlockMotion | None = None
+    """Changes by moves; None where the fit estimates none."""
 
     @property
     def fitted_view(self) -> View:
@@ -169,7 +200,17 @@ def write_block(folder: Path, block: Block) -> StoredFile:
     if (errors := block.instrument) is not None:
         instrument = {
             "error_names": np.array([errors.gain, errors.flare, *errors.lights]),
+            "shift_names": np.array(errors.shifts, dtype=np.str_),
             "brightest": np.array(errors.brightest),
+        }
+    motion: dict[str, NDArray[Any]] = {}
+    if (moved := block.motion) is not None:
+        motion = {
+            "slopes": moved.slopes.astype(np.float32),
+            "slope_noise": moved.slope_noise.astype(np.float16),
+            "displacement": moved.displacement.astype(np.float32),
+            "brightening": moved.brightening.astype(np.float16),
+            "centre_mm": moved.centre_mm,
         }
     return _write(
         folder,
@@ -183,6 +224,7 @@ def write_block(folder: Path, block: Block) -> StoredFile:
         **parts,
         **({} if block.cell is None else {"cell": block.cell}),
         **instrument,
+        **motion,
     )
 
 
@@ -196,7 +238,12 @@ def read_block(stored: StoredFile) -> Block:
     instrument = None
     if "error_names" in a:
         gain, flare, *lights = map(str, a["error_names"])
-        instrument = BlockInstrument(gain, tuple(lights), flare, float(np.asarray(a["brightest"], dtype=float)))
+        shifts = tuple(map(str, a["shift_names"])) if "shift_names" in a else ()
+        instrument = BlockInstrument(gain, tuple(lights), flare, float(np.asarray(a["brightest"], dtype=float)), shifts)
+    motion = None
+    if "slopes" in a:
+        names = "slopes", "slope_noise", "displacement", "brightening", "centre_mm"
+        motion = BlockMotion(*(a[name].astype(float) for name in names))
     return Block(
         view,
         a["reference"].astype(float),
@@ -206,6 +253,7 @@ def read_block(stored: StoredFile) -> Block:
         parts,
         cell,
         instrument,
+        motion,
     )
 
 

@@ -26,8 +26,9 @@ from services.fit.optics.parameters import Mouth, Optics, Tissue
 from services.fit.solve import adam, gauss_newton
 from services.fit.solve.closing import ClosingSums
 from services.fit.solve.covariance import ClosingModel, Uncertainty, closing_model, uncertainty, whitening
-from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State, StepTest
+from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
+from services.fit.solve.step_test import StepTest
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.execution.blocks import BlockTask, StoredFile, read_block
+from services.fit.execution.blocks import BlockTask, StoredFile
 from services.fit.execution.derivatives import Differentiation
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.passes import StackProblem, TraceRow, trace_row
 from services.fit.instrument.moves import Move, by_scene, moves_task
-from services.fit.instrument.photographs import error_derivatives, photographed
+from services.fit.instrument.photographs import block_of, error_derivatives, photographed
 from services.fit.optics.domain import Domain, similar_medium, to_natural
 from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
 from services.fit.solve.closing import ClosingSums, closing_sums
@@ -124,7 +124,7 @@ def displacements_task(
     host: EngineHost, task: BlockTask, tissue: Tissue, scene: DisplacedScene, seeds: tuple[int, int]
 ) -> NDArray[np.float32]:
     """Changes of a block's images by the displacements of a scene's dentin: (K, 2, L, N) by displacement and seed."""
-    view = read_block(task.block).fitted_view
+    view = block_of(task).fitted_view
 
     def images(mode: int) -> Array:
         weights = np.zeros(2 * scene.count)
@@ -155,7 +155,7 @@ def closing_task(
 
     Rows of ``slopes`` that are ``copied`` are taken from the similar media's Jacobian.
     """
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     view, errors = block.fitted_view, dict(task.errors)
 
     def image(tissue: Tissue | Mouth, seed: int, samples: int) -> Array:

@@ -26,7 +26,7 @@ from services.fit.execution.derivatives import Differentiation, differentiation,
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.executors import Executor
 from services.fit.execution.seeds import Seeds
-from services.fit.instrument.photographs import error_derivatives, photographed
+from services.fit.instrument.photographs import block_of, error_derivatives, photographed, placed, slope_noise
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, similar_tissue
 from services.fit.optics.parameters import Mouth, Optics, Tissue
@@ -75,7 +75,7 @@ class Products:
 
 def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Residual:
     """Render a block twice, each time with half the samples, and subtract the reference."""
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     half = max(task.samples // 2, 1)
     stacks: list[StackEstimate] = [
         host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed) for seed in seeds
@@ -94,7 +94,7 @@ def jacobian_task(
     near: Near | None,
 ) -> Products:
     """Render a block's derivatives with two seeds and multiply them by each other and by the residual."""
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     j1, j2 = differentiation.render(host, task, block.fitted_view, seeds, block.parts)
     if residual.images is not None:
         j1, j2 = (
@@ -109,6 +109,8 @@ def jacobian_task(
     equations = normal_equations(
         j1, j2, r1, r2, variance, weight, len(block.reference), regions, len(differentiation.errors)
     )
+    if differentiation.errors and block.motion is not None:
+        equations = equations.without_noise(*slope_noise(block, differentiation.errors))
     return Products(equations, (residual.trace, rendered, trace_row("products", task, start)))
 
 
@@ -122,7 +124,7 @@ def gradient_task(
     host: EngineHost, task: BlockTask, similar: Tissue, differentiation: Differentiation, seeds: tuple[int, int]
 ) -> tuple[Gradient, TraceRow]:
     """One block's stochastic gradient: residual from one seed, derivatives from another."""
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     stack: StackEstimate = host.call(
         "images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seeds[0]
     )
@@ -152,10 +154,8 @@ def compare_task(
     start, block = time.time(), read_block(task.block)
 
     def residuals(tissue: Tissue | Mouth, errors: Errors) -> tuple[Array, Array]:
-        stacks = [
-            host.call("images", task.recipe, tissue, block.fitted_view, samples=task.samples, seed=seed)
-            for seed in seeds
-        ]
+        view = placed(block, dict(errors)).fitted_view
+        stacks = [host.call("images", task.recipe, tissue, view, samples=task.samples, seed=seed) for seed in seeds]
         first, second = ((photographed(one.mean, block, dict(errors)) - block.reference).reshape(-1) for one in stacks)
         return first, second
 
@@ -168,7 +168,7 @@ def compare_task(
 
 def orders_task(host: EngineHost, task: BlockTask, edges: NDArray[np.int64], seed: int) -> tuple[Array, TraceRow]:
     """Images (K, L, N) of a block at albedo 1, split by scattering order, with their trace."""
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     orders = host.call(
         "order_images", task.recipe, task.tissue, block.fitted_view, bin_edges=edges, samples=task.samples, seed=seed
     )

@@ -21,12 +21,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.execution.blocks import BlockTask, read_block
+from services.fit.execution.blocks import BlockTask
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, compare_task, trace_row
 from services.fit.inputs.stain_uv import StainLayout
-from services.fit.instrument.photographs import photographed
+from services.fit.instrument.photographs import block_of, photographed
 from services.fit.optics.domain import similar_tissue
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.normal_equations import LossChange
@@ -49,7 +49,7 @@ def stain_task(
     """Derivatives of one block's sum(w ref C) and sum(w C1 C) with respect to the texels (H, W), from shared paths, and
     the block's sum of weighted squared residuals without their Monte Carlo variance.
     """
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     view, weight = block.fitted_view, block.fit_weight
     image: StackEstimate = host.call("images", task.recipe, task.tissue, view, samples=task.samples, seed=seeds[0])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -15,12 +16,15 @@ SOURCES = {
     "flare": "flare",
     "teeth": "scan",
     "dome": "dome",
+    "shift": "motion",
     "prior": "prior",
     "mean_cosine": "mean cosine",
     "shape": "dentin's shape",
     "unfinished": "unfinished",
 }
 """Sources of a standard error, with their headings in the report."""
+SHOWN_UNITS = {"1": ("%", 100.0), "rad": ("°", math.degrees(1)), "mm": ("mm", 1.0), "px": ("px", 1.0)}
+"""Unit of an error of the instrument in the report, and the factor to it, by its unit."""
 MIN_SHARE = 0.005
 """Smallest share of a squared standard error that is shown."""
 
@@ -47,20 +51,22 @@ def source_tables(
 
 def instrument_tables(report: FitReport) -> list[dict[str, Any]]:
     """Tables, by channel, of each error of the instrument: estimate, its standard error, and its standard error before
-    the fit, in percent.
+    the fit, in percent, degrees, mm or pixels.
     """
     tables = []
     for channel, found in report.instrument.items():
         rows = []
         for name, one in found.items():
             before = report.instrument_prior[channel][name]
+            unit, factor = SHOWN_UNITS[one.unit]
             rows.append(
                 {
                     "name": name,
-                    "found": f"{100 * one.value:+.2f}".replace("-", "−"),
-                    "se": f"{100 * (one.se or 0.0):.2f}",
-                    "before": f"{100 * before:.2g}",
-                    "assumed": name in report.assumed,
+                    "unit": unit,
+                    "found": f"{factor * one.value:+.2f}".replace("-", "−"),
+                    "se": f"{factor * (one.se or 0.0):.2f}",
+                    "before": f"{factor * before:.2g}",
+                    "assumed": name in report.assumed or (name.startswith("teeth.") and "teeth" in report.assumed),
                     "fault": name in report.instrument_faults.get(channel, ()),
                 }
             )

@@ -25,8 +25,8 @@ from services.fit.export.pictures import (
 )
 from services.fit.export.report import ReportPictures
 from services.fit.export.stains import stain_image
-from services.fit.inputs.observations import ViewStack
 from services.fit.inputs.stain_uv import ToothStains
+from services.fit.inputs.view_stack import ViewStack
 
 Array = NDArray[np.float64]
 PREVIEWS = "previews"

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import CaptureInputError, SettingsError
 from services.core.files.meshes import read_mesh, read_teeth
-from services.core.geometry import Camera, Mesh, Tooth
-from services.core.records import JobSpec, Loss
+from services.core.geometry import Mesh, Tooth
+from services.core.records import JobSpec, Loss, MaskBit
 from services.core.results import PreparedManifest
 from services.core.store import open_stage
-from services.fit.execution.blocks import Block, PixelParts, StoredFile, split_pixels, write_block, write_recipe
+from services.fit.execution.blocks import Block, StoredFile, split_pixels, write_block, write_recipe
 from services.fit.inputs.dentin import read_neighbours
 from services.fit.inputs.held_out import held_out_images, left_out_lights
 from services.fit.inputs.levels import LevelReader, reduced_camera, whole_squares
+from services.fit.inputs.slopes import image_slopes
+from services.fit.inputs.view_stack import ViewStack, comparison_cells, on_coarse_grid
 from services.fit.instrument.capture import Instrument
 from services.fit.instrument.errors import NO_ERRORS, InstrumentErrors
 from services.fit.instrument.moves import Move
@@ -28,45 +30,11 @@ from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 
 Array = NDArray[np.float64]
 
-CELL_EDGE = 4
-"""Edge of a comparison cell, in pixels of the coarse grid. Losses are compared as means over cells, because changes by
-parameters are smooth and noise is not."""
-MIN_CELLS = 24
-"""Least number of cells of a view, approximately: cells are smaller where there would be fewer, so that the error of a
-comparison can still be estimated."""
 COARSE_PIXELS = 600
 """Largest number of pixels of a view, for each of its teeth, in all stages but the last, and in the evaluations after
 each step."""
 SEARCH_PIXELS = 210
 """Number of pixels, over all views, that the table search compares."""
-
-
-@dataclass(frozen=True)
-class ViewStack:
-    """Pixels of one camera in one channel; arrays over (light, pixel) are (L, N), with lights in the
-    manifest's order.
-    """
-
-    camera: Camera
-    pixels: NDArray[np.int32]
-    reference: Array
-    variance: Array
-    valid: NDArray[np.bool_]
-    held_out: NDArray[np.bool_]
-    """Mask (L,) of the lights under which this camera's image is held out of the fit."""
-    parts: PixelParts | None = None
-    """Part of a jaw that each pixel shows; None where the scene is one tooth."""
-
-    def of(self, pixels: NDArray[np.bool_]) -> ViewStack:
-        """View of some of the pixels, by a mask (N,)."""
-        parts = None if self.parts is None else self.parts.of(pixels)
-        arrays = (self.reference[:, pixels], self.variance[:, pixels], self.valid[:, pixels])
-        return ViewStack(self.camera, self.pixels[pixels], *arrays, self.held_out, parts)
-
-    @property
-    def fitted(self) -> NDArray[np.bool_]:
-        """Mask (L, N) of the measurements that the fit may use."""
-        return self.valid & ~self.held_out[:, None]
 
 
 @dataclass(frozen=True)
@@ -194,9 +162,15 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
         y, x = np.nonzero(valid.any(axis=0))
         if len(x) == 0:
             continue
-        images = (level.image(c, light, camera) for light in lights)
-        reference, spread = (
-            np.stack(one) for one in zip(*((radiance[y, x], own[y, x]) for radiance, own in images), strict=True)
+        outside = np.uint16(MaskBit.OUTSIDE)
+        usable = (whole_squares(level.bits(c, light, camera) & ~outside == 0, spec.pixel_step) for light in lights)
+        images = ((*level.image(c, light, camera), seen) for light, seen in zip(lights, usable, strict=True))
+        reference, spread, slopes = (
+            np.stack(one)
+            for one in zip(
+                *((radiance[y, x], own[y, x], image_slopes(radiance, seen)[:, y, x]) for radiance, own, seen in images),
+                strict=True,
+            )
         )
         chosen = valid[:, y, x] & np.isfinite(reference)
         reference = np.where(chosen, reference, 0.0)
@@ -207,7 +181,15 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
         pixels = np.stack([x, y], axis=-1).astype(np.int32)
         reduced = reduced_camera(camera, spec.pixel_step)
         views.append(
-            ViewStack(reduced, pixels, reference, np.where(known, spread, assumed), chosen, observations.held_out[c])
+            ViewStack(
+                reduced,
+                pixels,
+                reference,
+                np.where(known, spread, assumed),
+                chosen,
+                observations.held_out[c],
+                slopes=np.where(chosen, slopes.swapaxes(0, 1), 0.0),
+            )
         )
     if not views:
         raise CaptureInputError(
@@ -303,6 +285,10 @@ def write_channel(
     brightest = {v.camera.name: float(np.where(v.valid, v.reference, 0.0).max(initial=0.0)) for v in views}
     fitted_cameras = [v.camera.name for v, f in zip(views, fitted, strict=True) if f.any()]
 
+    moved = dict(
+        zip(cells, [None] * len(views) if instrument is None else instrument.motions(scene, views), strict=True)
+    )
+
     def under(lights: NDArray[np.bool_]) -> SceneRecipe:
         return replace(
             scene,
@@ -320,7 +306,9 @@ def write_channel(
             if instrument is None
             else instrument.block_instrument(channel, view.camera.name, brightest[view.camera.name], lights)
         )
-        block = Block(*measured, weight[cut], held_out, parts, cells[view.camera.name][pixels], instrument_of_block)
+        motion = None if (of_view := moved[view.camera.name]) is None else of_view.of(lights, pixels)
+        cell = cells[view.camera.name][pixels]
+        block = Block(*measured, weight[cut], held_out, parts, cell, instrument_of_block, motion)
         return write_block(folder, block)
 
     def level(max_pixels: int | None) -> Level:
@@ -364,31 +352,6 @@ def write_channel(
         errors=NO_ERRORS if instrument is None else instrument.errors(channel, fitted_cameras, fitted_lights),
         moves=() if instrument is None else instrument.moves(folder, under(fitted_lights)),
     )
-
-
-def on_coarse_grid(pixels: NDArray[np.int32], counted: NDArray[np.bool_], max_pixels: int) -> NDArray[np.bool_]:
-    """Mask (N,) of the pixels (N, 2) on a grid of every n-th in x and y, with the least n that leaves at most
-    ``max_pixels`` of the counted pixels.
-    """
-    every = 1
-    while (counted & (kept := (pixels % every == 0).all(axis=1))).sum() > max_pixels:
-        every += 1
-    return np.asarray(kept)
-
-
-def comparison_cells(view: ViewStack, max_pixels: int) -> NDArray[np.int32]:
-    """Index (N,) of each pixel's comparison cell. Cells are squares of a few pixels of the coarse grid, which has at
-    most ``max_pixels`` fitted pixels; each cell shows one part only.
-    """
-    counted = np.asarray(view.fitted.any(axis=0))
-    coarse = view.pixels[counted & on_coarse_grid(view.pixels, counted, max_pixels)]
-    if not len(coarse):
-        return np.zeros(len(view.pixels), dtype=np.int32)
-    pitch = max(1, int(np.gcd.reduce((coarse - coarse[0]).ravel())))
-    edge = pitch * max(1, min(CELL_EDGE, round(np.sqrt(len(coarse) / MIN_CELLS))))
-    part = np.zeros(len(view.pixels), dtype=np.int64) if view.parts is None else view.parts.shown.astype(np.int64)
-    place = np.column_stack([view.pixels // edge, part])
-    return np.unique(place, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
 
 
 def _spread(pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:

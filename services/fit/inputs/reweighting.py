@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import Loss
-from services.fit.execution.blocks import BlockTask, StoredFile, read_block, write_block
+from services.fit.execution.blocks import BlockTask, StoredFile, write_block
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.journal import Journal
 from services.fit.execution.passes import Passes, TraceRow, trace_row
-from services.fit.instrument.photographs import photographed
+from services.fit.instrument.photographs import block_of, photographed
 from services.fit.optics.parameters import Tissue
 from services.fit.solve.losses import weights
 from services.fit.transport.scene.recipe import StackEstimate
@@ -32,7 +32,7 @@ class Residual:
 
 def residual_task(host: EngineHost, task: BlockTask, seed: int) -> Residual:
     """Render a block and subtract the reference."""
-    start, block = time.time(), read_block(task.block)
+    start, block = time.time(), block_of(task)
     stack: StackEstimate = host.call(
         "images", task.recipe, task.tissue, block.fitted_view, samples=task.samples, seed=seed
     )

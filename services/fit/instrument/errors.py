@@ -17,7 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 
 Array = NDArray[np.float64]
 
@@ -32,9 +32,15 @@ DEFAULT_MOVE_SE: Mapping[str, tuple[float, ...]] = MappingProxyType(
 """Standard errors of rotations (rad) and translations (mm) of the scan and of the dome where a calibration states none:
 the best that registration reaches, and the precision of a tape measure."""
 LINEAR_REACH = 0.1
-"""Length scale of an error for the lengths of steps; images are exactly linear in an error."""
+"""Length scale of an error for the lengths of steps, in its unit; images are exactly linear in all errors but the
+scan's pose."""
+CURVED_REACH: Mapping[str, float] = MappingProxyType(
+    dict.fromkeys((f"teeth.{axis}" for axis in TWIST[:3]), 0.05)
+    | dict.fromkeys((f"teeth.{axis}" for axis in TWIST[3:]), 0.25)
+)
+"""Length scale of each coordinate of the scan's pose, rad and mm, over which images of a tooth are about linear."""
 
-FAULT_Z: Mapping[str, float] = MappingProxyType({"light_gain": 3.0, "flare": 4.0})
+FAULT_Z: Mapping[str, float] = MappingProxyType({"light_gain": 3.0, "flare": 4.0, "shift": 3.0})
 """Kinds of errors that images show to be faults of the calibration, and the number of standard errors from its prior
 beyond which such an error is one. One sound light in 370 lies beyond 3 by chance. A flare also takes up light that the
 model leaves out, so sound flares lie beyond 3 more often. The gain of all is not among them, because images can hardly
@@ -52,7 +58,7 @@ MAX_ERROR = 10.0
 
 
 def kind_of_error(name: str) -> str:
-    """Kind of an error by its name: ``gain``, ``light_gain`` or ``flare``."""
+    """Kind of an error by its name: ``gain``, ``light_gain``, ``flare``, ``teeth`` or ``shift``."""
     return name.partition(".")[0]
 
 
@@ -81,6 +87,16 @@ class InstrumentErrors:
         return np.sqrt(np.diag(self.matrix))
 
     @property
+    def scale(self) -> Array:
+        """Length scale of each error, (K,)."""
+        return np.array([CURVED_REACH.get(name, LINEAR_REACH) for name in self.names])
+
+    def curved_length(self, step: Array) -> float:
+        """Length of the part of a step (K,) in which images are curved, in its scales."""
+        own = zip(self.names, step.tolist(), strict=True)
+        return float(np.linalg.norm([size / CURVED_REACH[name] for name, size in own if name in CURVED_REACH]))
+
+    @property
     def bounds(self) -> tuple[tuple[float, float], ...]:
         """Bounds of each error, wide enough to do no more than keep a wild step representable."""
         return ((-MAX_ERROR, MAX_ERROR),) * len(self.names)
@@ -89,15 +105,28 @@ class InstrumentErrors:
 NO_ERRORS = InstrumentErrors()
 
 
-def have_common_cause(faults: int, names: Sequence[str]) -> bool:
+COMMON_KINDS = (("light_gain", "flare"), ("shift",))
+"""Kinds of errors of which many far from their prior at once have one cause; the pose of the scan is one thing."""
+
+
+def have_common_cause(faults: int, names: Sequence[str], kinds: Sequence[str] = COMMON_KINDS[0]) -> bool:
     """Whether so many errors lie far from their prior that they have one cause, in the model or the photographs, and
     are no faults of the calibration.
 
     Args:
-        faults: number of errors that do. names: names of all errors.
+        faults: number of errors that do. names: names of all errors. kinds: kinds of errors that are counted.
     """
-    checked = sum(kind_of_error(name) in FAULT_Z for name in names)
+    checked = sum(kind_of_error(name) in kinds for name in names)
     return faults >= max(MANY_FAULTS, FAULT_SHARE * checked)
+
+
+def single_faults(faults: Sequence[int], names: Sequence[str]) -> tuple[int, ...]:
+    """Those of some faults, by their index among all errors, that have no cause in common with others."""
+    common = set[str]()
+    for kinds in COMMON_KINDS:
+        if have_common_cause(sum(kind_of_error(names[k]) in kinds for k in faults), names, kinds):
+            common.update(kinds)
+    return tuple(k for k in faults if kind_of_error(names[k]) not in common)
 
 
 def gain_name(channel: str) -> str:
@@ -117,24 +146,40 @@ def light_names(lights: Sequence[str], channel: str, stated: CalibrationUncertai
     return tuple(own[light] if own[light] in known else f"light_gain.{light}" for light in lights)
 
 
+def shift_name(camera: str, light: str) -> str:
+    """Name of the shift of a photograph, whose coordinates along x and y end in ``.x`` and ``.y``."""
+    return f"shift.{camera}.{light}"
+
+
 def errors_of(
-    channel: str, lights: Sequence[str], cameras: Sequence[str], stated: CalibrationUncertainty | None
+    channel: str,
+    lights: Sequence[str],
+    cameras: Sequence[str],
+    stated: CalibrationUncertainty | None,
+    *,
+    with_scan: bool = False,
+    shifts_px: Mapping[str, float] = MappingProxyType({}),
 ) -> InstrumentErrors:
     """Errors of a channel under the lights and cameras of its fit.
 
     Args:
         stated: the calibration's uncertainty; an error that it does not name takes a default, independent of all
             others.
+        with_scan: whether the pose of the scan is among them.
+        shifts_px: standard error of each photograph's shift, in pixels of the fit, by the shift's name.
     """
-    names = (
-        gain_name(channel),
-        *light_names(lights, channel, stated),
-        *(flare_name(camera, channel) for camera in cameras),
-    )
-    covariance = np.diag([DEFAULT_SE[kind_of_error(name)] ** 2 for name in names])
+    sizes = {
+        name: DEFAULT_SE[kind_of_error(name)] for name in (gain_name(channel), *light_names(lights, channel, stated))
+    }
+    sizes |= {flare_name(camera, channel): DEFAULT_SE["flare"] for camera in cameras}
+    if with_scan:
+        sizes |= {f"teeth.{axis}": se for axis, se in zip(TWIST, DEFAULT_MOVE_SE["teeth"], strict=True)}
+    own_shifts = {f"{name}.{axis}": se for name, se in shifts_px.items() for axis in "xy"}
+    names = (*sizes, *own_shifts)
+    covariance = np.diag([se**2 for se in (sizes | own_shifts).values()])
     if stated is not None:
         own = [name for name in names if name in stated.names]
         here, there = [names.index(name) for name in own], [stated.names.index(name) for name in own]
         covariance[np.ix_(here, here)] = stated.matrix[np.ix_(there, there)]
-    assumed = frozenset(names) - frozenset(() if stated is None else stated.names)
+    assumed = frozenset(sizes) - frozenset(() if stated is None else stated.names)
     return InstrumentErrors(names, tuple(map(tuple, covariance.tolist())), assumed)

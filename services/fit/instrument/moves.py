@@ -1,7 +1,7 @@
-"""Rigid moves of the scan and of the dome: their effect on images enters the standard errors, but no fit estimates
-them.
+"""Rigid moves of the dome, and in a jaw of the scan: their effect on images enters the standard errors, but no fit
+estimates them. A tooth's fit estimates the pose of its scan (``pose``).
 
-Images of a moved tooth need many paths: a move of 0.05 mm changes an image by 2 %, and two images of 256 paths differ
+Images under moved lights need many paths: a move changes an image by a few per cent, and two images of 256 paths differ
 by as much by chance. As coordinates of a fit, such moves would follow that noise. So they are considered and not
 estimated (Schmidt 1966): each move by one standard deviation changes the photographs, and with them the solution.
 
@@ -25,9 +25,11 @@ from numpy.typing import NDArray
 
 from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.geometry import Camera, Light
-from services.fit.execution.blocks import BlockTask, StoredFile, read_block, write_recipe
+from services.fit.execution.blocks import BlockTask, StoredFile, write_recipe
 from services.fit.execution.engine_host import EngineHost
 from services.fit.instrument.errors import DEFAULT_MOVE_SE
+from services.fit.instrument.photographs import block_of
+from services.fit.instrument.pose import moved_camera, rigid
 from services.fit.optics.parameters import Mouth, Tissue
 from services.fit.transport.scene.recipe import SceneRecipe, View
 
@@ -59,19 +61,7 @@ class Move:
 
     def moved_camera(self, camera: Camera) -> Camera:
         """The camera after the move."""
-        pose = np.asarray(camera.camera_from_world) @ np.array(self.camera_move)
-        return Camera.model_validate(camera.model_dump() | {"camera_from_world": tuple(map(tuple, pose.tolist()))})
-
-
-def rigid(twist: Array, centre_mm: Array) -> Array:
-    """Rigid transform (4, 4) by a rotation vector (rad) and a translation (mm) about a centre; Rodrigues' formula."""
-    angle = float(np.linalg.norm(twist[:3]))
-    x, y, z = twist[:3] / angle if angle > 0 else np.zeros(3)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    move = np.eye(4)
-    move[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    move[:3, 3] = centre_mm + twist[3:] - move[:3, :3] @ centre_mm
-    return move
+        return moved_camera(camera, np.array(self.camera_move))
 
 
 def is_dome_given_by_lights(stated: CalibrationUncertainty | None, lights: Sequence[Light]) -> bool:
@@ -137,7 +127,9 @@ def write_moves(
     lights, moves = recipe.light_positions_mm, list[tuple[str, Array, Array, Array]]()
     values, vectors = np.linalg.eigh(covariance)
     for value, vector in zip(values, vectors.T, strict=True):
-        twist = DIFFERENCE_WIDTH * np.sqrt(max(value, 0.0)) * vector
+        if value <= 0:
+            continue
+        twist = DIFFERENCE_WIDTH * np.sqrt(value) * vector
         body = MOVING_BODIES[int(np.abs(vector[6:]).max() > np.abs(vector[:6]).max())]
         forth = rigid(twist[:6], teeth_centre_mm)
         back, moved = np.linalg.inv(forth), _moved(rigid(twist[6:], dome_centre_mm), lights)
@@ -173,7 +165,7 @@ def moves_task(
     """Changes of a block's images by the moves of one scene, of one standard deviation each: (K, 2, L, N) by move and
     seed.
     """
-    block = read_block(task.block)
+    block = block_of(task)
     view, count = block.fitted_view, len(block.reference)
     lit = view.lights if view.lights is not None else tuple(range(count))
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
-from services.fit.instrument.errors import have_common_cause
+from services.fit.instrument.errors import single_faults
 from services.fit.instrument.moves import move_covariance
 from services.fit.instrument.sentences import assumed_names, instrument_sentences
 from services.fit.solve.covariance import Uncertainty
@@ -31,18 +31,22 @@ def instrument_report(
         errors, [body for body in moves if any(body in one.parts for one in uncertainties.values())]
     )
     faults = {channel: one.faults for channel, one in uncertainties.items() if one.faults}
-    named = {c: own for c, own in faults.items() if not have_common_cause(len(own), errors[c].names)}
+    named = {
+        c: tuple(errors[c].names[k] for k in single_faults([fault.index for fault in own], errors[c].names))
+        for c, own in faults.items()
+    }
     return {
         "instrument": found,
         "instrument_prior": {c: dict(zip(errors[c].names, errors[c].se.tolist(), strict=True)) for c in found},
         "assumed": assumed,
-        "instrument_faults": {c: tuple(errors[c].names[fault.index] for fault in own) for c, own in named.items()},
+        "instrument_faults": {c: names for c, names in named.items() if names},
         "instrument_told": instrument_sentences(
             spec,
             errors,
             faults,
             assumed,
             manifest.uncertainty,
+            found=found,
             is_alone=spec.kind == "tooth" and not manifest.surroundings,
         ),
     }

@@ -5,10 +5,19 @@ faults of the calibration.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from types import MappingProxyType
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.records import JobSpec
-from services.fit.instrument.errors import DEFAULT_SE, InstrumentErrors, have_common_cause, kind_of_error
+from services.core.results import Estimate
+from services.fit.instrument.errors import (
+    COMMON_KINDS,
+    DEFAULT_SE,
+    InstrumentErrors,
+    have_common_cause,
+    kind_of_error,
+)
+from services.fit.instrument.moved import pose_sentences, shift_sentences, stated_names
 from services.fit.solve.recombination import Fault
 
 SIZES = {
@@ -32,8 +41,8 @@ def assumed_names(errors: Mapping[str, InstrumentErrors], moves: Sequence[str]) 
         moves: ``teeth`` or ``dome``, each where its move is at least partly a default and some channel's standard
             errors include it.
     """
-    names = dict.fromkeys(name for own in errors.values() for name in own.names if name in own.assumed)
-    return (*names, *moves)
+    names = [name for own in errors.values() for name in own.names if name in own.assumed]
+    return stated_names([*names, *moves])
 
 
 def instrument_sentences(
@@ -43,6 +52,7 @@ def instrument_sentences(
     assumed: tuple[str, ...],
     stated: CalibrationUncertainty | None = None,
     *,
+    found: Mapping[str, Mapping[str, Estimate]] = MappingProxyType({}),
     is_alone: bool = True,
 ) -> tuple[str, ...]:
     """Sentences for the report, the assumptions first.
@@ -53,6 +63,7 @@ def instrument_sentences(
         assumed: names, as ``assumed_names`` gives them.
         errors: by channel, the errors before the fit.
         faults: by channel, the errors that the images show to be faults of the calibration.
+        found: by channel, the estimates of the errors by name.
         is_alone: whether the fit renders a tooth without gums and other teeth.
     """
     if spec.instrument == "off":
@@ -67,15 +78,14 @@ def instrument_sentences(
             ),
         )
     unmoved = (
-        ("The ± of a fit with two lobes take the scan and the dome to lie where the calibration says.",)
-        if spec.lobes == 2
-        else ()
+        ("The ± of a fit with two lobes take the dome to stand where the calibration says.",) if spec.lobes == 2 else ()
     )
     return (
         *_assumed(assumed, errors),
         *_unused(stated),
         *_exact_lights(errors),
         *unmoved,
+        *pose_sentences(errors, found),
         *_faults(spec, errors, faults, is_alone=is_alone),
     )
 
@@ -100,6 +110,9 @@ def _sizes(names: tuple[str, ...], every: Collection[str]) -> Iterator[str]:
     # Name a kind as a whole, or only those of its errors that the calibration does not state.
     for kind, size in SIZES.items():
         own = [name for name in names if kind_of_error(name) == kind]
+        if own and kind not in DEFAULT_SE:
+            yield size
+            continue
         if own and len(own) < sum(kind_of_error(name) == kind for name in every):
             yield f"{100 * DEFAULT_SE[kind]:g} % for {' and '.join([', '.join(own[:-1]), own[-1]] if own[1:] else own)}"
         elif own:
@@ -131,8 +144,11 @@ def _faults(
     alone = " Light from gums and other teeth is rendered with surroundings = 'on'." if is_alone else ""
     has_one_lobe = spec.kind == "tooth" and spec.lobes == 1
     options = f"Look also at the option{'s boundary and lobes' if has_one_lobe else ' boundary'}."
-    for channel, own in faults.items():
-        if have_common_cause(len(own), names := errors[channel].names):
+    for channel, every in faults.items():
+        names = errors[channel].names
+        yield from shift_sentences(channel, every, errors[channel])
+        own = [fault for fault in every if kind_of_error(names[fault.index]) in COMMON_KINDS[0]]
+        if have_common_cause(len(own), names):
             worst = max(own, key=lambda fault: abs(fault.z))
             yield (
                 f"In {channel} the images put {len(own)} gains of lights and flares off, most of all"

@@ -24,13 +24,13 @@ from services.fit.inputs.dentin import jaw_dentins
 from services.fit.inputs.observations import (
     ChannelFiles,
     Observations,
-    ViewStack,
     channel_scene,
     read_channel,
     read_observations,
     require_signal,
     write_channel,
 )
+from services.fit.inputs.view_stack import ViewStack
 from services.fit.instrument.capture import Instrument, instrument_of
 from services.fit.jaw.report import JawFit, report
 from services.fit.jaw.schedule import JawSchedule

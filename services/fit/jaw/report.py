@@ -18,7 +18,8 @@ from services.fit.checks.identifiability import determined_sentences
 from services.fit.checks.thickness import thickness_map
 from services.fit.execution.attempt import assess_convergence, standard_errors, worst_error
 from services.fit.execution.channel_fit import ChannelFit
-from services.fit.inputs.observations import Observations, ViewStack
+from services.fit.inputs.observations import Observations
+from services.fit.inputs.view_stack import ViewStack
 from services.fit.instrument.report import instrument_report
 from services.fit.jaw.starts import ToothStart
 from services.fit.optics.parameters import Mouth

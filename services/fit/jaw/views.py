@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.fit.execution.blocks import CAVITY, GUMS, PixelParts
-from services.fit.inputs.observations import Observations, ViewStack
+from services.fit.inputs.observations import Observations
+from services.fit.inputs.view_stack import ViewStack
 from services.fit.transport.rays import RayScene
 
 

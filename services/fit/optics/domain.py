@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import SettingsError
-from services.fit.instrument.errors import LINEAR_REACH, NO_ERRORS, InstrumentErrors
+from services.fit.instrument.errors import NO_ERRORS, InstrumentErrors
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Optics, Tissue
 
 LN10 = math.log(10.0)
@@ -194,7 +194,7 @@ class Domain:
     @property
     def scale(self) -> NDArray[np.float64]:
         """Step scale of x, (F,)."""
-        return np.array([STEP_SCALE[c.kind] for c in self.coordinates] + [LINEAR_REACH] * len(self.errors.names))
+        return np.array([STEP_SCALE[c.kind] for c in self.coordinates] + self.errors.scale.tolist())
 
     @property
     def prior(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

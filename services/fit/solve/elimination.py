@@ -55,6 +55,8 @@ class ReducedEquations:
     """Step (F + K,) of all coordinates that brings the errors to their optimum and leaves the tissue as it is."""
     root: Array
     """S^-1/2 (K, K), the square root of the errors' covariance where the tissue is known exactly."""
+    error_noise: Array
+    """Monte Carlo covariance (K, K) of the errors' step."""
 
     def eigenvalue_noise(self, directions: Array) -> Array:
         """Standard deviation of u'Hu for each column u of ``directions`` (F, K)."""
@@ -80,7 +82,8 @@ def eliminate(equations: NormalEquations, precision: Array, slope: Array, count:
     size = len(gradient)
     if count == size:
         noises = equations.hessian_noise, equations.gradient_noise
-        return ReducedEquations(hessian, gradient, *noises, np.eye(size), np.zeros(size), np.zeros((0, 0)))
+        none = np.zeros((0, 0))
+        return ReducedEquations(hessian, gradient, *noises, np.eye(size), np.zeros(size), none, none)
     own, errors = slice(0, count), slice(count, size)
     values, vectors = np.linalg.eigh(hessian[errors, errors])
     root, inverse = (vectors * values**-0.5) @ vectors.T, (vectors / values) @ vectors.T
@@ -96,4 +99,5 @@ def eliminate(equations: NormalEquations, precision: Array, slope: Array, count:
         lift,
         error_step,
         root,
+        inverse @ equations.gradient_noise[errors, errors] @ inverse,
     )

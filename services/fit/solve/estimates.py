@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.calibration.uncertainty import TWIST
 from services.core.results import Estimate
 from services.fit.optics.domain import UNITS, kind_of, natural_derivative
 from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
@@ -26,6 +27,11 @@ DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(
     }
 )
 """Derived quantities of a medium that are reported beside its parameters: unit and formula."""
+UNITS_OF_MOVES: Mapping[str, str] = MappingProxyType(
+    dict.fromkeys(TWIST[:3], "rad") | dict.fromkeys(TWIST[3:], "mm") | dict.fromkeys("xy", "px")
+)
+"""Units of the coordinates of the scan's pose and of a photograph's shift, by the end of their name; all other errors
+of the instrument are relative."""
 DIFFERENCE_STEP = 1e-5
 """Step of central differences in the unbounded domain, far below every scale and far above rounding."""
 
@@ -133,7 +139,7 @@ def instrument_estimates(uncertainty: Uncertainty) -> dict[str, Estimate]:
         found[name] = Estimate(
             value=float(uncertainty.x[first + k]),
             se=se,
-            unit="1",
+            unit=UNITS_OF_MOVES.get(name.rpartition(".")[2], "1"),
             determined=se < MIN_DATA_SHARE**0.5 * prior_se,
             se_parts=uncertainty.se_parts(slope),
         )

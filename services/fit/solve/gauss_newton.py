@@ -35,6 +35,7 @@ from services.core.errors import NonFiniteError
 from services.fit.optics.domain import Domain
 from services.fit.solve.elimination import ReducedEquations, eliminate
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
+from services.fit.solve.step_test import StepTest
 from services.fit.solve.trust_region import solve_box
 
 Array = NDArray[np.float64]
@@ -69,6 +70,15 @@ ADVICE = {
 
 DETERMINED = 3.0
 """A direction counts as determined where its curvature exceeds this many of its own standard deviations."""
+CURVED_STEP = 0.1
+"""Length of a move of the scan, in scales, beyond which the equations are set up again where the scan is put."""
+CURVED_WEIGHT = 3.0
+"""Weight of a move of the scan, beside a step of the tissue of as many scales, in how soon earlier equations count
+less."""
+LONGEST_CURVED_STEP = 2.0
+"""Largest length of such a move, in scales."""
+SIGNIFICANT_MOVE = 3.0
+"""Least ratio of such a move to its own noise."""
 LAST_STEP_Z = 1.0
 """Standard errors by which both estimates combined must favour the last step; no step follows that an error could
 mislead."""
@@ -204,6 +214,12 @@ class GaussNewton:
         # instrument's errors.
         equations = eliminate(pooled, self.domain.precision, self.domain.prior_slope(x), self.domain.tissue_count)
         best, error_step = x + equations.error_step, equations.error_step
+        if self._is_far(equations):
+            # Images are not linear in the scan's pose: go there and linearise again.
+            error_step = error_step / max(self._curved_length(error_step) / LONGEST_CURVED_STEP, 1.0)
+            return self._with_step_limit(
+                self._carry(replace(state, x=x + error_step, verdict="the scan moved"), error_step, 0.0)
+            )
         noise_gain = gain_by_noise(equations)
 
         # Converged: nothing to gain beyond noise, and the noise itself small. Tested at full radius, so that a small
@@ -337,9 +353,21 @@ class GaussNewton:
         # Count the pooled samples as fewer after a long step, because the model's error grows with the step while its
         # noise does not.
         assert state.memory is not None
+        whole = math.hypot(length, CURVED_WEIGHT * self._curved_length(step))
         return replace(
-            state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (length / 0.3) ** 2)
+            state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (whole / 0.3) ** 2)
         )
+
+    def _curved_length(self, step: Array) -> float:
+        # Length of the part of a step (F,) that moves the scan, in scales.
+        return self.domain.errors.curved_length(step[self.domain.tissue_count :])
+
+    def _is_far(self, equations: ReducedEquations) -> bool:
+        # Whether the scan has to move so far that the equations do not hold there, beyond what noise alone does.
+        noise = np.sqrt(np.maximum(np.diag(equations.error_noise), 0.0))
+        shared = np.concatenate([np.zeros(self.domain.tissue_count), noise])
+        least = max(CURVED_STEP, SIGNIFICANT_MOVE * self._curved_length(shared))
+        return self._curved_length(equations.error_step) > least
 
     def _with_step_limit(self, state: State) -> State:
         return replace(state, result=Result.MAX_STEPS) if state.step >= self.options.max_steps else state
@@ -360,41 +388,3 @@ def gain_by_noise(equations: NormalEquations | ReducedEquations) -> float:
     floor = np.maximum(equations.eigenvalue_noise(vectors), 1e-13 * max(float(np.abs(eigenvalues).max()), 1e-300))
     spread = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise, vectors)
     return 0.5 * float(np.maximum(spread, 0.0) @ (1 / np.maximum(eigenvalues, floor)))
-
-
-@dataclass(frozen=True)
-class StepTest:
-    """A step's change of F by comparison and by the model; ``significance_z`` standard errors are significant."""
-
-    change: float
-    change_se: float
-    model: float
-    model_se: float
-    significance_z: float = 3.0
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether the comparison is significantly worse."""
-        return self.change > self.significance_z * self.change_se
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether the two estimates differ significantly."""
-        return abs(self.change - self.model) > self.significance_z * math.hypot(self.change_se, self.model_se)
-
-    def is_better(self, z: float) -> bool:
-        """Whether both estimates combined are better by z standard errors. A comparison that is significantly worse, or
-        contradicts the prediction and is worse, overrules them.
-        """
-        total, total_se = _combine(self.change, self.change_se, self.model, self.model_se)
-        return total + z * total_se < 0 and not self.is_worse and not (self.is_contradicted and self.change > 0)
-
-
-def _combine(first: float, first_se: float, second: float, second_se: float) -> tuple[float, float]:
-    # Inverse-variance mean; an estimate without error is used alone, the comparison before the prediction.
-    if first_se == 0:
-        return first, 0.0
-    if second_se == 0:
-        return second, 0.0
-    a, b = first_se**-2, second_se**-2
-    return (a * first + b * second) / (a + b), (a + b) ** -0.5

@@ -20,6 +20,10 @@ from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise, 
 Array = NDArray[np.float64]
 
 
+MAX_NOISE_SHARE = 0.9
+"""Largest share of a derivative's mean square that is taken for its known noise."""
+
+
 @dataclass(frozen=True)
 class NormalEquations:
     """Sums over measurements i with weights w: F = 1/2 sum w r^2, for coordinates x (F,)."""
@@ -71,6 +75,25 @@ class NormalEquations:
             self.expected_squares * linear,
             self.carried * linear,
         )
+
+    def without_noise(self, of_hessian: Array, of_data_noise: Array) -> NormalEquations:
+        """The sums without what known noise of the last K derivatives adds to them, (K, K) each; at most
+        ``MAX_NOISE_SHARE`` of any direction's curvature is taken away.
+        """
+        first = len(self.gradient) - len(of_hessian)
+        own = self.hessian[first:, first:]
+        values, vectors = np.linalg.eigh(0.5 * (own + own.T))
+        used = values > 1e-12 * max(float(values.max()), 1e-300)
+        root = vectors[:, used] * np.sqrt(values[used])
+        whiten = vectors[:, used] / np.sqrt(values[used])
+        shares, axes = np.linalg.eigh(whiten.T @ of_hessian @ whiten)
+        kept = np.minimum(shares, MAX_NOISE_SHARE) / np.where(shares > 0, shares, 1.0)
+        removed, ratio = (axes * np.minimum(shares, MAX_NOISE_SHARE)) @ axes.T, (axes * kept) @ axes.T
+        hessian, noise = self.hessian.copy(), self.data_noise.copy()
+        hessian[first:, first:] -= root @ removed @ root.T
+        part = root @ ratio @ whiten.T
+        noise[first:, first:] -= 0.5 * (part @ of_data_noise + of_data_noise @ part.T)
+        return replace(self, hessian=hessian, data_noise=noise)
 
     def moved(self, step: Array) -> NormalEquations:
         """The quadratic model expanded at ``step`` (F,) from here; the curvature's noise adds to the gradient's."""

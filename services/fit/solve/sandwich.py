@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.instrument.errors import FAULT_Z, have_common_cause, kind_of_error
+from services.fit.instrument.errors import FAULT_Z, kind_of_error, single_faults
 from services.fit.optics.domain import Domain
 from services.fit.solve.recombination import Fault, Recombination, faults
 
@@ -106,8 +106,7 @@ def combine_with_prior(
     weighed = Recombination(whole + sandwich.product(sandwich.inverse, sandwich.weighing), response, sandwich.prior)
     kinds = map(kind_of_error, domain.errors.names)
     detected = faults(x[count:], found, {k: FAULT_Z[kind] for k, kind in enumerate(kinds) if kind in FAULT_Z})
-    is_common = have_common_cause(len(detected), domain.errors.names)
-    rejected = () if is_common else tuple(fault.index for fault in detected)
+    rejected = single_faults([fault.index for fault in detected], domain.errors.names)
     change = weighed.change(rejected)
     updated = found.updated(change)
 

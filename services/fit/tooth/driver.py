@@ -33,13 +33,13 @@ from services.fit.inputs.dentin import dentin_shape, neighbour_surfaces, with_sh
 from services.fit.inputs.observations import (
     ChannelFiles,
     Observations,
-    ViewStack,
     channel_scene,
     read_channel,
     read_observations,
     write_channel,
 )
 from services.fit.inputs.stain_uv import ToothStains, stain_layout, texel_edge_mm
+from services.fit.inputs.view_stack import ViewStack
 from services.fit.instrument.capture import instrument_of
 from services.fit.instrument.report import instrument_report
 from services.fit.optics.parameters import Tissue
