@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,6 +60,7 @@ def write_prepared(
     engine: type[FakeEngine] = FakeEngine,
     notes: tuple[str, ...] = (),
     scan_se: tuple[float, float] | None = None,
+    motion_error_px: float | None = None,
 ) -> PreparedManifest:
     """Publish ``prepared`` with two cameras of 20 x 24 pixels.
 
@@ -73,6 +75,7 @@ def write_prepared(
             either.
         stain_uv: texture coordinates of the outer surface, for a truth with stains.
         engine: fake engine whose formula the photographs follow.
+        motion_error_px: error of every photograph's motion; None where the preparation says nothing of it.
         scan_se: stated standard errors of the scan's pose, rad and mm; None where nothing is stated.
     """
     writer = StageWriter(root, "prepared", 1)
@@ -116,6 +119,11 @@ def write_prepared(
         median_motion_px=None, notes=notes, valid_fraction=0.9,
         uncertainty=None if scan_se is None else _of_the_scan(*scan_se),
     )  # fmt: skip
+    if motion_error_px is not None:
+        every = [
+            {"camera": c.name, "light": k.name, "motion_error_px": motion_error_px} for c in cameras for k in all_lights
+        ]
+        (writer.folder / "quality.json").write_text(json.dumps({"images": every}))
     writer.publish(manifest)
     return manifest
 

@@ -176,7 +176,7 @@ def test_what_noise_squares_to_in_the_elimination_is_known() -> None:
         one = equations(np.random.default_rng([6, seed]), noise=1.0)
         known, inverse = one.hessian[2:, 2:], np.linalg.inv(one.hessian[2:, 2:] + ERRORS.precision)
         expected = 0.5 * 1e2 * float((inverse * known).sum())
-        found.append(one.hessian_noise.of_eliminated(inverse) / expected)
+        found.append(one.hessian_noise.of_eliminated(inverse, 2) / expected)
     # One such estimate rests on 40 squares of noise: 4 standard errors of the mean of 100.
     error = np.std(found, axis=0) / np.sqrt(len(found))
     assert (np.abs(np.mean(found, axis=0) - np.eye(2)) < 4 * error).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from services.fit.execution.blocks import Block, BlockInstrument, read_block, wr
 from services.fit.inputs.slopes import image_slopes, motions_of
 from services.fit.inputs.view_stack import ViewStack
 from services.fit.instrument.errors import errors_of
+from services.fit.instrument.motion import MAX_SHIFTED, shift_errors_px
 from services.fit.instrument.moved import pose_sentences, shift_sentences
 from services.fit.instrument.photographs import error_derivatives, photographed, placed
 from services.fit.instrument.pose import SCAN, brightenings, displacements, moved_camera, rigid
@@ -161,6 +163,17 @@ def moved_mesh(mesh: Mesh, twist: Array) -> Mesh:
     return Mesh(mesh.vertices_mm @ move[:3, :3].T + move[:3, 3], mesh.faces)
 
 
+def test_only_photographs_whose_motion_is_unsure_are_shifted(tmp_path: Path) -> None:
+    assert shift_errors_px(tmp_path, 1) == {}
+    errors = [0.0, None, 0.2, *np.linspace(0.3, 0.6, MAX_SHIFTED).tolist()]
+    images = [{"camera": "c0", "light": f"l{k}", "motion_error_px": own} for k, own in enumerate(errors)]
+    (tmp_path / "quality.json").write_text(json.dumps({"images": images}))
+    found = shift_errors_px(tmp_path, 2)
+    assert len(found) == MAX_SHIFTED
+    assert min(found.values()) == pytest.approx(0.15)
+    assert ("c0", "l2") not in found
+
+
 def test_the_report_says_where_the_scan_lies_and_when_that_is_too_far() -> None:
     errors = {"green": errors_of("green", ("a",), ("c0",), None, with_scan=True)}
 
@@ -215,3 +228,37 @@ def test_a_fit_finds_a_scan_that_lies_aside(tmp_path: Path) -> None:
     assert across == pytest.approx((0.12 * 0.1 + 0.1 * 0.08) / np.hypot(0.12, 0.1), abs=0.005)
     assert max(one.se or np.inf for one in found.values()) < 0.12
     assert any("put the scan" in sentence for sentence in report.instrument_told)
+
+
+@pytest.mark.dear("a whole fit by the formula, of photographs of which one is shifted")
+def test_a_fit_names_a_photograph_that_moved_farther_than_is_stated(tmp_path: Path) -> None:
+    class Moved(FakeEngine):
+        def _formula(self, tissue: object, view: View) -> Array:
+            image = super()._formula(tissue, view)  # type: ignore[arg-type]
+            if view.camera.name == "c1":
+                # 0.5 px to the right under one light.
+                move = rigid(np.array([0.0, 0.0, 0.0, 0.25, 0.0, 0.0]), np.zeros(3))
+                image[2] = super()._formula(tissue, View(moved_camera(view.camera, move), view.pixels))[2]  # type: ignore[arg-type]
+            return image
+
+    write_prepared(tmp_path, engine=Moved, scan_se=(1e-4, 1e-3), motion_error_px=0.1)
+    options = {
+        "capture": tmp_path, "boundary": "matched", "dentin": "known", "samples_per_pixel": 64, "advise": False,
+        "search_candidates": 2000,
+    }  # fmt: skip
+    report = run(
+        JobSpec.model_validate(options), LocalContext(tmp_path), engine="tests.support.fake_engine:QuietFakeEngine"
+    )
+    found = report.instrument["green"]
+    shifts = [name for name in found if name.startswith("shift.")]
+    # Two cameras under five fitted lights.
+    assert len(shifts) == 20
+    assert report.instrument_prior["green"][shifts[0]] == pytest.approx(0.1)
+    named = [told for told in report.instrument_told if "is shifted by" in told]
+    assert len(named) == 1, report.instrument_told
+    assert "the photograph of camera c1 under light l2 is shifted by" in named[0]
+    # The pattern of the formula's light moves with 0.12 x + 0.1 y.
+    across = (0.12 * found["shift.c1.l2.x"].value + 0.1 * found["shift.c1.l2.y"].value) / 0.12
+    assert across == pytest.approx(0.5, abs=0.1)
+    still = [found[name].value for name in shifts if "c1.l2" not in name]
+    assert np.sqrt(np.mean(np.square(still))) < 0.1

@@ -26,6 +26,7 @@ from services.fit.execution.derivatives import Differentiation, differentiation,
 from services.fit.execution.engine_host import EngineHost
 from services.fit.execution.executors import Executor
 from services.fit.execution.seeds import Seeds
+from services.fit.instrument.errors import kind_of_error
 from services.fit.instrument.photographs import block_of, error_derivatives, photographed, placed, slope_noise
 from services.fit.jaw.neighbours import Neighbours
 from services.fit.optics.domain import Domain, similar_tissue
@@ -107,7 +108,16 @@ def jacobian_task(
     )
     regions = None if near is None else _regions(block, near)
     equations = normal_equations(
-        j1, j2, r1, r2, variance, weight, len(block.reference), regions, len(differentiation.errors)
+        j1,
+        j2,
+        r1,
+        r2,
+        variance,
+        weight,
+        len(block.reference),
+        regions,
+        len(differentiation.errors),
+        sum(kind_of_error(name) == "shift" for name in differentiation.errors),
     )
     if differentiation.errors and block.motion is not None:
         equations = equations.without_noise(*slope_noise(block, differentiation.errors))

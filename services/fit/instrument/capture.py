@@ -18,6 +18,7 @@ from services.fit.inputs.slopes import motions_of
 from services.fit.inputs.view_stack import ViewStack
 from services.fit.instrument.errors import InstrumentErrors, errors_of, flare_name, gain_name, light_names, shift_name
 from services.fit.instrument.irradiance import uncertainty_at_teeth
+from services.fit.instrument.motion import shift_errors_px
 from services.fit.instrument.moves import Move, is_dome_given_by_lights, move_covariance, write_moves
 from services.fit.instrument.pose import SCAN
 from services.fit.transport.scene.recipe import SceneRecipe
@@ -89,7 +90,9 @@ class Instrument:
         return [light.name for light, is_chosen in zip(self.lights, lights, strict=True) if is_chosen]
 
 
-def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[np.float64]) -> Instrument | None:
+def instrument_of(
+    manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[np.float64], prepared: Path | None = None
+) -> Instrument | None:
     """The instrument of a capture; None where the job takes it for exact, and for the solver adam, which does not fit
     its errors.
 
@@ -97,11 +100,18 @@ def instrument_of(manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[n
         manifest: manifest of the prepared capture.
         spec: the job.
         teeth_mm: centre of the teeth (3,).
+        prepared: folder of the prepared capture, whose photographs' motion a tooth's fit estimates; None to take it for
+            exact.
     """
     if spec.instrument == "off" or spec.solver == "adam":
         return None
     max_gains = MAX_JAW_LIGHTS if spec.kind == "jaw" else None
     stated = uncertainty_at_teeth(manifest.uncertainty, manifest.lights, manifest.channels, teeth_mm)
     return Instrument(
-        manifest.lights, stated, stated is not manifest.uncertainty, max_gains, has_pose=spec.kind == "tooth"
+        manifest.lights,
+        stated,
+        stated is not manifest.uncertainty,
+        max_gains,
+        has_pose=spec.kind == "tooth",
+        shifts_px=shift_errors_px(prepared, spec.pixel_step) if prepared is not None and spec.kind == "tooth" else {},
     )

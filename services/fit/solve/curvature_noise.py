@@ -105,14 +105,14 @@ class CurvatureNoise:
             total[np.ix_(own, own)] += product @ part.moments @ product.T
         return total
 
-    def of_eliminated(self, inverse: Array) -> Array:
-        """Bias (F, F) that noise gives A S^-1 A', where A (F, K) are the entries with the last K coordinates, all
-        exact: sum_kl S^-1_kl Cov(A_ak, A_bl).
+    def of_eliminated(self, inverse: Array, count: int) -> Array:
+        """Bias (F, F) that noise gives A S^-1 A', where A (F, K) are the entries of the first F coordinates with the
+        others, all exact: sum_kl S^-1_kl Cov(A_ak, A_bl).
 
         Args:
             inverse: S^-1 (K, K).
+            count: number F of the first coordinates.
         """
-        count = max(max(part.own) for part in self.parts) + 1 - len(inverse)
         total = np.zeros((count, count))
         for part in self.parts:
             own, known = list(part.coordinates), [k - count for k in part.exact]

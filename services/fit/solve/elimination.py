@@ -89,7 +89,11 @@ def eliminate(equations: NormalEquations, precision: Array, slope: Array, count:
     root, inverse = (vectors * values**-0.5) @ vectors.T, (vectors / values) @ vectors.T
     error_response = inverse @ hessian[errors, own]
     lift = np.concatenate([np.eye(count), -error_response])
-    reduced = hessian[own, own] - hessian[own, errors] @ error_response + equations.hessian_noise.of_eliminated(inverse)
+    reduced = (
+        hessian[own, own]
+        - hessian[own, errors] @ error_response
+        + equations.hessian_noise.of_eliminated(inverse, count)
+    )
     error_step = np.concatenate([np.zeros(count), -inverse @ gradient[errors]])
     return ReducedEquations(
         0.5 * (reduced + reduced.T),

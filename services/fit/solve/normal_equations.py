@@ -122,6 +122,7 @@ def normal_equations(
     lights: int = 1,
     regions: Sequence[Region] | None = None,
     exact: int = 0,
+    alone: int = 0,
 ) -> NormalEquations:
     """Normal equations of one block of measurements.
 
@@ -141,6 +142,9 @@ def normal_equations(
         exact: number of coordinates, the last of all, whose derivatives, such as those to a gain, come from the very
             renders of r1 and r2. Each of these derivatives is multiplied with the residual of the other render; their
             own noise in the curvature, far smaller than that of the other derivatives, is neglected.
+        alone: number of exact coordinates, the last of all, that act on one photograph each, such as its shift. The
+            noise of their entries with other coordinates is not kept: it takes from the curvature what one of a
+            photograph's many pixels adds, and would take the square of their number in memory.
     """
     mean, difference = 0.5 * (j1 + j2), j1 - j2
     residual, spread = 0.5 * (r1 + r2), 0.5 * (r1 - r2)
@@ -150,7 +154,7 @@ def normal_equations(
     hessian = weighted @ mean.T - 0.25 * (weight * difference) @ difference.T
     noisy = len(mean) - exact
     regions = regions if regions is not None else ((range(noisy), np.ones(len(weight), dtype=bool)),)
-    known = range(noisy, len(mean))
+    known = range(noisy, len(mean) - alone)
     noise = [
         CurvatureNoise((curvature_noise(mean, difference, np.where(chosen, weight, 0.0), near, lights, known),))
         for near, chosen in regions

@@ -75,7 +75,8 @@ class FitDriver:
             )
             for channel in channels
         }
-        instrument = instrument_of(observations.manifest, spec, tooth.outer.vertices_mm.mean(axis=0))
+        centre_mm = tooth.outer.vertices_mm.mean(axis=0)
+        instrument = instrument_of(observations.manifest, spec, centre_mm, observations.folder)
         files = {
             channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss, instrument)
             for channel in channels
