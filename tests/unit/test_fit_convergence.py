@@ -49,3 +49,16 @@ def test_a_large_error_is_not_converged_and_said_once(error: float) -> None:
     assert (found.converged, found.doubtful) == (False, False)
     (told,) = found.advice
     assert "the images are still" in told
+
+
+def test_lack_of_samples_is_said_before_anything_else() -> None:
+    # 26.5 ± 26.5 %: nothing but noise, above the limit.
+    found = assess_convergence({"green": fit(0.0, 0.265**4)})
+    assert not found.converged
+    (told,) = found.lacking
+    assert told.startswith("green: the renders are too noisy to tell how far the images are off (26 ± 26 %); raise")
+    assert found.advice == []
+    # An error that noise does not explain is the model's or the photographs'.
+    found = assess_convergence({"green": fit(0.265, (2 * 0.265 * 0.02) ** 2)})
+    assert found.lacking == []
+    assert "still 26 % off" in found.advice[0]

@@ -24,6 +24,9 @@ from services.fit.optics.parameters import Mouth, Tissue
 
 Array = NDArray[np.float64]
 
+SIGNIFICANT_Z = 3.0
+"""Standard errors by the renders' noise beyond which a photograph's error is its own."""
+
 
 @dataclass(frozen=True)
 class ErrorSums:
@@ -94,9 +97,22 @@ class FrameSums:
     """Sum of (C1 - ref)(C2 - ref) less the reference's variance, for two independent renders C1 and C2."""
     signal: Array
     """Sum of ref^2 less the reference's variance."""
+    noise: Array
+    """Monte Carlo variance of ``product``."""
 
     def __add__(self, other: FrameSums) -> FrameSums:
-        return FrameSums(self.product + other.product, self.signal + other.signal)
+        return FrameSums(self.product + other.product, self.signal + other.signal, self.noise + other.noise)
+
+    def is_above(self, error: float) -> NDArray[np.bool_]:
+        """Mask (L, L) of the errors that exceed a limit by more than ``SIGNIFICANT_Z`` standard errors of the renders'
+        noise.
+        """
+        return np.asarray(self.product - error**2 * self.signal > SIGNIFICANT_Z * np.sqrt(self.noise))
+
+    def are_apart(self, worse: tuple[int, int], better: tuple[int, int]) -> bool:
+        """Whether of two entries (render, photograph) the first is worse by more than the renders' noise."""
+        noise = float(np.sqrt(self.noise[worse] + self.noise[better]))
+        return bool(self.product[worse] - self.product[better] > SIGNIFICANT_Z * noise)
 
     @property
     def errors(self) -> Array:
@@ -111,7 +127,10 @@ def frame_sums(first: Array, second: Array, reference: Array, variance: Array, v
     a, b, r, v = (np.where(valid, values, 0.0) for values in (first, second, reference, variance))
     counted = valid.astype(np.float64)
     signal = counted @ (r**2 - v).T
-    return FrameSums((a * b) @ counted.T - (a + b) @ r.T + signal, signal)
+    # The variance of (a - ref)(b - ref) is the mean of (a - b)^2 ((a + b) / 2 - ref)^2, pixel by pixel.
+    square, mean = (a - b) ** 2, 0.5 * (a + b)
+    noise = (square * mean**2) @ counted.T - 2 * (square * mean) @ r.T + square @ (r**2).T
+    return FrameSums((a * b) @ counted.T - (a + b) @ r.T + signal, signal, np.maximum(noise, 0.0))
 
 
 Shown = tuple[tuple[str, int], ...]

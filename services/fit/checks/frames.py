@@ -3,6 +3,7 @@
 A photograph that another light's render explains far better than its own was filed under the wrong light. Two
 photographs that explain each other were exchanged. A photograph that no render explains, while the others are well
 explained, was taken wrongly. Such frames bias the media, and in an average over all frames their error hardly shows.
+A photograph is blamed only for what exceeds the renders' noise: with too few samples any render is far off.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
     if not len(shown):
         return
     for first, second in combinations(range(len(lights)), 2):
-        if {first, second} & reported or not _are_exchanged(errors, first, second):
+        if {first, second} & reported or not _are_exchanged(sums, first, second):
             continue
         reported |= {first, second}
         yield WrongFrame(camera, lights[first], float(own[first]), lights[second], exchanged=True)
@@ -80,6 +81,7 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
         if np.isfinite(own[photo])
         and own[photo] > TESTED_ERROR
         and errors[:, photo].min() <= MAX_OTHER_ERROR * own[photo]
+        and sums.are_apart((photo, photo), (int(errors[:, photo].argmin()), photo))
     }
     for photo, light in best_lights.items():
         if photo in reported:
@@ -89,15 +91,19 @@ def wrong_frames(camera: str, lights: Sequence[str], sums: FrameSums) -> Iterato
     limit = max(MIN_ODD_ERROR, ODD_RATIO * float(np.median(shown)))
     misfit, signal = np.diag(sums.product), np.diag(sums.signal)
     matters = misfit > MIN_ODD_SHARE**2 * np.median(signal[np.isfinite(own)])
-    odd = np.flatnonzero(np.isfinite(own) & (own > limit) & matters).tolist() if len(shown) >= MIN_FRAMES else []
+    is_odd = np.isfinite(own) & np.diag(sums.is_above(limit)) & matters
+    odd = np.flatnonzero(is_odd).tolist() if len(shown) >= MIN_FRAMES else []
     for photo in odd:
         if photo not in reported:
             yield WrongFrame(camera, lights[photo], float(own[photo]))
 
 
-def _are_exchanged(errors: Array, first: int, second: int) -> bool:
+def _are_exchanged(sums: FrameSums, first: int, second: int) -> bool:
+    errors = sums.errors
     own, others = (errors[first, first], errors[second, second]), (errors[second, first], errors[first, second])
     if not np.isfinite([*own, *others]).all() or np.hypot(*own) <= np.sqrt(2) * TESTED_ERROR:
+        return False
+    if not all(sums.are_apart((one, one), (other, one)) for one, other in ((first, second), (second, first))):
         return False
     return bool(others[0] < own[0] and others[1] < own[1] and np.hypot(*others) <= MAX_EXCHANGED_ERROR * np.hypot(*own))
 

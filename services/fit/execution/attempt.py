@@ -70,6 +70,9 @@ default, so it must not be added here: fits that were begun before the option ex
 DOUBTFUL_ERROR = 0.05
 """Held-out error above which a converged fit is reported as doubtful. Fits of three virtual mouths with 3.1 to 4.3 %
 were at most 3.1 standard errors off, and three with 6.6 to 6.8 % between 6 and 11."""
+NOISE_Z = 2.0
+"""Standard errors by the renders' noise by which an error has to exceed its limit to be one of the model or the
+photographs."""
 STEPS_PER_PREVIEW = 3
 """Number of steps between two previews; the first follows the first step."""
 
@@ -168,8 +171,8 @@ def worst_error(fit: ChannelFit[Any]) -> float:
 
 def _doubtful_error(fit: ChannelFit[Any]) -> float | None:
     # Held-out error where it lies two standard errors above ``DOUBTFUL_ERROR``.
-    error, se = fit.evaluation.held_out.error, fit.evaluation.held_out.error_se
-    return error if error is not None and se is not None and error - 2 * se > DOUBTFUL_ERROR else None
+    held_out = fit.evaluation.held_out
+    return held_out.error if is_above(held_out, DOUBTFUL_ERROR) else None
 
 
 def standard_errors(sums: Mapping[str, ErrorSums]) -> dict[str, float]:
@@ -185,13 +188,16 @@ class Assessment:
     doubtful: bool
     """Whether unseen images are farther off than a model that holds would leave them."""
     advice: list[str]
+    lacking: list[str] = field(default_factory=list)
+    """What is to be said before anything else: that the renders are too noisy to judge the photographs by."""
 
 
 def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> Assessment:
     """Judge the fits of these channels, with advice where they did not converge or are doubtful."""
     advice = [f"{c}: {fit.solution.advice}" for c, fit in fits.items() if fit.solution.advice]
     errors = {c: worst_error(fit) for c, fit in fits.items()}
-    unexplained = [c for c, error in errors.items() if error > MAX_ERROR]
+    lacking = {c: sums for c, fit in fits.items() if (sums := _unresolved(fit)) is not None}
+    unexplained = [c for c, error in errors.items() if error > MAX_ERROR and c not in lacking]
     advice += [
         f"{c}: the images are still {100 * errors[c]:.0f} % off; check mesh, lights and boundary model, or raise the"
         " samples."
@@ -204,8 +210,27 @@ def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> Assessment:
         for c, fit in fits.items()
         if c not in unexplained and (error := _doubtful_error(fit)) is not None
     ]
-    converged = not unexplained and all(fit.solution.result.converged for fit in fits.values())
-    return Assessment(converged, bool(doubts), advice + doubts)
+    converged = not unexplained and not lacking and all(fit.solution.result.converged for fit in fits.values())
+    first = [
+        f"{c}: the renders are too noisy to tell how far the images are off ({100 * (sums.resolved_error or 0.0):.0f} ±"
+        f" {100 * (sums.error_se or 0.0):.0f} %); raise max_samples_per_pixel before looking for another cause."
+        for c, sums in lacking.items()
+    ]
+    return Assessment(converged, bool(doubts), advice + doubts, first)
+
+
+def _unresolved(fit: ChannelFit[Any]) -> ErrorSums | None:
+    # Sums of the fitted or of the held-out images whose error is above the limit by noise alone, if any.
+    both = fit.evaluation.held_out, fit.evaluation.fitted
+    if any(is_above(sums, MAX_ERROR) for sums in both):
+        return None
+    return next((sums for sums in both if (sums.resolved_error or 0.0) > MAX_ERROR), None)
+
+
+def is_above(sums: ErrorSums, limit: float) -> bool:
+    """Whether an image error exceeds a limit by more than the renders' noise."""
+    error, se = sums.resolved_error, sums.error_se
+    return error is not None and se is not None and error - NOISE_Z * se > limit
 
 
 def fingerprint(spec: JobSpec, engine: str, files: Iterable[ChannelFiles]) -> str:

@@ -16,7 +16,7 @@ from services.fit.checks.evaluate import ErrorSums, Evaluation
 from services.fit.checks.frames import photograph_sentences
 from services.fit.checks.identifiability import determined_sentences
 from services.fit.checks.thickness import thickness_map
-from services.fit.execution.attempt import assess_convergence, standard_errors, worst_error
+from services.fit.execution.attempt import assess_convergence, is_above, standard_errors, worst_error
 from services.fit.execution.channel_fit import ChannelFit
 from services.fit.inputs.observations import Observations
 from services.fit.inputs.view_stack import ViewStack
@@ -70,7 +70,7 @@ def report(
         "the jaw's meshes",
     )
     wrong = photograph_sentences(_evaluations(fits), observations, _views(fits), is_placed=not misplaced)
-    advice = misplaced + wrong + assessment.advice
+    advice = assessment.lacking + misplaced + wrong + assessment.advice
     teeth = {
         str(start.fdi): _tooth(k, fits, first, dentins[k], observations, is_placed=not misplaced)
         for k, start in enumerate(first.starts)
@@ -121,8 +121,13 @@ def _tooth(
     start = max((jaw.starts[k] for jaw in fits.values()), key=lambda s: STATES.index(s.state))
     fit_error, held_out_error = (_errors(_evaluations(fits), k, kind) for kind in (0, 1))
     worst = max([*fit_error.values(), *held_out_error.values()], default=0.0)
-    sentence = start.sentence
-    if start.state == "fitted" and worst > MAX_ERROR:
+    sentence, sums = start.sentence, [one for own in _evaluations(fits).values() for one in own.parts.get(k, ())]
+    if start.state == "fitted" and worst > MAX_ERROR and not any(is_above(one, MAX_ERROR) for one in sums):
+        sentence = (
+            f"The renders of tooth {start.fdi} are too noisy to tell how far its images are off; raise"
+            " max_samples_per_pixel."
+        )
+    elif start.state == "fitted" and worst > MAX_ERROR:
         sentence = f"Tooth {start.fdi} is still {100 * worst:.0f} % off in its images; check its mesh and its masks."
         if is_placed:
             errors = {c: max(fit_error.get(c, 0.0), held_out_error.get(c, 0.0)) for c in fits}

@@ -180,7 +180,7 @@ class FitDriver:
         return FitReport(
             converged=converged,
             doubtful=assessment.doubtful,
-            advice=" ".join(misplaced + wrong + assessment.advice),
+            advice=" ".join(assessment.lacking + misplaced + wrong + assessment.advice),
             parameters=tables,
             fit_error={c: fit.fit_error for c, fit in fits.items()},
             held_out_error={c: fit.held_out_error for c, fit in fits.items() if fit.held_out_error is not None},
