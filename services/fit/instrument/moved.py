@@ -41,8 +41,8 @@ def pose_sentences(
         way, way_se, way_before = _along(value[millimetres], se[millimetres], prior[millimetres, millimetres])
         far = max(turn / turn_before, way / way_before)
         beyond = (
-            f" That is {far:.1f} times what the calibration allows: the scan was registered wrongly, or it is not of"
-            " this tooth; register it again."
+            f" That is {far:.1f} times what the calibration states: check how the scan was registered, and the ± that"
+            " the registration states."
             if far > FAR_Z
             else ""
         )

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 SCAN = tuple(f"teeth.{axis}" for axis in TWIST)
 """Names of the six coordinates."""
-SAMPLES = 3000
+SAMPLES = 1500
 """Number of surface points at which the change of irradiance is computed."""
 SPREAD_MM = 2.0
 """Standard deviation of the distance over which a tooth spreads the light that enters it: about two mean free paths of
