@@ -161,9 +161,9 @@ def moved_note(images: Sequence[ImageQuality]) -> tuple[str, ...]:
         return ()
     farthest = max(moved, key=lambda image: image.motion_px or 0)
     note = (
-        f"{len(moved)} images were moved, as the outline of the teeth lies elsewhere in them than in the first ones:"
-        f" most of all, by {farthest.motion_px:.1f} px, in camera {farthest.camera} under light {farthest.light}; give"
-        " motion = 'off' if the subject cannot have moved."
+        f"The subject moved since the first image in {len(moved)} of {len(images)}, as the outline of the teeth lies"
+        f" elsewhere there: most of all, by {farthest.motion_px:.1f} px, in camera {farthest.camera} under light"
+        f" {farthest.light}; give motion = 'off' if it cannot have moved."
     )
     return (note,)
 

@@ -128,7 +128,7 @@ def test_a_job_is_named_listed_downloaded_and_deleted_by_the_base_install(
     assert "exists already" in sentence(dentine("download", job, "--out", str(zipped), *address))
 
     receipt = json.loads(bare.dentine("delete", job, "--json", *address).stdout)
-    assert (receipt["job"], receipt["files"]) == (job, 2)
+    assert (receipt["job"], receipt["files"]) == (job, 3)
     assert "There is no job" in sentence(dentine("delete", job, *address))
     assert "There is no job" in sentence(dentine("download", job, "--out", str(tmp_path / "gone.zip"), *address))
     assert not (tmp_path / "gone.zip").exists()

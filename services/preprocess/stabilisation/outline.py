@@ -62,9 +62,10 @@ UNLIT_ERROR_PX = 1e3
 """Standard error of an outline that its light does not reach: it tells nothing, but it is no sign of a fault either."""
 MIN_ERROR_PX = 0.1
 """Smallest standard error, pixels of the last reduced image: the errors that opaque static subjects leave."""
-MAX_UNEXPLAINED = 0.25
+MAX_UNEXPLAINED = 0.1
 """Largest mean square that the outline leaves, as a share of what a cubic polynomial of the place leaves, which knows
-of no outline. With more there is none to be seen where it is looked for. Teeth before a dark ground leave 0.01."""
+of no outline. With more there is none to be seen where it is looked for. Teeth before a dark ground leave 0.01 to
+0.05."""
 MIN_BODY_PX = 8
 """Smallest longer side of a body whose outline is looked for."""
 MIN_PIXELS_PER_TERM = 6
@@ -143,10 +144,10 @@ class OutlineMatcher:
             grey = reduce_grey(own, template.factor, level).astype(np.float64)
             grey /= max(float(np.abs(grey).max()), 1e-30)
             lit = template.under(light_mm)
-            start = shift_px / template.factor
+            starts = [shift_px / template.factor]
             if template is self._templates[0]:
-                start = lit.searched(grey)
-            found = lit.refined(grey, start)
+                starts.append(lit.searched(grey))
+            found = min((lit.refined(grey, start) for start in starts), key=lambda shift: lit.unexplained(grey, shift))
             shift_px = found * template.factor
         return lit.judged(grey, found)
 
@@ -255,7 +256,7 @@ class _LitTemplate:
     def judged(self, grey: FloatArray, shift: FloatArray) -> OutlineShift:
         """The translation with its error and its values by odd and even arcs, in pixels of the unreduced image."""
         pixels, factor = self._band(shift), self._template.factor
-        left, coefficients, design, residual = self._fit(grey, pixels, shift)
+        _, coefficients, design, residual = self._fit(grey, pixels, shift)
         slope = self._projected_slope(pixels, shift, coefficients, design)
         moved = np.rint(shift).astype(int)
         arc = self._template.arc[pixels[0] - moved[1], pixels[1] - moved[0]]
@@ -268,7 +269,7 @@ class _LitTemplate:
             for k in (1, 0)
         )
         error = max(ERROR_OF_RESIDUAL * float(np.sqrt(np.trace(covariance) / 2)), MIN_ERROR_PX)
-        is_seen = left < MAX_UNEXPLAINED * _left_without_outline(grey, pixels)
+        is_seen = self.unexplained(grey, shift) < MAX_UNEXPLAINED
         is_within = np.abs(shift).max() < self._template.reach - 1
         if self._lit_share < MIN_LIT_SHARE:
             return OutlineShift(np.zeros(2), UNLIT_ERROR_PX, NOT_SEEN.arcs_px)
@@ -276,6 +277,11 @@ class _LitTemplate:
             return NOT_SEEN
         arcs = (float(odd[0]), float(odd[1])), (float(even[0]), float(even[1]))
         return OutlineShift(shift * factor, error * factor, arcs)
+
+    def unexplained(self, grey: FloatArray, shift: FloatArray) -> float:
+        """Mean square that an outline at a translation leaves, as a share of what no outline leaves."""
+        pixels = self._band(shift)
+        return self._fit(grey, pixels, shift)[0] / max(_left_without_outline(grey, pixels), 1e-30)
 
     def _band(self, shift: FloatArray) -> Indices:
         """Rows and columns of the pixels along the outline after a translation by the nearest whole pixels."""
