@@ -55,17 +55,18 @@ ERROR_OF_RESIDUAL = 4.0
 """Standard error of the translation over that by the residuals. What the terms do not describe shifts all of an outline
 alike and so leaves less residual than error: over static images by another renderer the ratio of their rms is 2 to 3.4,
 and single opaque teeth in a hundred lie 4 residual errors off."""
-MIN_LIT_SHARE = 1 / 6
+MIN_LIT_SHARE = 1 / 4
 """Smallest share of the visible surface that a light from behind has to reach for the outline to tell a translation.
-With less an opaque tooth is a bright crescent, whose width its gloss sets: such images lie up to 1.7 px off."""
+With less an opaque tooth is a bright crescent, whose width its gloss sets: such images lie up to 1.7 px off, by up to
+seven of their errors."""
 UNLIT_ERROR_PX = 1e3
 """Standard error of an outline that its light does not reach: it tells nothing, but it is no sign of a fault either."""
 MIN_ERROR_PX = 0.1
 """Smallest standard error, pixels of the last reduced image: the errors that opaque static subjects leave."""
-MAX_UNEXPLAINED = 0.1
+MAX_UNEXPLAINED = 0.25
 """Largest mean square that the outline leaves, as a share of what a cubic polynomial of the place leaves, which knows
 of no outline. With more there is none to be seen where it is looked for. Teeth before a dark ground leave 0.01 to
-0.05."""
+0.05, and more where their noise is a tenth of the brightness."""
 MIN_BODY_PX = 8
 """Smallest longer side of a body whose outline is looked for."""
 MIN_PIXELS_PER_TERM = 6
