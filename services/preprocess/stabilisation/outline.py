@@ -11,7 +11,7 @@ Pereyra 1973, with the derivative of Kaufman 1975).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,23 +20,16 @@ from services.core.geometry import Camera
 from services.preprocess.masking.shadows import expected_irradiance
 from services.preprocess.projection import Footprint
 from services.preprocess.stabilisation.stabilise import reduce_grey
-from services.preprocess.window import Window
+from services.preprocess.stabilisation.surface_samples import ARCS, BAND_PX, SurfaceSamples, surroundings
 
 FloatArray = NDArray[np.float64]
-Image = NDArray[np.float32]
 Indices = tuple[NDArray[np.intp], NDArray[np.intp]]
 
-BAND_PX = 2
-"""Width of the compared band on either side of the outline, pixels. Farther in, the terms follow a translucent tooth's
-shading less well than the outline needs: with bands of 5 and 8 pixels errors are 10 and 25 % larger."""
 COARSEST_PX, FINEST_PX = 64, 256
 """Longest side of the body in the reduced images: below ``COARSEST_PX`` in the first, in which a translation is
 searched, and at most ``FINEST_PX`` in the last, in which an error of 0.1 px is 0.3 px of a body of 700 px."""
 MARGIN_PX = BAND_PX + 3
 """Margin of the compared part of an image beyond the reach, pixels of the coarsest image."""
-SAMPLED_PX, MIN_SAMPLES, MAX_SAMPLES = 200, 2, 6
-"""Longest side of the body in samples of the surface, and the bounds of the samples along a pixel's side: the share of
-an outline's pixel that is covered is known to a few per cent, and the template of a large body fits in memory."""
 SEARCH_STEP_PX = 2
 """Distance between the translations that are tried first, pixels of the coarsest image: less than the basin of the
 right one, which is about as wide as the band."""
@@ -72,9 +65,6 @@ MIN_BODY_PX = 8
 MIN_PIXELS_PER_TERM = 6
 """Smallest number of compared pixels for each term; an image with fewer tells no translation. Some teeth that are 10
 pixels wide have 4, and one image in twenty is then a pixel off."""
-ARCS = 12
-"""Number of arcs of the outline whose residuals count as independent of each other: shading is alike along a twelfth of
-an outline and differs beyond it."""
 
 
 @dataclass(frozen=True)
@@ -113,17 +103,17 @@ class OutlineMatcher:
     ) -> None:
         """Sample the surface for each reduced image."""
         extent_px = float(max(np.ptp(np.flatnonzero(visible.any(axis=axis))) + 1 for axis in (0, 1)))
-        self._templates: list[_Template] = []
+        self._templates: list[SurfaceSamples] = []
         if extent_px < MIN_BODY_PX:
             return
         finest = max(1, int(np.ceil(extent_px / FINEST_PX)))
         factors = [finest]
         while extent_px / factors[0] >= COARSEST_PX:
             factors.insert(0, 2 * factors[0])
-        self._part = _surroundings(visible, int(np.ceil(reach_px)) + MARGIN_PX * factors[0])
+        self._part = surroundings(visible, int(np.ceil(reach_px)) + MARGIN_PX * factors[0])
         camera = self._part.cropped(camera)
         self._templates = [
-            _Template(camera, numbers, factor, extent_px / factor, reach_px / factor, footprint_in)
+            SurfaceSamples(camera, numbers, factor, extent_px / factor, reach_px / factor, footprint_in)
             for factor in factors
         ]
 
@@ -144,7 +134,7 @@ class OutlineMatcher:
         for template in self._templates:
             grey = reduce_grey(own, template.factor, level).astype(np.float64)
             grey /= max(float(np.abs(grey).max()), 1e-30)
-            lit = template.under(light_mm)
+            lit = _LitTemplate.under(template, light_mm)
             starts = [shift_px / template.factor]
             if template is self._templates[0]:
                 starts.append(lit.searched(grey))
@@ -153,68 +143,10 @@ class OutlineMatcher:
         return lit.judged(grey, found)
 
 
-class _Template:
-    """Samples of the surface in one reduced image."""
-
-    def __init__(
-        self,
-        camera: Camera,
-        numbers: Sequence[int],
-        factor: int,
-        extent: float,
-        reach: float,
-        footprint_in: Callable[[Camera], Footprint],
-    ) -> None:
-        """Sample the surface; lengths are in pixels of the reduced image."""
-        import cv2
-
-        self.factor, self.reach = factor, reach
-        self.samples = int(np.clip(np.ceil(SAMPLED_PX / extent), MIN_SAMPLES, MAX_SAMPLES))
-        self.pad = int(np.ceil(reach)) + BAND_PX + 2
-        width, height = (max(1, n // factor) for n in camera.size)
-        self.shape = height, width
-        sampled = _sampled_camera(camera, factor, self.samples, self.pad, (width, height))
-        footprint = footprint_in(sampled)
-        self._body = np.isin(footprint.mesh, list(numbers))
-        surface = np.isfinite(footprint.depth_mm)
-        self._other = surface & ~self._body
-        y, x = np.mgrid[0 : self._body.shape[0], 0 : self._body.shape[1]]
-        # Points and normals of all surfaces, in the world for the light and along the camera's axes for the shading
-        every = replace(footprint, mesh=np.where(surface, 0, -1).astype(np.int16))
-        self._points_mm = every.points_at(sampled, y, x).astype(np.float32)
-        self._normal = footprint.normal
-        pose = np.asarray(camera.camera_from_world)[:3, :3].astype(np.float32)
-        facing = footprint.normal @ pose.T
-        inside = np.flatnonzero(self._body.any(axis=1)), np.flatnonzero(self._body.any(axis=0))
-        middle = inside[1].mean(), inside[0].mean()
-        half = 0.5 * max(1, int(np.ptp(inside[0])), int(np.ptp(inside[1])))
-        place = ((x - middle[0]) / half).astype(np.float32), ((y - middle[1]) / half).astype(np.float32)
-        self._shading = _polynomial(facing[..., 0], facing[..., 1], *place)
-        self._place = place
-        # Pixels by whether they see the body: the band along its outline, and the whole with its surroundings
-        covered = _block_mean(self._body, self.samples, self.pad, self.shape)
-        self.arc = _arcs(covered)
-        self.band = _near_outline(covered)
-        disc = _disc(int(np.ceil(reach)) + 1)
-        self.around = cv2.dilate((covered > 0).astype(np.uint8), disc) > 0
-
-    def under(self, light_mm: tuple[float, float, float]) -> _LitTemplate:
-        """Terms of an image under one light."""
-        irradiance = expected_irradiance(self._points_mm, self._normal, light_mm, None)
-        lit_share = float((irradiance[self._body] > 0).mean())
-        irradiance /= max(float(irradiance.max()), 1e-30)
-        body, other = self._body[..., None].astype(np.float32), self._other[..., None].astype(np.float32)
-        linear = np.stack([np.ones_like(irradiance), *self._place], axis=-1)
-        parts = [body * self._shading * irradiance[..., None], body * self._shading, (1 - body - other) * linear]
-        if self._other.any():
-            parts += [other * linear, other * irradiance[..., None]]
-        return _LitTemplate(self, np.concatenate(parts, axis=-1), lit_share)
-
-
 class _LitTemplate:
     """Terms of a reduced image under one light, each the mean over a pixel at any translation."""
 
-    def __init__(self, template: _Template, terms: NDArray[np.float32], lit_share: float) -> None:
+    def __init__(self, template: SurfaceSamples, terms: NDArray[np.float32], lit_share: float) -> None:
         import cv2
 
         self._template, self._lit_share = template, lit_share
@@ -222,6 +154,19 @@ class _LitTemplate:
         # Each sample holds the mean over the pixel that begins there
         means = [cv2.blur(np.ascontiguousarray(term), side, anchor=(0, 0)) for term in np.moveaxis(terms, -1, 0)]
         self._means = np.stack(means, axis=-1)
+
+    @classmethod
+    def under(cls, samples: SurfaceSamples, light_mm: tuple[float, float, float]) -> _LitTemplate:
+        """Terms of an image under one light."""
+        irradiance = expected_irradiance(samples.points_mm, samples.normal, light_mm, None)
+        lit_share = float((irradiance[samples.body] > 0).mean())
+        irradiance /= max(float(irradiance.max()), 1e-30)
+        body, other = samples.body[..., None].astype(np.float32), samples.other[..., None].astype(np.float32)
+        linear = np.stack([np.ones_like(irradiance), *samples.place], axis=-1)
+        parts = [body * samples.shading * irradiance[..., None], body * samples.shading, (1 - body - other) * linear]
+        if samples.other.any():
+            parts += [other * linear, other * irradiance[..., None]]
+        return cls(samples, np.concatenate(parts, axis=-1), lit_share)
 
     def searched(self, grey: FloatArray) -> FloatArray:
         """Best translation (2,) of a grid over the reach."""
@@ -334,69 +279,9 @@ class _LitTemplate:
         return value
 
 
-def _surroundings(visible: NDArray[np.bool_], margin_px: int) -> Window:
-    """Part of an image that holds a body (H, W) and a margin."""
-    rows, columns = (np.flatnonzero(visible.any(axis=axis)) for axis in (1, 0))
-    body = Window(int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1)
-    return body.grown(margin_px, (visible.shape[1], visible.shape[0]))
-
-
-def _sampled_camera(camera: Camera, factor: int, samples: int, pad: int, size: tuple[int, int]) -> Camera:
-    """Camera whose pixels are samples of the reduced image of ``size`` (width, height) and of ``pad`` pixels around."""
-    K = np.array(camera.K)
-    K[:2] /= factor
-    K[:2, 2] += pad
-    K[:2] *= samples
-    width, height = ((n + 2 * pad) * samples for n in size)
-    return camera.model_copy(update={"size": (width, height), "K": tuple(map(tuple, K.tolist()))})
-
-
-def _polynomial(right: Image, down: Image, x: Image, y: Image) -> Image:
-    """Polynomials (H, W, 14) of a normal's components to the right and down and of a place x, y, each (H, W).
-
-    All products of two of one kind are there, and those with the normal's third component, with which the light from
-    inside a translucent tooth fades towards the outline.
-    """
-    towards = np.sqrt(np.clip(1 - right * right - down * down, 0, 1))
-    terms = [np.ones_like(right), right, down, x, y, towards, towards * right, towards * down]
-    for first, second in ((right, down), (x, y)):
-        terms += [first * first, first * second, second * second]
-    return np.stack(terms, axis=-1)
-
-
 def _left_without_outline(grey: FloatArray, pixels: Indices) -> float:
     """Mean square that a cubic polynomial of the place leaves over some pixels."""
     y, x = ((index - index.mean()) / max(int(np.ptp(index)), 1) for index in pixels)
     design = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1)
     residual = grey[pixels] - design @ np.linalg.lstsq(design, grey[pixels], rcond=None)[0]
     return float((residual * residual).mean())
-
-
-def _block_mean(body: NDArray[np.bool_], samples: int, pad: int, shape: tuple[int, int]) -> Image:
-    """Covered share (H, W) of each pixel of the reduced image."""
-    inner = body[pad * samples : (pad + shape[0]) * samples, pad * samples : (pad + shape[1]) * samples]
-    blocks = inner.reshape(shape[0], samples, shape[1], samples)
-    return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
-
-
-def _near_outline(covered: Image) -> NDArray[np.bool_]:
-    """Pixels (H, W) at most ``BAND_PX`` inside or outside the outline."""
-    import cv2
-
-    disc = _disc(BAND_PX)
-    outer = cv2.dilate((covered > 0).astype(np.uint8), disc)
-    return np.asarray((outer > 0) & (cv2.erode((covered >= 1).astype(np.uint8), disc) == 0))
-
-
-def _arcs(covered: Image) -> NDArray[np.intp]:
-    """Number (H, W) of the arc of the outline to which a pixel belongs, by its direction from the body's centre."""
-    rows, columns = np.nonzero(covered > 0)
-    y, x = np.indices(covered.shape)
-    turn = np.arctan2(y - rows.mean(), x - columns.mean()) / (2 * np.pi) + 0.5
-    return np.asarray(np.minimum((turn * ARCS).astype(np.intp), ARCS - 1))
-
-
-def _disc(radius: int) -> NDArray[np.uint8]:
-    import cv2
-
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), dtype=np.uint8)
