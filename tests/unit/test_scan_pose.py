@@ -172,6 +172,8 @@ def test_only_photographs_whose_motion_is_unsure_are_shifted(tmp_path: Path) -> 
     assert len(found) == MAX_SHIFTED
     assert min(found.values()) == pytest.approx(0.15)
     assert ("c0", "l2") not in found
+    # With pixels of the fit ten times as wide the smaller errors are too small to be seen
+    assert len(shift_errors_px(tmp_path, 10)) == sum(error is not None and error >= 0.5 for error in errors)
 
 
 def test_the_report_says_where_the_scan_lies_and_when_that_is_too_far() -> None:

@@ -10,6 +10,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+MIN_ERROR_PX = 0.05
+"""Least error of a photograph's motion, in pixels of the fit, that is estimated. A shift by less changes a tooth's image
+by half a per cent, which is less than photographs and renders hold of it."""
 MAX_SHIFTED = 36
 """Largest number of photographs whose shifts are estimated, those of the largest errors. Each adds two derivatives to
 every block, 4 MB in a block of 200,000 measurements."""
@@ -17,7 +20,7 @@ every block, 4 MB in a block of 200,000 measurements."""
 
 def shift_errors_px(prepared: Path, pixel_step: int) -> dict[tuple[str, str], float]:
     """Standard error of each photograph's shift along x and y, in pixels of the fit, by camera and light; only of those
-    that have one.
+    that have one of ``MIN_ERROR_PX`` or more.
 
     Args:
         prepared: folder of the prepared capture.
@@ -26,5 +29,5 @@ def shift_errors_px(prepared: Path, pixel_step: int) -> dict[tuple[str, str], fl
     path = prepared / "quality.json"
     images = json.loads(path.read_text())["images"] if path.is_file() else []
     found = {(one["camera"], one["light"]): (one.get("motion_error_px") or 0.0) / pixel_step for one in images}
-    largest = sorted((photograph for photograph, error in found.items() if error > 0), key=lambda one: -found[one])
+    largest = sorted((one for one, error in found.items() if error >= MIN_ERROR_PX), key=lambda one: -found[one])
     return {photograph: found[photograph] for photograph in largest[:MAX_SHIFTED]}
