@@ -11,8 +11,8 @@ import json
 from pathlib import Path
 
 MIN_ERROR_PX = 0.05
-"""Least error of a photograph's motion, in pixels of the fit, that is estimated. A shift by less changes a tooth's image
-by half a per cent, which is less than photographs and renders hold of it."""
+"""Least error of a photograph's motion, in pixels of the fit, that is estimated. A shift by less changes a tooth's
+image by half a per cent, which is less than photographs and renders hold of it."""
 MAX_SHIFTED = 36
 """Largest number of photographs whose shifts are estimated, those of the largest errors. Each adds two derivatives to
 every block, 4 MB in a block of 200,000 measurements."""
