@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from services.client.client import Client as Client
     from services.core.asset import load_asset as load_asset
     from services.core.records import JobSpec as JobSpec
-    from services.fit.plugin.integrator import register_integrator as register_mitsuba
-    from services.fit.slab.simulate import simulate_slab as simulate_slab
     from services.pipeline.stages import run_job as run
+    from services.slab.simulate import simulate_slab as simulate_slab
+    from services.transport.plugin.integrator import register_integrator as register_mitsuba
 
 _PLACES = MappingProxyType(
     {
@@ -36,9 +36,9 @@ _PLACES = MappingProxyType(
         "Client": "services.client.client:Client",
         "JobSpec": "services.core.records:JobSpec",
         "load_asset": "services.core.asset:load_asset",
-        "register_mitsuba": "services.fit.plugin.integrator:register_integrator",
+        "register_mitsuba": "services.transport.plugin.integrator:register_integrator",
         "run": "services.pipeline.stages:run_job",
-        "simulate_slab": "services.fit.slab.simulate:simulate_slab",
+        "simulate_slab": "services.slab.simulate:simulate_slab",
     }
 )
 __all__ = ["AsyncClient", "Client", "JobSpec", "load_asset", "register_mitsuba", "run", "simulate_slab"]

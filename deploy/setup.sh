@@ -46,7 +46,7 @@ prepare_packages() {
 
 # Set $lack to one sentence on what the renderer lacks on this machine; false if it lacks something.
 check_renderer() {
-    lack=$(.venv/bin/python -m services.fit.transport.platform 2>&1) && return
+    lack=$(.venv/bin/python -m services.transport.platform 2>&1) && return
     lack=$(printf '%s\n' "$lack" | tail -n 1)
     return 1
 }

@@ -31,7 +31,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     device = session.config.getoption("--device")
     if device is not None:
         from services.core.errors import PlatformError
-        from services.fit.transport.platform import prepare_device
+        from services.transport.platform import prepare_device
 
         try:
             prepare_device(backend=device)

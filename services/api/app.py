@@ -64,13 +64,13 @@ def create_app(settings: ServerSettings, run: RunJob | None = None, doors: Mappi
     from services.api.auth.access import refuse_open_network
     from services.api.auth.browser_protection import BrowserProtection
     from services.api.auth.install import install
-    from services.api.calibrations.routes import build_calibrations_router
     from services.api.captures.routes import build_captures_router
     from services.api.dome.dome import Dome
     from services.api.dome.routes import build_dome_router
     from services.api.health.worker_routes import build_workers_router
     from services.api.http import problems
     from services.api.http.thread_pools import ThreadPool
+    from services.api.jobs.calibration_routes import build_calibrations_router
     from services.api.jobs.event_stream import EventBroadcaster
     from services.api.jobs.routes import build_router
     from services.api.masks.masks import Masks

@@ -8,10 +8,11 @@ from collections.abc import Callable
 
 from fastapi import FastAPI
 
-from services.api.health.metrics import RequestMetrics, build_registry
+from services.api.health.metrics import build_registry
 from services.api.health.readiness import Readiness
 from services.api.health.routes import build_health_router
 from services.api.http.request_log import RequestLog
+from services.api.http.request_metrics import RequestMetrics
 from services.api.http.thread_pools import ThreadPool
 from services.api.jobs.history_routes import build_observe_router
 from services.api.jobs.jobs import Jobs

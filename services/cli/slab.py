@@ -76,7 +76,7 @@ def simulate_slab_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Reflectance and transmittance of a slab by the walk that the fit uses."""
-    from services.fit.slab.simulate import simulate_slab
+    from services.slab.simulate import simulate_slab
 
     stack = _read_layers(layers, {"alpha": alpha, "sigma": sigma, "width": width}, g)
     cosines, edges_mm = _numbers("--exit-cosines", exit_cosines), _numbers("--ring-edges", ring_edges)
@@ -113,7 +113,7 @@ def _read_layers(text: str | None, slab: dict[str, float | None], g: float) -> t
     from pydantic import TypeAdapter, ValidationError
 
     from services.core.files.validation import remedied
-    from services.fit.slab.simulate import Layer
+    from services.slab.simulate import Layer
 
     given = [name for name, value in slab.items() if value is not None]
     if text is None:

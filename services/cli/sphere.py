@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from services.fit.slab.sphere.invert import Fitted
-    from services.fit.slab.sphere.results import SphereFit, SphereQuantity
+    from services.slab.sphere.invert import Fitted
+    from services.slab.sphere.results import SphereFit, SphereQuantity
 
 PROGRESS_S = 5.0
 """Time between two lines of progress."""
@@ -31,10 +31,10 @@ def sphere_command(
     """Measure absorption and reduced scattering from a slab's reflectance and transmittance."""
     from services.core.errors import SettingsError
     from services.core.verdict import NOT_CONVERGED_STATUS
-    from services.fit.slab.sphere.invert import fitted_readings
-    from services.fit.slab.sphere.readings import read_readings
-    from services.fit.slab.sphere.translucency import translucency_of
-    from services.fit.slab.sphere.write import write_sphere
+    from services.slab.sphere.invert import fitted_readings
+    from services.slab.sphere.readings import read_readings
+    from services.slab.sphere.translucency import translucency_of
+    from services.slab.sphere.write import write_sphere
 
     if not black < white:
         raise SettingsError(

@@ -48,9 +48,9 @@ _TEETH: Mapping[StageName, str] = {
     "register": "services.calibrate.stage:run",
     "prepare": "services.preprocess.stage:run",
     "fit": "services.fit.stage:run",
-    "export": "services.fit.stage:export",
+    "export": "services.assets.stage:export",
 }
-_SLAB: Mapping[StageName, str] = {"fit": "services.fit.slab.stage:run", "export": "services.fit.slab.stage:export"}
+_SLAB: Mapping[StageName, str] = {"fit": "services.slab.stage:run", "export": "services.slab.stage:export"}
 
 SLAB_OPTIONS = frozenset({"effort", "dictionary", "particle_index", "particle_absorption"})
 """Options that only a slab has."""

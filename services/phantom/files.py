@@ -13,7 +13,7 @@ from services.core.errors import InputError
 from services.core.geometry import Camera, Light
 from services.core.records import Boundary, FolderCapture, ImageEntry
 from services.core.store import write_atomic, write_record
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium
 
 CHANNELS = {1: ("green",), 3: ("red", "green", "blue")}
 """Names of the channels by their number."""

@@ -20,9 +20,6 @@ from services.core.errors import MeshError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.records import Boundary
-from services.fit.optics.parameters import Mouth
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import (
     CHANNELS,
@@ -37,6 +34,9 @@ from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth
 from services.phantom.lips import joined, lips_and_retractor
 from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.tooth import IOR
+from services.transport.optics.parameters import Mouth
+from services.transport.platform import prepare_device
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
 Painter = Callable[[Camera, int, int], Stack]
 """Function that renders one channel's images of a camera, given the paths per pixel and a seed."""
@@ -234,7 +234,7 @@ def known_mouth(jaw: JawSurfaces, channel: str, subject: int | None) -> Mouth:
 def _by_engine(
     jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], boundary: Boundary
 ) -> list[Painter]:
-    from services.fit.transport.engine import Engine
+    from services.transport.engine import Engine
 
     def painter(channel: int, mouth: Mouth) -> Painter:
         engine = Engine(jaw.recipe(lights, channel, boundary))
@@ -246,7 +246,7 @@ def _by_engine(
 
 
 def _by_mitsuba(jaw: JawSurfaces, mouths: dict[str, Mouth], lights: tuple[Light, ...], folder: Path) -> list[Painter]:
-    from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
+    from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
 
     prepare_device()
     files, fdi = write_mouth_surfaces(folder, jaw.teeth, jaw.gums, jaw.opaque), tuple(tooth.fdi for tooth in jaw.teeth)

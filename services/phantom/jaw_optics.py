@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from services.fit.optics.parameters import Medium, Mouth, Tissue
 from services.phantom.reflection import GUM_REFLECTANCE
 from services.phantom.tooth import TRUE_TISSUE
+from services.transport.optics.parameters import Medium, Mouth, Tissue
 
 GUMS_IOR = 1.33
 """Refractive index of the gums."""

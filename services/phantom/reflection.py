@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light, Mesh
-from services.fit.transport.rays import RayScene, pixel_rays
+from services.transport.rays import RayScene, pixel_rays
 
 ROUGHNESS = 0.12
 """GGX roughness of wet enamel at the scale of a pixel."""

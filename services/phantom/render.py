@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
-from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.scene.recipe import View
+from services.transport.optics.parameters import Mouth, Tissue
+from services.transport.scene.recipe import View
 
 if TYPE_CHECKING:
-    from services.fit.export.mitsuba_scene import SceneDict
-    from services.fit.transport.engine import Engine
+    from services.assets.mitsuba.scene import SceneDict
+    from services.transport.engine import Engine
 
 Stack = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Radiance (L, H, W) and the variance (L, H, W) of its estimate."""
@@ -35,7 +35,7 @@ def render_mitsuba(scene: SceneDict, lights: tuple[Light, ...], channel: int, sa
     """Render a scene with one camera by stock Mitsuba; its point light ``light`` becomes each light in turn."""
     import mitsuba as mi
 
-    from services.fit.export.mitsuba_scene import load_scene, render_batches
+    from services.assets.mitsuba.scene import load_scene, render_batches
 
     loaded = load_scene(scene)
     params = mi.traverse(loaded)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Mesh
-from services.fit.inputs.stain_uv import StainLayout, ToothStains, stain_layout
+from services.transport.scene.stain_uv import StainLayout, ToothStains, stain_layout
 
 TEXEL_MM = 0.5
 """Size of a texel on the surface, mm."""

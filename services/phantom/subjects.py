@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.fit.optics.parameters import Medium, Tissue
+from services.transport.optics.parameters import Medium, Tissue
 
 Range = tuple[float, float]
 

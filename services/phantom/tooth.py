@@ -11,15 +11,11 @@ import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
+from services.assets.stains import write_textures
 from services.core.errors import InputError
 from services.core.files.meshes import read_mesh, write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.records import Boundary
-from services.fit.export.stains import store_stains, write_textures
-from services.fit.inputs.stain_uv import ToothStains
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import (
     CHANNELS,
@@ -35,6 +31,10 @@ from services.phantom.reflection import ROUGHNESS, Reflection, reflect
 from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.stain_paint import painted_stains
 from services.phantom.subjects import subject_tissues
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.platform import prepare_device
+from services.transport.scene.recipe import single_tooth
+from services.transport.scene.stain_uv import ToothStains, store_stains
 
 FDI = 11
 """FDI number of the procedural incisor."""
@@ -199,7 +199,7 @@ def _render(
     """Render one channel's light that was inside the tooth, under each light."""
     prepare_device()
     if renderer == "mitsuba":
-        from services.fit.export.mitsuba_scene import nested_scene
+        from services.assets.mitsuba.scene import nested_scene
 
         folder = teeth_folder(out, tooth.fdi)
         shell, stain_textures = folder / "outer.ply", {}
@@ -210,7 +210,7 @@ def _render(
         files = {str(tooth.fdi): (shell, folder / "dentin.ply" if tooth.dentin is not None else None)}
         scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0, stains=stain_textures)
         return render_mitsuba(scene, lights, channel, samples, seed)
-    from services.fit.transport.engine import Engine
+    from services.transport.engine import Engine
 
     recipe = single_tooth(
         outer=tooth.outer,

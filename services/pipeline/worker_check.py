@@ -24,7 +24,10 @@ CHECK_S = 120.0
 as long."""
 
 CHECKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {DOME: ("services.capture.stage:check",), STAGES: ("services.preprocess.stage:check", "services.fit.stage:check")}
+    {
+        DOME: ("services.capture.stage:check",),
+        STAGES: ("services.preprocess.stage:check", "services.fit.stage:check", "services.assets.stage:check"),
+    }
 )
 """Resource that a worker claims -> ``module:function`` of the checks, which raise an error for what is missing."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.core.page import page_template
+from services.core.pages.page import page_template
 from services.core.store import write_atomic
 from services.preprocess.quality import STOPS, CameraFlow, ImageQuality
 

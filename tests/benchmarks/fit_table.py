@@ -26,16 +26,17 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
+from services.assets.stage import fitted_teeth
 from services.bench.fits.tooth_capture import PreparedTooth, prepared_tooth, tissue_of
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
-from services.fit.checks.thickness import thickness_image
-from services.fit.optics.parameters import Tissue
-from services.fit.stage import fitted_teeth, run
-from services.fit.tooth.schedule import ChannelSchedule
-from services.fit.transport.platform import prepare_device
+from services.fit.stage import run
+from services.fit.stages.tooth.schedule import ChannelSchedule
+from services.transport.optics.parameters import Tissue
+from services.transport.platform import prepare_device
+from services.transport.thickness import thickness_image
 from tests.support.truths import SIDE_LIGHTS, Truth, read, write_capture
 
 LAYERED = ("central-incisor", "canine", "premolar")

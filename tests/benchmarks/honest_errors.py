@@ -28,18 +28,18 @@ from typing import Protocol
 
 import numpy as np
 
+from services.anatomy.job_dentin import dentin_shape
 from services.core.files.meshes import read_teeth
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import open_stage
-from services.fit.inputs.dentin import dentin_shape
-from services.fit.optics.domain import to_natural
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.priors import COSINE, WEAK
+from services.fit.coordinates.domain import to_natural
+from services.fit.coordinates.priors import COSINE, WEAK
 from services.fit.stage import ENGINE, run
-from services.fit.tooth.driver import fitted_thickness
-from services.fit.transport.platform import prepare_device
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.platform import prepare_device
+from services.transport.thickness import fitted_thickness
 from tests.support.fake_engine import DirectFakeEngine
 from tests.support.prepared import write_prepared
 from tests.support.rendered_capture import rendered_tooth

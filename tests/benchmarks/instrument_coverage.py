@@ -31,15 +31,16 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.execution import channel_fit, closing
-from services.fit.execution.blocks import Block, BlockTask, read_block
-from services.fit.instrument.errors import DEFAULT_SE, kind_of_error
-from services.fit.optics.domain import Domain
+from services.fit.coordinates.domain import Domain
+from services.fit.coordinates.instrument_errors import DEFAULT_SE, kind_of_error
+from services.fit.measurements.blocks import Block, BlockTask, read_block
+from services.fit.passes import final_uncertainty as closing
 from services.fit.solve import covariance
 from services.fit.solve.closing import ClosingSums, positive_part
 from services.fit.solve.recombination import Recombination
 from services.fit.solve.sandwich import CombinedSolution, Sandwich, combine_with_prior
-from services.fit.transport.platform import prepare_device
+from services.fit.stages import channel_fit
+from services.transport.platform import prepare_device
 from tests.benchmarks.instrument_errors import QUANTITIES, fit, relative_slopes
 from tests.benchmarks.render_moves import STORED
 

@@ -36,13 +36,13 @@ from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
-from services.fit.optics.domain import Domain
-from services.fit.optics.parameters import Tissue
+from services.fit.coordinates.domain import Domain
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import DERIVED, estimates
 from services.fit.stage import run
-from services.fit.tooth import driver
-from services.fit.transport.platform import prepare_device
+from services.fit.stages.tooth import driver
+from services.transport.optics.parameters import Tissue
+from services.transport.platform import prepare_device
 from tests.benchmarks.instrument_perturbations import ERRORS, EXCHANGED, FAR_LIGHT, perturb
 from tests.support.truths import SIDE_LIGHTS, read, write_capture
 

@@ -28,15 +28,15 @@ import numpy as np
 
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import build_jaw
+from services.assets.stage import fitted_teeth
 from services.bench.fits.jaw import prepared_jaw, reported_mouth
 from services.bench.fits.tooth_capture import PreparedTooth
 from services.core.records import JobSpec
 from services.core.results import FitReport, PreparedManifest
 from services.core.store import open_stage
-from services.fit.checks.thickness import enamel_thickness_mm
-from services.fit.jaw.views import views_of_parts
-from services.fit.optics.parameters import Mouth
-from services.fit.stage import fitted_teeth
+from services.fit.stages.jaw.views import views_of_parts
+from services.transport.optics.parameters import Mouth
+from services.transport.thickness import enamel_thickness_mm
 from tests.benchmarks.fit_table import Figure
 from tests.support.jaw_truth import CHANNEL, SUBJECT, JawTruth, by_engine, read_jaw_truth, write_jaw_capture
 

@@ -32,11 +32,11 @@ from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import is_published, open_stage, write_atomic
-from services.fit.instrument.errors import DEFAULT_SE
-from services.fit.instrument.pose import rigid
+from services.fit.coordinates.instrument_errors import DEFAULT_SE
+from services.fit.measurements.instrument.pose import rigid
 from services.fit.stage import run
-from services.fit.transport.platform import prepare_device
 from services.preprocess.stage import run as prepare
+from services.transport.platform import prepare_device
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from services.core.records import FolderCapture, JobSpec
 from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import StoredArray, is_published, open_stage, read_record, write_atomic, write_record
-from services.fit.checks.evaluate import ErrorSums
+from services.fit.passes.evaluate import ErrorSums
 from services.phantom.tooth import write_phantom
 from tests.support.raw_captures import write_raw_capture
 from tests.support.raw_sensor import Sensor
@@ -170,7 +170,7 @@ def _images_error(jobs: dict[str, Path]) -> dict[str, float]:
 def _fitted(spec: JobSpec, job: Path) -> dict[str, Any]:
     """Fit a prepared capture; returns errors, parameters and time. A result in the job's folder is read instead."""
     from services.fit.stage import run as fit
-    from services.fit.transport.platform import prepare_device
+    from services.transport.platform import prepare_device
 
     kept = job / "row.json"
     if kept.is_file():

@@ -110,7 +110,7 @@ def _prepared(specs: dict[str, JobSpec], jobs: dict[str, Path]) -> dict[str, Any
 
 def _fitted(spec: JobSpec, job: Path) -> dict[str, Any]:
     from services.fit.stage import run as fit
-    from services.fit.transport.platform import prepare_device
+    from services.transport.platform import prepare_device
 
     kept = job / "row.json"
     if not kept.is_file():

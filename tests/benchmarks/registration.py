@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from services.fit.checks.alignment import TESTED_ERROR, Offset, reported_offset
-from services.fit.transport.platform import prepare_device
+from services.transport.platform import prepare_device
 from tests.support.registered_phantoms import Noise, Phantom, Place, rendered_phantom
 
 PHANTOMS, IN_PLACE_DRAWS, BESIDE_DRAWS = 20, 10, 5

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.export.mitsuba_scene import load_scene
-from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
-from services.fit.transport.platform import prepare_device
+from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
+from services.assets.mitsuba.scene import load_scene
 from services.phantom.jaw import jaw_surfaces, known_mouth
+from services.transport.platform import prepare_device
 from tests.support.jaw_truth import CHANNEL, STORED, SUBJECT, cameras, lights, pack
 
 PASSES, SAMPLES = 100, 64

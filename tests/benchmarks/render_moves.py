@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
-from services.fit.instrument.errors import DEFAULT_MOVE_SE
-from services.fit.instrument.pose import rigid
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.coordinates.instrument_errors import DEFAULT_MOVE_SE
+from services.fit.measurements.instrument.pose import rigid
+from services.transport.optics.parameters import Medium, Tissue
 from tests.benchmarks.instrument_errors import SUBJECT
 from tests.support.truths import SIDE_LIGHTS, Truth, read
 
@@ -67,7 +67,7 @@ def render(truth: Truth, place: Place, samples: int, folder: Path) -> dict[str, 
     """Images (L, H, W) under the fitted lights by camera."""
     import mitsuba as mi
 
-    from services.fit.export.mitsuba_scene import load_scene, nested_scene
+    from services.assets.mitsuba.scene import load_scene, nested_scene
 
     enamel, dentin = (
         Medium(one["sigma"], one["alpha"], beta=one["beta"], g1=one["g1"], g2=one["g2"])

@@ -23,15 +23,15 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from services.assets.mitsuba.scene import load_scene, surface_dict
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Camera, Light
 from services.core.records import FolderCapture, JobSpec, MaskBit
 from services.core.stage import LocalContext
 from services.core.store import read_record, write_atomic
-from services.fit.export.mitsuba_scene import load_scene, surface_dict
-from services.fit.transport.platform import prepare_device
 from services.preprocess import stage
 from services.preprocess.projection import project
+from services.transport.platform import prepare_device
 
 NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002
 """Standard deviation of the sensor's noise as shares of the pixel's value and of the image's maximum."""

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from services.bench.slab.dispersions import truths
 from services.bench.slab.recovery import FINE_RAD, photographed, write_images
 from services.core.slab.folder import read_folder
-from services.fit.slab.dictionaries.chosen import dictionary_of
-from services.fit.slab.fit import Wavelength, fit_images
-from services.fit.slab.images import read_images
-from services.fit.slab.options import SlabOptions
+from services.slab.dictionaries.chosen import dictionary_of
+from services.slab.fit import Wavelength, fit_images
+from services.slab.images import read_images
+from services.slab.options import SlabOptions
 from tests.pipeline.test_slab_fit import noisy_truth
 
 ENDS_DEG = (0, 7, 20, 45, 90, 135, 181)

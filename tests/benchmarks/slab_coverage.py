@@ -29,17 +29,17 @@ from numpy.typing import NDArray
 from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.plain_photons import plain_images
 from services.core.slab.folder import SlabFolder
-from services.fit.slab.images import shot_noise
-from services.fit.slab.model.dictionary import ANGLES_RAD, Material, henyey_greenstein, hg_values
-from services.fit.slab.model.forward import Batches, render
-from services.fit.slab.model.rig import Rig, rig_of
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import DAMPING, Solution, quadratic_at
-from services.fit.slab.solve.measured_directions import step_matrix
-from services.fit.slab.solve.normal import NormalEquations, derivative_rows, normal_equations
-from services.fit.slab.solve.prior import precision
-from services.fit.slab.solve.uncertainty import phase_chain, slopes, uncertainty_of
-from services.fit.slab.solve.weights import Weights, smoothed_covariance, weights_of
+from services.slab.images import shot_noise
+from services.slab.model.dictionary import ANGLES_RAD, Material, henyey_greenstein, hg_values
+from services.slab.model.forward import Batches, render
+from services.slab.model.rig import Rig, rig_of
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.gauss_newton import DAMPING, Solution, quadratic_at
+from services.slab.solve.measured_directions import step_matrix
+from services.slab.solve.normal import NormalEquations, derivative_rows, normal_equations
+from services.slab.solve.prior import precision
+from services.slab.solve.uncertainty import phase_chain, slopes, uncertainty_of
+from services.slab.solve.weights import Weights, smoothed_covariance, weights_of
 
 Array = NDArray[np.float64]
 

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from services.core.slab.folder import read_folder
-from services.fit.slab.dictionaries.mie import scattered
-from services.fit.slab.fit import fit_slab
-from services.fit.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.solve.weights import smoothed_variance
+from services.slab.dictionaries.mie import scattered
+from services.slab.fit import fit_slab
+from services.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.slab.model.forward import render
+from services.slab.model.rig import rig_of
+from services.slab.options import SlabOptions
+from services.slab.solve.weights import smoothed_variance
 from tests.pipeline.test_slab_fit import NOISE, errors_of, noisy_truth
 from tests.support.shared_data import shared_path
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.simulate import Sums
+from services.slab.simulate import Sums
 from tests.support.slab_tables import SlabCase, derivative_cases, is_costly, named, passes, simulate, total_cases
 
 DEEP_TOLERANCE = 1e-3

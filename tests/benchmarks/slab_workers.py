@@ -27,10 +27,10 @@ import numpy as np
 from services.bench.slab.cell import near_beam_folder
 from services.core.records import JobSpec
 from services.core.stage import LocalContext
-from services.fit.slab.model.dictionary import henyey_greenstein
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.results.result import SlabReport
+from services.slab.model.dictionary import henyey_greenstein
+from services.slab.model.forward import render
+from services.slab.model.rig import rig_of
+from services.slab.results.result import SlabReport
 
 MEDIA = {532.0: (1.0, 0.8, 0.03), 635.0: (0.8, 0.7, 0.02), 488.0: (1.2, 0.8, 0.04)}
 """Scattering per mm, mean cosine and absorption per mm by wavelength, nm."""
@@ -89,7 +89,7 @@ def fitted(client: Any, cell: Path, count: int, effort: float) -> tuple[float, S
 
 def _stage(spec: JobSpec, root: Path) -> SlabReport:
     # Runs on a worker; the fit spreads its blocks from there.
-    from services.fit.slab.stage import run
+    from services.slab.stage import run
 
     return run(spec, LocalContext(root))
 

@@ -11,8 +11,8 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from services.api.app import STATIC, create_app
-from services.api.jobs.lifecycle import Trigger
 from services.api.jobs.repository import Repository
+from services.api.tables.lifecycle import Trigger
 from services.core.records import JobSpec
 from services.core.settings import DATABASE_FILE, ServerSettings
 from services.pipeline.database import sqlite_url

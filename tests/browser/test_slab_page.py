@@ -17,10 +17,10 @@ from services.core.results import FitReport
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
 from services.core.verdict import VERDICT, verdict_of
-from services.fit.slab.model.dictionary import ANGLES_RAD, hg_values
-from services.fit.slab.results.chart import phase_picture
-from services.fit.slab.results.result import PhaseFunction
 from services.pipeline.event_log import EventAddress
+from services.slab.model.dictionary import ANGLES_RAD, hg_values
+from services.slab.results.chart import phase_picture
+from services.slab.results.result import PhaseFunction
 from tests.browser.pages import LOOKS, looked_at, watched_page
 from tests.browser.scripted_job import expect_state
 from tests.support.live_server import serving

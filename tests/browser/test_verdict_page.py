@@ -14,10 +14,10 @@ from playwright.sync_api import Browser, expect
 
 from services.api.app import create_app
 from services.api.jobs.admission import Machine
+from services.assets.report import _spread
 from services.core.results import Estimate, FitReport
 from services.core.settings import ServerSettings
 from services.core.verdict import percent, verdict_of
-from services.fit.export.report import _spread
 from tests.browser.pages import looked_at, watched_page
 from tests.browser.scripted_job import STEPS, ScriptedJob, expect_state, submit
 from tests.support.live_server import serving

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from services.assets.stage import export
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
-from services.fit.stage import export, run
+from services.fit.stage import run
 from services.phantom.tooth import write_phantom
 from services.preprocess.stage import run as prepare
 

@@ -15,16 +15,16 @@ import pytest
 from distributed import Client, LocalCluster
 
 from services.core.errors import JobCancelledError
+from services.core.files.content_files import StoredFile
 from services.core.placement import STAGES, UNLIMITED
 from services.core.records import JobSpec
 from services.core.stage import CANCEL_FLAG, StageContext
-from services.fit.execution.blocks import StoredFile
-from services.fit.execution.engine_host import ChildHost
-from services.fit.execution.executors import DaskExecutor
 from services.pipeline.event_log import EventAddress, folder_events
 from services.pipeline.following import follow_stage
 from services.pipeline.stage_task import StageTask
 from services.preprocess.tasks import executors as of_blocks
+from services.tasks.engine_host import ChildHost
+from services.tasks.executors import DaskExecutor
 from tests.support.small_system import PATIENCE_S
 
 ENGINE = "tests.support.fake_engine:FakeEngine"

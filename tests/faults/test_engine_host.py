@@ -18,11 +18,12 @@ import pytest
 from distributed import Client, LocalCluster, get_worker
 
 from services.core.errors import CrashError, JobCancelledError, MemoryKillError, ResourceError, WorkerLostError
-from services.fit.execution.blocks import StoredFile, write_recipe
-from services.fit.execution.engine_host import CancellableHost, ChildHost, EngineHost
-from services.fit.execution.engine_process import memory_kills
-from services.fit.execution.executors import DaskExecutor
-from services.fit.transport.scene.recipe import single_tooth
+from services.core.files.content_files import StoredFile
+from services.tasks.engine_host import CancellableHost, ChildHost, EngineHost
+from services.tasks.engine_process import memory_kills
+from services.tasks.executors import DaskExecutor
+from services.transport.scene.recipe import single_tooth
+from services.transport.scene.recipe_files import write_recipe
 from tests.support.prepared import sphere
 
 BROKEN = "tests.support.broken_engine:BrokenEngine"
@@ -108,7 +109,7 @@ def test_a_kill_that_the_system_counts_as_one_for_memory_is_told_as_that(
 ) -> None:
     # Only the system's counter of memory kills shows the cause; the kill itself is like any other.
     counted = iter([7, 8])
-    monkeypatch.setattr("services.fit.execution.engine_process.memory_kills", lambda: next(counted))
+    monkeypatch.setattr("services.tasks.engine_process.memory_kills", lambda: next(counted))
     with pytest.raises(MemoryKillError, match="lack of memory"):
         host.call("die", recipe, int(signal.SIGKILL))
 

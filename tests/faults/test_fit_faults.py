@@ -20,9 +20,9 @@ from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
-from services.fit.execution.executors import DaskExecutor, executor
-from services.fit.execution.journal import read_entries as read_entries_of
 from services.fit.stage import run
+from services.tasks.executors import DaskExecutor, executor
+from services.tasks.journal import read_entries as read_entries_of
 from tests.support.prepared import FAKE, write_prepared
 from tests.support.small_jaw import jaw_spec, write_prepared_jaw
 
@@ -257,7 +257,7 @@ def test_killed_worker_in_mid_jaw_changes_nothing(client: Client, tmp_path: Path
 
 
 def test_renderers_end_with_their_worker(tmp_path: Path) -> None:
-    from services.fit.execution.engine_host import ChildHost
+    from services.tasks.engine_host import ChildHost
 
     process = ChildHost(FAKE)._start()
     process.pipe.close()

@@ -156,7 +156,7 @@ def die(*_: object, **__: object) -> None:
     [
         "services.api.captures.captures.sync_folders",
         "pathlib.Path.rename",
-        "services.api.captures.table.CaptureTable.change_state",
+        "services.api.tables.captures.CaptureTable.change_state",
     ],
 )
 def test_a_commit_that_died_anywhere_is_invisible_or_complete(
@@ -184,7 +184,7 @@ def test_a_commit_that_died_anywhere_is_invisible_or_complete(
     [
         "shutil.rmtree",
         "services.api.captures.blobs.Blobs.remove",
-        "services.api.captures.table.CaptureTable.delete_files",
+        "services.api.tables.captures.CaptureTable.delete_files",
     ],
 )
 def test_a_deletion_that_died_anywhere_is_completed_by_the_next_server(

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.api.jobs.lifecycle import Trigger
 from services.api.jobs.repository import Repository
+from services.api.tables.lifecycle import Trigger
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageEvent

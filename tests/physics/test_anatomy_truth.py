@@ -6,11 +6,11 @@ import json
 
 import numpy as np
 
+from services.assets.mitsuba.scene import load_scene, nested_scene, render_batches
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.platform import prepare_device
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.platform import prepare_device
 from tests.support.shared_data import shared_path
 
 

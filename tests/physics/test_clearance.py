@@ -7,7 +7,7 @@ import trimesh
 
 from services.anatomy.distance import SurfaceDistance
 from services.core.geometry import Mesh
-from services.fit.transport.platform import prepare_device
+from services.transport.platform import prepare_device
 
 EDGE_MM, RADIUS_MM = (12.0, 6.0, 6.0), 1.5
 ROUNDING_MM = 1e-4
@@ -23,7 +23,7 @@ def test_bounds_hold_and_tell_something_as_surfaces_move() -> None:
     prepare_device()
     import mitsuba as mi
 
-    from services.fit.transport.scene.clearance import Clearance
+    from services.transport.scene.clearance import Clearance
 
     box = trimesh.creation.box(EDGE_MM).subdivide_to_size(1.0)
     outer = Mesh(np.asarray(box.vertices), np.asarray(box.faces, dtype=np.int32))

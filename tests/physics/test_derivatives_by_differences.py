@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from services.core.records import Boundary
-from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import SceneRecipe
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Mouth, Tissue
+from services.transport.scene.recipe import SceneRecipe
 from tests.support.one_sided_border import leave_out_scattering
 from tests.support.small_mouth import MOUTH, mouth_recipe
 from tests.support.small_tooth import camera_at, recipe, whole_view

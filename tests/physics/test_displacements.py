@@ -9,12 +9,13 @@ import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Mesh
-from services.fit.execution.blocks import Block, BlockTask, write_block, write_recipe
-from services.fit.execution.closing import DisplacedScene, displacements_task
-from services.fit.execution.engine_host import InProcessHost
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import ToothSurfaces
+from services.fit.measurements.blocks import Block, BlockTask, write_block
+from services.fit.passes.final_uncertainty import DisplacedScene, displacements_task
+from services.tasks.engine_host import InProcessHost
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import ToothSurfaces
+from services.transport.scene.recipe_files import write_recipe
 from tests.support.small_tooth import camera_at, dentin_shape, recipe, whole_view
 
 WEIGHTS = (0.4, 0.2)

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from services.core.errors import DentineError, InputError, MeshError, NonFiniteError, PlatformError
 from services.core.geometry import Mesh
-from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.slab.simulate import Layer, simulate_slab
-from services.fit.transport.engine import Engine
-from services.fit.transport.platform import require_llvm
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View, single_tooth
+from services.slab.simulate import Layer, simulate_slab
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Mouth, Tissue
+from services.transport.platform import require_llvm
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces, View, single_tooth
 from tests.support.small_mouth import MOUTH, mouth_recipe, wall
 from tests.support.small_tooth import LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, recipe, whole_view
 
@@ -45,7 +45,7 @@ def engine() -> Engine:
 @pytest.fixture
 def no_kernel(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
     """Make the test fail if a walk is traced."""
-    from services.fit.transport.paths.walk import Walk
+    from services.transport.paths.walk import Walk
 
     def refuse(*_: Any) -> None:
         raise AssertionError("a kernel ran")
@@ -225,7 +225,7 @@ def test_an_unusable_libllvm_ends_with_a_sentence(tmp_path: Path, before: str, s
     library = tmp_path / "libLLVM.so"
     library.touch()
     script = (
-        f"{before}; from services.fit.transport.engine import Engine; from tests.support.small_tooth import recipe;"
+        f"{before}; from services.transport.engine import Engine; from tests.support.small_tooth import recipe;"
         " Engine(recipe())"
     )
     root = Path(__file__).resolve().parents[2]
@@ -292,7 +292,7 @@ def test_slabs_that_make_no_sense_are_refused(no_kernel: None) -> None:
 def test_a_result_that_is_not_finite_raises_with_its_pixels(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, wrong: float, derivative: bool
 ) -> None:
-    from services.fit.transport.paths.tally import Tally
+    from services.transport.paths.tally import Tally
 
     view, broken = whole_view(camera_at((0, 1, 0))), [5, 11, 40, 63]
     honest = Tally.arrays

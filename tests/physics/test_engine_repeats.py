@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from services.core.records import Boundary
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
+from services.transport.engine import Engine
+from services.transport.scene.recipe import View
 from tests.support.render_once import NAMES, TISSUE, Picture, picture, render_into
 from tests.support.small_tooth import camera_at, recipe, whole_view
 from tests.support.stained_tooth import stained_recipe

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from services.bench.transport.skip import Case, cases, kernel_operations
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.slab.simulate import Layer, accumulate
-from services.fit.transport.engine import Engine
+from services.slab.simulate import Layer, accumulate
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
 from tests.support.small_tooth import LIGHTS_MM, camera_at, recipe, whole_view
 
 NAMES = ("enamel.sigma", "dentin.alpha", "shape.1")
@@ -111,5 +111,5 @@ def slab_operations(**options: Any) -> int:
 def test_a_slab_pays_only_for_what_is_asked_of_it(feature: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = slab_operations(**SLAB_FEATURES[feature])
     # The kernel without these features must not even construct the class ``Exits``.
-    monkeypatch.delattr("services.fit.transport.paths.walk.Exits")
+    monkeypatch.delattr("services.transport.paths.walk.Exits")
     assert slab_operations() < asked

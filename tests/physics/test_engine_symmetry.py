@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
 from services.core.records import Boundary
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import single_tooth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import single_tooth
 from tests.support.small_tooth import CAMERA_DISTANCE_MM, camera_at, recipe, sphere, whole_view
 from tests.support.z_scores import LARGEST_Z
 

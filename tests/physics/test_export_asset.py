@@ -14,19 +14,19 @@ import pytest
 
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
+from services.assets.asset import tissue_of, write_asset
+from services.assets.mitsuba.scene import load_scene, nested_scene, sensor_dict, with_square_pixels
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Tooth
 from services.core.records import Boundary
 from services.core.results import Estimate, FitReport
-from services.fit.export.asset import tissue_of, write_asset
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict, with_square_pixels
-from services.fit.inputs.stain_uv import ToothStains, stain_layout
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.stain_paint import painted_depth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.transport.platform import prepare_device
+from services.transport.scene.recipe import View, single_tooth
+from services.transport.scene.stain_uv import ToothStains, stain_layout
 
 TISSUE = Tissue(Medium(2.5, 0.97, 0.9, 0.6, -0.1), Medium(6.0, 0.93, 1.0, 0.5, 0.0))
 """Tissue with paths of some tens of scattering events, so that the comparison takes seconds."""

@@ -14,14 +14,14 @@ import pytest
 from scipy import stats
 
 from services.anatomy.dentin_shape import DentinShape
+from services.assets.mitsuba.scene import load_scene, nested_scene
 from services.bench.transport.gradient import our_gradient
 from services.bench.transport.gradient_rows import of_parts
 from services.bench.transport.stock_gradient import StockGradient
 from services.core.files.meshes import write_mesh
-from services.fit.export.mitsuba_scene import load_scene, nested_scene
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import single_tooth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import single_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
 TISSUE = Tissue(Medium(1.5, 0.9, 0.7, 0.6, -0.3), Medium(0.7, 0.7, g1=0.5))

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from services.core.errors import InputError
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
 from tests.support.small_tooth import LIGHTS_MM, camera_at, recipe, whole_view
 
 TISSUE = Tissue(Medium(2, 0.95, 0.8, 0.6, -0.3), Medium(3, 0.8, 0.7, 0.6, -0.3), (0.5, 0.4))
@@ -175,7 +175,7 @@ def test_a_dark_image_is_as_sure_as_it_gets(engine: Engine) -> None:
 def test_what_cannot_be_reached_is_refused(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any], named: tuple[str, ...]
 ) -> None:
-    from services.fit.transport.paths.walk import Walk
+    from services.transport.paths.walk import Walk
 
     monkeypatch.setattr(Walk, "run", lambda *_: pytest.fail("a kernel was started"))
     for call in (

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from services.anatomy.dentin_shape import DentinShape
+from services.assets.mitsuba.scene import load_scene, nested_scene, render_batches
 from services.core.files.meshes import read_teeth, write_mesh
 from services.core.records import Boundary, FolderCapture
 from services.core.store import read_record
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import single_tooth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.platform import prepare_device
+from services.transport.scene.recipe import single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.shared_data import shared_path
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
@@ -36,7 +36,7 @@ TISSUE = Tissue(Medium(1.5, 0.95, 0.8, 0.6, -0.3), Medium(4.0, 0.85, 1.0, 0.5))
 def test_the_small_tooth_looks_as_in_mitsuba(boundary: Boundary, size: int, tmp_path: Path) -> None:
     prepare_device()
     # The thin boundary's plug-in shares no code with the engine.
-    importlib.import_module("services.fit.export.shipped.thin_boundary").register()
+    importlib.import_module("services.assets.mitsuba.shipped.thin_boundary").register()
     outer, shape = ellipsoid(SEMI_AXES_MM), dentin_shape()
     core = shape.vertices_mm((0.5, 0.4))
     dentin = DentinShape.known(type(outer)(core, outer.faces))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.assets.mitsuba.scene import load_scene, nested_scene
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.fit.export.mitsuba_scene import load_scene, nested_scene
 from tests.physics.test_integrator import CAMERA, CORE, LAMP, OUTER, TISSUE, properties, sentence, write_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at
 

@@ -17,15 +17,15 @@ import pytest
 from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
+from services.assets.mitsuba.scene import load_scene, nested_scene, sensor_dict
 from services.core.errors import DentineError, InputError, MeshError, PlatformError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
 from services.core.records import Boundary
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, sensor_dict
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import single_tooth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.platform import prepare_device
+from services.transport.scene.recipe import single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
@@ -56,7 +56,7 @@ def table(height_mm: float, reflectance: float | SceneDict) -> SceneDict:
 def write_tooth(folder: Path) -> Path:
     """Write the small tooth's two surfaces into a folder, and register the plug-in."""
     prepare_device()
-    from services.fit.plugin.integrator import register_integrator
+    from services.transport.plugin.integrator import register_integrator
 
     register_integrator()
     write_mesh(folder / "outer.ply", OUTER)
@@ -87,7 +87,7 @@ def properties(*tissues: Tissue, **others: Any) -> SceneDict:
     """Description of the integrator for tissues of one or three channels, with matched boundaries unless ``others``
     says otherwise.
     """
-    from services.fit.plugin.integrator import medium_properties
+    from services.transport.plugin.integrator import medium_properties
 
     media = {
         k: v
@@ -187,7 +187,7 @@ def test_without_a_tooth_in_sight_it_is_a_path_tracer(tooth: Path) -> None:
 
 def test_each_colour_has_its_own_media(tooth: Path) -> None:
     # Compare each channel to the engine, which renders one channel at a time.
-    from services.fit.plugin.integrator import register_integrator
+    from services.transport.plugin.integrator import register_integrator
 
     tissues = (
         TISSUE,
@@ -296,7 +296,7 @@ def sentence(problem: BaseException) -> str:
 def test_impossible_properties_are_refused(tooth: Path, given: SceneDict, words: str) -> None:
     import mitsuba as mi
 
-    from services.fit.plugin.integrator import read_properties
+    from services.transport.plugin.integrator import read_properties
 
     wrong = {name: value for name, value in (properties() | given).items() if name != "type"}
     with pytest.raises(InputError) as refused:
@@ -332,7 +332,7 @@ def test_impossible_scenes_are_refused(tooth: Path, tmp_path: Path) -> None:
 
 
 def test_a_variant_without_arrays_is_refused(tooth: Path) -> None:
-    from services.fit.plugin.integrator import register_integrator
+    from services.transport.plugin.integrator import register_integrator
 
     with variant("scalar_rgb"), pytest.raises(PlatformError, match="not scalar_rgb"):
         register_integrator()
@@ -385,8 +385,8 @@ def test_the_gallery_shows_a_tooth_on_a_table(tooth: Path, tmp_path: Path) -> No
 def test_the_gallery_renders_a_scene_of_ones_own(
     tooth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    from services.assets.mitsuba.scene_xml import write_scene
     from services.bench.figures.gallery import main
-    from services.fit.export.scene_xml import write_scene
 
     scene = tmp_path / "scene.xml"
     write_scene(scene, scene_dict(tooth))

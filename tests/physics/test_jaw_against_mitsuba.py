@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
-from services.fit.transport.engine import Engine
-from services.fit.transport.platform import prepare_device
+from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.jaw import JawSurfaces, jaw_surfaces, known_mouth
 from services.phantom.render import render_engine, render_mitsuba
+from services.transport.engine import Engine
+from services.transport.platform import prepare_device
 from tests.support.pictures import pixel_scores, require_same_pictures
 from tests.support.shared_data import shared_path
 

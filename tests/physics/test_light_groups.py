@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.transport.platform import prepare_device
 from services.phantom.dome_rig import dome_lights
+from services.transport.platform import prepare_device
 
 POINT_MM = (1.0, -2.0, 3.0)
 AHEAD = np.array([0.6, 0.0, 0.8])
@@ -25,7 +25,7 @@ def test_a_light_is_chosen_as_often_as_it_is_bright(lights: int) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.fit.transport.lighting.light_groups import LightGroups
+    from services.transport.lighting.light_groups import LightGroups
 
     rig = dome_lights(lights, ("green",), seed=1)
     positions, intensities = (
@@ -62,7 +62,7 @@ def test_no_light_of_no_brightness_is_chosen() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.fit.transport.lighting.light_groups import LightGroups
+    from services.transport.lighting.light_groups import LightGroups
 
     # Seven lights fill three groups and leave two places empty; lights at negative x have zero importance.
     positions = np.array([light.position_mm for light in dome_lights(7, ("green",), seed=1)])

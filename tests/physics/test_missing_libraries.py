@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 SENTENCE = "The renderer needs libatomib.so.1, which this machine lacks; install the package of libatomib.so.1."
 ENTRIES = {
-    "check": ["-m", "services.fit.transport.platform"],
+    "check": ["-m", "services.transport.platform"],
     "phantom": ["-m", "services", "phantom", "--out", "mouth", "--samples", "16"],
     "slab": ["-m", "services", "simulate", "slab", "--alpha", "0.9", "--sigma", "1", "--width", "1"],
 }
@@ -50,7 +50,7 @@ def test_a_missing_library_is_told_as_one_sentence(entry: str, packages: Path, t
 
 def test_the_package_of_the_library_that_a_bare_debian_lacks_is_named(packages: Path, tmp_path: Path) -> None:
     code = """
-import services.fit.transport.platform as platform
+import services.transport.platform as platform
 platform.PACKAGES = {"libatomib.so.1": platform.PACKAGES["libatomic.so.1"]}
 platform.prepare_device()
 """

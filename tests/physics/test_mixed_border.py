@@ -17,17 +17,17 @@ from scipy import stats
 
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.distance import SurfaceDistance
+from services.assets.mitsuba.scene import load_scene, nested_scene, render_batches
 from services.core.errors import InputError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.phase_table import PhaseTable
-from services.fit.transport.engine import Engine
-from services.fit.transport.paths.scores import Scores
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.mixed_border import MixedBorder
-from services.fit.transport.scene.recipe import single_tooth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.optics.phase_table import PhaseTable
+from services.transport.paths.scores import Scores
+from services.transport.platform import prepare_device
+from services.transport.scene.mixed_border import MixedBorder
+from services.transport.scene.recipe import single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_mouth import MOUTH, mouth_recipe
 from tests.support.small_tooth import (

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.assets.mitsuba.scene import load_scene, render_batches
 from services.core.records import Boundary
-from services.fit.export.mitsuba_scene import load_scene, render_batches
-from services.fit.transport.engine import Engine
-from services.fit.transport.lighting.mouth_maps import MouthMaps
-from services.fit.transport.platform import prepare_device
+from services.transport.engine import Engine
+from services.transport.lighting.mouth_maps import MouthMaps
+from services.transport.platform import prepare_device
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_mouth import LIGHTS_MM, MOUTH, mouth_recipe, stock_mouth
 from tests.support.small_tooth import camera_at, whole_view
@@ -32,7 +32,7 @@ from tests.support.small_tooth import camera_at, whole_view
 def test_the_small_mouth_looks_as_in_mitsuba(boundary: Boundary, size: int, tmp_path: Path) -> None:
     prepare_device()
     # The thin boundary's plug-in shares no code with the engine.
-    importlib.import_module("services.fit.export.shipped.thin_boundary").register()
+    importlib.import_module("services.assets.mitsuba.shipped.thin_boundary").register()
     camera = camera_at((0.1, 1, 0.2), size=size, span_mm=15.0)
     ours = Engine(mouth_recipe(boundary)).images(MOUTH, whole_view(camera), samples=2048, seed=61, batches=BATCHES)
     scores = []
@@ -51,7 +51,7 @@ def test_coarser_tables_of_larger_scenes_change_the_noise_alone(monkeypatch: pyt
     view = whole_view(camera_at((0.1, 1, 0.2), size=12, span_mm=15.0))
     fine = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=5, batches=BATCHES)
     monkeypatch.setattr(MouthMaps, "MAX_BYTES", 2**14)
-    monkeypatch.setattr("services.fit.transport.scene.clearance.MAX_CELLS", 2000)
+    monkeypatch.setattr("services.transport.scene.clearance.MAX_CELLS", 2000)
     coarse = Engine(mouth_recipe("thin")).images(MOUTH, view, samples=1024, seed=6, batches=BATCHES)
     # Pixels are independent of each other, but the two lights of a pixel are not.
     spread = np.sqrt(sum(image.variance.sum(axis=1) for image in (fine, coarse)))

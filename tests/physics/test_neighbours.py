@@ -12,12 +12,12 @@ import pytest
 
 from services.core.errors import InputError
 from services.core.records import Boundary
-from services.fit.execution.blocks import read_recipe, write_recipe
-from services.fit.optics.domain import similar_tissue
-from services.fit.optics.parameters import MEDIUM_FIELDS, Mouth
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.names import parameter_names
-from services.fit.transport.scene.recipe import SceneRecipe
+from services.fit.coordinates.domain import similar_tissue
+from services.transport.engine import Engine
+from services.transport.optics.parameters import MEDIUM_FIELDS, Mouth
+from services.transport.scene.names import parameter_names
+from services.transport.scene.recipe import SceneRecipe
+from services.transport.scene.recipe_files import read_recipe, write_recipe
 from tests.support.small_mouth import MOUTH, mouth_recipe
 from tests.support.small_tooth import camera_at, whole_view
 

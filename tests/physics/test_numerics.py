@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.execution.numerics import NUMERICS, numerics_name
+from services.transport.numerics import NUMERICS, numerics_name
 from tests.support.golden_numerics import STORED, fit_results, renders
 
-REMEDY = (
-    "if that is meant, raise services.fit.execution.numerics.NUMERICS and run python -m tests.support.golden_numerics"
-)
+REMEDY = "if that is meant, raise services.transport.numerics.NUMERICS and run python -m tests.support.golden_numerics"
 RENDER_TOLERANCE = 1e-3
 """Tolerance of rendered values as a fraction of the largest one. The number of threads alone changes an image by 1e-5
 and a derivative by 1e-4 of its norm (test_engine_repeats); other random numbers change most values by a tenth."""

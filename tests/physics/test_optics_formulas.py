@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.optics.parameters import Medium
-from services.fit.transport.platform import prepare_device
+from services.transport.optics.parameters import Medium
+from services.transport.platform import prepare_device
 from tests.support.z_scores import LARGEST_Z
 
 G = np.array(
@@ -50,7 +50,7 @@ def density64(g: NDArray[np.float64], m: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def test_phase_function_values() -> None:
-    from services.fit.optics import phase
+    from services.transport.optics import phase
 
     g, m = G[:, None], deviations()[None, :]
     # The formula has a dozen roundings, one of them to the power 3/2.
@@ -60,7 +60,7 @@ def test_phase_function_values() -> None:
 
 
 def test_phase_function_derivatives() -> None:
-    from services.fit.optics import phase
+    from services.transport.optics import phase
 
     g, m = G.astype(np.float64)[:, None], deviations().astype(np.float64)[None, :]
     a, sign = np.abs(g), np.where(g < 0, -1.0, 1.0)
@@ -81,7 +81,7 @@ def test_phase_function_derivatives() -> None:
 
 
 def test_phase_functions_integrate_to_one() -> None:
-    from services.fit.optics import phase
+    from services.transport.optics import phase
 
     # Integrate by Gauss-Legendre quadrature on panels that shrink towards the peak of the narrowest lobe.
     nodes, weights = np.polynomial.legendre.leggauss(8)
@@ -93,7 +93,7 @@ def test_phase_functions_integrate_to_one() -> None:
 
 
 def test_sampled_deviations_invert_the_distribution() -> None:
-    from services.fit.optics import phase
+    from services.transport.optics import phase
 
     u = np.concatenate([np.linspace(0, 1, 401)[:-1], 1 - np.logspace(-7, -2, 60), np.logspace(-9, -2, 60)]).astype(
         np.float32
@@ -113,7 +113,7 @@ def test_sampled_directions_have_the_right_moments() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.fit.optics import phase
+    from services.transport.optics import phase
 
     count = 1 << 18
     for number, g in enumerate(G):
@@ -136,7 +136,7 @@ def test_sampled_directions_have_the_right_moments() -> None:
 
 
 def test_nearly_parallel_directions_stay_apart() -> None:
-    from services.fit.optics import phase
+    from services.transport.optics import phase
 
     angle = np.logspace(-6, np.log10(3.1), 300)
     along, side = np.array([0.6, 0.0, 0.8]), np.array([0.8, 0.0, -0.6])
@@ -158,7 +158,7 @@ def direction_deviation(
 
 @pytest.mark.parametrize("eta", [1.0001, 1.33, 1.5, 1.631, 4.0, 1 / 1.33, 1 / 1.631, 0.25])
 def test_fresnel_reflectance(eta: float) -> None:
-    from services.fit.optics import fresnel
+    from services.transport.optics import fresnel
 
     cosine = np.concatenate([np.logspace(-4, -1, 200), np.linspace(0.1, 1, 500)]).astype(np.float32)
     c, n = cosine.astype(np.float64), np.float64(np.float32(eta))
@@ -180,7 +180,7 @@ def fresnel_at_normal(values: NDArray[np.float64], cosine: NDArray[np.float32]) 
 
 
 def test_free_flight_functions_do_not_cancel() -> None:
-    from services.fit.optics.free_flight import minus_log1m, one_minus_exp
+    from services.transport.optics.free_flight import minus_log1m, one_minus_exp
 
     depth = np.concatenate([[0.0], np.logspace(-20, 2, 600)]).astype(np.float32)
     np.testing.assert_allclose(kernel(one_minus_exp, depth), -np.expm1(-np.float64(depth)), rtol=2e-6)
@@ -191,7 +191,7 @@ def test_free_flight_functions_do_not_cancel() -> None:
 def test_albedos_near_one_keep_their_absorption() -> None:
     import drjit as dr
 
-    from services.fit.transport.scene.media import Media
+    from services.transport.scene.media import Media
 
     # Compute alpha^k as the walk does, for numbers of scattering events k up to where the absorption shows.
     for absorbed in (1e-7, 1e-6, 1e-4, 0.01, 0.5, 0.9):

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from services.anatomy.dentin_shape import DentinShape
+from services.assets.mitsuba.scene import load_scene, nested_scene, render_batches
 from services.core.errors import InputError
 from services.core.files.meshes import write_mesh
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.phase_table import PhaseTable, tent_weights
-from services.fit.slab.simulate import Layer, simulate_slab
-from services.fit.transport.engine import Engine
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.recipe import single_tooth
+from services.slab.simulate import Layer, simulate_slab
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.optics.phase_table import PhaseTable, tent_weights
+from services.transport.platform import prepare_device
+from services.transport.scene.recipe import single_tooth
 from tests.support.exit_tables import angular_cases
 from tests.support.phase_tables import (
     TENT_SPACING_RAD,
@@ -98,7 +98,7 @@ def test_a_dictionary_of_tents_adds_up() -> None:
 def test_values_in_a_kernel(name: str) -> None:
     import mitsuba as mi
 
-    from services.fit.transport.scene.tables import PhaseTables
+    from services.transport.scene.tables import PhaseTables
 
     table = TABLES[name]
     rng = np.random.default_rng(5)
@@ -121,7 +121,7 @@ def test_values_in_a_kernel(name: str) -> None:
 def test_nodes_closer_than_single_precision_stay_finite() -> None:
     import mitsuba as mi
 
-    from services.fit.transport.scene.tables import PhaseTables
+    from services.transport.scene.tables import PhaseTables
 
     kernel = PhaseTables([PhaseTable((0.0, math.pi / 2 - 1e-9, math.pi / 2 + 1e-9, math.pi), (1.0, 2.0, 2.0, 1.0))])
     sideways = kernel.density(mi.UInt32(1), mi.Vector3f(0, 0, 1), mi.Vector3f(1, 0, 0))
@@ -133,7 +133,7 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.fit.transport.scene.tables import PhaseTables
+    from services.transport.scene.tables import PhaseTables
 
     table = TABLES[name]
     rng = mi.PCG32(SAMPLES, initstate=3)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from services.anatomy.dentin_shape import DentinShape
-from services.fit.execution.blocks import Block, BlockInstrument
-from services.fit.inputs.slopes import image_slopes, motions_of
-from services.fit.inputs.view_stack import ViewStack
-from services.fit.instrument.photographs import error_derivatives, photographed, placed, slope_noise
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View, single_tooth
+from services.fit.measurements.blocks import Block, BlockInstrument
+from services.fit.measurements.instrument.photographs import error_derivatives, photographed, placed, slope_noise
+from services.fit.measurements.slopes import image_slopes, motions_of
+from services.fit.measurements.view_stack import ViewStack
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import View, single_tooth
 from tests.support.prepared import SIZE, camera, sphere
 
 TISSUE = Tissue(Medium(3.0, 0.99, g1=0.3), Medium(6.0, 0.97, g1=0.3))

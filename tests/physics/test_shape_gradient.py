@@ -19,10 +19,10 @@ from scipy import stats
 from services.anatomy.dentin_shape import DentinShape
 from services.core.errors import InputError
 from services.core.records import Boundary
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.optics.phase_table import PhaseTable
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.optics.phase_table import PhaseTable
+from services.transport.scene.recipe import View
 from tests.support.small_mouth import FREE_MM, LIGHTS_MM, MOUTH, mouth_recipe, revolved
 from tests.support.small_tooth import camera_at, recipe, whole_view
 

@@ -9,11 +9,11 @@ import math
 import numpy as np
 import pytest
 
-from services.fit.slab.images import Measurements
-from services.fit.slab.model.dictionary import KNOTS, henyey_greenstein, mixture
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.single import single_scattering
-from services.fit.slab.solve.projected_descent import DescentOptions, descend, image_weights, projected, weight_gradient
+from services.slab.images import Measurements
+from services.slab.model.dictionary import KNOTS, henyey_greenstein, mixture
+from services.slab.model.forward import render
+from services.slab.model.single import single_scattering
+from services.slab.solve.projected_descent import DescentOptions, descend, image_weights, projected, weight_gradient
 from tests.support.small_slab import small_rig
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.slab.simulate import Layer, SlabResult, simulate_slab
+from services.slab.simulate import Layer, SlabResult, simulate_slab
 from tests.support.exit_tables import ExitCase, angular_cases, half_space_cases, ring_case
 from tests.support.slab_tables import fewer_lanes
 from tests.support.z_scores import LARGEST_Z, require_unbiased

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.simulate import Layer, Sums
+from services.slab.simulate import Layer, Sums
 from tests.support.slab_tables import SOURCES, SlabCase, fewer_lanes, is_costly, simulate, total_cases
 from tests.support.z_scores import require_unbiased, z_scores
 

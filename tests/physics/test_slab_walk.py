@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from services.core.slab.folder import Light
-from services.fit.slab.model.dictionary import KNOTS, Material, henyey_greenstein
-from services.fit.slab.model.forward import Block, render, run_block
-from services.fit.slab.model.interface import Interface, fresnel
-from services.fit.slab.model.single import single_scattering
-from services.fit.slab.solve.normal import derivative_rows
+from services.slab.model.dictionary import KNOTS, Material, henyey_greenstein
+from services.slab.model.forward import Block, render, run_block
+from services.slab.model.interface import Interface, fresnel
+from services.slab.model.single import single_scattering
+from services.slab.solve.normal import derivative_rows
 from tests.support.shared_data import shared_path
 from tests.support.small_slab import small_rig
 from tests.support.z_scores import require_unbiased, student_to_normal

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from services.core.slab.folder import Cell, Glass
-from services.fit.slab.model.interface import Interface
-from services.fit.slab.sphere.instrument import expected
-from services.fit.slab.sphere.invert import interface_of
-from services.fit.slab.sphere.records import Sphere, SphereFile, TotalsReading
-from services.fit.slab.sphere.totals import Optics, Totals, slab_totals
+from services.slab.model.interface import Interface
+from services.slab.sphere.instrument import expected
+from services.slab.sphere.invert import interface_of
+from services.slab.sphere.records import Sphere, SphereFile, TotalsReading
+from services.slab.sphere.totals import Optics, Totals, slab_totals
 from tests.support.slab_tables import total_cases
 
 GLASS = Cell(width_mm=1, index=1.34, glass=Glass(index=1.5, thickness_mm=1))

@@ -18,14 +18,14 @@ from services.bench.stability.formula_errors import FORMULAS
 from services.bench.stability.run import WHITE, as_table, formula_rows, stress_plan, trace, walk_rows
 from services.core.errors import InputError, MeshError
 from services.core.geometry import Mesh
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.slab.simulate import Layer, simulate_slab, specular_share
-from services.fit.transport.engine import Engine
-from services.fit.transport.lighting.lights import DARKEST_CHANCE, ShadowRay
-from services.fit.transport.paths.connections import Connections, LookupCheck
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.nesting import winding_number
-from services.fit.transport.scene.recipe import SceneRecipe, single_tooth
+from services.slab.simulate import Layer, simulate_slab, specular_share
+from services.transport.engine import Engine
+from services.transport.lighting.lights import DARKEST_CHANCE, ShadowRay
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.paths.connections import Connections, LookupCheck
+from services.transport.platform import prepare_device
+from services.transport.scene.nesting import winding_number
+from services.transport.scene.recipe import SceneRecipe, single_tooth
 from tests.support.slab_tables import total_cases
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, whole_view
 from tests.support.z_scores import LARGEST_Z, require_unbiased, z_scores
@@ -95,10 +95,10 @@ def test_the_walk_holds_in_every_corner(corners: Corners) -> None:
 
 @pytest.mark.parametrize("boundary", [MATCHED, THIN, SMOOTH])
 def test_a_lane_is_the_walk_that_a_slab_of_its_own_takes(corners: Corners, boundary: int) -> None:
-    from services.fit.transport.paths.starts import SlabStart
-    from services.fit.transport.paths.walk import Walk
-    from services.fit.transport.scene.geometry import SlabGeometry
-    from services.fit.transport.scene.media import Media
+    from services.transport.paths.starts import SlabStart
+    from services.transport.paths.walk import Walk
+    from services.transport.scene.geometry import SlabGeometry
+    from services.transport.scene.media import Media
 
     lanes = trace(corners, paths=4, most_steps=STEPS, seed=5)
     brightest = (
@@ -172,7 +172,7 @@ def test_slivers_leave_the_surface_where_it_was() -> None:
 
 
 def test_sets_out_of_range_are_refused(corners: Corners, monkeypatch: pytest.MonkeyPatch) -> None:
-    from services.fit.transport.paths.walk import Walk
+    from services.transport.paths.walk import Walk
 
     monkeypatch.setattr(Walk, "run", lambda *_: pytest.fail("a kernel ran"))
     wrong = {
@@ -196,9 +196,9 @@ def test_black_layers_end_and_tell_what_albedo_would_bring() -> None:
     # Between two media without scattering, the border's secondary walk has no direction and must end at once.
     import mitsuba as mi
 
-    from services.fit.transport.gradients.border import BorderScattering, no_crossing
-    from services.fit.transport.scene.geometry import SlabGeometry
-    from services.fit.transport.scene.media import Media
+    from services.transport.scene.border import BorderScattering, no_crossing
+    from services.transport.scene.geometry import SlabGeometry
+    from services.transport.scene.media import Media
 
     crossing = no_crossing(1)
     crossing.before, crossing.after = mi.UInt32(1), mi.UInt32(2)
@@ -246,7 +246,7 @@ def test_dentin_has_room_inside_enamel() -> None:
 def test_light_does_not_scatter_where_no_surface_is_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     # Coincident surfaces hide one another. A path outside that counts as inside must not scatter in endless enamel,
     # which would be 100 times too bright.
-    monkeypatch.setattr("services.fit.transport.scene.mesh_geometry.require_nested", lambda *_: None)
+    monkeypatch.setattr("services.transport.scene.mesh_geometry.require_nested", lambda *_: None)
     outer = ellipsoid(np.array([3.0, 2.0, 4.0]))
     known = DentinShape.known(outer)
     enamel, dentin, view = Medium(3, 0.99, g1=0.8), Medium(8, 0.98, g1=0.7), whole_view(camera_at((0, 1, 0)))

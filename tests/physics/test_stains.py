@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from services.anatomy.dentin_shape import DentinShape
+from services.assets.mitsuba.scene import load_scene, nested_scene, render_batches
 from services.core.errors import InputError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
 from services.core.records import Boundary
-from services.fit.export.mitsuba_scene import load_scene, nested_scene, render_batches
-from services.fit.optics.parameters import Medium, Stain, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.platform import prepare_device
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Stain, Tissue
+from services.transport.platform import prepare_device
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, camera_at, recipe, whole_view
 from tests.support.stained_tooth import WIDTH, stain, stained_recipe, texture_coordinates

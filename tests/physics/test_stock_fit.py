@@ -11,8 +11,8 @@ import pytest
 from services.bench.fits.stock_fit import StockFit
 from services.bench.fits.tooth_capture import prepared_tooth
 from services.core.records import JobSpec
-from services.fit.optics.parameters import Medium, Tissue
 from services.phantom.tooth import write_phantom
+from services.transport.optics.parameters import Medium, Tissue
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 from services.bench.figures.surroundings import environment_light, read_environment, render_under
 from services.core.errors import InputError
 from services.core.geometry import Mesh
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.platform import prepare_device
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.platform import prepare_device
 from tests.support.small_tooth import SEMI_AXES_MM, camera_at, ellipsoid
 
 TISSUE = Tissue(Medium(3.0, 0.999999), Medium(9.0, 0.999999))

@@ -16,7 +16,7 @@ import sqlalchemy as sql
 
 from services.api.app import create_app
 from services.api.jobs.jobs import Jobs
-from services.api.jobs.lifecycle import JobState
+from services.api.tables.lifecycle import JobState
 from services.core.errors import JobCancelledError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings

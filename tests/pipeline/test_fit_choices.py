@@ -11,8 +11,8 @@ import pytest
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
-from services.fit.execution.journal import read_entries
 from services.fit.stage import run
+from services.tasks.journal import read_entries
 from tests.support.prepared import FAKE, TRUTH, write_prepared
 
 QUANTITIES = [(part, leaf) for part in ("enamel", "dentin") for leaf in ("sigma_s_reduced", "alpha_reduced")]

@@ -11,15 +11,16 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from services.assets.stage import export
 from services.core.calibration.uncertainty import TWIST
 from services.core.records import JobSpec
 from services.core.results import Estimate, FitReport, PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import MANIFEST, open_stage
-from services.fit.inputs.observations import Observations, read_channel
-from services.fit.inputs.view_stack import ViewStack
+from services.fit.measurements.observations import Observations, read_channel
+from services.fit.measurements.view_stack import ViewStack
 from services.fit.solve.covariance import Uncertainty, uncertainty
-from services.fit.stage import export, run
+from services.fit.stage import run
 from tests.support.prepared import TRUTH, write_prepared
 
 ENGINE = "tests.support.fake_engine:QuietFakeEngine"
@@ -56,7 +57,7 @@ def fit(
         light = np.array(gains)[:, None]
         return tuple(replace(v, reference=v.reference * light + flare * v.reference.max()) for v in views)
 
-    with patch("services.fit.tooth.driver.read_channel", photographed):
+    with patch("services.fit.stages.tooth.driver.read_channel", photographed):
         return run(JobSpec.model_validate(OPTIONS | {"capture": root} | options), LocalContext(root), engine=ENGINE)
 
 
@@ -146,7 +147,7 @@ def test_photographs_that_were_exchanged_are_named(tmp_path: Path) -> None:
         order = [2, 1, 0, 3, 4, 5]
         return first, replace(second, reference=second.reference[order], variance=second.variance[order])
 
-    with patch("services.fit.tooth.driver.read_channel", exchanged):
+    with patch("services.fit.stages.tooth.driver.read_channel", exchanged):
         spec = JobSpec.model_validate(OPTIONS | {"capture": tmp_path, "max_steps": 2})
         report = run(spec, LocalContext(tmp_path), engine=ENGINE)
     assert "The photographs of camera c1 under lights l0 and l2 seem exchanged" in report.advice
@@ -190,7 +191,7 @@ def test_a_fit_whose_prior_took_it_too_far_looks_again_from_there(tmp_path: Path
         found.append(replace(uncertainty(*args, **named), is_full_step=bool(found)))
         return found[-1]
 
-    with patch("services.fit.execution.channel_fit.uncertainty", cut_at_first):
+    with patch("services.fit.stages.channel_fit.uncertainty", cut_at_first):
         report = fit(tmp_path, gains=(1.02,) * 6)
     stage, _ = open_stage(tmp_path, "fit", FitReport)
     history = json.loads((stage / "history.json").read_text())

@@ -11,16 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.assets.stage import export, fitted_teeth
 from services.core.errors import CaptureInputError, DentineError, InputError, SettingsError
 from services.core.records import JobSpec
 from services.core.results import FitReport, PreparedManifest
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
-from services.fit.checks.thickness import enamel_thickness_mm
-from services.fit.jaw.schedule import TIED_SD
-from services.fit.optics.priors import SHAPE
-from services.fit.stage import ENGINE, export, fitted_teeth, run
-from services.fit.transport.platform import prepare_device
+from services.fit.coordinates.priors import SHAPE
+from services.fit.stage import ENGINE, run
+from services.fit.stages.jaw.schedule import TIED_SD
+from services.transport.platform import prepare_device
+from services.transport.thickness import enamel_thickness_mm
 from tests.support.small_jaw import FDI, TRUE_GUMS, TRUE_REFLECTANCE, TRUE_TEETH, jaw_spec, write_prepared_jaw
 
 FAKE = "tests.support.fake_mouth:FakeMouthEngine"

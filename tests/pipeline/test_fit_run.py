@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.assets.stage import export
 from services.core.errors import CaptureInputError, DentineError, JobCancelledError, MissingStageError, SettingsError
 from services.core.records import JobSpec
 from services.core.results import AssetManifest, FitReport
@@ -17,8 +18,8 @@ from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage
 from services.core.verdict import VERDICT, verdict_of
 from services.fit.checks.identifiability import NOT_EXPLAINED, PARTLY_EXPLAINED
-from services.fit.execution.numerics import NUMERICS, numerics_name
-from services.fit.stage import export, run
+from services.fit.stage import run
+from services.transport.numerics import NUMERICS, numerics_name
 from tests.support.prepared import FAKE, TRUTH, write_prepared
 
 
@@ -225,7 +226,7 @@ def test_a_checkpoint_of_other_numerics_is_not_continued(
     for attempt, (number, told, untold) in enumerate(
         ((NUMERICS, "continues after", "starts anew"), (NUMERICS + 1, "starts anew", "continues after")), start=2
     ):
-        monkeypatch.setattr("services.fit.execution.attempt.numerics_name", lambda number=number: numerics_name(number))
+        monkeypatch.setattr("services.fit.stages.attempt.numerics_name", lambda number=number: numerics_name(number))
         events: list[StageEvent] = []
         fit(tmp_path, attempt=attempt, events=events, max_steps=1)
         assert [event for event in events if told in event.message]

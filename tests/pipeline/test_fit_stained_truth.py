@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from services.anatomy.job_dentin import dentin_shape
+from services.assets.stage import export
 from services.bench.fits.tooth_capture import prepared_tooth, tissue_of
 from services.core.files.meshes import read_mesh
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
-from services.fit.export.stains import read_stains
-from services.fit.inputs.dentin import dentin_shape
-from services.fit.inputs.observations import channel_scene
-from services.fit.inputs.stain_uv import stain_layout, texel_edge_mm
-from services.fit.optics.domain import similar_tissue
-from services.fit.stage import export, run
-from services.fit.tooth.schedule import SIMILAR_G
-from services.fit.transport.engine import Engine
+from services.fit.coordinates.domain import similar_tissue
+from services.fit.measurements.observations import channel_scene
+from services.fit.stage import run
+from services.fit.stages.tooth.schedule import SIMILAR_G
 from services.phantom.stain_paint import TEXEL_MM, painted_depth
 from services.phantom.tooth import write_phantom
 from services.preprocess.stage import run as prepare
+from services.transport.engine import Engine
+from services.transport.scene.stain_uv import read_stains, stain_layout, texel_edge_mm
 
 PIXEL_MM, SEED = 0.8, 4
 MIN_GAIN = 0.2
@@ -50,7 +50,7 @@ def test_each_stage_lowers_the_loss_and_the_texture_is_the_painted_one(tmp_path:
     )  # fmt: skip
     events: list[StageEvent] = []
     prepare(spec, LocalContext(tmp_path))
-    report = run(spec, LocalContext(tmp_path, 1, events.append), engine="services.fit.transport.engine:Engine")
+    report = run(spec, LocalContext(tmp_path, 1, events.append), engine="services.transport.engine:Engine")
     found = read_stains(tmp_path / "fit")
     assert found is not None
 

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.assets.stage import export
 from services.core.files.meshes import read_mesh
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
-from services.fit.execution.journal import read_entries
-from services.fit.export.stains import read_stains
-from services.fit.inputs.stain_uv import StainLayout, stain_layout, texel_edge_mm
-from services.fit.optics.parameters import Tissue
-from services.fit.stage import export, run
-from services.fit.transport.scene.recipe import ToothSurfaces, View, single_tooth
+from services.fit.stage import run
+from services.tasks.journal import read_entries
+from services.transport.optics.parameters import Tissue
+from services.transport.scene.recipe import ToothSurfaces, View, single_tooth
+from services.transport.scene.stain_uv import StainLayout, read_stains, stain_layout, texel_edge_mm
 from tests.support.fake_engine import FakeEngine
 from tests.support.prepared import FAKE, SIZE, TRUTH, camera, sphere, write_prepared
 

@@ -13,16 +13,17 @@ from pathlib import Path
 
 import pytest
 
+from services.assets.stage import export
 from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import MANIFEST
-from services.fit.stage import export, run
-from services.fit.transport.scene.recipe import SceneRecipe
+from services.fit.stage import run
+from services.transport.scene.recipe import SceneRecipe
 from tests.support.fake_mouth import FakeMouthEngine
 from tests.support.small_jaw import FDI, jaw_spec, write_prepared_jaw
 
 FITTED = 11
-ENGINE = "services.fit.transport.engine:Engine"
+ENGINE = "services.transport.engine:Engine"
 FORMULA = f"{__name__}:AmongOthers"
 
 

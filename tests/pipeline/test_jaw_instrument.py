@@ -11,12 +11,13 @@ from unittest.mock import patch
 
 import pytest
 
+from services.assets.stage import export
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext
-from services.fit.inputs.observations import Observations, read_channel
-from services.fit.inputs.view_stack import ViewStack
-from services.fit.stage import export, run
+from services.fit.measurements.observations import Observations, read_channel
+from services.fit.measurements.view_stack import ViewStack
+from services.fit.stage import run
 from tests.support.small_jaw import jaw_spec, write_prepared_jaw
 
 ENGINE = "tests.support.fake_mouth:QuietFakeMouthEngine"
@@ -33,7 +34,7 @@ def brighter(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, JobSpec, F
     def photographed(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
         return tuple(replace(v, reference=GAIN * v.reference) for v in read_channel(observations, channel, spec))
 
-    with patch("services.fit.jaw.driver.read_channel", photographed):
+    with patch("services.fit.stages.jaw.driver.read_channel", photographed):
         return root, spec, run(spec, LocalContext(root), engine=ENGINE)
 
 

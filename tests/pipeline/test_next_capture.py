@@ -20,17 +20,18 @@ from services.fit.checks.next_capture import (
     rotated_camera,
     sentence,
 )
-from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block, write_recipe
-from services.fit.execution.engine_host import InProcessHost
-from services.fit.execution.executors import LocalExecutor
-from services.fit.execution.passes import Passes, StackProblem
-from services.fit.execution.seeds import Seeds
-from services.fit.optics.parameters import Tissue
+from services.fit.measurements.blocks import Block, BlockInstrument, read_block, write_block
+from services.fit.passes.passes import Passes, StackProblem
 from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.estimates import estimates
 from services.fit.solve.information import AddedInformation, covariance_with
-from services.fit.tooth.schedule import media_domain
-from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
+from services.fit.stages.tooth.schedule import media_domain
+from services.tasks.engine_host import InProcessHost
+from services.tasks.executors import LocalExecutor
+from services.tasks.seeds import Seeds
+from services.transport.optics.parameters import Tissue
+from services.transport.scene.recipe import SceneRecipe, View, single_tooth
+from services.transport.scene.recipe_files import read_recipe, write_recipe
 from tests.support.fake_engine import FakeEngine
 from tests.support.prepared import FAKE, SIZE, TRUTH, camera, sphere
 

@@ -24,8 +24,8 @@ from services.core.records import FolderCapture, JobSpec, MaskBit
 from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import read_record
-from services.fit.transport.rays import RayScene, pixel_rays
 from services.preprocess.stage import run
+from services.transport.rays import RayScene, pixel_rays
 
 FDI = (*range(11, 18), *range(21, 28))
 GUMS, CAVITY = len(FDI), len(FDI) + 1

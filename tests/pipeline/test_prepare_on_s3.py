@@ -20,8 +20,8 @@ from services.core.records import JobSpec
 from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import StoredArray, open_stage, require_intact, withdraw
-from services.fit.inputs.levels import LevelReader
-from services.fit.inputs.observations import read_channel, read_observations
+from services.fit.measurements.levels import LevelReader
+from services.fit.measurements.observations import read_channel, read_observations
 from services.preprocess.stage import run
 from services.preprocess.tasks import attempt_files
 from tests.support.folder_captures import prepare, write_folder, write_tree

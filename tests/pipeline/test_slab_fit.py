@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from services.core.slab.folder import SlabFolder, read_folder
-from services.fit.slab.fit import fit_slab, write_results
-from services.fit.slab.model.dictionary import ANGLES_RAD, henyey_greenstein
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.result import SlabFit
+from services.slab.fit import fit_slab, write_results
+from services.slab.model.dictionary import ANGLES_RAD, henyey_greenstein
+from services.slab.model.forward import render
+from services.slab.model.rig import rig_of
+from services.slab.options import SlabOptions
+from services.slab.results.result import SlabFit
 from tests.support.shared_data import shared_path
 from tests.support.small_slab import WAVELENGTH_NM, description
 
@@ -90,7 +90,7 @@ def test_results_are_written_by_wavelength(small_fit: SlabFit, tmp_path: Path) -
 def test_the_command_refuses_a_folder_that_is_none(tmp_path: Path) -> None:
     import typer
 
-    from services.fit.slab.__main__ import main
+    from services.slab.__main__ import main
 
     command = typer.Typer()
     command.command()(main)

@@ -20,18 +20,18 @@ from services.core.results import AssetManifest
 from services.core.settings import job_from_tree
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import open_stage
-from services.fit.execution.engine_host import InProcessHost
-from services.fit.execution.executors import LocalExecutor
-from services.fit.slab.dictionaries.hg import COSINES
-from services.fit.slab.model.dictionary import ANGLES_RAD, hg_values
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.stored import IMAGES, StoredResult, read_result
-from services.fit.slab.results.tabphase import tabphase_values
-from services.fit.slab.schedule import WavelengthTask, run_wavelengths
-from services.fit.slab.solve.checkpoint import Checkpoint
-from services.fit.slab.stage import CHECKPOINT, export, run
-from services.fit.transport.platform import prepare_device
 from services.pipeline.stages import run_job, stages_of
+from services.slab.dictionaries.hg import COSINES
+from services.slab.model.dictionary import ANGLES_RAD, hg_values
+from services.slab.options import SlabOptions
+from services.slab.results.stored import IMAGES, StoredResult, read_result
+from services.slab.results.tabphase import tabphase_values
+from services.slab.schedule import WavelengthTask, run_wavelengths
+from services.slab.solve.checkpoint import Checkpoint
+from services.slab.stage import CHECKPOINT, export, run
+from services.tasks.engine_host import InProcessHost
+from services.tasks.executors import LocalExecutor
+from services.transport.platform import prepare_device
 from tests.support.recording_executor import RecordingExecutor
 from tests.support.small_slab import TRUTHS, made_up_fit, write_cell, write_folder
 
@@ -243,8 +243,8 @@ def test_a_wavelength_is_told_before_the_next_one_is_fitted(
         fit = made_up_fit(wavelength_nm)
         return StoredResult(of="", fit=fit)
 
-    monkeypatch.setattr("services.fit.slab.schedule.fit_wavelength", fit)
-    monkeypatch.setattr("services.fit.slab.results.stored.read_result", stored_result)
+    monkeypatch.setattr("services.slab.schedule.fit_wavelength", fit)
+    monkeypatch.setattr("services.slab.results.stored.read_result", stored_result)
     run(JobSpec(kind="slab", capture=root), Told(tmp_path / "job"))
     assert order == ["fitted 532", "told 532 at 0.5", "fitted 635", "told 635 at 1.0"]
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from services.core.slab.folder import read_folder
-from services.fit.slab.dictionaries.chosen import ChosenDictionary
-from services.fit.slab.fit import fit_images
-from services.fit.slab.images import read_images
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.solve.coordinates import Knots
+from services.slab.dictionaries.chosen import ChosenDictionary
+from services.slab.fit import fit_images
+from services.slab.images import read_images
+from services.slab.options import SlabOptions
+from services.slab.solve.coordinates import Knots
 from tests.support.small_slab import TRUTHS, write_cell
 
 WAVELENGTH_NM = 635.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from services.bench.slab.accuracy import spread_truths
-from services.fit.slab.images import Measurements, shot_noise
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.solve.start import start
+from services.slab.images import Measurements, shot_noise
+from services.slab.model.forward import render
+from services.slab.model.rig import rig_of
+from services.slab.solve.start import start
 
 
 @pytest.mark.parametrize("number", [0, 11], ids=["thin and dim", "thick and dark"])

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from services.bench.slab.cell import near_beam_folder
-from services.fit.slab.images import Measurements, shot_noise
-from services.fit.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.solve.budget import Budget
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import GaussNewton
-from services.fit.slab.solve.start import start
-from services.fit.slab.solve.uncertainty import slopes, uncertainty_of
+from services.slab.images import Measurements, shot_noise
+from services.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.slab.model.forward import render
+from services.slab.model.rig import rig_of
+from services.slab.solve.budget import Budget
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.gauss_newton import GaussNewton
+from services.slab.solve.start import start
+from services.slab.solve.uncertainty import slopes, uncertainty_of
 
 THICKNESS = 6.0
 """Optical thickness sigma_t w, with a width w of 1 mm."""

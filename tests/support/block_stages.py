@@ -12,7 +12,7 @@ from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.stage import CANCEL_FLAG, StageContext
-from services.fit.execution.executors import executor
+from services.tasks.executors import executor
 from tests.support import toy_stages
 
 capture, prepare, export = toy_stages.capture, toy_stages.prepare, toy_stages.export

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE
-from services.fit.slab.sphere.instrument import expected
-from services.fit.slab.sphere.invert import ASSUMED_SE, ASSUMED_UNSCATTERED_SHARE, fit_readings, interface_of
-from services.fit.slab.sphere.records import SphereFile
-from services.fit.slab.sphere.results import SphereFit
-from services.fit.slab.sphere.totals import NODES, Optics, slab_totals
+from services.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE
+from services.slab.sphere.instrument import expected
+from services.slab.sphere.invert import ASSUMED_SE, ASSUMED_UNSCATTERED_SHARE, fit_readings, interface_of
+from services.slab.sphere.records import SphereFile
+from services.slab.sphere.results import SphereFit
+from services.slab.sphere.totals import NODES, Optics, slab_totals
 
 WIDTH_MM = 2.0
 TRUTH_SHARE = 2e-3

@@ -9,16 +9,17 @@ import signal
 from pathlib import Path
 from typing import Any
 
+from services.core.files.content_files import StoredFile
 from services.core.records import JobSpec
 from services.core.results import AssetManifest, CaptureManifest
 from services.core.stage import CANCEL_FLAG, StageContext
 from services.core.store import read_record
-from services.fit.execution.blocks import StoredFile, write_recipe
-from services.fit.execution.engine_host import EngineHost
-from services.fit.execution.executors import executor
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import SceneRecipe
+from services.tasks.engine_host import EngineHost
+from services.tasks.executors import executor
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import SceneRecipe
+from services.transport.scene.recipe_files import write_recipe
 from tests.support import toy_stages
 from tests.support.small_tooth import camera_at, recipe, whole_view
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.slab.simulate import Layer, Sums, accumulate
+from services.slab.simulate import Layer, Sums, accumulate
 from tests.support.slab_tables import rows_of
 from tests.support.z_scores import z_scores
 

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from services.anatomy.blend import MODES
 from services.core.errors import NonFiniteError
-from services.fit.inputs.stain_uv import bilinear_texels
-from services.fit.optics.parameters import Stain, Tissue
 from services.fit.solve.table_search import bin_powers
-from services.fit.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View
+from services.transport.optics.parameters import Stain, Tissue
+from services.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, StainGradient, View
+from services.transport.scene.stain_uv import bilinear_texels
 
 Array = NDArray[np.float64]
 

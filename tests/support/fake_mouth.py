@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.scene.recipe import SceneRecipe, View
+from services.transport.optics.parameters import Mouth, Tissue
+from services.transport.rays import RayScene, pixel_rays
+from services.transport.scene.recipe import SceneRecipe, View
 from tests.support.fake_engine import NOISE, FakeEngine, Slowly
 
 Array = NDArray[np.float64]

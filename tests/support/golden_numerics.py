@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from services.core.records import Boundary, JobSpec
 from services.core.stage import LocalContext
-from services.fit.execution.journal import read_entries
-from services.fit.execution.numerics import NUMERICS
 from services.fit.stage import run
+from services.tasks.journal import read_entries
+from services.transport.numerics import NUMERICS
 from tests.support.prepared import FAKE, write_prepared
 
 STORED = Path(__file__).parents[1] / "data" / "numerics.npz"
@@ -39,7 +39,7 @@ PASSING = frozenset({"begun", "seconds"})
 
 def renders() -> dict[str, NDArray[np.float32]]:
     """Render images and derivatives with the real engine, by boundary and kind."""
-    from services.fit.transport.engine import Engine
+    from services.transport.engine import Engine
     from tests.support.render_once import Picture, picture
     from tests.support.stained_tooth import stained_recipe
 
@@ -93,7 +93,7 @@ def _numbers(value: Any) -> Iterator[float]:
 def main() -> None:
     """Store the results of this tree, unless the file already holds results for this value of ``NUMERICS``."""
     if STORED.exists() and int(np.load(STORED)["numerics"]) >= NUMERICS:
-        sys.exit(f"{STORED} holds numerics {NUMERICS}; raise services.fit.execution.numerics.NUMERICS first.")
+        sys.exit(f"{STORED} holds numerics {NUMERICS}; raise services.transport.numerics.NUMERICS first.")
     np.savez_compressed(STORED, numerics=NUMERICS, **measure())  # type: ignore[arg-type]  # none is called allow_pickle
     print(f"{STORED}: {STORED.stat().st_size} bytes")
 

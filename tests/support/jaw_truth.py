@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light
-from services.fit.optics.parameters import Mouth
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import held_out_lights, write_description, write_images
 from services.phantom.jaw import JawSurfaces, jaw_surfaces, jaw_truth, known_mouth, write_jaw_meshes
+from services.transport.optics.parameters import Mouth
 
 STORED = Path(__file__).resolve().parents[1] / "data" / "truths-jaw" / "subject-1.npz"
 SUBJECT, CHANNEL = 1, "green"
@@ -92,8 +92,8 @@ def by_engine(truth: JawTruth, samples: int) -> JawTruth:
     """Render the same jaw with the project's own engine, for tests of fits to images with less noise than stock Mitsuba
     can render in the same time.
     """
-    from services.fit.transport.engine import Engine
     from services.phantom.render import render_engine
+    from services.transport.engine import Engine
 
     engine = Engine(truth.jaw.recipe(truth.lights, 0, "matched"))
     whole = [(9001 + k, camera, np.ones(camera.size[::-1], dtype=bool)) for k, camera in enumerate(truth.cameras)]

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from services.fit.transport.platform import prepare_device
+from services.transport.platform import prepare_device
 
 
 def leave_out_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the scattering term out of every border derivative for the rest of the test."""
     prepare_device()
-    from services.fit.transport.paths import walk
+    from services.transport.paths import walk
 
     class WithoutScattering(walk.Walk):
         def _start_secondary(self, walker: Any, ended: Any, tally: Any) -> Any:  # noqa: ARG002

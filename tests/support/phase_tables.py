@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.optics.phase_table import PhaseTable
+from services.transport.optics.phase_table import PhaseTable
 
 TENT_SPACING_RAD = math.pi / 199
 

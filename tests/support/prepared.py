@@ -17,8 +17,8 @@ from services.core.geometry import Camera, Light, Mesh
 from services.core.records import MaskBit
 from services.core.results import PreparedManifest
 from services.core.store import StageWriter, create_array
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.scene.recipe import View, single_tooth
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import View, single_tooth
 from tests.support.fake_engine import FakeEngine
 
 FAKE = "tests.support.fake_engine:FakeEngine"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from services.fit.execution.engine_host import InProcessHost
-from services.fit.execution.executors import LocalExecutor
+from services.tasks.engine_host import InProcessHost
+from services.tasks.executors import LocalExecutor
 
 
 class RecordingExecutor(LocalExecutor):

@@ -19,15 +19,15 @@ from scipy.spatial.transform import Rotation
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Camera, Light, Mesh
-from services.fit.checks.evaluate import error_sums
 from services.fit.checks.offset import MAX_OFFSET_MM, Comparison
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import single_tooth
+from services.fit.passes.evaluate import error_sums
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.reflection import reflect
 from services.phantom.render import render_engine
 from services.phantom.subjects import subject_tissues
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import single_tooth
 
 Array = NDArray[np.float64]
 

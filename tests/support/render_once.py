@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import Boundary
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
 from tests.support.small_tooth import camera_at, whole_view
 from tests.support.stained_tooth import stain, stained_recipe
 

@@ -16,9 +16,9 @@ from services.core.geometry import Camera, Light
 from services.core.records import MaskBit
 from services.core.results import PreparedManifest
 from services.core.store import StageWriter, create_array
-from services.fit.optics.parameters import Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import SceneRecipe, single_tooth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Tissue
+from services.transport.scene.recipe import SceneRecipe, single_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, ellipsoid, whole_view
 
 Array = NDArray[np.float64]

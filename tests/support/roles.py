@@ -39,9 +39,9 @@ _WORKER: tuple[str, ...] = (
     "services.cli.raw.register",
     "services.preprocess.stage",
     "services.fit.stage",
-    "services.fit.execution.engine_host",
+    "services.tasks.engine_host",
 )
-_WORKER += ("services.fit.transport.engine", "services.pipeline.worker_setup", "services.pipeline.worker_check")
+_WORKER += ("services.transport.engine", "services.pipeline.worker_setup", "services.pipeline.worker_check")
 
 ROLES: Mapping[str, Role] = {
     "api": Role(("api", "capture"), (*_COMMANDS, "services.cli.serve", "services.cli.token", DOME_AT_THE_SERVER)),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.slab.simulate import Layer, Sums, accumulate
+from services.slab.simulate import Layer, Sums, accumulate
 from tests.support.shared_data import shared_path
 
 SOURCES = ("normal", "diffuse")
@@ -66,7 +66,7 @@ def fewer_lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the passes of a test have a quarter of the walks, for simulations that reach their error in less than the
     usual first pass. The spread of 2048 lanes gives an error to 2 %.
     """
-    monkeypatch.setattr("services.fit.slab.simulate.LANES", 2048)
+    monkeypatch.setattr("services.slab.simulate.LANES", 2048)
 
 
 def passes(count: int) -> Callable[[Sums], float]:

@@ -20,9 +20,9 @@ from services.core.geometry import Camera, Light, Mesh
 from services.core.records import JobSpec, MaskBit
 from services.core.results import PreparedManifest
 from services.core.store import StageWriter, create_array
-from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
+from services.transport.optics.parameters import Medium, Mouth, Tissue
+from services.transport.rays import RayScene, pixel_rays
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 from tests.support.small_mouth import revolved
 from tests.support.small_tooth import camera_at
 

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
+from services.assets.mitsuba.scene import boundary_dict, medium_dict, sensor_dict
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
 from services.core.records import Boundary
-from services.fit.export.mitsuba_scene import boundary_dict, medium_dict, sensor_dict
-from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
+from services.transport.optics.parameters import Medium, Mouth, Tissue
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from tests.support.small_tooth import INTENSITY
 
 AROUND, ALONG = 48, 24

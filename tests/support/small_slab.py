@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from services.core.slab.folder import SlabFolder
-from services.fit.slab.model.dictionary import henyey_greenstein
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import Rig, rig_of
-from services.fit.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
+from services.slab.model.dictionary import henyey_greenstein
+from services.slab.model.forward import render
+from services.slab.model.rig import Rig, rig_of
+from services.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
 
 WAVELENGTH_NM = 532.0
 TRUTHS = {532.0: (1.2, 0.6), 635.0: (0.8, 0.4)}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera, Mesh
 from services.core.records import Boundary
-from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
+from services.transport.scene.recipe import SceneRecipe, View, single_tooth
 
 SEMI_AXES_MM = np.array([3.0, 2.0, 4.0])
 LIGHTS_MM = np.array([[100, 600, 50], [500, 300, 100], [-500, 200, -200], [0, -600, 100], [50, 100, 600.0]])

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import Boundary
-from services.fit.optics.parameters import Stain
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
+from services.transport.optics.parameters import Stain
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from tests.support.small_tooth import SEMI_AXES_MM, ellipsoid, recipe
 
 HEIGHT, WIDTH = 6, 8

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.records import Failure
 from services.api.jobs.repository import Repository
+from services.api.tables.lifecycle import JobState, Trigger
 from services.api.webhooks.address import AddressPolicy
 from services.api.webhooks.deliveries import Deliveries, Delivery
 from services.api.webhooks.sender import WebhookSender

@@ -17,11 +17,11 @@ from services.anatomy.distance import SurfaceDistance
 from services.anatomy.templates.dimensions import UPPER_TEETH, upper_tooth
 from services.anatomy.templates.jaw import GAP_MM, SHORT_OF_PLANE_MM, TILT_SPREAD_DEG, Jaw, JawTooth, build_jaw
 from services.core.geometry import Mesh
-from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.nesting import require_nested
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Mouth, Tissue
+from services.transport.scene.nesting import require_nested
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces, View
 from tests.support.phantom_bodies import phantom_jaw
 from tests.support.shared_data import shared_path
 
@@ -275,7 +275,7 @@ def test_a_seed_repeats_and_seeds_differ(subject: Jaw, average: Jaw) -> None:
 
 def test_the_engine_takes_the_whole_jaw(subject: Jaw, monkeypatch: pytest.MonkeyPatch) -> None:
     # A coarse grid of clearances is soon measured, and changes no image.
-    monkeypatch.setattr("services.fit.transport.scene.clearance.MAX_CELLS", 300_000)
+    monkeypatch.setattr("services.transport.scene.clearance.MAX_CELLS", 300_000)
     lights = dome_lights(3, ("green",), seed=1)
     teeth = tuple(ToothSurfaces(t.outer, DentinShape.known(t.dentin)) for t in subject.teeth)
     recipe = SceneRecipe(

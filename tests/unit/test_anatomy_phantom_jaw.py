@@ -16,11 +16,11 @@ from services.core.errors import CaptureInputError, InputError
 from services.core.files.meshes import read_teeth
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.optics.parameters import Medium
 from services.phantom.files import Renderer, held_out_lights
 from services.phantom.jaw import SCAN_DENTIN, write_jaw_phantom
 from services.phantom.jaw_optics import COSINE_SPREAD, SIGMA_SPREAD, gums_medium, jaw_mouth
 from services.phantom.tooth import TRUE_TISSUE
+from services.transport.optics.parameters import Medium
 from tests.support.labelled_scan import bumps, universal, write_vtp
 
 FDI = (11, 12, 13, 21)

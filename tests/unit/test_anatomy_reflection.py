@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from services.anatomy.templates.incisor import build_incisor
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.rays import RayScene
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.reflection import fresnel, ggx_reflection, reflect
+from services.transport.platform import prepare_device
+from services.transport.rays import RayScene
 
 NORMAL = np.array([0.0, 0.0, 1.0])
 

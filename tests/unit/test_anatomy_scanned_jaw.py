@@ -19,7 +19,7 @@ from services.anatomy.scans.scanned_gums import fill_outline
 from services.anatomy.scans.scanned_jaw import STEEPEST_TILT_DEG, ScannedJaw, jaw_from_scan
 from services.core.errors import CaptureInputError, MeshError
 from services.core.geometry import Mesh
-from services.fit.transport.rays import RayScene
+from services.transport.rays import RayScene
 from tests.support.labelled_scan import CROWN_MM, NECK_MM, PITCH_MM, bumps
 from tests.support.shared_data import shared_path
 

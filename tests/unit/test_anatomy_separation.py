@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from services.anatomy.scans.patches import areas_mm2
 from services.anatomy.scans.separation import separate
+from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.core.errors import MeshError
 from services.core.geometry import Mesh, Tooth
-from services.fit.export.mouth_scene import mouth_scene, write_mouth_surfaces
-from services.fit.optics.parameters import Medium, Mouth, Tissue
+from services.transport.optics.parameters import Medium, Mouth, Tissue
 
 RADIUS_MM = 3.0
 

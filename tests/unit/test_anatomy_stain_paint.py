@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from services.anatomy.templates.incisor import build_incisor
-from services.fit.export.stains import read_stains
-from services.fit.inputs.stain_uv import stain_layout
 from services.phantom.stain_paint import STRENGTH, painted_depth, painted_stains
 from services.phantom.tooth import write_phantom
+from services.transport.scene.stain_uv import read_stains, stain_layout
 
 
 def test_painted_stains_are_plausible() -> None:

@@ -10,7 +10,7 @@ import trimesh
 
 from services.anatomy.templates.incisor import build_incisor
 from services.core.geometry import Mesh
-from services.fit.inputs.stain_uv import (
+from services.transport.scene.stain_uv import (
     NEIGHBOUR_DISTANCE,
     TEXEL_MM,
     StainLayout,

@@ -11,8 +11,8 @@ from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.fit.checks.thickness import enamel_thickness_mm, thickness_image, thickness_map, uncertain_thickness
 from services.phantom.dome_rig import dome_cameras
+from services.transport.thickness import enamel_thickness_mm, thickness_image, thickness_map, uncertain_thickness
 from tests.support.shared_data import shared_path
 from tests.support.small_tooth import SEMI_AXES_MM, dentin_shape, ellipsoid, sphere
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from services.bench.fits.jaw import ErrorRecorder, mouth_of, picture, relative_errors
-from services.fit.checks.evaluate import ErrorSums
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
+from services.fit.passes.evaluate import ErrorSums
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 
 TRUTH = Mouth(
     (Tissue(Medium(4.0, 0.99, g1=0.8), Medium(12.0, 0.98, g1=0.75)), Tissue(Medium(5.0, 0.98), Medium(5.0, 0.98))),

@@ -11,8 +11,8 @@ import pytest
 
 from services.bench.fits.tooth import PEER, ErrorRecorder, ToothRow, picture, summary
 from services.bench.fits.tooth_capture import tissue_of
-from services.fit.checks.evaluate import ErrorSums
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.passes.evaluate import ErrorSums
+from services.transport.optics.parameters import Medium, Tissue
 
 
 def row(peer: str, seconds: float, error: float, rate: float | None = None) -> ToothRow:

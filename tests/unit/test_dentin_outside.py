@@ -8,7 +8,7 @@ import trimesh
 
 from services.core.errors import MeshError
 from services.core.geometry import Mesh
-from services.fit.transport.scene.nesting import require_nested
+from services.transport.scene.nesting import require_nested
 
 
 def test_the_move_that_is_asked_for_suffices() -> None:

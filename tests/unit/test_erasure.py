@@ -12,8 +12,8 @@ import pytest
 from services.api.jobs import erasure, jobs
 from services.api.jobs.erasure import Erased, erase, forget_listing
 from services.api.jobs.jobs import Jobs
-from services.api.jobs.lifecycle import JobState, Trigger
-from services.api.jobs.table import job_table
+from services.api.tables.jobs import job_table
+from services.api.tables.lifecycle import JobState, Trigger
 from services.core.errors import StoreError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings

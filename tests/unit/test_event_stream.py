@@ -16,9 +16,9 @@ import sqlalchemy as sql
 
 from services.api.jobs import event_stream
 from services.api.jobs.event_stream import Epoch, EventBroadcaster
-from services.api.jobs.lifecycle import Trigger
 from services.api.jobs.records import Lease
 from services.api.jobs.repository import Repository
+from services.api.tables.lifecycle import Trigger
 from services.core.records import JobSpec
 from services.core.stage import StageEvent
 from tests.support.empty_database import empty_database

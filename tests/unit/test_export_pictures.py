@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.fit.export.pictures import (
+from services.core.pages.pictures import (
     DIVERGING,
     MASKED,
     Picture,

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.assets.curves import Series, log_chart
+from services.assets.report import THIN_CAVEAT, ReportPictures, write_report
+from services.core.pages.pictures import Picture
 from services.core.results import Correlation, Estimate, FitReport
-from services.fit.checks.thickness import ThicknessMap
-from services.fit.export.curves import Series, log_chart
-from services.fit.export.pictures import Picture
-from services.fit.export.report import THIN_CAVEAT, ReportPictures, write_report
+from services.transport.thickness import ThicknessMap
 
 HISTORY = [
     {"channel": "green", "stage": "homogeneous", "step": 1, "loss": 0.2, "held_out_error": 0.3},

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from services.assets.mitsuba.scene import nested_scene
+from services.assets.mitsuba.scene_xml import SceneParameter, write_scene
 from services.core.geometry import Camera
-from services.fit.export.mitsuba_scene import nested_scene
-from services.fit.export.scene_xml import SceneParameter, write_scene
-from services.fit.optics.parameters import Medium, Tissue
+from services.transport.optics.parameters import Medium, Tissue
 
 CAMERA = Camera(
     name="c0",

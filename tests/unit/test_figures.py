@@ -21,9 +21,9 @@ from services.bench.figures.environment import finer
 from services.bench.figures.mosaic import GAP_PX, HEAD_PX, PAPER, Column, cropped, mosaic, photo_and_fit
 from services.core.errors import DentineError, InputError
 from services.core.geometry import Camera, Light
+from services.core.pages.pictures import MASKED, Picture
 from services.core.records import FolderCapture, ImageEntry
 from services.core.store import read_record, write_record
-from services.fit.export.pictures import MASKED, Picture
 
 SIZE = (4, 3)
 """Width and height of the small capture's images."""

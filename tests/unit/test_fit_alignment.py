@@ -13,10 +13,10 @@ from services.core.records import MaskBit
 from services.core.results import PreparedManifest
 from services.core.store import create_array
 from services.fit.checks.alignment import Offset, clearest_offset, offset_sentences
-from services.fit.checks.evaluate import ErrorSums, Evaluation
-from services.fit.execution.blocks import PixelParts
-from services.fit.inputs.observations import Observations
-from services.fit.inputs.view_stack import ViewStack
+from services.fit.measurements.blocks import PixelParts
+from services.fit.measurements.observations import Observations
+from services.fit.measurements.view_stack import ViewStack
+from services.fit.passes.evaluate import ErrorSums, Evaluation
 from tests.support.prepared import lights, sphere
 
 SIZE, PIXEL_MM, RADIUS_PX = 40, 0.4, 10

@@ -9,21 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.core.files.content_files import StoredFile
 from services.core.records import Device
-from services.fit.checks.evaluate import evaluate_task
-from services.fit.execution.blocks import (
-    Block,
-    BlockTask,
-    StoredFile,
-    read_block,
-    read_recipe,
-    write_block,
-    write_recipe,
-)
-from services.fit.execution.derivatives import Differentiation
-from services.fit.execution.passes import compare_task, image_task, jacobian_task, orders_task
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, ToothSurfaces, View
+from services.fit.measurements.blocks import Block, BlockTask, read_block, write_block
+from services.fit.passes.derivatives import Differentiation
+from services.fit.passes.evaluate import evaluate_task
+from services.fit.passes.passes import compare_task, image_task, jacobian_task, orders_task
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, ToothSurfaces, View
+from services.transport.scene.recipe_files import read_recipe, write_recipe
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, sphere
 
 

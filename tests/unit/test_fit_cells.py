@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from services.anatomy.templates.incisor import build_incisor
-from services.fit.execution.blocks import PixelParts
-from services.fit.inputs.view_stack import CELL_EDGE, MIN_CELLS, ViewStack, comparison_cells, on_coarse_grid
+from services.fit.measurements.blocks import PixelParts
+from services.fit.measurements.view_stack import CELL_EDGE, MIN_CELLS, ViewStack, comparison_cells, on_coarse_grid
 from services.phantom.dome_rig import dome_cameras
 
 

@@ -7,9 +7,9 @@ from typing import Any, cast
 
 import pytest
 
-from services.fit.checks.evaluate import ErrorSums
-from services.fit.execution.attempt import Assessment, assess_convergence
+from services.fit.passes.evaluate import ErrorSums
 from services.fit.solve.gauss_newton import Result
+from services.fit.stages.attempt import Assessment, assess_convergence
 
 
 def fit(error: float, product_noise: float = 0.0) -> Any:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from services.core.errors import SettingsError
 from services.core.records import JobSpec
-from services.fit.optics.domain import (
+from services.fit.coordinates.domain import (
     BOUNDS,
     HELD_G,
     Coordinate,
@@ -23,7 +23,7 @@ from services.fit.optics.domain import (
     to_dual,
     to_natural,
 )
-from services.fit.optics.parameters import Medium, Tissue
+from services.transport.optics.parameters import Medium, Tissue
 
 KINDS = tuple(BOUNDS)
 

@@ -7,10 +7,11 @@ import numpy as np
 from services.anatomy.blend import dentin_blend_shape
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty
-from services.fit.tooth.driver import fitted_thickness, shape_covariance
+from services.fit.stages.tooth.driver import shape_covariance
 from services.phantom.dome_rig import dome_cameras
+from services.transport.thickness import fitted_thickness
 
 
 def known(*names: str) -> Uncertainty:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.checks.evaluate import ErrorSums, error_sums
+from services.fit.passes.evaluate import ErrorSums, error_sums
 
 
 @pytest.mark.parametrize("truth_error", [0.0, 0.05, 0.2])

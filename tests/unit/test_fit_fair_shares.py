@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from services.fit.execution.fair_shares import DECAY_S, LEVELS_KEY, PUBLISH_INTERVAL_S, PublishedLevels, Share
+from services.tasks.fair_shares import DECAY_S, LEVELS_KEY, PUBLISH_INTERVAL_S, PublishedLevels, Share
 
 WORKERS, AHEAD, BLOCKS, PAUSE_S = 2, 4, 12, 0.5
 

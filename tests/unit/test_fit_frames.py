@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.checks.evaluate import FrameSums, frame_sums
 from services.fit.checks.frames import WrongFrame, report_frames, wrong_frames
+from services.fit.passes.evaluate import FrameSums, frame_sums
 
 LIGHTS = tuple(f"l{k}" for k in range(6))
 

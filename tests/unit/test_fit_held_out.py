@@ -11,8 +11,8 @@ from services.core.errors import SettingsError
 from services.core.geometry import Light
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
-from services.fit.inputs.held_out import held_out_images, left_out_lights
-from services.fit.inputs.observations import read_channel, read_observations
+from services.fit.measurements.held_out import held_out_images, left_out_lights
+from services.fit.measurements.observations import read_channel, read_observations
 from tests.support.prepared import camera, write_prepared
 
 

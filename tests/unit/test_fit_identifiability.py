@@ -7,7 +7,7 @@ import pytest
 
 from services.core.results import Correlation, Estimate
 from services.fit.checks.identifiability import correlation, determined_sentences
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.covariance import Uncertainty
 
 NAMES = ("enamel.sigma", "enamel.alpha", "dentin.sigma", "dentin.alpha")

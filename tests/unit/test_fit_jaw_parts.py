@@ -11,21 +11,21 @@ import pytest
 import trimesh
 
 from services.anatomy.distance import SurfaceDistance
+from services.anatomy.job_dentin import jaw_dentins
 from services.anatomy.templates.crown import build_tooth
 from services.anatomy.templates.dimensions import upper_tooth
 from services.core.errors import CaptureInputError, InputError, JobCancelledError, MeshError
 from services.core.geometry import Mesh, Tooth
 from services.core.records import JobSpec
-from services.fit.execution.closing import _with_cosine
-from services.fit.inputs.dentin import jaw_dentins
-from services.fit.jaw.neighbours import Neighbours, arch_position
-from services.fit.jaw.schedule import JawSchedule
-from services.fit.jaw.starts import MIN_TOOTH_PIXELS, ToothStart, median_tissue, start_mouth, start_tooth
-from services.fit.optics.domain import Coordinate, Domain, kind_of, similar_tissue
-from services.fit.optics.half_space import half_space_reflectance
-from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.optics.priors import SHAPE
+from services.fit.coordinates.domain import Coordinate, Domain, kind_of, similar_tissue
+from services.fit.coordinates.priors import SHAPE
+from services.fit.passes.final_uncertainty import _with_cosine
+from services.fit.passes.neighbours import Neighbours, arch_position
+from services.fit.stages.jaw.schedule import JawSchedule
+from services.fit.stages.jaw.starts import MIN_TOOTH_PIXELS, ToothStart, median_tissue, start_mouth, start_tooth
 from services.phantom.dome_rig import dome_cameras
+from services.transport.optics.half_space import half_space_reflectance
+from services.transport.optics.parameters import Medium, Mouth, Tissue
 
 
 def tissue(sigma: float, alpha: float = 0.99) -> Tissue:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from services.core.errors import FencedError
-from services.fit.execution.journal import Journal, read_entries
+from services.tasks.journal import Journal, read_entries
 
 HEAD = b'{"format": 2, "fingerprint": "a"}\n'
 

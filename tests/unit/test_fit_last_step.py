@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.fit.execution.channel_fit import CLOSING_MIN_SHARE, CLOSING_TRIALS, last_step
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.normal_equations import LossChange
+from services.fit.stages.channel_fit import CLOSING_MIN_SHARE, CLOSING_TRIALS, last_step
 
 WHOLE = 0.5
 

@@ -11,8 +11,8 @@ from services.core.geometry import Camera
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
 from services.core.store import create_array, open_stage
-from services.fit.inputs.levels import LevelReader, averaged, reduced_camera, whole_squares
-from services.fit.inputs.observations import read_channel, read_observations
+from services.fit.measurements.levels import LevelReader, averaged, reduced_camera, whole_squares
+from services.fit.measurements.observations import read_channel, read_observations
 from tests.support.prepared import SIZE, write_prepared
 
 CAMERA = Camera(

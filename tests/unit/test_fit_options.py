@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
+from services.assets.stage import describe_options
+from services.core.files.content_files import StoredFile
 from services.core.records import JobSpec
-from services.fit.execution.attempt import fingerprint
-from services.fit.execution.blocks import StoredFile
-from services.fit.inputs.observations import ChannelFiles, Level
-from services.fit.instrument.errors import InstrumentErrors
-from services.fit.instrument.moves import Move
-from services.fit.stage import describe_options
+from services.fit.coordinates.instrument_errors import InstrumentErrors
+from services.fit.measurements.instrument.moves import Move
+from services.fit.measurements.observations import ChannelFiles, Level
+from services.fit.stages.attempt import fingerprint
 
 CAPTURE = Path("/captures/anna")
 # Digests made by the code before any option was added to those of version 0.1; "numerics" and "engine" stand for the
@@ -26,7 +26,7 @@ OPTIONS: dict[str, Any] = {"max_steps": 4, "loss": "robust", "held": {"enamel.si
 
 @pytest.fixture(autouse=True)
 def numerics(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.fit.execution.attempt.numerics_name", lambda: "numerics")
+    monkeypatch.setattr("services.fit.stages.attempt.numerics_name", lambda: "numerics")
 
 
 def digest(**options: object) -> str:

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from services.core.files.content_files import StoredFile
 from services.core.geometry import Camera
-from services.fit.execution.blocks import BlockTask, PixelParts, StoredFile
-from services.fit.execution.derivatives import DIFFERENCE_STEPS, SCORES_DIVISOR, Differentiation
-from services.fit.execution.passes import StackProblem
-from services.fit.jaw.neighbours import Neighbours
-from services.fit.optics.domain import Coordinate, Domain, natural_derivative, to_dual
-from services.fit.optics.parameters import Medium, Mouth, Tissue
-from services.fit.transport.scene.recipe import View
+from services.fit.coordinates.domain import Coordinate, Domain, natural_derivative, to_dual
+from services.fit.measurements.blocks import BlockTask, PixelParts
+from services.fit.passes.derivatives import DIFFERENCE_STEPS, SCORES_DIVISOR, Differentiation
+from services.fit.passes.neighbours import Neighbours
+from services.fit.passes.passes import StackProblem
+from services.transport.optics.parameters import Medium, Mouth, Tissue
+from services.transport.scene.recipe import View
 
 TISSUE = Tissue(Medium(5.0, 0.997, g1=0.72), Medium(14.0, 0.995, g1=0.8))
 DOMAIN = Domain(

@@ -7,8 +7,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from services.fit.export.previews import pictures_of, spacing
-from services.fit.inputs.view_stack import ViewStack
+from services.fit.measurements.view_stack import ViewStack
+from services.fit.stages.previews import pictures_of, spacing
 from tests.support.prepared import camera, lights
 
 

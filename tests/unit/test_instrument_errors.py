@@ -18,22 +18,30 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Light
 from services.core.records import FolderCapture, JobSpec
 from services.core.store import read_record
+from services.fit.checks.instrument.sentences import REMEDY, assumed_names, instrument_sentences
 from services.fit.checks.next_calibration import calibration_advice, covariance_if_known
-from services.fit.execution.blocks import Block, BlockInstrument, read_block, read_recipe, write_block
-from services.fit.instrument.errors import COMMON_KINDS, DEFAULT_SE, InstrumentErrors, errors_of, have_common_cause
-from services.fit.instrument.moves import by_scene, move_covariance, write_moves
-from services.fit.instrument.photographs import error_derivatives, photographed
-from services.fit.instrument.pose import rigid
-from services.fit.instrument.sentences import REMEDY, assumed_names, instrument_sentences
-from services.fit.optics.domain import Coordinate, Domain
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.coordinates.domain import Coordinate, Domain
+from services.fit.coordinates.instrument_errors import (
+    COMMON_KINDS,
+    DEFAULT_SE,
+    InstrumentErrors,
+    errors_of,
+    have_common_cause,
+)
+from services.fit.measurements.blocks import Block, BlockInstrument, read_block, write_block
+from services.fit.measurements.instrument.moves import move_covariance, write_moves
+from services.fit.measurements.instrument.photographs import error_derivatives, photographed
+from services.fit.measurements.instrument.pose import rigid
+from services.fit.passes.moves import by_scene
 from services.fit.solve.covariance import _prior_parts, uncertainty
 from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.estimates import estimates, instrument_estimates
 from services.fit.solve.normal_equations import normal_equations
 from services.fit.solve.recombination import Fault
-from services.fit.transport.scene.recipe import View, single_tooth
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import View, single_tooth
+from services.transport.scene.recipe_files import read_recipe
 from tests.support.prepared import camera, sphere
 
 NAMES = ("gain.green", "light_gain.a", "light_gain.b", "flare.c0.green")

@@ -7,7 +7,7 @@ import pytest
 
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Light
-from services.fit.instrument.irradiance import DRIFT, uncertainty_at_teeth
+from services.fit.measurements.instrument.irradiance import DRIFT, uncertainty_at_teeth
 
 CHANNELS = ("red",)
 LIGHTS = tuple(

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from services.core.geometry import Light
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
-from services.fit.execution.blocks import Block, BlockInstrument
-from services.fit.instrument.capture import MAX_JAW_LIGHTS, instrument_of
-from services.fit.instrument.errors import errors_of
-from services.fit.instrument.photographs import error_derivatives, photographed
-from services.fit.instrument.sentences import instrument_sentences
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.checks.instrument.sentences import instrument_sentences
+from services.fit.coordinates.domain import Coordinate, Domain
+from services.fit.coordinates.instrument_errors import errors_of
+from services.fit.measurements.blocks import Block, BlockInstrument
+from services.fit.measurements.instrument.capture import MAX_JAW_LIGHTS, instrument_of
+from services.fit.measurements.instrument.photographs import error_derivatives, photographed
 from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.estimates import instrument_estimates
 from services.fit.solve.normal_equations import NormalEquations, normal_equations
-from services.fit.transport.scene.recipe import View
+from services.transport.scene.recipe import View
 from tests.support.prepared import camera
 
 Array = NDArray[np.float64]

@@ -13,12 +13,12 @@ from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.geometry import Light
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
-from services.fit.execution.blocks import read_recipe
-from services.fit.instrument.capture import instrument_of
-from services.fit.instrument.errors import DEFAULT_MOVE_SE
-from services.fit.instrument.moves import move_covariance
-from services.fit.instrument.pose import rigid
-from services.fit.transport.scene.recipe import single_tooth
+from services.fit.coordinates.instrument_errors import DEFAULT_MOVE_SE
+from services.fit.measurements.instrument.capture import instrument_of
+from services.fit.measurements.instrument.moves import move_covariance
+from services.fit.measurements.instrument.pose import rigid
+from services.transport.scene.recipe import single_tooth
+from services.transport.scene.recipe_files import read_recipe
 from tests.support.prepared import camera, sphere
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from services.api.calibrations.job_calibrations import calibration_of_job
-from services.api.jobs.lifecycle import JobState
+from services.api.jobs.job_calibrations import calibration_of_job
+from services.api.tables.lifecycle import JobState
 from services.client.errors import JobStateError
 from services.core.results import AssetManifest
 from services.core.store import StageWriter

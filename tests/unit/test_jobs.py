@@ -12,8 +12,8 @@ import pytest
 from services.api.jobs import admission
 from services.api.jobs.admission import Needs
 from services.api.jobs.jobs import Jobs
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Lease
+from services.api.tables.lifecycle import JobState
 from services.core.errors import DiskFullError
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from services.api.jobs import lifecycle
-from services.api.jobs.lifecycle import TABLE, Instruction, JobState, Trigger, apply
+from services.api.tables import lifecycle
+from services.api.tables.lifecycle import TABLE, Instruction, JobState, Trigger, apply
 from services.client.errors import JobStateError
 
 

@@ -13,7 +13,7 @@ from services.core.files.meshes import read_mesh, write_mesh
 from services.core.geometry import Camera, Mesh
 from services.core.raw.registration import REGISTRATION
 from services.core.records import JobSpec
-from services.fit.inputs.observations import read_observations
+from services.fit.measurements.observations import read_observations
 from services.preprocess.subject import read_subject
 from tests.support.folder_captures import prepare, write_folder
 

@@ -14,13 +14,13 @@ from alembic.migration import MigrationContext
 
 from services.api import data_folder
 from services.api.auth import audit, ended_sessions, setup_links, tokens
-from services.api.captures import table as capture_table
-from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.records import Failure
 from services.api.jobs.repository import Repository
-from services.api.jobs.table import JobFilter, job_table
 from services.api.migrations import FIRST, upgrade
-from services.api.webhooks import tables as webhook_tables
+from services.api.tables import captures as capture_table
+from services.api.tables import webhooks as webhook_tables
+from services.api.tables.jobs import JobFilter, job_table
+from services.api.tables.lifecycle import JobState, Trigger
 from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import FencedError, SettingsError
 from services.core.records import JobSpec

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from services.fit.export import shipped
+from services.assets.mitsuba import shipped
 
 PROGRAM = """
 import os, runpy, sys

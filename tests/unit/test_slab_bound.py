@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.bound import Bound, bound_of
-from services.fit.slab.model.dictionary import henyey_greenstein
-from services.fit.slab.solve.uncertainty import slopes
+from services.slab.bound import Bound, bound_of
+from services.slab.model.dictionary import henyey_greenstein
+from services.slab.solve.uncertainty import slopes
 from tests.support.small_slab import small_rig
 
 MATERIAL = henyey_greenstein(1.2, 0.6, 0.05)

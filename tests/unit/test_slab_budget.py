@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.images import Measurements
-from services.fit.slab.model.dictionary import Material, henyey_greenstein
-from services.fit.slab.solve.budget import Budget
-from services.fit.slab.solve.checkpoint import Checkpoint
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import MAX_THICKNESS, GaussNewton
-from services.fit.slab.solve.weights import Weights, weights_of
+from services.slab.images import Measurements
+from services.slab.model.dictionary import Material, henyey_greenstein
+from services.slab.solve.budget import Budget
+from services.slab.solve.checkpoint import Checkpoint
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.gauss_newton import MAX_THICKNESS, GaussNewton
+from services.slab.solve.weights import Weights, weights_of
 from tests.support.small_slab import small_rig
 
 THIN, THICK = henyey_greenstein(1.2, 0.6, 0.05), henyey_greenstein(6.0, 0.6, 0.05)
@@ -73,7 +73,7 @@ def given_noise(monkeypatch: pytest.MonkeyPatch, *, combine: bool, share: float 
         given.extend(noise)
         return weights_of(images, variances, noise)
 
-    monkeypatch.setattr("services.fit.slab.solve.gauss_newton.weights_of", watched)
+    monkeypatch.setattr("services.slab.solve.gauss_newton.weights_of", watched)
     fit = solver()
     fit.path_noise = fit.multiple = None
     fit.linearised(THIN, 200, 4, combine=combine, noise_share=share)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.fit.slab.model.dictionary import Material, henyey_greenstein
-from services.fit.slab.solve.checkpoint import FILE, Checkpoint, CheckpointFile, CombinedRenders
-from services.fit.slab.solve.mixture import Mixture
-from services.fit.slab.solve.normal import DerivativeSums, ResidualSums
+from services.slab.model.dictionary import Material, henyey_greenstein
+from services.slab.solve.checkpoint import FILE, Checkpoint, CheckpointFile, CombinedRenders
+from services.slab.solve.mixture import Mixture
+from services.slab.solve.normal import DerivativeSums, ResidualSums
 
 
 def checkpoint(material: Material, combined: CombinedRenders | None = None) -> Checkpoint:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.core.slab.folder import Beam, Light, PixelGrid, SlabCamera, SlabFolder
-from services.fit.slab.diagnosis import (
+from services.slab.diagnosis import (
     grid_faults,
     image_faults,
     max_power_per_sr,
@@ -15,13 +15,13 @@ from services.fit.slab.diagnosis import (
     similarity_faults,
     standing_out,
 )
-from services.fit.slab.dictionaries.chosen import ChosenDictionary
-from services.fit.slab.fit import fit_images
-from services.fit.slab.images import Measurements, shot_noise
-from services.fit.slab.model.dictionary import henyey_greenstein
-from services.fit.slab.model.forward import render
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.solve.coordinates import Knots
+from services.slab.dictionaries.chosen import ChosenDictionary
+from services.slab.fit import fit_images
+from services.slab.images import Measurements, shot_noise
+from services.slab.model.dictionary import henyey_greenstein
+from services.slab.model.forward import render
+from services.slab.options import SlabOptions
+from services.slab.solve.coordinates import Knots
 from tests.support.small_slab import description, small_rig
 
 PIXELS = PixelGrid(x_mm=(-4.0, 4.0), y_mm=(-4.0, 4.0), columns=16, rows=16)

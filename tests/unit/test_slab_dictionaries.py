@@ -20,21 +20,21 @@ from services.core.records import JobSpec
 from services.core.results import Estimate
 from services.core.slab.dictionaries import DICTIONARIES
 from services.core.slab.folder import SlabFolder, read_folder
-from services.fit.execution.numerics import numerics_name
-from services.fit.slab.diagnosis import misfit_faults
-from services.fit.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
-from services.fit.slab.dictionaries.mie import scattered
-from services.fit.slab.fit import fit_slab, write_results
-from services.fit.slab.model.dictionary import ANGLES_RAD, cosine_moments, hg_values, tent_solid_angles
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.model.single import single_scattering
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.result import SlabFit
-from services.fit.slab.results.stored import fingerprint
-from services.fit.slab.solve.mixture import Mixture, Mixtures, unit_atoms
-from services.fit.slab.solve.normal import derivative_rows
-from services.fit.slab.solve.weights import smoothed_variance
+from services.slab.diagnosis import misfit_faults
+from services.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
+from services.slab.dictionaries.mie import scattered
+from services.slab.fit import fit_slab, write_results
+from services.slab.model.dictionary import ANGLES_RAD, cosine_moments, hg_values, tent_solid_angles
+from services.slab.model.forward import render
+from services.slab.model.rig import rig_of
+from services.slab.model.single import single_scattering
+from services.slab.options import SlabOptions
+from services.slab.results.result import SlabFit
+from services.slab.results.stored import fingerprint
+from services.slab.solve.mixture import Mixture, Mixtures, unit_atoms
+from services.slab.solve.normal import derivative_rows
+from services.slab.solve.weights import smoothed_variance
+from services.transport.numerics import numerics_name
 from tests.support.shared_data import shared_path
 from tests.support.small_slab import WAVELENGTH_NM, description, small_rig, write_folder
 

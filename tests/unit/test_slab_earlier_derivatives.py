@@ -7,16 +7,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.model.dictionary import KNOTS, Material, henyey_greenstein
-from services.fit.slab.model.forward import Batches
-from services.fit.slab.solve.normal import (
+from services.slab.model.dictionary import KNOTS, Material, henyey_greenstein
+from services.slab.model.forward import Batches
+from services.slab.solve.normal import (
     UNKNOWNS,
     DerivativeSums,
     NormalEquations,
     ResidualSums,
     normal_equations,
 )
-from services.fit.slab.solve.weights import independent_weights
+from services.slab.solve.weights import independent_weights
 
 MATERIAL = henyey_greenstein(5.0, 0.5, 0.1)
 IMAGES, PIXELS, COUNT = 2, 20, 6

@@ -15,10 +15,10 @@ from services.api.captures.contents import content_fault
 from services.core.errors import CaptureInputError
 from services.core.settings import UploadLimits
 from services.core.slab.folder import read_folder
-from services.fit.slab.images import read_images
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.stored import fingerprint
+from services.slab.images import read_images
+from services.slab.model.rig import rig_of
+from services.slab.options import SlabOptions
+from services.slab.results.stored import fingerprint
 from tests.support.raw_sensor import Sensor
 from tests.support.small_slab import WAVELENGTH_NM, description
 

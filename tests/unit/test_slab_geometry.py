@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.fit.transport.platform import prepare_device
+from services.transport.platform import prepare_device
 
 
 def test_layers_mix_with_nothing() -> None:
     prepare_device()
     import mitsuba as mi
 
-    from services.fit.transport.scene.geometry import SlabGeometry
+    from services.transport.scene.geometry import SlabGeometry
 
     slab = SlabGeometry((1.0, 2.0), moving_border=True)
     place, where, active = mi.UInt32([1, 2, 3]), mi.Point3f([0, 0, 0], [0, 0, 0], [0.5, 1.5, 4]), mi.Bool(True)

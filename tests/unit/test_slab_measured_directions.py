@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.fit.slab.model.dictionary import henyey_greenstein
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.measured_directions import broad_step, measured_directions, noise_ratio, step_matrix
-from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import Quadratic
+from services.slab.model.dictionary import henyey_greenstein
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.measured_directions import broad_step, measured_directions, noise_ratio, step_matrix
+from services.slab.solve.normal import UNKNOWNS
+from services.slab.solve.prior import Quadratic
 
 BROAD = Knots().broad_directions()
 DEVIATIONS = Knots().broad_standard_deviations(henyey_greenstein(5.0, 0.5, 0.0))

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from services.fit.slab.images import Measurements
-from services.fit.slab.model.dictionary import henyey_greenstein
-from services.fit.slab.notes import notes_of
-from services.fit.slab.results.result import Errors
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import Solution
-from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import Quadratic
+from services.slab.images import Measurements
+from services.slab.model.dictionary import henyey_greenstein
+from services.slab.notes import notes_of
+from services.slab.results.result import Errors
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.gauss_newton import Solution
+from services.slab.solve.normal import UNKNOWNS
+from services.slab.solve.prior import Quadratic
 from tests.support.small_slab import made_up_fit, small_rig
 
 GOOD = Errors(fit_error=0.01, held_out_error=None)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.fit.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, henyey_greenstein
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.prior import POLE_SCALE, Quadratic, precision, pull_covariance, second_differences, widened
+from services.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, henyey_greenstein
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.prior import POLE_SCALE, Quadratic, precision, pull_covariance, second_differences, widened
 
 TROUGH = KNOTS // 3
 """Knot of a trough between two rings, three knots wide; ln f bends there by 100 per rad2 and more."""

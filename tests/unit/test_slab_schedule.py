@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.schedule import WavelengthTask, run_wavelengths
+from services.slab.options import SlabOptions
+from services.slab.schedule import WavelengthTask, run_wavelengths
 from tests.support.recording_executor import RecordingExecutor
 from tests.support.small_slab import description, write_folder
 
@@ -15,7 +15,7 @@ from tests.support.small_slab import description, write_folder
 def test_wavelengths_that_the_workers_do_not_divide_evenly_are_shared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.fit.slab.schedule.fit_wavelength", lambda task, *_: task.place)
+    monkeypatch.setattr("services.slab.schedule.fit_wavelength", lambda task, *_: task.place)
     root = write_folder(tmp_path / "cell", description())
     tasks = [
         WavelengthTask(root, nm, SlabOptions(), tmp_path / f"{nm:g}", tmp_path / "cancelled")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.model.forward import Batches
-from services.fit.slab.model.rig import Grid
-from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.smooth import smoother_of
+from services.slab.model.forward import Batches
+from services.slab.model.rig import Grid
+from services.slab.solve.normal import UNKNOWNS
+from services.slab.solve.smooth import smoother_of
 
 GRID = Grid(x_from_mm=-4, y_from_mm=0, pitch_x_mm=0.5, pitch_y_mm=0.5, columns=16, rows=8, folded=True)
 X_MM, Y_MM = (one.ravel() for one in np.meshgrid(np.arange(-3.75, 4, 0.5), np.arange(0.25, 4, 0.5)))

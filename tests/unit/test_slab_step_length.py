@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.model.dictionary import KNOTS, tent_solid_angles
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.mixture import Mixtures
-from services.fit.slab.solve.normal import UNKNOWNS
-from services.fit.slab.solve.prior import Quadratic
-from services.fit.slab.solve.step_length import predicted_fall, shortened
+from services.slab.model.dictionary import KNOTS, tent_solid_angles
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.mixture import Mixtures
+from services.slab.solve.normal import UNKNOWNS
+from services.slab.solve.prior import Quadratic
+from services.slab.solve.step_length import predicted_fall, shortened
 
 PRIOR = np.zeros((UNKNOWNS, UNKNOWNS))
 ZIGZAG = np.append(np.where(np.arange(KNOTS) % 2 == 0, 1.0, -1.0), 0.0)

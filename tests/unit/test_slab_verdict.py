@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.results.result import Errors, SlabReport, image_error
+from services.slab.results.result import Errors, SlabReport, image_error
 from tests.support.small_slab import made_up_fit
 
 FAR, NEAR = 2.5, 0.01

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.slab.solve.weights import independent_weights, smoothed_covariance, weights_of
+from services.slab.solve.weights import independent_weights, smoothed_covariance, weights_of
 
 SHAPE = (2, 3)
 GROUPS = (np.array([0, 2]), np.array([1, 3]))

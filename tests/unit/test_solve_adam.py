@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from services.core.errors import NonFiniteError
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.adam import ADVICE_MORE_STEPS, Adam, Gradient, Options, State, state_from, state_record
 from services.fit.solve.gauss_newton import Result
 

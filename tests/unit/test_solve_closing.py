@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.instrument.errors import InstrumentErrors
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.coordinates.domain import Coordinate, Domain
+from services.fit.coordinates.instrument_errors import InstrumentErrors
 from services.fit.solve.closing import ClosingSums, closing_sums, response
 from services.fit.solve.covariance import ClosingModel, Uncertainty, Whitening, closing_model, uncertainty, whitening
 from services.fit.solve.normal_equations import NormalEquations, normal_equations

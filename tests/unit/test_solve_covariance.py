@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.fit.optics.domain import Coordinate, Domain
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.covariance import uncertainty
 from services.fit.solve.estimates import estimates
 from services.fit.solve.normal_equations import NormalEquations
+from services.transport.optics.parameters import Medium, Tissue
 from tests.support.curvature import isotropic
 
 TISSUE = Tissue(Medium(5.0, 0.995, g1=0.8), Medium(12.0, 0.99, g1=0.8))

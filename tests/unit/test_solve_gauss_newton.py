@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from services.core.errors import NonFiniteError
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.gauss_newton import ADVICE, GaussNewton, Options, Result, state_from, state_record
 from services.fit.solve.normal_equations import LossChange, NormalEquations
 from services.fit.solve.trust_region import solve_ball

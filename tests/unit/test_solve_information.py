@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.fit.optics.domain import Coordinate, Domain
+from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.covariance import uncertainty
 from services.fit.solve.information import AddedInformation, added_information, covariance_with
 from services.fit.solve.normal_equations import NormalEquations, normal_equations

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.fit.optics.parameters import MEDIUM_FIELDS
 from services.phantom.subjects import subject_tissues
+from services.transport.optics.parameters import MEDIUM_FIELDS
 from tests.support.truths import FOLDER, SIDE_LIGHTS, names, read, write_capture
 
 

@@ -10,8 +10,8 @@ import pytest
 from services.calibrate.colour.chart import read_reference
 from services.core.errors import CaptureInputError
 from services.core.files.scans import read_sidecar
-from services.fit.slab.sphere.invert import fit_readings
-from services.fit.slab.sphere.readings import read_readings
+from services.slab.sphere.invert import fit_readings
+from services.slab.sphere.readings import read_readings
 from tests.support.shared_data import shared_path
 
 D50, D65 = np.array([0.9642, 1.0, 0.8251]), np.array([0.9504, 1.0, 1.0888])

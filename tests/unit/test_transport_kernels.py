@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import View
 from tests.support.small_tooth import camera_at, recipe, whole_view
 
 

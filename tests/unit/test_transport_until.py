@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.fit.transport.paths.until import FIRST_ROUND, GROWTH, MIN_GROWTH, Effort, trace_until
-from services.fit.transport.scene.recipe import StackEstimate, relative_error
+from services.transport.paths.until import FIRST_ROUND, GROWTH, MIN_GROWTH, Effort, trace_until
+from services.transport.scene.recipe import StackEstimate, relative_error
 
 PIXELS = 400
 

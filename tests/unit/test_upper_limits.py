@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from services.core.pages.cells import cell
 from services.core.results import Estimate
-from services.fit.export.report import cell
 
 
 @pytest.mark.parametrize(

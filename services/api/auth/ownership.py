@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 
 import sqlalchemy as sql
 
-from services.api.captures.table import capture_table, unknown_capture
-from services.api.jobs.table import deletion_table, job_table, unknown_deletion, unknown_job
+from services.api.tables.captures import capture_table, unknown_capture
+from services.api.tables.jobs import deletion_table, job_table, unknown_deletion, unknown_job
 from services.core.errors import DentineError
 from services.pipeline.database import Query
 

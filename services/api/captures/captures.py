@@ -21,8 +21,8 @@ import sqlalchemy as sql
 from services.api.captures.blobs import Blobs, Write, sync_folders
 from services.api.captures.descriptions import CaptureReader, InProcessReader
 from services.api.captures.file_locks import FileLocks
-from services.api.captures.table import CaptureTable, FileRow, unknown_capture
 from services.api.captures.uploads import Uploads, upload_path
+from services.api.tables.captures import CaptureTable, FileRow, unknown_capture
 from services.client.capture_paths import TEXTS, require_paths
 from services.client.capture_records import (
     CaptureDetail,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from services.api.captures.blobs import Blobs, PartialFile
 from services.api.captures.file_locks import FileLocks
-from services.api.captures.table import CaptureTable, FileRow, unknown_capture
+from services.api.tables.captures import CaptureTable, FileRow, unknown_capture
 from services.client.capture_records import CaptureState
 from services.client.errors import CaptureStateError, CorruptUploadError, ExpiredError, OffsetError, UnknownCaptureError
 from services.core.owners import LOCAL_VIEWER, Viewer

@@ -12,46 +12,18 @@ from contextlib import suppress
 from typing import Any, get_args
 
 import sqlalchemy as sql
-from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector
+from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from services.api.health.readiness import Readiness
-from services.api.jobs.lifecycle import JobState
-from services.api.jobs.table import job_table
-from services.api.webhooks.tables import DeliveryState, delivery_table
+from services.api.tables.jobs import job_table
+from services.api.tables.lifecycle import JobState
+from services.api.tables.webhooks import DeliveryState, delivery_table
 from services.core.stage import StageName
 from services.pipeline.event_log import event_table
 
-METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 STAGES: tuple[StageName, ...] = get_args(StageName)
-_LATENCIES_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-
-
-class RequestMetrics:
-    """Counts answers and their latency."""
-
-    def __init__(self, registry: CollectorRegistry) -> None:
-        labels = ("method", "route")
-        self._answers = Counter(
-            "dentine_requests",
-            "Answers by method, route template and class of status",
-            (*labels, "status"),
-            registry=registry,
-        )
-        self._latency = Histogram(
-            "dentine_request_latency_seconds",
-            "Time to the head of the answer",
-            labels,
-            buckets=_LATENCIES_S,
-            registry=registry,
-        )
-
-    def count(self, method: str, route: str, status: int, latency_s: float) -> None:
-        """Count one answer."""
-        method = method if method in METHODS else "other"
-        self._answers.labels(method, route, f"{status // 100}xx").inc()
-        self._latency.labels(method, route).observe(latency_s)
 
 
 def build_registry(engine: sql.Engine, readiness: Readiness, free_bytes: Callable[[], int]) -> CollectorRegistry:

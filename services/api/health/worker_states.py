@@ -10,9 +10,9 @@ from typing import Any, get_args
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.repository import Repository
-from services.api.jobs.table import job_table
+from services.api.tables.jobs import job_table
+from services.api.tables.lifecycle import JobState
 from services.core.geometry import Record
 from services.core.owners import LOCAL_VIEWER, Viewer
 from services.core.placement import DOME, STAGES

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from starlette.datastructures import Headers, MutableHeaders
 
-from services.api.health.metrics import METHODS, RequestMetrics
+from services.api.http.request_metrics import METHODS, RequestMetrics
 from services.pipeline.logs import bind_request
 
 if TYPE_CHECKING:

@@ -1,1 +1,1 @@
-"""Jobs: their states, table, queue, history and times."""
+"""Jobs: their records, queue, history and times."""

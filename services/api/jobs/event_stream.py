@@ -22,8 +22,8 @@ from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
 
 from services.api.http.problems import response_of
 from services.api.http.stream_places import StreamPlaces
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.repository import Repository
+from services.api.tables.lifecycle import JobState
 from services.client.errors import RateError, UnknownJobError
 from services.core.settings import ConnectionLimits
 

@@ -17,14 +17,14 @@ from services.api.captures.reading import SubprocessReader
 from services.api.data_folder import OpenedFolder, keep_password_apart, require_own_folder
 from services.api.jobs.admission import Admission, Machine
 from services.api.jobs.erasure import erase, forget_listing
-from services.api.jobs.lifecycle import Instruction, JobState, Trigger
 from services.api.jobs.light_limits import LightLimits, require_recent
 from services.api.jobs.records import Creation, Deletion, Job
 from services.api.jobs.repository import Repository
 from services.api.jobs.runner import RunJob, Runner
 from services.api.jobs.server_paths import ServerPaths, ServerStores
-from services.api.jobs.table import JobFilter
 from services.api.jobs.time_ranges import TimeRange, TimeRanges
+from services.api.tables.jobs import JobFilter
+from services.api.tables.lifecycle import Instruction, JobState, Trigger
 from services.client.errors import JobStateError, UnknownJobError
 from services.core.errors import DentineError, SettingsError
 from services.core.events import JobEvent

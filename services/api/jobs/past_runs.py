@@ -11,8 +11,8 @@ from typing import Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.size import JobSize
+from services.api.tables.lifecycle import JobState, Trigger
 from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.stage import StageName

@@ -7,8 +7,8 @@ from typing import Self
 
 from pydantic import Field
 
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.server_paths import without_folders
+from services.api.tables.lifecycle import JobState
 from services.core.errors import DentineError
 from services.core.geometry import Record
 from services.core.owners import DEFAULT_GROUP, Viewer

@@ -15,13 +15,13 @@ from typing import Any
 
 import sqlalchemy as sql
 
-from services.api.jobs.lifecycle import JobState, Transition, Trigger, apply
 from services.api.jobs.past_runs import PastRuns, past_run_table
 from services.api.jobs.records import Creation, Deletion, Failure, Job, Lease
-from services.api.jobs.table import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
 from services.api.jobs.verdicts import Verdicts
 from services.api.migrations import upgrade
-from services.api.webhooks.outbox import collect_changes
+from services.api.tables.jobs import JobFilter, deletion_table, job_table, unknown_deletion, unknown_job
+from services.api.tables.lifecycle import JobState, Transition, Trigger, apply
+from services.api.tables.outbox import collect_changes
 from services.client.errors import JobStateError
 from services.core.errors import FencedError
 from services.core.owners import LOCAL_VIEWER, Viewer

@@ -20,10 +20,10 @@ from services.api.http.problems import refusals
 from services.api.http.thread_pools import ThreadPool
 from services.api.jobs.event_stream import EVENT_ANSWERS, EventBroadcaster, EventStream, end_of
 from services.api.jobs.jobs import Jobs, StageProgress
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Deletion, Job
-from services.api.jobs.table import JobFilter
 from services.api.jobs.time_ranges import TimeRange
+from services.api.tables.jobs import JobFilter
+from services.api.tables.lifecycle import JobState
 from services.core.geometry import Record
 from services.core.job_kinds import foreign_options, job_kinds
 from services.core.light.safety import FlashAcknowledgement

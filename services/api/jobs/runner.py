@@ -13,9 +13,9 @@ from pathlib import Path
 from sqlalchemy.exc import DBAPIError
 
 from services.api.jobs.admission import Admission, queue_order
-from services.api.jobs.lifecycle import JobState, Transition, Trigger
 from services.api.jobs.records import Failure, Job, Lease
 from services.api.jobs.repository import Repository
+from services.api.tables.lifecycle import JobState, Transition, Trigger
 from services.client.errors import JobStateError
 from services.core.errors import (
     DentineError,

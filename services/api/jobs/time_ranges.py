@@ -17,11 +17,11 @@ from pydantic import Field
 from services.api.captures.descriptions import Describe, describe
 from services.api.jobs.admission import queue_order
 from services.api.jobs.forecast import MIN_OBSERVATIONS, Observation, foresee
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.past_runs import TENTHS, PastRun, tenth_of
 from services.api.jobs.records import Job
 from services.api.jobs.repository import Repository
 from services.api.jobs.size import method_of, size_of
+from services.api.tables.lifecycle import JobState
 from services.core.events import JobEvent
 from services.core.geometry import Record
 from services.core.records import JobSpec

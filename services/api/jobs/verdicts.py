@@ -14,8 +14,8 @@ import sqlalchemy as sql
 from pydantic import ValidationError
 from pydantic_core import from_json
 
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Job
+from services.api.tables.lifecycle import JobState
 from services.core.results import Verdict
 from services.core.verdict import VERDICT
 from services.pipeline.event_log import event_table

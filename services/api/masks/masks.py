@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import Field
 
 from services.api.jobs.jobs import Jobs
-from services.api.jobs.lifecycle import JobState
 from services.api.jobs.records import Job
 from services.api.masks.images import picture_of, require_mask
+from services.api.tables.lifecycle import JobState
 from services.client.errors import JobStateError, MaskError, UnknownMaskError
 from services.core.calibration.record import Calibration
 from services.core.files.image_metadata import plain_png

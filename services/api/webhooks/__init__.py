@@ -1,1 +1,1 @@
-"""Webhooks: subscriptions, the outbox and deliveries."""
+"""Webhooks: subscriptions and deliveries."""

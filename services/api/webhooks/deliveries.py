@@ -15,7 +15,7 @@ from typing import Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.webhooks.outbox import (
+from services.api.tables.outbox import (
     DAY_S,
     TRY_FOR_S,
     collect_changes,
@@ -23,7 +23,7 @@ from services.api.webhooks.outbox import (
     insert_delivery,
     message_body,
 )
-from services.api.webhooks.tables import DeliveryState, attempt_table, delivery_table, webhook_table
+from services.api.tables.webhooks import DeliveryState, attempt_table, delivery_table, webhook_table
 from services.api.webhooks.webhooks import find_webhook, switch_off
 from services.client.errors import UnknownWebhookError
 from services.core.geometry import Record

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 import sqlalchemy as sql
 from pydantic import Field
 
-from services.api.jobs.lifecycle import JobState
+from services.api.tables.lifecycle import JobState
+from services.api.tables.outbox import collect_changes, states_of
+from services.api.tables.webhooks import DeliveryState, attempt_table, delivery_table, webhook_table
 from services.api.webhooks.address import AddressPolicy
-from services.api.webhooks.outbox import collect_changes, states_of
-from services.api.webhooks.tables import DeliveryState, attempt_table, delivery_table, webhook_table
 from services.client.errors import JobStateError, UnknownWebhookError
 from services.core.geometry import Record
 from services.pipeline.database import writing

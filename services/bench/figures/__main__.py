@@ -27,8 +27,8 @@ from services.bench.figures.environment import memorial, under_an_environment
 from services.bench.figures.figure_cases import FULL, QUICK, FigureCases
 from services.bench.fits.tooth_capture import real_tooth
 from services.core.errors import DentineError, InputError
+from services.core.pages.pictures import png_bytes
 from services.core.store import write_atomic
-from services.fit.export.pictures import png_bytes
 
 Drawing = Callable[[FigureCases], Drawn]
 

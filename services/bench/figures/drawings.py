@@ -18,9 +18,9 @@ from services.bench.figures.figure_cases import (
 )
 from services.bench.figures.fitted import Comparisons, Fitted, Image, error_of, loss_of
 from services.bench.figures.mosaic import RESIDUAL_LIMIT, Column, cropped, mosaic, photo_and_fit
-from services.fit.export.pictures import Image8, signed_map, tone_map, white_level
-from services.fit.optics.domain import similar_tissue
-from services.fit.tooth.schedule import SIMILAR_G
+from services.core.pages.pictures import Image8, signed_map, tone_map, white_level
+from services.fit.coordinates.domain import similar_tissue
+from services.fit.stages.tooth.schedule import SIMILAR_G
 
 DIFFERENCE = f"Differences are fit minus photograph, blue to orange within ±{100 * RESIDUAL_LIMIT:.0f} % of white."
 

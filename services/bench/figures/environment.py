@@ -15,10 +15,10 @@ from services.bench.figures.gallery import SIMILAR_G
 from services.bench.figures.mosaic import Column, mosaic
 from services.bench.figures.surroundings import environment_light, read_environment, render_under
 from services.core.geometry import Camera, Mesh
-from services.fit.export.pictures import tone_map, white_level
-from services.fit.optics.domain import similar_tissue
-from services.fit.optics.parameters import Tissue
+from services.core.pages.pictures import tone_map, white_level
+from services.fit.coordinates.domain import similar_tissue
 from services.phantom.reflection import ROUGHNESS
+from services.transport.optics.parameters import Tissue
 
 MEMORIAL = Path("shared") / "data" / "hdr-memorial" / "memorial.hdr"
 TURNS_DEGREES = (0.0, 120.0, 240.0)

@@ -12,22 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
+from services.anatomy.job_dentin import dentin_shape, known_dentins
+from services.assets.asset import mouth_of
+from services.assets.stage import fitted_teeth
 from services.bench.figures.cases import job_of
 from services.bench.fits.tooth_capture import tissue_of
+from services.core.pages.pictures import Picture
 from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.core.store import open_stage
-from services.fit.checks.evaluate import ErrorSums, error_sums
-from services.fit.export.asset import mouth_of
-from services.fit.export.pictures import Picture
-from services.fit.export.stains import read_stains
-from services.fit.inputs.dentin import dentin_shape, known_dentins
-from services.fit.inputs.observations import Observations, channel_scene, read_channel, read_observations
-from services.fit.inputs.view_stack import ViewStack
-from services.fit.optics.parameters import Mouth, Tissue
-from services.fit.stage import fitted_teeth
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
+from services.fit.measurements.observations import Observations, channel_scene, read_channel, read_observations
+from services.fit.measurements.view_stack import ViewStack
+from services.fit.passes.evaluate import ErrorSums, error_sums
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Mouth, Tissue
+from services.transport.scene.recipe import View
+from services.transport.scene.stain_uv import read_stains
 
 Image = tuple[str, str]
 """Names of an image's camera and light."""

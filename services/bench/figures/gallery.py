@@ -24,11 +24,11 @@ from services.anatomy.templates.incisor import build_incisor
 from services.core.errors import DentineError, InputError, NonFiniteError
 from services.core.files.meshes import read_mesh, write_mesh
 from services.core.geometry import Mesh, Vector3
+from services.core.pages.pictures import png_bytes, tone_map, white_level
 from services.core.store import write_atomic
-from services.fit.export.pictures import png_bytes, tone_map, white_level
-from services.fit.optics.domain import similar_medium
-from services.fit.transport.platform import prepare_device
+from services.fit.coordinates.domain import similar_medium
 from services.phantom.tooth import TRUE_TISSUE
+from services.transport.platform import prepare_device
 
 SceneDict = dict[str, Any]
 Image = NDArray[np.float64]
@@ -156,7 +156,7 @@ def tooth_integrator(enamel: str, dentin: str | None, *, exact: bool) -> SceneDi
         dentin: ids of the shapes that bound the dentin, if any.
         exact: use the media themselves instead of similar ones, which look alike and cost less.
     """
-    from services.fit.plugin.integrator import medium_properties
+    from services.transport.plugin.integrator import medium_properties
 
     properties: SceneDict = {"type": "dentine", "boundary": "thin", "roughness": ROUGHNESS}
     for part, ids in (("enamel", enamel), ("dentin", dentin)):
@@ -250,8 +250,8 @@ def own_pictures(options: argparse.Namespace) -> Iterator[tuple[str, Image, floa
     """
     import mitsuba as mi
 
-    from services.fit.plugin.integrator import read_properties
-    from services.fit.plugin.scene_teeth import SceneTeeth
+    from services.transport.plugin.integrator import read_properties
+    from services.transport.plugin.scene_teeth import SceneTeeth
 
     if not options.scene.is_file():
         raise InputError(f"Scene file {options.scene} does not exist; give a Mitsuba XML scene in millimetres.")
@@ -304,7 +304,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.samples < 1 or min(options.size) < 1:
             raise InputError("A picture needs at least one sample and one pixel; raise --samples or --size.")
         prepare_device(backend=options.variant, colours="rgb")
-        from services.fit.plugin.integrator import register_integrator
+        from services.transport.plugin.integrator import register_integrator
 
         register_integrator()
         options.out.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from services.core.errors import InputError
-from services.fit.export.pictures import Image8, Picture, signed_map, tone_map, white_level
+from services.core.pages.pictures import Image8, Picture, signed_map, tone_map, white_level
 
 GAP_PX, HEAD_PX, LINE_PX = 6, 20, 16
 FONT_PX = 13

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.assets.mitsuba.scene import load_scene, sensor_dict
 from services.bench.figures.gallery import render
 from services.core.errors import InputError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
-from services.fit.export.mitsuba_scene import load_scene, sensor_dict
-from services.fit.optics.parameters import Tissue
-from services.fit.transport.platform import prepare_device
+from services.transport.optics.parameters import Tissue
+from services.transport.platform import prepare_device
 
 Array = NDArray[np.float64]
 Surfaces = Mapping[str, Mesh]
@@ -81,7 +81,7 @@ def render_under(
         roughness: GGX roughness of the mirror reflection on the enamel; None for no reflection.
     """
     prepare_device()
-    from services.fit.plugin.integrator import medium_properties, register_integrator
+    from services.transport.plugin.integrator import medium_properties, register_integrator
 
     register_integrator()
     parts = {"enamel": "outer"} | ({"dentin": "dentin"} if "dentin" in surfaces else {})

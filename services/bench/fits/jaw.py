@@ -27,8 +27,8 @@ from services.core.records import FolderCapture, JobSpec
 from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter, is_published, read_record
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
-from services.fit.transport.platform import prepare_device
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
+from services.transport.platform import prepare_device
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -159,10 +159,10 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
     """Prepare a jaw's capture below ``job`` if it is not prepared, and build its scene; its views are labelled with
     what each pixel shows.
     """
-    from services.fit.inputs.dentin import jaw_dentins
-    from services.fit.inputs.observations import channel_scene, read_channel, read_observations
-    from services.fit.jaw.views import label_views
-    from services.fit.transport.engine import Engine
+    from services.anatomy.job_dentin import jaw_dentins
+    from services.fit.measurements.observations import channel_scene, read_channel, read_observations
+    from services.fit.stages.jaw.views import label_views
+    from services.transport.engine import Engine
 
     if not is_published(job, "prepared"):
         prepare(job, spec)
@@ -176,9 +176,9 @@ def prepared_jaw(job: Path, spec: JobSpec) -> PreparedTooth:
 
 def timed_fit(recorder: ErrorRecorder) -> FitReport:
     """Run the product's own fit stage in this process, and measure its error after every joint step and at its end."""
-    from services.fit.execution.attempt import Attempt
-    from services.fit.jaw.driver import JawDriver
     from services.fit.stage import ENGINE
+    from services.fit.stages.attempt import Attempt
+    from services.fit.stages.jaw.driver import JawDriver
 
     paused, step = 0.0, 0
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from services.bench.fits.tooth_capture import CHANNEL, PreparedTooth
 from services.core.files.meshes import write_mesh
-from services.fit.optics.domain import LN10, to_dual, to_natural
-from services.fit.optics.parameters import Medium, Tissue
+from services.fit.coordinates.domain import LN10, to_dual, to_natural
+from services.transport.optics.parameters import Medium, Tissue
 
 START = Medium(6.0, 0.99, g1=0.8)
 """Medium of enamel and dentin at the start."""
@@ -36,7 +36,7 @@ class StockFit:
         import drjit as dr
         import mitsuba as mi
 
-        from services.fit.export.mitsuba_scene import load_scene, nested_scene
+        from services.assets.mitsuba.scene import load_scene, nested_scene
 
         self.rate, self.rounds, self.seconds, self._samples = rate, 0, 0.0, samples
         begun = time.process_time()

@@ -28,8 +28,8 @@ from services.bench.fits.stock_fit import StockFit
 from services.bench.fits.tooth_capture import PreparedTooth, smallest_case, tissue_of
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
-from services.fit.optics.parameters import Tissue
-from services.fit.transport.platform import prepare_device
+from services.transport.optics.parameters import Tissue
+from services.transport.platform import prepare_device
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -132,9 +132,9 @@ def our_fit(recorder: ErrorRecorder, folder: Path, peer: str, spec: JobSpec) -> 
     end.
     """
     from services.core.store import StageWriter
-    from services.fit.execution.attempt import Attempt
     from services.fit.stage import ENGINE
-    from services.fit.tooth.driver import FitDriver
+    from services.fit.stages.attempt import Attempt
+    from services.fit.stages.tooth.driver import FitDriver
 
     rows: list[ToothRow] = []
     paused = 0.0

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from services.core.records import JobSpec
 from services.core.stage import LocalContext
 from services.core.store import is_published
-from services.fit.checks.evaluate import ErrorSums, error_sums
-from services.fit.inputs.observations import Observations, read_channel, read_observations
-from services.fit.inputs.view_stack import ViewStack
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View, single_tooth
+from services.fit.measurements.observations import Observations, read_channel, read_observations
+from services.fit.measurements.view_stack import ViewStack
+from services.fit.passes.evaluate import ErrorSums, error_sums
+from services.transport.engine import Engine
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
+from services.transport.scene.recipe import View, single_tooth
 
 REAL_TOOTH = Path("shared") / "data" / "tooth-ur1-truth"
 """Capture of a scanned incisor; a phantom replaces it where this data does not lie beside the checkout."""
@@ -132,8 +132,8 @@ def prepare(job: Path, spec: JobSpec) -> None:
 
 def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> PreparedTooth:
     """Prepare a capture below ``job`` if it is not prepared, and build its scene."""
-    from services.fit.inputs.dentin import dentin_shape
-    from services.fit.transport.platform import prepare_device
+    from services.anatomy.job_dentin import dentin_shape
+    from services.transport.platform import prepare_device
 
     prepare_device()
     if not is_published(job, "prepared"):

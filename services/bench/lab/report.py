@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from services.core.page import page_template
+from services.core.pages.page import page_template
 from services.core.store import write_atomic
 
 SUMMARY, PAGE = "summary.json", "summary.html"

@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from services.bench import Row
-from services.fit.slab.simulate import Layer, simulate_slab
+from services.slab.simulate import Layer, simulate_slab
 
 CASES = {
     "slab-clear": (Layer(sigma=2, alpha=0.9, g1=0.75, thickness_mm=1), 1.0),

@@ -15,13 +15,13 @@ from services.bench import Row
 from services.bench.slab.plain_photons import plain_images
 from services.core.geometry import Record
 from services.core.slab.folder import SlabFolder
-from services.fit.slab.bound import Bound, bound_of
-from services.fit.slab.fit import fit_slab
-from services.fit.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.options import SlabOptions
-from services.fit.slab.results.result import SlabFit
-from services.fit.slab.solve.uncertainty import slopes
+from services.slab.bound import Bound, bound_of
+from services.slab.fit import fit_slab
+from services.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.slab.model.rig import rig_of
+from services.slab.options import SlabOptions
+from services.slab.results.result import SlabFit
+from services.slab.solve.uncertainty import slopes
 
 Array = NDArray[np.float64]
 

@@ -20,15 +20,15 @@ from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import FINE_RAD, NOISE, Truth
 from services.core.errors import InputError
-from services.fit.slab.images import Measurements, shot_noise
-from services.fit.slab.model.dictionary import ANGLES_RAD, Material
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import Rig, rig_of
-from services.fit.slab.solve.budget import Budget
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import GaussNewton
-from services.fit.slab.solve.projected_descent import DescentOptions, descend
-from services.fit.slab.solve.start import start
+from services.slab.images import Measurements, shot_noise
+from services.slab.model.dictionary import ANGLES_RAD, Material
+from services.slab.model.forward import render
+from services.slab.model.rig import Rig, rig_of
+from services.slab.solve.budget import Budget
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.gauss_newton import GaussNewton
+from services.slab.solve.projected_descent import DescentOptions, descend
+from services.slab.solve.start import start
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,15 +21,15 @@ from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import Truth, photographed
 from services.bench.slab.solvers import ABSORPTION_PER_MM, EFFORTS, QUICK_EFFORTS, SCATTERING_PER_MM, compared
 from services.bench.slab.stock_cell import matched_folder, medium_of, node_angles, scenes, turned
-from services.fit.slab.dictionaries.hg import COSINES
-from services.fit.slab.images import Measurements, folded
-from services.fit.slab.model.dictionary import Material, hg_values
-from services.fit.slab.model.rig import rig_of
-from services.fit.slab.solve.budget import Budget
-from services.fit.slab.solve.coordinates import Knots
-from services.fit.slab.solve.gauss_newton import GaussNewton
-from services.fit.slab.solve.mixture import Mixtures, unit_atoms
-from services.fit.slab.solve.start import start
+from services.slab.dictionaries.hg import COSINES
+from services.slab.images import Measurements, folded
+from services.slab.model.dictionary import Material, hg_values
+from services.slab.model.rig import rig_of
+from services.slab.solve.budget import Budget
+from services.slab.solve.coordinates import Knots
+from services.slab.solve.gauss_newton import GaussNewton
+from services.slab.solve.mixture import Mixtures, unit_atoms
+from services.slab.solve.start import start
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +102,7 @@ def descend(
     Yields:
         Number of iterations, the medium after them and processor seconds so far.
     """
-    from services.fit.transport.platform import prepare_device
+    from services.transport.platform import prepare_device
 
     prepare_device()
     import mitsuba as mi

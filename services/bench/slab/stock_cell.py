@@ -56,7 +56,7 @@ def stock_images(
         seed: seed of the first render.
         done: called with the number of each finished image.
     """
-    from services.fit.transport.platform import prepare_device
+    from services.transport.platform import prepare_device
 
     prepare_device()
     import mitsuba as mi

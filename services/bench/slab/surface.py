@@ -19,10 +19,10 @@ from services.bench import Row
 from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import squared_share
-from services.fit.slab.model.dictionary import Material, hg_values
-from services.fit.slab.model.forward import render
-from services.fit.slab.model.rig import Rig, rig_of
-from services.fit.slab.solve.mixture import unit_atoms
+from services.slab.model.dictionary import Material, hg_values
+from services.slab.model.forward import render
+from services.slab.model.rig import Rig, rig_of
+from services.slab.solve.mixture import unit_atoms
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

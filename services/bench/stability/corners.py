@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.optics.parameters import Medium
+from services.transport.optics.parameters import Medium
 
 SIGMA = (1e-4, 1e4)
 """Range of extinction, per mm."""

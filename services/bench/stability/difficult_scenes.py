@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera, Mesh
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
+from services.transport.engine import Engine
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.transport.scene.recipe import SceneRecipe, View, single_tooth
 
 SEMI_AXES_MM = np.array([3.0, 2.0, 4.0])
 BOX_MM = 4.0

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.bench.stability.corners import REGIONS, SMOOTH, Corners
-from services.fit.optics import fresnel, phase
-from services.fit.optics.domain import BOUNDS, natural_derivative, to_dual, to_natural
-from services.fit.optics.free_flight import minus_log1m, one_minus_exp
-from services.fit.transport.scene.media import Media
+from services.fit.coordinates.domain import BOUNDS, natural_derivative, to_dual, to_natural
+from services.transport.optics import fresnel, phase
+from services.transport.optics.free_flight import minus_log1m, one_minus_exp
+from services.transport.scene.media import Media
 
 Floats = NDArray[np.float64]
 ROUNDING = 2.0**-24

@@ -21,15 +21,15 @@ from services.bench import Row
 from services.bench.stability.corners import REGIONS, SMOOTH, Corners, draw
 from services.bench.stability.difficult_scenes import check_scene, scenes
 from services.bench.stability.formula_errors import FORMULAS, worst_by_region
-from services.fit.optics import fresnel
-from services.fit.optics.parameters import MEDIUM_FIELDS
-from services.fit.slab.simulate import specular_share
-from services.fit.transport.paths.scores import Plan
-from services.fit.transport.paths.starts import PathStart, SlabStart, stream
-from services.fit.transport.paths.walk import Walk
-from services.fit.transport.platform import prepare_device
-from services.fit.transport.scene.geometry import SlabGeometry
-from services.fit.transport.scene.media import Media, Score
+from services.slab.simulate import specular_share
+from services.transport.optics import fresnel
+from services.transport.optics.parameters import MEDIUM_FIELDS
+from services.transport.paths.scores import Plan
+from services.transport.paths.starts import PathStart, SlabStart, stream
+from services.transport.paths.walk import Walk
+from services.transport.platform import prepare_device
+from services.transport.scene.geometry import SlabGeometry
+from services.transport.scene.media import Media, Score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -32,9 +32,9 @@ from services.bench.transport.incisor_stack import TISSUE, IncisorStack, incisor
 from services.bench.transport.shape_gradient import shape_rows
 from services.bench.transport.stain_gradient import stain_rows
 from services.bench.transport.stock_gradient import StockGradient, shared_names
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import View
 
 Array = NDArray[np.float64]
 

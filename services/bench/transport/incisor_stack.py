@@ -15,10 +15,10 @@ from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import SceneRecipe, View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import SceneRecipe, View, single_tooth
 
 TISSUE = Tissue(Medium(4.5, 0.997, 0.93, 0.82, -0.1), Medium(12.0, 0.9945, 1.0, 0.75))
 PIXEL_MM = 0.5
@@ -55,7 +55,7 @@ class IncisorStack:
 
     def stock_scene(self, folder: Path, tissue: Tissue, light: int, samples: int = 16) -> Any:
         """Return the scene under one light for stock Mitsuba; its meshes are written into ``folder``."""
-        from services.fit.export.mitsuba_scene import load_scene, nested_scene
+        from services.assets.mitsuba.scene import load_scene, nested_scene
 
         files = folder / "outer.ply", folder / "dentin.ply"
         if not files[1].exists():

@@ -18,9 +18,9 @@ import numpy as np
 
 from services.bench import Row
 from services.bench.transport.incisor_stack import TISSUE, incisor_stack
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
 from services.phantom.dome_rig import dome_cameras
+from services.transport.engine import Engine
+from services.transport.scene.recipe import View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,15 +9,15 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from services.fit.optics.free_flight import minus_log1m
-from services.fit.transport.engine import Engine
-from services.fit.transport.lighting.lights import PointLights
-from services.fit.transport.paths.scores import Plan
-from services.fit.transport.paths.starts import CameraStart
-from services.fit.transport.paths.tally import Tally
-from services.fit.transport.paths.walk import ROULETTE_WEIGHT, Walk
-from services.fit.transport.paths.walker import Flight, Walker
-from services.fit.transport.scene.media import Media, PhaseFunction
+from services.transport.engine import Engine
+from services.transport.lighting.lights import PointLights
+from services.transport.optics.free_flight import minus_log1m
+from services.transport.paths.scores import Plan
+from services.transport.paths.starts import CameraStart
+from services.transport.paths.tally import Tally
+from services.transport.paths.walk import ROULETTE_WEIGHT, Walk
+from services.transport.paths.walker import Flight, Walker
+from services.transport.scene.media import Media, PhaseFunction
 
 
 class PlainEngine(Engine):

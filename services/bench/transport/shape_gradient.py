@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from services.anatomy.blend import dentin_blend_shape
 from services.bench.transport.gradient_rows import Estimate, GradientRow, of_parts
 from services.bench.transport.incisor_stack import TISSUE, incisor_stack
-from services.fit.optics.parameters import Medium, Tissue
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.recipe import View
 
 Array = NDArray[np.float64]
 

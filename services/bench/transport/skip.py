@@ -23,11 +23,11 @@ from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.templates.incisor import build_incisor
 from services.bench import Row
 from services.core.geometry import Camera, Mesh
-from services.fit.optics.parameters import Medium, Stain, Tissue
-from services.fit.optics.phase_table import PhaseTable
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View, single_tooth
 from services.phantom.dome_rig import dome_cameras, dome_lights
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Medium, Stain, Tissue
+from services.transport.optics.phase_table import PhaseTable
+from services.transport.scene.recipe import View, single_tooth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

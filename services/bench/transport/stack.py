@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from services.bench import Row
 from services.bench.transport.incisor_stack import TISSUE, IncisorStack, incisor_stack
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import View
+from services.transport.engine import Engine
+from services.transport.scene.recipe import View
 
 
 def run(*, quick: bool) -> list[dict[str, Any]]:
@@ -48,7 +48,7 @@ def run(*, quick: bool) -> list[dict[str, Any]]:
 
 
 def _peer(folder: Path, stack: IncisorStack, view: View, count: int, samples: int) -> Row:
-    from services.fit.export.mitsuba_scene import render_batches
+    from services.assets.mitsuba.scene import render_batches
 
     seconds, mean, variance = 0.0, [], []
     x, y = view.pixels.T

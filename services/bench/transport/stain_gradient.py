@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from services.bench.transport.gradient_rows import GradientRow
 from services.bench.transport.incisor_stack import TISSUE, IncisorStack, incisor_stack
-from services.fit.optics.parameters import Stain
-from services.fit.transport.engine import Engine
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Stain
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.optics.parameters import Tissue
-from services.fit.transport.scene.recipe import View
+from services.transport.optics.parameters import Tissue
+from services.transport.scene.recipe import View
 
 
 def shared_names(tissue: Tissue) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from services.calibrate.registration.photographs import mean_photograph
 from services.core.errors import CaptureInputError
 from services.core.files.scans import read_scan_file
 from services.core.geometry import Mesh
-from services.core.page import page_template
+from services.core.pages.page import page_template
 from services.core.raw.folder import DESCRIPTION, read_raw_folder
 from services.core.raw.records import RawFolder
 from services.core.store import write_atomic

@@ -13,7 +13,7 @@ from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View
 from services.calibrate.registration.pose import PoseStep, RigidPose
 from services.core.geometry import Mesh
-from services.core.page import page_template
+from services.core.pages.page import page_template
 from services.core.raw.registration import Registration
 from services.core.store import write_atomic
 

@@ -21,7 +21,7 @@ from services.calibrate.session.drawings import (
 from services.calibrate.session.record import REFLECTANCE_SE
 from services.calibrate.session.run import Session
 from services.core.calibration.record import Calibration
-from services.core.page import page_template
+from services.core.pages.page import page_template
 from services.core.store import write_atomic
 
 REPORT = "report.html"

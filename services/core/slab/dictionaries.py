@@ -23,12 +23,12 @@ class SlabDictionary:
 DEFAULT_DICTIONARY = "tents"
 DICTIONARIES: Mapping[str, SlabDictionary] = MappingProxyType(
     {
-        "tents": SlabDictionary("any smooth phase function", "services.fit.slab.dictionaries.tents:tents"),
-        "hg": SlabDictionary("a mix of Henyey-Greenstein lobes", "services.fit.slab.dictionaries.hg:lobes"),
-        "mie": SlabDictionary("spheres of many sizes", "services.fit.slab.dictionaries.mie:spheres"),
+        "tents": SlabDictionary("any smooth phase function", "services.slab.dictionaries.tents:tents"),
+        "hg": SlabDictionary("a mix of Henyey-Greenstein lobes", "services.slab.dictionaries.hg:lobes"),
+        "mie": SlabDictionary("spheres of many sizes", "services.slab.dictionaries.mie:spheres"),
         "table": SlabDictionary(
             "phase functions of your own, from dictionary.csv or dictionary.npy in the folder",
-            "services.fit.slab.dictionaries.table:table",
+            "services.slab.dictionaries.table:table",
         ),
     }
 )

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.records import MaskBit
-from services.fit.checks.evaluate import Evaluation
 from services.fit.checks.offset import Comparison, FoundOffset, ShiftedRender, best_offset
-from services.fit.inputs.levels import LevelReader, whole_squares
-from services.fit.inputs.observations import Observations
-from services.fit.inputs.view_stack import ViewStack
+from services.fit.measurements.levels import LevelReader, whole_squares
+from services.fit.measurements.observations import Observations
+from services.fit.measurements.view_stack import ViewStack
+from services.fit.passes.evaluate import Evaluation
 
 TESTED_ERROR = 0.05
 """Relative image error above which a fit is tested for an offset: below it, a shift does not matter."""

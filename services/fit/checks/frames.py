@@ -15,9 +15,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.checks.evaluate import Evaluation, FrameSums
-from services.fit.inputs.observations import Observations
-from services.fit.inputs.view_stack import ViewStack
+from services.fit.measurements.observations import Observations
+from services.fit.measurements.view_stack import ViewStack
+from services.fit.passes.evaluate import Evaluation, FrameSums
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from services.fit.checks.identifiability import quantity_in_words
 from services.fit.checks.next_capture import MIN_REDUCTION, in_percent, relative_errors
-from services.fit.instrument.errors import kind_of_error
-from services.fit.instrument.moves import MOVING_BODIES
-from services.fit.optics.parameters import Tissue
+from services.fit.coordinates.instrument_errors import kind_of_error
+from services.fit.measurements.instrument.moves import MOVING_BODIES
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import estimates
 from services.fit.solve.information import AddedInformation, covariance_after
+from services.transport.optics.parameters import Tissue
 
 Array = NDArray[np.float64]
 

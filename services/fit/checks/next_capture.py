@@ -12,30 +12,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.files.content_files import StoredFile
 from services.core.geometry import Camera
 from services.core.results import Estimate
 from services.fit.checks.identifiability import QUANTITIES, quantity_in_words
-from services.fit.execution.blocks import (
-    Block,
-    BlockInstrument,
-    BlockTask,
-    StoredFile,
-    read_recipe,
-    write_block,
-    write_recipe,
-)
-from services.fit.execution.derivatives import Differentiation
-from services.fit.execution.engine_host import EngineHost
-from services.fit.execution.passes import StackProblem, TraceRow, trace_row
-from services.fit.instrument.errors import DEFAULT_SE
-from services.fit.instrument.photographs import block_of, error_derivatives
-from services.fit.instrument.pose import rigid
-from services.fit.optics.parameters import Tissue
+from services.fit.coordinates.instrument_errors import DEFAULT_SE
+from services.fit.measurements.blocks import Block, BlockInstrument, BlockTask, write_block
+from services.fit.measurements.instrument.photographs import block_of, error_derivatives
+from services.fit.measurements.instrument.pose import rigid
+from services.fit.passes.derivatives import Differentiation
+from services.fit.passes.passes import StackProblem, TraceRow, trace_row
 from services.fit.solve.covariance import Uncertainty
 from services.fit.solve.estimates import estimates
 from services.fit.solve.information import AddedInformation, added_information, covariance_after
 from services.fit.solve.sandwich import Sandwich
-from services.fit.transport.scene.recipe import SceneRecipe, View
+from services.tasks.engine_host import EngineHost
+from services.transport.optics.parameters import Tissue
+from services.transport.scene.recipe import SceneRecipe, View
+from services.transport.scene.recipe_files import read_recipe, write_recipe
 
 Array = NDArray[np.float64]
 

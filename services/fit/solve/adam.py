@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
-from services.fit.optics.domain import Domain
+from services.fit.coordinates.domain import Domain
 from services.fit.solve.gauss_newton import ADVICE, Result, Solution
 
 Array = NDArray[np.float64]

@@ -26,8 +26,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.instrument.errors import kind_of_error
-from services.fit.optics.domain import Domain
+from services.fit.coordinates.domain import Domain
+from services.fit.coordinates.instrument_errors import kind_of_error
 from services.fit.solve.closing import ClosingSums, Response, positive_part, response
 from services.fit.solve.elimination import eliminate
 from services.fit.solve.normal_equations import NormalEquations

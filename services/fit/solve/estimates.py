@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from services.core.calibration.uncertainty import TWIST
 from services.core.results import Estimate
-from services.fit.optics.domain import UNITS, kind_of, natural_derivative
-from services.fit.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
+from services.fit.coordinates.domain import UNITS, kind_of, natural_derivative
 from services.fit.solve.covariance import MIN_DATA_SHARE, Uncertainty
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Optics, Tissue
 
 Array = NDArray[np.float64]
 DERIVED: Mapping[str, tuple[str, Callable[[Medium], float]]] = MappingProxyType(

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
-from services.fit.optics.domain import Domain
+from services.fit.coordinates.domain import Domain
 from services.fit.solve.elimination import ReducedEquations, eliminate
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
 from services.fit.solve.step_test import StepTest

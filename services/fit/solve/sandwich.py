@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.instrument.errors import FAULT_Z, kind_of_error, single_faults
-from services.fit.optics.domain import Domain
+from services.fit.coordinates.domain import Domain
+from services.fit.coordinates.instrument_errors import FAULT_Z, kind_of_error, single_faults
 from services.fit.solve.recombination import Fault, Recombination, faults
 
 Array = NDArray[np.float64]

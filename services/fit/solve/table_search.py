@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.execution.blocks import Block
-from services.fit.optics.domain import to_natural
+from services.fit.coordinates.domain import to_natural
 
 Array = NDArray[np.float64]
 
@@ -90,9 +89,9 @@ class Observed:
     weight: Array
 
     @staticmethod
-    def of(block: Block) -> Observed:
-        """Photographs of a stored block."""
-        return Observed(block.reference.reshape(-1), block.variance.reshape(-1), block.fit_weight.reshape(-1))
+    def of(reference: Array, variance: Array, weight: Array) -> Observed:
+        """Photographs (L, N) with their variance and their weight in the fit."""
+        return Observed(reference.reshape(-1), variance.reshape(-1), weight.reshape(-1))
 
 
 def search_node(

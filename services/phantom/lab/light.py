@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight
 from services.core.geometry import Tooth
-from services.fit.optics.parameters import Mouth
-from services.fit.transport.engine import Engine
-from services.fit.transport.rays import RayScene, pixel_rays
-from services.fit.transport.scene.recipe import SceneRecipe, ToothSurfaces
 from services.phantom.jaw_optics import GUMS_IOR
 from services.phantom.lab.mouth import LabMouth
 from services.phantom.lab.rig import CHANNELS
 from services.phantom.render import render_engine
+from services.transport.engine import Engine
+from services.transport.optics.parameters import Mouth
+from services.transport.rays import RayScene, pixel_rays
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
 Floats = NDArray[np.float64]
 SUBPIXELS = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))

@@ -23,7 +23,6 @@ from services.core.records import JobSpec, MaskBit
 from services.core.stage import LocalContext
 from services.preprocess.brightness import measure_light
 from services.preprocess.masking.masks import HandMasks
-from services.preprocess.masking.shade import shade
 from services.preprocess.masking.valid import require_visible_teeth, valid_bits
 from services.preprocess.opening import open_source
 from services.preprocess.quality import assess, by_stop, write_picture
@@ -33,6 +32,7 @@ from services.preprocess.stabilisation.motion import stored_step
 from services.preprocess.subject import NO_SURFACE, Subject, read_subject
 from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone
+from services.preprocess.tasks.shade import shade
 
 NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)
 """Mask bits of pixels that are left out of an image's brightness levels and noise."""

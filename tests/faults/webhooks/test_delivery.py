@@ -7,8 +7,8 @@ import json
 import pytest
 from standardwebhooks.webhooks import Webhook as Verifier
 
-from services.api.jobs.lifecycle import JobState, Trigger
 from services.api.jobs.records import Failure
+from services.api.tables.lifecycle import JobState, Trigger
 from services.api.webhooks.sender import FIRST_RETRY_S
 from services.api.webhooks.webhooks import WebhookChange
 from tests.support.receiver import receiving

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from services.api.tables.outbox import DAY_S
 from services.api.webhooks.deliveries import DISABLE_AFTER_S, KEEP_S, Attempt
-from services.api.webhooks.outbox import DAY_S
 from services.api.webhooks.sender import retry_s
 from services.api.webhooks.webhooks import WebhookChange
 from tests.support.receiver import receiving, wait_until

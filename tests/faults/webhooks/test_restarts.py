@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 
-from services.api.jobs.lifecycle import Trigger
+from services.api.tables.lifecycle import Trigger
 from services.api.webhooks.deliveries import CLAIM_S
 from tests.support.receiver import receiving
 from tests.support.webhook_service import Service, states_in

@@ -1,0 +1,1 @@
+"""Assets of a fit: scenes, textures, parameters and report, as people open them."""

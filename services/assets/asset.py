@@ -1,0 +1,198 @@
+"""The exported asset: a folder that stock Mitsuba renders, with the measured parameters beside the scenes.
+
+::
+
+    scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
+    teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
+    gums.ply, cavity.ply       of a jaw
+    surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
+    teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer
+                               surface's u, v
+    rig.json                   cameras, lights and channels by name
+    parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number,
+                               ``11.enamel.sigma``
+    errors.json                fitted and held-out image error, whether the fit converged, correlations, which
+                               quantities the capture determines; for a jaw's teeth too
+    NOT-CONVERGED.txt          only where the fit did not converge: advice on what to do
+    render.py                  renders the scenes
+    thin_boundary.py           surface model that Mitsuba lacks, only for the boundary model ``thin``
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
+from services.assets.mitsuba.scene import nested_scene, with_square_pixels
+from services.assets.mitsuba.scene_xml import SceneParameter, write_scene
+from services.assets.stains import write_textures
+from services.core.files.meshes import write_mapped_mesh, write_mesh
+from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
+from services.core.records import Boundary
+from services.core.results import Estimate, FitReport
+from services.core.store import write_atomic
+from services.core.verdict import VERDICT, verdict_of
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
+from services.transport.scene.stain_uv import ToothStains
+
+SHIPPED = Path(__file__).parent / "shipped"
+NOT_CONVERGED = "NOT-CONVERGED.txt"
+"""File in the asset of a fit that did not converge, with advice on what to do."""
+
+
+def write_asset(
+    folder: Path,
+    report: FitReport,
+    teeth: tuple[Tooth, ...],
+    cameras: tuple[Camera, ...],
+    lights: tuple[Light, ...],
+    *,
+    channels: tuple[str, ...],
+    boundary: Boundary,
+    ior: float,
+    gums: Mesh | None = None,
+    cavity: Mesh | None = None,
+    stains: ToothStains | None = None,
+) -> tuple[str, ...]:
+    """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; return the files' paths relative to
+    ``folder``.
+
+    Args:
+        teeth: with the **fitted** dentin surface (``DentinShape.vertices_mm(shape)``) where the fit had one.
+        lights: ``intensity`` in the order of ``channels``.
+        gums, cavity: surfaces of a jaw; None for a single tooth.
+        stains: stain textures of a single tooth.
+
+    Raises:
+        CaptureInputError: a camera that Mitsuba cannot render.
+        MeshError: surfaces of a jaw that cannot be cut along each other.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {}
+    for tooth in teeth:
+        place = teeth_folder(Path(), tooth.fdi)
+        files[str(tooth.fdi)] = (place / "outer.ply", place / "dentin.ply" if tooth.dentin is not None else None)
+        if stains is None:
+            write_mesh(folder / place / "outer.ply", tooth.outer)
+        else:
+            write_mapped_mesh(folder / place / "outer.ply", tooth.outer, stains.corners_uv)
+        if tooth.dentin is not None:
+            write_mesh(folder / place / "dentin.ply", tooth.dentin)
+    for name, mesh in (("gums.ply", gums), ("cavity.ply", cavity)):
+        if mesh is not None:
+            write_mesh(folder / name, mesh)
+    cut = write_mouth_surfaces(folder / "surfaces", teeth, gums, cavity) if report.teeth else {}
+    surfaces = {name: path.relative_to(folder) for name, path in cut.items()}
+
+    textures = {}
+    if stains is not None:
+        (tooth,) = teeth
+        textures = {
+            channel: path.relative_to(folder)
+            for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()
+        }
+
+    first, shown = lights[0], tuple(with_square_pixels(camera) for camera in cameras)
+    position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
+    for index, channel in enumerate(channels):
+        intensity = SceneParameter("intensity", first.intensity[index])
+        samples = SceneParameter("spp", 256)
+        if report.teeth:
+            numbers, mouth = tuple(tooth.fdi for tooth in teeth), mouth_of(report, channel)
+            scene = mouth_scene(
+                surfaces, numbers, mouth, shown, position, intensity, boundary=boundary, ior=ior, samples=samples
+            )
+        else:
+            tissue = tissue_of(report.parameters[channel])
+            stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
+            scene = nested_scene(
+                files, tissue, shown, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained
+            )
+        write_scene(folder / f"scene_{channel}.xml", scene)
+
+    rig = {
+        "units": "mm",
+        "boundary": boundary,
+        "channels": list(channels),
+        "cameras": [camera.name for camera in cameras],
+        "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},
+    }
+    _write_json(folder / "rig.json", rig)
+    _write_json(folder / "parameters.json", parameters_json(report))
+    _write_json(folder / "errors.json", errors_json(report))
+    if not (verdict := verdict_of(report)).converged:
+        write_atomic(folder / NOT_CONVERGED, f"The fit did not converge. {verdict.headline} {report.advice}\n".encode())
+    for name in ("render.py", "thin_boundary.py") if boundary == "thin" else ("render.py",):
+        write_atomic(folder / name, (SHIPPED / name).read_bytes())
+    return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
+
+
+def tissue_of(table: dict[str, Estimate]) -> Tissue:
+    """Tissue of a table of estimates; a part that was not modelled is an empty medium."""
+    return Tissue(_medium_of(table, "enamel"), _medium_of(table, "dentin"))
+
+
+def mouth_of(report: FitReport, channel: str) -> Mouth:
+    """Mouth of a jaw's report in one channel, with the teeth in the report's order."""
+    table = report.parameters[channel]
+    gums = _medium_of(table, "gums") if "gums.sigma" in table else None
+    reflectance = table["cavity.reflectance"].value if "cavity.reflectance" in table else None
+    return Mouth(tuple(tissue_of(tooth.parameters[channel]) for tooth in report.teeth.values()), gums, reflectance)
+
+
+def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
+    values: dict[str, Any] = {
+        field: table[f"{part}.{field}"].value for field in MEDIUM_FIELDS if f"{part}.{field}" in table
+    }
+    return Medium(**values) if {"sigma", "alpha"} <= set(values) else Medium(0.0, 0.0)
+
+
+def parameters_json(report: FitReport) -> dict[str, Any]:
+    """Estimates per channel and name as JSON values: value, se, unit, determined, se_parts; the instrument's errors are
+    included.
+    """
+    tables = {channel: dict(table) | report.instrument.get(channel, {}) for channel, table in report.parameters.items()}
+    for fdi, tooth in report.teeth.items():
+        for channel, own in tooth.parameters.items():
+            tables[channel] |= {f"{fdi}.{name}": estimate for name, estimate in own.items()}
+            if tooth.enamel_thickness is not None:
+                tables[channel][f"{fdi}.enamel.thickness"] = tooth.enamel_thickness
+    if report.enamel_thickness is not None:
+        for table in tables.values():
+            table["enamel.thickness"] = report.enamel_thickness
+    return {channel: {name: _plain(estimate) for name, estimate in table.items()} for channel, table in tables.items()}
+
+
+def _plain(estimate: Estimate) -> dict[str, Any]:
+    return estimate.model_dump(exclude=None if estimate.se_parts else {"se_parts"})
+
+
+def errors_json(report: FitReport) -> dict[str, Any]:
+    """Relative image errors per channel as JSON values, with the verdict on the fit's convergence."""
+    verdict = verdict_of(report)
+    errors = {
+        "unit": "1",
+        "fit_error": report.fit_error,
+        "fit_error_se": report.fit_error_se,
+        "held_out_error": report.held_out_error,
+        "held_out_error_se": report.held_out_error_se,
+        "converged": verdict.converged,
+        VERDICT: verdict.model_dump(mode="json"),
+        "advice": report.advice,
+        "notes": report.notes,
+        "instrument": report.instrument_told,
+        "told": report.told,
+        "next_capture": report.next_capture,
+        "correlations": {channel: found.model_dump() for channel, found in report.correlations.items()},
+    }
+    teeth = {
+        fdi: tooth.model_dump(include={"state", "sentence", "fit_error", "held_out_error"})
+        for fdi, tooth in report.teeth.items()
+    }
+    return errors | ({"teeth": teeth} if teeth else {})
+
+
+def _write_json(path: Path, value: object) -> None:
+    write_atomic(path, (json.dumps(value, indent=1) + "\n").encode())

@@ -1,0 +1,1 @@
+"""Exporter to Mitsuba: scenes as dictionaries and as XML files."""

@@ -1,0 +1,178 @@
+"""The export stage: turns a published fit into an asset, and writes its report."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from services.core.geometry import Mesh
+from services.core.installed import require_packages
+from services.core.records import JobSpec
+from services.core.results import AssetManifest, FitReport, PreparedManifest, ToothReport
+from services.core.stage import StageContext, StageEvent
+from services.core.store import StageWriter, open_stage, write_atomic, write_record
+from services.core.verdict import verdict_of
+
+if TYPE_CHECKING:
+    from services.anatomy.dentin_shape import DentinShape
+    from services.core.geometry import Tooth
+
+PACKAGES = ("jinja2", "mitsuba", "PIL")
+"""Packages of the extra ``fit`` that an export needs, by the names under which they are imported."""
+
+
+def check() -> None:
+    """Import the modules that an export needs.
+
+    Raises:
+        PlatformError: a package is missing.
+    """
+    require_packages(PACKAGES, "fit")
+    for module in ("asset", "fit_pictures", "report"):
+        importlib.import_module(f"services.assets.{module}")
+
+
+def export(spec: JobSpec, context: StageContext) -> AssetManifest:
+    """Write the asset, and parameters.json, errors.json and report.html beside it in the job's folder.
+
+    Raises:
+        StoreError: the fit or the prepared stage is missing or damaged.
+    """
+    import numpy as np
+
+    from services.assets.asset import errors_json, parameters_json, write_asset
+    from services.assets.fit_pictures import report_pictures
+    from services.assets.report import write_report
+    from services.core.files.meshes import read_mesh
+    from services.transport.scene.stain_uv import read_stains
+    from services.transport.thickness import fitted_thickness
+
+    context.report(StageEvent(stage="export", kind="started"))
+    context.raise_if_cancelled()
+    fit_folder, report = open_stage(context.root, "fit", FitReport)
+    prepared_folder, prepared = open_stage(context.root, "prepared", PreparedManifest, verify=False)
+    writer = StageWriter(context.root, "asset", context.attempt)
+    channels = tuple(report.parameters)
+    shaped = fitted_dentins(prepared_folder, prepared, spec, report)
+    teeth = tuple(_with_dentin(*each) for each in shaped)
+    surroundings = [prepared_folder / name for name in ("gums.ply", "cavity.ply")]
+    gums, cavity = (read_mesh(path) if spec.kind == "jaw" and path.is_file() else None for path in surroundings)
+    index = [prepared.channels.index(channel) for channel in channels]
+    lights = tuple(
+        light.model_copy(
+            update={"intensity": tuple(light.intensity[k if len(light.intensity) > 1 else 0] for k in index)}
+        )
+        for light in prepared.lights
+    )
+    stains = read_stains(fit_folder)
+    files = write_asset(
+        writer.folder,
+        report,
+        teeth,
+        prepared.cameras,
+        lights,
+        channels=channels,
+        boundary=spec.boundary,
+        ior=spec.ior,
+        gums=gums,
+        cavity=cavity,
+        stains=stains,
+    )
+
+    history = json.loads((fit_folder / "history.json").read_text())
+    title = f"Tooth {teeth[0].fdi}" if spec.kind == "tooth" else f"Jaw of {len(teeth)} teeth"
+    facts = {
+        "title": title,
+        "boundary": spec.boundary,
+        "ior": spec.ior,
+        "provenance": {"source": _source(spec), "seed": str(spec.seed), "options": describe_options(spec)},
+    }
+    thickness = None
+    if spec.kind == "tooth":
+        ((tooth, dentin, shape),) = shaped
+        thickness = fitted_thickness(tooth.outer, dentin, shape, report.shape_covariance, prepared.cameras[0])
+    pictures = report_pictures(
+        fit_folder, channels, teeth[0] if spec.kind == "tooth" else None, prepared.cameras, thickness, stains
+    )
+    write_report(context.root / "report.html", report, pictures, history, facts)
+    write_atomic(context.root / "parameters.json", _json(parameters_json(report)))
+    write_atomic(context.root / "errors.json", _json(errors_json(report)))
+
+    corners = [
+        corner
+        for tooth in teeth
+        for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))
+    ]
+    centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
+    centre_mm = float(centre[0]), float(centre[1]), float(centre[2])
+    verdict = verdict_of(report)
+    manifest = AssetManifest(
+        files=files,
+        held_out_error=verdict.held_out_error,
+        converged=verdict.converged,
+        advice=report.advice,
+        verdict=verdict,
+        centre_mm=centre_mm,
+    )
+    write_record(writer.folder / "asset.json", manifest)
+    writer.publish(manifest)
+    context.report(
+        StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written.")
+    )
+    return manifest
+
+
+def fitted_teeth(
+    prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport
+) -> tuple[Tooth, ...]:
+    """The teeth with the fitted dentin surfaces."""
+    return tuple(_with_dentin(*each) for each in fitted_dentins(prepared_folder, prepared, spec, report))
+
+
+def fitted_dentins(
+    prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport
+) -> list[tuple[Tooth, DentinShape | None, tuple[float, ...]]]:
+    """Each tooth as it was prepared, its dentin as it was modelled, and the fitted weights of its blend modes."""
+    from services.anatomy.job_dentin import dentin_shape, jaw_dentins
+    from services.core.files.meshes import read_teeth
+
+    teeth = read_teeth(prepared_folder, prepared.fdi)
+    if spec.kind == "jaw":
+        shapes = [(report.teeth[str(tooth.fdi)].shape, _is_layered(report.teeth[str(tooth.fdi)])) for tooth in teeth]
+        dentins = [
+            dentin if layered else None
+            for dentin, (_, layered) in zip(jaw_dentins(teeth, prepared.cameras, spec), shapes, strict=True)
+        ]
+        return [(tooth, dentin, shape) for tooth, dentin, (shape, _) in zip(teeth, dentins, shapes, strict=True)]
+    (tooth,) = teeth
+    return [(tooth, dentin_shape(tooth, prepared.cameras, spec), report.shape)]
+
+
+def _is_layered(tooth: ToothReport) -> bool:
+    return all("dentin.sigma" in table for table in tooth.parameters.values())
+
+
+def _with_dentin(tooth: Tooth, dentin: DentinShape | None, shape: tuple[float, ...]) -> Tooth:
+    return replace(tooth, dentin=None if dentin is None else Mesh(dentin.vertices_mm(shape), dentin.base.faces))
+
+
+def describe_options(spec: JobSpec) -> str:
+    """Options of a fit that differ from their defaults, as one sentence.
+
+    Paths are left out, because they mean nothing to the reader of a report.
+    """
+    named = spec.changed_options - {"kind", "capture", "rig", "calibration", "seed", "workers", "priority"}
+    values = spec.model_dump(mode="json", include=set(named))
+    rows = [f"{name} = {value if isinstance(value, str) else json.dumps(value)}" for name, value in values.items()]
+    return "; ".join(rows) + "; all others at their defaults" if rows else "all at their defaults"
+
+
+def _source(spec: JobSpec) -> str:
+    return spec.capture.name if spec.capture is not None else f"rig {spec.rig.dome if spec.rig else ''}"
+
+
+def _json(value: object) -> bytes:
+    return (json.dumps(value, indent=1) + "\n").encode()

@@ -1,0 +1,1 @@
+"""What the reports of all stages share: page template and style, pictures."""

@@ -1,0 +1,1 @@
+"""The instrument as the photographs show it: gains, flare, moves of scan and photographs."""

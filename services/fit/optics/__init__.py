@@ -1,1 +1,0 @@
-"""Phase functions, Fresnel, medium parameters and their fitting domain."""

@@ -1,0 +1,370 @@
+"""Common parts of the stages of every fit: the solver's loop with its journal, a report after each step, and the errors
+and curvature at the end.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Generic
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.core.records import JobSpec
+from services.fit.coordinates.domain import Domain, similar_tissue
+from services.fit.measurements.observations import ChannelFiles, Level
+from services.fit.passes.evaluate import Evaluation, Shown, evaluate
+from services.fit.passes.final_uncertainty import DisplacedScene, HeldCosines, HeldShapes, measure_closing
+from services.fit.passes.passes import Passes, StackProblem
+from services.fit.solve import adam, gauss_newton
+from services.fit.solve.closing import ClosingSums
+from services.fit.solve.covariance import ClosingModel, Uncertainty, closing_model, uncertainty, whitening
+from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State
+from services.fit.solve.normal_equations import NormalEquations
+from services.fit.solve.step_test import StepTest
+from services.fit.stages.step_report import StepReport, history_key, message_prefix
+from services.tasks.journal import Journal
+from services.transport.optics.parameters import Mouth, Optics, Tissue
+
+Array = NDArray[np.float64]
+
+SIMILAR_TOLERANCE = 0.02
+"""Relative change of the images at which a stage in similar media has converged: its next step is within Monte Carlo
+noise, and that noise in its parameters changes the images by no more. For exact media the option ``image_tolerance``
+takes this place."""
+SLOPE_ERROR = 0.5
+"""Relative error of the change that Jacobians of similar media predict for one tooth's exact images, however short the
+step; the errors of several teeth are independent."""
+CLOSING_DIVISOR = 2
+"""Divisor of the paths for the closing measurement, which is combined with all equations of the exact steps."""
+CLOSING_TRIALS = 2
+"""Number of lengths that are tried for the step after the closing measurement."""
+CLOSING_MIN_SHARE = 0.1
+"""Shortest length that is tried, as a share of the one before."""
+REPEAT_STAGE = "again"
+"""Name of the stage that continues a fit from its first solution, where the prior of the instrument's errors moved that
+solution far."""
+MIN_SAMPLES = 4
+"""Least number of paths per pixel, however many pixels there are."""
+
+
+def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_count: int, samples: int) -> Array:
+    """The step (F,) from x by the closing measurement, possibly shortened; zeros where its predicted gain is within
+    noise or no length is better.
+
+    Args:
+        part_count: number of objects that the images tell apart; the errors of their predicted changes are independent.
+        samples: paths per pixel of a comparison.
+    """
+    step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
+    for trial in range(CLOSING_TRIALS):
+        predicted, predicted_se = model.predicted_change(step)
+        if predicted >= 0:
+            break
+        compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
+        change = compared.change + problem.domain.prior_change(x, x + step)
+        step_test = StepTest(change, compared.se, predicted, math.hypot(predicted_se, slope_error * predicted))
+        if step_test.is_better(LAST_STEP_Z):
+            return step
+        if not (step_test.is_worse or step_test.is_contradicted):
+            break
+        # Go to the minimum of the parabola through slope and comparison (Nocedal and Wright 2006, section 3.5).
+        slope = model.slope(step)
+        step = max(0.5 * slope / (slope - max(change, 0.0)), CLOSING_MIN_SHARE) * step
+    return np.zeros(len(x))
+
+
+@dataclass(frozen=True)
+class ChannelFit(Generic[Optics]):
+    """Result of one channel's fit."""
+
+    tissue: Optics
+    domain: Domain
+    solution: Solution
+    equations: NormalEquations
+    uncertainty: Uncertainty
+    fit_error: float
+    held_out_error: float | None
+    steps: int
+    evaluation: Evaluation
+    problem: StackProblem[Optics]
+    """The least-squares problem at the solution."""
+    samples: int
+    """Paths per pixel of the last measurement."""
+
+
+@dataclass(kw_only=True)
+class Stages(ABC, Generic[Optics]):
+    """Stages of one channel's fit; every costly result is recorded in the journal, under a key that begins with the
+    seeds' channel.
+    """
+
+    files: ChannelFiles
+    passes: Passes
+    spec: JobSpec
+    journal: Journal
+    report: Callable[[StepReport, Evaluation], None]
+    log: Callable[[str], None]
+    """Reports one sentence to the job's event log."""
+    raise_if_cancelled: Callable[[], None]
+    """Called between steps; raises when the job is cancelled."""
+    shown: Shown = ()
+    steps: int = 0
+    """Number of steps so far, with those of earlier fits that count as part of this one."""
+    tooth: int | None = None
+    """FDI number of the tooth, where this is the fit of one tooth of a jaw."""
+
+    @property
+    @abstractmethod
+    def media(self) -> tuple[str, ...]:
+        """Media that the reports of steps list."""
+
+    @abstractmethod
+    def _other_values(self, tissue: Optics) -> dict[str, float]:
+        """Values, by name, that the reports of steps list beside the media."""
+
+    def _reported_name(self, name: str) -> str:
+        """Name of a parameter in the reports of steps."""
+        return name
+
+    @abstractmethod
+    def _held_cosines(self, domain: Domain) -> HeldCosines:
+        """Mean cosines that this domain holds, as input of the closing measurement."""
+
+    def _held_shapes(self) -> HeldShapes:
+        """Shapes of the dentin that this fit holds though they have an error."""
+        return ()
+
+    def _displaced_scene(self, tissue: Optics) -> DisplacedScene | None:  # noqa: ARG002 - for those that have one
+        """Scene whose dentin also moves as no fitted shape can, as input of the closing measurement."""
+        return None
+
+    @property
+    def part_count(self) -> int:
+        """Number of objects that the fit treats as separate in the images, such as teeth."""
+        return 1
+
+    @property
+    def scope(self) -> str:
+        """Start of this fit's journal keys."""
+        return self.passes.seeds.channel
+
+    @property
+    def is_reported(self) -> bool:
+        """Whether the last step is in the history; a step that was interrupted before its report is not."""
+        return history_key(self.files.channel, self.steps) in self.journal.entries
+
+    def options(self, level: Level) -> Options:
+        """Solver limits of a stage on images of this resolution; it has converged within ``image_tolerance``."""
+        most = self.spec.max_samples_per_pixel
+        samples = self.full_image_samples(most) if level is self.files.full else most
+        return Options(
+            max_steps=self.spec.max_steps,
+            max_samples=samples,
+            tolerance=0.5 * self.spec.image_tolerance**2 * level.signal,
+            part_count=self.part_count,
+        )
+
+    def preparatory_options(self, steps: int) -> Options:
+        """Solver limits of a stage that only prepares the next: at most ``steps`` steps, with few samples."""
+        options = self.options(self.files.coarse)
+        samples = min(2 * self.spec.samples_per_pixel, options.max_samples)
+        return replace(options, max_steps=min(steps, options.max_steps), max_samples=samples)
+
+    def similar_media_options(self, options: Options) -> Options:
+        """Solver limits of a stage in similar media, which only finds the neighbourhood of the solution, because the
+        images' bias is larger than the noise of a few samples.
+        """
+        most = min(2 * self.spec.samples_per_pixel, options.max_samples)
+        return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
+
+    def switch_to_full_resolution(self) -> Options:
+        """Continue with images of full resolution; returns the solver limits there."""
+        self.passes = replace(self.passes, blocks=self.files.full.blocks)
+        return self.options(self.files.full)
+
+    def full_image_samples(self, samples: int) -> int:
+        """Paths per pixel of full images that cost as much in all as ``samples`` per pixel of coarse images."""
+        return max(round(samples * self.files.coarse.pixels / self.files.full.pixels), MIN_SAMPLES)
+
+    def _iterate(
+        self, problem: StackProblem[Optics], options: Options, samples: int, previous: Solution | None = None
+    ) -> tuple[Optics, Solution]:
+        if problem.jacobian_g != problem.image_g:
+            options = replace(options, slope_error=SLOPE_ERROR)
+        solver = gauss_newton.GaussNewton(problem.domain, options)
+        return self._run(
+            solver,
+            gauss_newton,
+            problem,
+            solver.init(self._start_of(problem), min(samples, options.max_samples), previous),
+        )
+
+    def _start_of(self, problem: StackProblem[Optics]) -> Array:
+        # Start of a stage: its tissue, and the instrument's errors as the last stage left them.
+        return problem.domain.x_of(problem.base, dict(self.passes.errors))
+
+    def _apply_errors(self, domain: Domain, x: Array) -> None:
+        # Apply the instrument's errors in x to the renders of later passes.
+        if domain.errors.names:
+            self.passes = replace(self.passes, errors=domain.errors_at(x))
+
+    def _run(
+        self, solver: Any, solver_module: Any, problem: StackProblem[Optics], state: Any, steps_per_entry: int = 1
+    ) -> tuple[Optics, Solution]:
+        # Run a solver from its first state. Every ``steps_per_entry`` steps are one journal entry, written and read by
+        # ``solver_module``, and one report.
+        def advance(state: Any) -> Any:
+            for _ in range(steps_per_entry):
+                state = state if solver.terminate(state) else solver.step(problem, state)
+            return solver_module.state_record(state)
+
+        while not solver.terminate(state):
+            self.raise_if_cancelled()
+            entry, _ = self.journal.get_or_compute(
+                f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state)
+            )
+            self.steps -= state.step
+            state = solver_module.state_from(entry)
+            self.steps += state.step
+            self._apply_errors(problem.domain, state.x)
+            if not self.is_reported:
+                self._report_step(problem, state)
+        solution = solver.finish(state)
+        return problem.domain.tissue_at(solution.x, problem.base), solution
+
+    def _finish(self, problem: StackProblem[Optics], solution: Solution) -> ChannelFit[Optics]:
+        # Uncertainty at the solution, and the errors that are reported.
+        samples = max(
+            solution.samples,
+            self.full_image_samples(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)),
+        )
+        problem, solution, equations, known = self._with_uncertainty(problem, solution, samples)
+        if not known.is_full_step:
+            # The move is too long for one linear model: fit once more from its end.
+            self._apply_errors(problem.domain, solution.x)
+            again = replace(problem, passes=self.passes, stage=REPEAT_STAGE)
+            base, solution = self._iterate(again, self.options(self.files.full), samples)
+            problem, solution, equations, known = self._with_uncertainty(replace(again, base=base), solution, samples)
+        self._apply_errors(problem.domain, solution.x)
+        samples_shown = self.full_image_samples(self.spec.max_samples_per_pixel)
+        evaluation = self._evaluate("final", problem.base, samples_shown, self.files.full, by_frame=True)
+        fitted, held_out = evaluation.fitted.resolved_error or 0.0, evaluation.held_out.resolved_error
+        return ChannelFit(
+            problem.base,
+            problem.domain,
+            solution,
+            equations,
+            known,
+            fitted,
+            held_out,
+            self.steps,
+            evaluation,
+            problem,
+            samples,
+        )
+
+    def _with_uncertainty(
+        self, problem: StackProblem[Optics], solution: Solution, samples: int
+    ) -> tuple[StackProblem[Optics], Solution, NormalEquations, Uncertainty]:
+        # Uncertainty at a solution, moved where the instrument's errors use their prior in full. Curvature and noise
+        # are rendered anew only where the solver ended without them.
+        again, equations = f".{REPEAT_STAGE}" if problem.stage == REPEAT_STAGE else "", solution.equations
+        if equations is None:
+            self.raise_if_cancelled()
+            stored, _ = self.journal.get_or_compute(
+                f"{self.scope}/final{again}",
+                lambda: problem.linearise(solution.x, samples=samples, step=0).record(),
+            )
+            equations = NormalEquations.of(stored)
+        if problem.jacobian_g is None or solution.result is Result.STALLED:
+            known = uncertainty(problem.domain, solution.x, equations, part_count=self.part_count)
+            if not problem.domain.errors.names:
+                return problem, solution, equations, known
+        else:
+            known = self._measure_uncertainty(f"{self.scope}/closing{again}", problem, solution.x, equations, samples)
+        base = problem.domain.tissue_at(known.x, problem.base)
+        return replace(problem, base=base), replace(solution, x=known.x), equations, known
+
+    def _measure_uncertainty(
+        self, key: str, problem: StackProblem[Optics], x: Array, equations: NormalEquations, samples: int
+    ) -> Uncertainty:
+        # Measure the response of the exact images where Jacobians came from similar media. Make one more step with it
+        # where the predicted gain exceeds noise, and prediction and comparison combined are better.
+        domain = problem.domain
+        whitened, moves, shapes = whitening(domain, equations), self.files.moves, self._held_shapes()
+
+        def compute() -> dict[str, Any]:
+            displaced = self._displaced_scene(domain.tissue_at(x, problem.base))
+            prefix = message_prefix(self.files.channel, self.tooth)
+            self.log(f"{prefix}: renders around the answer tell its ±, which may take as long as all steps.")
+            held, fewer = self._held_cosines(domain), max(samples // CLOSING_DIVISOR, 1)
+            sums = measure_closing(problem, x, whitened.transform, held, fewer, moves, shapes, displaced)
+            return {
+                "sums": sums.record(),
+                "step": last_step(
+                    problem, x, closing_model(domain, x, equations, sums), self.part_count, samples
+                ).tolist(),
+                "displacements": 0 if displaced is None else displaced.count,
+            }
+
+        self.raise_if_cancelled()
+        entry, _ = self.journal.get_or_compute(key, compute)
+        step = np.array(entry["step"])
+        sums = ClosingSums.of(entry["sums"])
+        sources = ["shape"] * (len(shapes) + entry["displacements"]) + [move.body for move in moves]
+        return uncertainty(domain, x + step, equations, sums, step, sources, self.part_count)
+
+    def _solve(
+        self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float
+    ) -> tuple[Optics, Solution]:
+        # Fit a stage in similar media.
+        problem = StackProblem(self.passes, domain, tissue, stage, jacobian_g=similar_g, image_g=similar_g)
+        return self._iterate(problem, self.similar_media_options(options), samples)
+
+    def _evaluate(
+        self, label: str, tissue: Tissue | Mouth, samples: int, level: Level, *, by_frame: bool = False
+    ) -> Evaluation:
+        passes = replace(self.passes, blocks=level.evaluation_blocks, recipe=self.files.evaluation_recipe)
+        return evaluate(passes, label, tissue, samples, self.shown, by_frame=by_frame)
+
+    def _report_step(self, problem: StackProblem[Optics], state: State | adam.State) -> None:
+        stage, tissue = problem.stage, problem.domain.tissue_at(state.x, problem.base)
+        shown = tissue if problem.image_g is None else similar_tissue(tissue, problem.image_g)
+        self._evaluate_and_report(stage, state.step, tissue, state.samples, state.verdict, shown)
+
+    def _evaluate_and_report(
+        self, stage: str, stage_step: int, tissue: Optics, samples: int, verdict: str, shown: Optics | None = None
+    ) -> None:
+        # Evaluate ``shown``, which is the tissue itself unless it is fitted through other media, and report.
+        evaluation = self._evaluate(
+            f"{stage}-{stage_step}", shown or tissue, self.spec.samples_per_pixel, self.files.coarse
+        )
+        fitted, held_out = evaluation.fitted, evaluation.held_out
+        leaves = ("sigma", "alpha", "beta", "g1", "g2", "sigma_s_reduced")
+        values = {
+            f"{part}.{leaf}": float(getattr(tissue.medium(part), leaf)) for part in self.media for leaf in leaves
+        } | self._other_values(tissue)
+        values = {self._reported_name(name): value for name, value in values.items()}
+        loss = fitted.loss or 0.0
+        self.report(
+            StepReport(
+                self.files.channel,
+                stage,
+                self.steps,
+                stage_step,
+                loss,
+                fitted.resolved_error,
+                held_out.resolved_error,
+                held_out.error_se,
+                values,
+                samples,
+                verdict,
+                self.tooth,
+            ),
+            evaluation,
+        )

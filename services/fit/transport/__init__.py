@@ -1,1 +1,0 @@
-"""The nested-media walk: images under all lights at once, with derivatives."""

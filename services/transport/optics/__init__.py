@@ -1,0 +1,1 @@
+"""Optics of media: parameters, phase functions, Fresnel reflection, half space."""

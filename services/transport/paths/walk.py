@@ -1,0 +1,399 @@
+"""The nested-media walk: free flights, crossings, scattering, connections to all lights, and scores for derivatives.
+
+One loop serves camera walks in a tooth, which connect to point lights, and walks in a flat slab, which count the light
+that leaves either face. Code for features that a scene lacks is absent from its kernel.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from services.transport.lighting.lights import PointLights, shadow
+from services.transport.optics import fresnel
+from services.transport.optics.free_flight import minus_log1m, one_minus_exp
+from services.transport.paths.connections import Connections, Vertex
+from services.transport.paths.exits import Exits
+from services.transport.paths.scores import Plan, Scores
+from services.transport.paths.starts import CameraStart, LightStart, SlabStart
+from services.transport.paths.tally import Tally
+from services.transport.paths.walker import Flight, Walker
+from services.transport.scene.border import BorderScattering, inverse_cosine, no_crossing, offer
+from services.transport.scene.geometry import Geometry, SlabGeometry
+from services.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
+from services.transport.scene.stain_textures import FaceCrossing
+
+ROULETTE_WEIGHT = 0.1
+"""Fraction of the reference weight below which a path survives in proportion to its weight."""
+
+
+class Walk:
+    """The walk through one geometry under one plan; call ``run``."""
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        media: Media,
+        lights: PointLights | None,
+        start: CameraStart | LightStart | SlabStart,
+        plan: Plan,
+        ior: float | None,
+    ) -> None:
+        self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
+        self.ior = None if ior is None else dr.opaque(mi.Float, ior)
+        media.two_lobes |= any(score.field == "beta" for score in plan.scores)
+        self.scores = Scores(plan, media, mixing=geometry.mixing)
+        self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.scores, self.ior)
+        self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
+        self.limited = int(plan.most_steps is not None)
+        self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
+        self.exits: Exits | None = None
+        if plan.exit_cosines or plan.ring_edges_mm:
+            assert isinstance(geometry, SlabGeometry)
+            self.exits = Exits(geometry, media, plan, self.ior, first_slot=self.slots)
+            self.slots += self.exits.slots
+
+    def run(self, samples: int, tally: Tally | None = None) -> Tally:
+        """Tally of ``samples`` paths in every lane, evaluated; a plan for stains needs a tally of its own kind."""
+        tally = tally or Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
+        self.trace(samples, tally)
+        tally.evaluate()
+        return tally
+
+    def trace(self, samples: int, tally: Tally) -> None:
+        """Record the loop; it adds to ``tally`` without evaluating it.
+
+        Dr.Jit would record a body again, four times in nested loops, to take constant state out of it. This is turned
+        off, and such state left out by hand: recording is half the time of a small image.
+        """
+        limit = dr.opaque(mi.UInt32, samples)
+        lane = dr.arange(mi.UInt32, self.start.lanes)
+        path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
+
+        def zeros(count: int) -> list[mi.Float]:
+            return [mi.Float(0) for _ in range(count)]
+
+        walker = Walker(
+            rng=path.rng,
+            origin=path.origin,
+            omega=path.omega,
+            place=path.place,
+            weight=path.weight,
+            reference=mi.Float(path.weight),
+            scatterings=self.scores.unscattered(),
+            steps=[mi.UInt32(0) for _ in range(self.limited)],
+            sums=self.scores.zero(),
+            border_sums=zeros(self.modes),
+            border_crossing=[no_crossing(self.modes)] * (self.plan.shape is not None),
+            stains=[FaceCrossing.none(path.rng.next_float32()) for _ in range(self.plan.stains)],
+            vertex=None if self.connections is None else self.connections.no_vertex(),
+            connection_step=mi.UInt32(0),
+            secondary=[mi.Bool(False)] * (self.plan.shape is not None),
+            shape_factor=zeros(self.modes),
+            lane=lane,
+            sample=mi.UInt32(0),
+            active=lane < dr.opaque(mi.UInt32, self.start.lanes),
+        )
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            walker = dr.while_loop(
+                (walker,), lambda walker: walker.active, lambda one: (self._step(one, tally, limit),), label="walk"
+            )[0]
+            if self.connections is not None:
+                self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
+
+    def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
+        throughput = self._throughput(walker)
+        flight = self._fly_past_faces(walker, throughput, tally) if self.plan.faces else self._fly(walker)
+        throughput = self._throughput(walker)
+        self._move(walker, flight, throughput)
+        if self.connections is not None:
+            self._connect(walker, flight, tally)
+        self._deflect(walker, flight)
+        ended = self._end(walker, flight)
+        if self.plan.most_steps is not None:
+            ended = self._cut(walker, ended, self.plan.most_steps, tally)
+        if self.plan.shape is not None:
+            ended = self._start_secondary(walker, ended, tally)
+        self._renew(walker, ended, limit)
+        return walker
+
+    def _throughput(self, walker: Walker) -> mi.Float:
+        return walker.weight * self.scores.albedo(walker.scatterings)
+
+    def _fly(self, walker: Walker) -> Flight:
+        medium = self.geometry.medium(walker.place)
+        sigma = self.media.extinction(medium)
+        distance = dr.select(sigma > 0, minus_log1m(walker.rng.next_float32()) / sigma, dr.inf)
+        # A flight that ends within the known clearance meets no surface: no ray is traced.
+        inside = walker.active & (medium != 0)
+        traced = walker.active & (distance >= self.geometry.clearance(walker.origin, inside))
+        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, traced)
+        # A lane with no surface ahead has left the tooth, whatever its place is: it meets nothing and ends.
+        scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
+        meets = walker.active & ~scatters & hit.valid
+        reflects = mi.Bool(False)
+        if self.ior is not None:
+            # A thin face lets a camera ray in, weighted, where its mirror image would be of empty space, and reflects
+            # other rays by chance.
+            contrast = self.geometry.contrast(
+                self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit)
+            )
+            mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), contrast)
+            reflects = meets & hit.outer & ~hit.opaque
+            entry = self._omits_reflection(walker, medium)
+            walker.weight *= dr.select(reflects & entry, 1 - mirrored, 1)
+            reflects &= ~entry & (walker.rng.next_float32() < mirrored)
+        return Flight(medium, sigma, hit, distance, scatters, meets, reflects, meets & hit.opaque)
+
+    def _omits_reflection(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
+        """Lanes whose reflection at an outer face is left out: camera rays that would mirror empty space."""
+        if not self.geometry.single:
+            return mi.Bool(False)
+        return (self.scores.order(walker.scatterings) == 0) & (medium == 0) & walker.primary
+
+    def _fly_past_faces(self, walker: Walker, throughput: mi.Float, tally: Tally) -> Flight:
+        medium = self.geometry.medium(walker.place)
+        sigma = self.media.extinction(medium)
+        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, walker.active)
+        leaving = hit.valid & hit.outer
+        through = mi.Float(1)
+        if self.ior is not None:
+            through = 1 - fresnel.reflectance(
+                dr.abs(dr.dot(walker.omega, hit.normal)), dr.rcp(self.ior) if self.plan.bend else self.ior
+            )
+
+        # Count the share that leaves through an outer face.
+        collides = one_minus_exp(sigma * hit.distance)
+        face = dr.select(walker.omega.z > 0, mi.UInt32(1), mi.UInt32(0))
+        value = throughput * (1 - collides) * through
+        lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.scores.sigma_media}
+        primary = walker.active & leaving & walker.primary
+        tally.add(walker.lane, face, value, primary)
+        if self.exits is not None:
+            self.exits.count_ring(walker, self.scores.order(walker.scatterings), hit, face, value, tally)
+            self.exits.connect(
+                walker, hit, sigma, throughput * dr.exp(self.media.pick(self.media.log_alpha, medium)), tally
+            )
+        for which, score in enumerate(self.scores.complete(walker.sums, walker.scatterings, mi.UInt32(0), {}, lengths)):
+            tally.add_derivative(which, walker.lane, face, value * score, primary)
+        for mode in range(self.modes):
+            factor = dr.select(walker.primary, walker.border_sums[mode], walker.shape_factor[mode])
+            tally.add_derivative(
+                len(self.plan.scores) + mode, walker.lane, face, value * factor, walker.active & leaving
+            )
+
+        # The rest collides before the face or is reflected by it.
+        remains = dr.select(leaving, collides + (1 - collides) * (1 - through), 1)
+        reflects = leaving & (walker.rng.next_float32() * remains >= collides)
+        distance = minus_log1m(walker.rng.next_float32() * dr.select(leaving, collides, 1)) / sigma
+        scatters = walker.active & dr.select(leaving, ~reflects, distance < hit.distance)
+        distance = dr.select(leaving, dr.minimum(distance, hit.distance), distance)
+        first = scatters & (self.scores.order(walker.scatterings) == 0) & walker.primary
+        walker.weight *= remains
+        # Compare roulette with the weight after one scattering, so that single scattering survives at any albedo.
+        walker.reference = dr.select(
+            first, walker.weight * dr.exp(self.media.pick(self.media.log_alpha, medium)), walker.reference
+        )
+        return Flight(
+            medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects, mi.Bool(False)
+        )
+
+    def _move(self, walker: Walker, flight: Flight, throughput: mi.Float) -> None:
+        hit, omega = flight.hit, walker.omega
+        length = dr.select(flight.scatters, flight.distance, dr.select(flight.meets, hit.distance, 0))
+        walker.sums = self.scores.flight(walker.sums, flight.medium, length, flight.scatters)
+        crosses = flight.meets & ~flight.reflects & ~flight.bounces
+        behind = self.geometry.beyond(walker.place, omega, hit)
+        cosine = dr.dot(omega, hit.normal)
+        if self.plan.shape is not None:
+            # Score the border's transmittance change, and offer the crossing for the scattering change.
+            shifts = [speed * inverse_cosine(cosine) for speed in self.geometry.velocity(hit, self.plan.shape, crosses)]
+            jump = dr.select(crosses, self.media.extinction(self.geometry.medium(behind)) - flight.sigma, 0)
+            walker.border_sums = [
+                dr.fma(jump, shift, total) for shift, total in zip(shifts, walker.border_sums, strict=True)
+            ]
+            at_border = crosses & ~hit.outer & walker.primary
+            u = walker.rng.next_float32()
+            crossing_point = dr.fma(omega, hit.distance, walker.origin)
+            walker.border_crossing = [
+                offer(kept, crossing_point, omega, hit, walker.place, behind, throughput, shifts, u, at_border)
+                for kept in walker.border_crossing
+            ]
+        if self.geometry.stained:
+            stained = crosses & self.geometry.on_stain(hit, walker.place, behind)
+            walker.weight *= self.geometry.stain(hit, stained)
+            walker.stains = [reservoir.offer(hit, stained) for reservoir in walker.stains]
+        reached = self.geometry.advance(walker.origin, omega, hit, crosses)
+        walker.origin = dr.select(
+            flight.scatters,
+            dr.fma(omega, flight.distance, walker.origin),
+            dr.select(flight.meets, reached, walker.origin),
+        )
+        walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
+        walker.place = dr.select(crosses, behind, walker.place)
+        scattered_in: mi.UInt32 | Mixed = flight.medium
+        if self.geometry.opaque:
+            scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium)
+        if self.geometry.mixing:
+            scattered_in = self._mixed(walker, flight)
+            walker.sums = self.scores.mixed_albedo(walker.sums, scattered_in, flight.scatters | flight.bounces)
+            self._score_mixture(walker, self.scores.albedo_slope(scattered_in), flight.scatters)
+        walker.scatterings = self.scores.scatter(walker.scatterings, scattered_in, flight.scatters | flight.bounces)
+
+    def _mixed(self, walker: Walker, flight: Flight) -> Mixed:
+        """Mixture of media in which the vertex at the end of a flight scatters."""
+        mixed = self.geometry.mixed(walker.origin, walker.place, flight.scatters)
+        if self.geometry.opaque:
+            wall = mi.UInt32(self.media.count)
+            mixed.first, mixed.second = (
+                dr.select(flight.bounces, wall, mixed.first),
+                dr.select(flight.bounces, wall, mixed.second),
+            )
+            mixed.share, mixed.slope = (
+                dr.select(flight.bounces, 1, mixed.share),
+                dr.select(flight.bounces, 0, mixed.slope),
+            )
+        return mixed
+
+    def _score_mixture(self, walker: Walker, change: mi.Float, active: mi.Bool) -> None:
+        """Score the border's motion at a scattering vertex by ``change``, the mixture's change per mm of distance."""
+        if self.plan.shape is not None:
+            motion = self.geometry.mixture_motion(walker.origin, self.plan.shape, active)
+            walker.border_sums = [
+                total + dr.select(active, change * rate, 0)
+                for total, rate in zip(walker.border_sums, motion, strict=True)
+            ]
+
+    def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
+        assert self.connections is not None
+        assert walker.vertex is not None
+        bound = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
+        omega, wall = walker.omega, []
+        if self.geometry.opaque:
+            omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
+        found = Vertex(
+            walker.origin, omega, walker.place, self._throughput(walker), bound, walker.scatterings, walker.sums,
+            walker.border_sums, walker.secondary, walker.shape_factor, wall, walker.stains, mi.Float(0),
+        )  # fmt: skip
+        walker.vertex = self.connections.offer(
+            walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces
+        )
+        walker.connection_step += 1
+        due = walker.active & (walker.connection_step == self.connections.period) & (walker.vertex.total > 0)
+        walker.rng = self.connections.connect(walker.vertex, walker.lane, walker.rng, due, tally)
+        walker.vertex.total = dr.select(due, 0, walker.vertex.total)
+        walker.connection_step = dr.select(walker.connection_step == self.connections.period, 0, walker.connection_step)
+
+    def _deflect(self, walker: Walker, flight: Flight) -> None:
+        medium = self._mixed(walker, flight) if self.geometry.mixing else flight.medium
+        phase, rng = PhaseFunction(self.media, medium), walker.rng
+        u_lobe = rng.next_float32() if self.media.two_lobes else None
+        u, v = rng.next_float32(), rng.next_float32()
+        onward = phase.sample(walker.omega, u_lobe, u, v)
+        walker.sums = self.scores.deflection(
+            walker.sums, medium, phase.scores(self.scores.phase_fields, walker.omega, onward), flight.scatters
+        )
+        if isinstance(medium, Mixed) and self.plan.shape is not None:
+            self._score_mixture(
+                walker, self.scores.lobe_slope(medium, phase.scores(LOBE_FIELDS, walker.omega, onward)), flight.scatters
+            )
+        if self.geometry.opaque:
+            diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(
+                mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
+            )
+            walker.omega = dr.select(flight.bounces, diffuse, walker.omega)
+        walker.omega = dr.select(flight.scatters, onward, walker.omega)
+
+    def _facing(self, walker: Walker, flight: Flight) -> mi.Vector3f:
+        """The surface's normal on the side that the walker came from."""
+        return -dr.mulsign(mi.Vector3f(flight.hit.normal), dr.dot(walker.omega, flight.hit.normal))
+
+    def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
+        # Let faded paths survive in proportion to their throughput; end those that met nothing.
+        share = self._throughput(walker) / (ROULETTE_WEIGHT * walker.reference)
+        faded = (share < 1) & (walker.rng.next_float32() >= share)
+        walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
+        ended = walker.active & ((~flight.scatters & ~flight.meets) | faded)
+        if self.plan.order_edges:
+            ended |= walker.active & (self.scores.order(walker.scatterings) >= self.plan.order_edges[-1])
+        return ended
+
+    def _cut(self, walker: Walker, ended: mi.Bool, most_steps: int, tally: Tally) -> mi.Bool:
+        """End paths that took their last step, and count the throughput that they still carried."""
+        walker.steps = [count + 1 for count in walker.steps]
+        cut = walker.active & ~ended & (walker.steps[0] >= most_steps)
+        if self.plan.faces:
+            tally.add(walker.lane, mi.UInt32(2), self._throughput(walker), cut & walker.primary)
+        return ended | cut
+
+    def _start_secondary(self, walker: Walker, ended: mi.Bool, tally: Tally) -> mi.Bool:
+        """Start the kept crossing's secondary walk where paths ended; returns the lanes that are wholly finished."""
+        begins = ended & walker.primary & (walker.border_crossing[0].total > 0)
+
+        def begin(walker: Walker, begins: mi.Bool) -> Walker:
+            crossing, rng = walker.border_crossing[0], walker.rng
+            scattering = BorderScattering(self.geometry, self.media, crossing)
+            size = sum((dr.abs(shift) for shift in crossing.shifts), start=mi.Float(0))
+            strength = crossing.throughput * crossing.total / crossing.importance * size
+            ratios = [shift / size for shift in crossing.shifts]
+
+            # Add the light that the border point scatters directly.
+            if self.lights is not None:
+                chosen = self.lights.choose(crossing.point, scattering, rng, begins)
+                point, place = scattering.point(chosen.direction), scattering.place(chosen.direction)
+                ray = shadow(self.geometry, self.media, point, chosen.direction, place, begins, thin_ior=self.ior)
+                value = strength * chosen.total * scattering.balance(chosen.direction) * ray.transmittance()
+                for mode, ratio in enumerate(ratios):
+                    tally.add_derivative(len(self.plan.scores) + mode, walker.lane, chosen.index, value * ratio, begins)
+
+            # Start one walk for the lobes of both sides, which carries their signed difference.
+            u_lobe = rng.next_float32() if self.media.two_lobes else None
+            omega = scattering.sample(rng.next_float32(), u_lobe, rng.next_float32(), rng.next_float32())
+            balance = scattering.balance(omega)
+            walker.origin, walker.place, walker.omega = scattering.point(omega), scattering.place(omega), omega
+            walker.weight = strength * (scattering.sigma_a + scattering.sigma_b) * dr.abs(balance)
+            walker.reference = mi.Float(walker.weight)
+            walker.shape_factor = [dr.mulsign(ratio, balance) for ratio in ratios]
+            walker.scatterings = self.scores.unscattered()
+            walker.steps = [dr.zeros(mi.UInt32) for _ in walker.steps]
+            walker.secondary = [mi.Bool(True)]
+            walker.rng = rng
+            return walker
+
+        walker_after = dr.if_stmt((walker, begins), begins, begin, lambda walker, _: walker, label="secondary walk")
+        for field in (
+            "rng",
+            "origin",
+            "omega",
+            "place",
+            "weight",
+            "reference",
+            "scatterings",
+            "steps",
+            "secondary",
+            "shape_factor",
+        ):
+            setattr(walker, field, getattr(walker_after, field))
+        return (ended & ~begins) | (begins & (walker.weight == 0))
+
+    def _renew(self, walker: Walker, ended: mi.Bool, limit: mi.UInt32) -> None:
+        """Put the lane's next sample in place of finished paths."""
+
+        def renew(walker: Walker, ended: mi.Bool) -> Walker:
+            walker.sample = walker.sample + 1
+            path = self.start.begin(walker.lane, walker.sample, ended)
+            walker.rng, walker.origin, walker.omega, walker.place = path.rng, path.origin, path.omega, path.place
+            walker.weight, walker.reference = path.weight, mi.Float(path.weight)
+            walker.scatterings = self.scores.unscattered()
+            walker.steps = [mi.UInt32(0) for _ in walker.steps]
+            walker.sums = [mi.Float(0) for _ in walker.sums]
+            walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
+            for crossing in walker.border_crossing:
+                crossing.total = mi.Float(0)
+            walker.stains = [FaceCrossing.none(walker.rng.next_float32()) for _ in walker.stains]
+            walker.secondary = [mi.Bool(False) for _ in walker.secondary]
+            walker.active = walker.sample < limit
+            return walker
+
+        renewed = dr.if_stmt((walker, ended), ended, renew, lambda walker, _: walker, label="next sample")
+        vars(walker).update(vars(renewed))

@@ -1,0 +1,82 @@
+"""Scenes in files, from which every process that renders builds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.anatomy.dentin_shape import DentinShape
+from services.core.choices import chosen
+from services.core.files.content_files import StoredFile, write_arrays
+from services.core.geometry import Mesh
+from services.core.records import Boundary, Device
+from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
+
+
+def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
+    """Store a recipe in ``folder``."""
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def add(name: str, mesh: Mesh | None) -> None:
+        if mesh is not None:
+            arrays.update({f"{name}_vertices": mesh.vertices_mm, f"{name}_faces": mesh.faces})
+
+    for k, tooth in enumerate(recipe.all_teeth):
+        add(f"outer{k}", tooth.outer)
+        if tooth.dentin is not None:
+            add(f"dentin{k}", tooth.dentin.base)
+            arrays[f"dentin{k}_modes"] = tooth.dentin.modes_mm
+        if tooth.stain_uv is not None:
+            arrays[f"stain{k}_uv"] = tooth.stain_uv
+    add("gums", recipe.gums)
+    add("cavity", recipe.cavity)
+    return write_arrays(
+        folder,
+        "scene",
+        teeth=np.array(len(recipe.teeth)),
+        neighbours=np.array(len(recipe.neighbours)),
+        light_positions=recipe.light_positions_mm,
+        light_intensities=recipe.light_intensities,
+        boundary=np.array(recipe.boundary),
+        ior=np.array(recipe.ior),
+        gums_ior=np.array(recipe.gums_ior),
+        border_width_mm=np.array(recipe.border_width_mm),
+        device=np.array(recipe.device or ""),
+        **arrays,
+    )
+
+
+def read_recipe(stored: StoredFile) -> SceneRecipe:
+    """Read a recipe."""
+    a = stored.load()
+
+    def mesh(name: str) -> Mesh | None:
+        return (
+            Mesh(a[f"{name}_vertices"].astype(float), a[f"{name}_faces"].astype(np.int32))
+            if f"{name}_faces" in a
+            else None
+        )
+
+    def tooth(k: int) -> ToothSurfaces:
+        outer, base = mesh(f"outer{k}"), mesh(f"dentin{k}")
+        assert outer is not None
+        dentin = None if base is None else DentinShape(base, a[f"dentin{k}_modes"].astype(float))
+        return ToothSurfaces(outer, dentin, a[f"stain{k}_uv"].astype(float) if f"stain{k}_uv" in a else None)
+
+    own, others = (int(np.asarray(a[name], dtype=int)) for name in ("teeth", "neighbours"))
+    return SceneRecipe(
+        teeth=tuple(tooth(k) for k in range(own)),
+        neighbours=tuple(tooth(k) for k in range(own, own + others)),
+        light_positions_mm=a["light_positions"].astype(float),
+        light_intensities=a["light_intensities"].astype(float),
+        boundary=chosen("Boundary", str(a["boundary"]), {name: name for name in get_args(Boundary)}),
+        ior=float(np.asarray(a["ior"], dtype=float)),
+        device=chosen("Device", str(a["device"]), {"": None, **{name: name for name in get_args(Device)}}),
+        gums=mesh("gums"),
+        gums_ior=float(np.asarray(a["gums_ior"], dtype=float)),
+        cavity=mesh("cavity"),
+        border_width_mm=float(np.asarray(a["border_width_mm"], dtype=float)),
+    )
