@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +11,20 @@ from numpy.typing import NDArray
 
 from services.core.slab.folder import SlabFolder, read_folder
 from services.core.store import write_atomic
+from services.slab.cell.dictionary import Material
+from services.slab.cell.forward import Blocks, render
+from services.slab.cell.rig import Rig, rig_of
+from services.slab.design.next_measurement import next_measurement
 from services.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
-from services.slab.images import Measurements, read_images
-from services.slab.model.dictionary import Material
-from services.slab.model.forward import Blocks, render
-from services.slab.model.rig import Rig, rig_of
-from services.slab.next_measurement import next_measurement
-from services.slab.notes import is_short_of_paths, notes_of
+from services.slab.dictionaries.through_beam import index_of
 from services.slab.options import SlabOptions
+from services.slab.read.images import Measurements, read_images
 from services.slab.results.atoms import atoms_of
+from services.slab.results.notes import is_short_of_paths, notes_of
 from services.slab.results.result import (
     Errors,
     SlabFit,
+    Wavelength,
     image_error,
     is_unlike,
     parameters_of,
@@ -36,28 +37,12 @@ from services.slab.solve.gauss_newton import GaussNewton
 from services.slab.solve.normal import Each
 from services.slab.solve.start import start
 from services.slab.solve.uncertainty import uncertainty_of
-from services.slab.through_beam import index_of
 
 STEPS_OF_ATOMS = 20
 """Largest number of steps of a search by the weights of atoms: narrow lobes are noisy and their steps damped, and a
 start that was 30 % off took 11."""
 FINAL_RENDER = 2**30
 """Number of the render from which image errors are taken, apart from those of the solver."""
-
-
-@dataclass(frozen=True)
-class Wavelength:
-    """One wavelength's result, with its images (images, rows, columns)."""
-
-    fit: SlabFit
-    measured: NDArray[np.float64]
-    """NaN where a pixel was left out."""
-    predicted: NDArray[np.float64]
-    held_out: NDArray[np.bool_]
-    names: tuple[str, ...]
-    """Camera and light of each image."""
-    averaging: NDArray[np.float64] | None = None
-    """Averaging kernels of the phase function; see ``Uncertainty``."""
 
 
 def fit_slab(root: Path, options: SlabOptions | None = None, blocks: Blocks = map) -> tuple[SlabFit, ...]:

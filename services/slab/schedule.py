@@ -15,12 +15,12 @@ from typing import Any
 
 from services.core.errors import JobCancelledError
 from services.core.slab.folder import SlabFolder, read_folder
+from services.slab.cell.dictionary import KNOTS
+from services.slab.cell.forward import Block, Blocks, BlockSums
 from services.slab.dictionaries.chosen import dictionary_of
 from services.slab.fit import fit_images
-from services.slab.images import read_images
-from services.slab.model.dictionary import KNOTS
-from services.slab.model.forward import Block, Blocks, BlockSums
 from services.slab.options import SlabOptions
+from services.slab.read.images import read_images
 from services.slab.results.stored import fingerprint, read_result, store_result
 from services.slab.solve.checkpoint import Checkpoint, CheckpointFile
 from services.slab.solve.normal import Each

@@ -36,8 +36,8 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
         JobCancelledError: between two blocks of paths.
     """
     from services.slab.dictionaries.chosen import dictionary_of
-    from services.slab.images import read_images
     from services.slab.options import SlabOptions
+    from services.slab.read.images import read_images
     from services.slab.results.result import SlabReport
     from services.slab.results.stored import IMAGES, read_result
     from services.slab.schedule import WavelengthTask, run_wavelengths

@@ -26,9 +26,10 @@ from services.bench.slab.dispersions import truths
 from services.bench.slab.recovery import FINE_RAD, photographed, write_images
 from services.core.slab.folder import read_folder
 from services.slab.dictionaries.chosen import dictionary_of
-from services.slab.fit import Wavelength, fit_images
-from services.slab.images import read_images
+from services.slab.fit import fit_images
 from services.slab.options import SlabOptions
+from services.slab.read.images import read_images
+from services.slab.results.result import Wavelength
 from tests.pipeline.test_slab_fit import noisy_truth
 
 ENDS_DEG = (0, 7, 20, 45, 90, 135, 181)

@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.plain_photons import plain_images
 from services.core.slab.folder import SlabFolder
-from services.slab.images import shot_noise
-from services.slab.model.dictionary import ANGLES_RAD, Material, henyey_greenstein, hg_values
-from services.slab.model.forward import Batches, render
-from services.slab.model.rig import Rig, rig_of
+from services.slab.cell.dictionary import ANGLES_RAD, Material, henyey_greenstein, hg_values
+from services.slab.cell.forward import Batches, render
+from services.slab.cell.rig import Rig, rig_of
+from services.slab.read.images import shot_noise
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.gauss_newton import DAMPING, Solution, quadratic_at
 from services.slab.solve.measured_directions import step_matrix

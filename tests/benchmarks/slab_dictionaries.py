@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from services.core.slab.folder import read_folder
+from services.slab.cell.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
 from services.slab.dictionaries.mie import scattered
 from services.slab.fit import fit_slab
-from services.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
 from services.slab.options import SlabOptions
 from services.slab.solve.weights import smoothed_variance
 from tests.pipeline.test_slab_fit import NOISE, errors_of, noisy_truth

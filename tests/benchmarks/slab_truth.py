@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab.folder import read_folder
-from services.slab.bound import Bound, bound_of
+from services.slab.cell.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.slab.cell.rig import rig_of
+from services.slab.design.bound import Bound, bound_of
 from services.slab.fit import fit_slab
-from services.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
-from services.slab.model.rig import rig_of
 from services.slab.options import SlabOptions
 from services.slab.solve.uncertainty import slopes
 from tests.pipeline.test_slab_fit import NOISE, errors_of, noisy_truth

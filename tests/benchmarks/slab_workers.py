@@ -27,9 +27,9 @@ import numpy as np
 from services.bench.slab.cell import near_beam_folder
 from services.core.records import JobSpec
 from services.core.stage import LocalContext
-from services.slab.model.dictionary import henyey_greenstein
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
 from services.slab.results.result import SlabReport
 
 MEDIA = {532.0: (1.0, 0.8, 0.03), 635.0: (0.8, 0.7, 0.02), 488.0: (1.2, 0.8, 0.04)}

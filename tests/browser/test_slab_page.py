@@ -18,7 +18,7 @@ from services.core.settings import ServerSettings
 from services.core.stage import StageEvent
 from services.core.verdict import VERDICT, verdict_of
 from services.pipeline.event_log import EventAddress
-from services.slab.model.dictionary import ANGLES_RAD, hg_values
+from services.slab.cell.dictionary import ANGLES_RAD, hg_values
 from services.slab.results.chart import phase_picture
 from services.slab.results.result import PhaseFunction
 from tests.browser.pages import LOOKS, looked_at, watched_page

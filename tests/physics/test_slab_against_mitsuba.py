@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import henyey_greenstein
-from services.slab.model.forward import render
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.cell.forward import render
 from services.transport.platform import prepare_device
 from tests.support.small_slab import small_rig
 from tests.support.z_scores import require_unbiased, student_to_normal

@@ -9,10 +9,10 @@ import math
 import numpy as np
 import pytest
 
-from services.slab.images import Measurements
-from services.slab.model.dictionary import KNOTS, henyey_greenstein, mixture
-from services.slab.model.forward import render
-from services.slab.model.single import single_scattering
+from services.slab.cell.dictionary import KNOTS, henyey_greenstein, mixture
+from services.slab.cell.forward import render
+from services.slab.cell.single import single_scattering
+from services.slab.read.images import Measurements
 from services.slab.solve.projected_descent import DescentOptions, descend, image_weights, projected, weight_gradient
 from tests.support.small_slab import small_rig
 

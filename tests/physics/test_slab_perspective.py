@@ -11,10 +11,10 @@ import pytest
 
 from services.bench.slab.plain_photons import BATCHES, plain_images
 from services.core.slab.folder import SlabFolder
-from services.slab.model.dictionary import KNOTS, Material, henyey_greenstein, hg_values
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
-from services.slab.model.single import single_scattering
+from services.slab.cell.dictionary import KNOTS, Material, henyey_greenstein, hg_values
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
+from services.slab.cell.single import single_scattering
 from services.slab.solve.normal import derivative_rows
 from tests.support.small_slab import WAVELENGTH_NM, description, small_rig
 from tests.support.z_scores import require_unbiased, student_to_normal

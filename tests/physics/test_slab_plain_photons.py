@@ -14,9 +14,9 @@ from services.bench.slab.dispersions import COLOURS, DIAMETERS_NM, mie_truth, tr
 from services.bench.slab.plain_photons import BATCHES, plain_images
 from services.bench.slab.stock_cell import RENDERS, matched_folder, medium_of, stock_images
 from services.core.slab.folder import SlabFolder
-from services.slab.model.dictionary import henyey_greenstein
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
 from tests.support.slab_tables import rows_of
 from tests.support.small_slab import WAVELENGTH_NM, description
 from tests.support.z_scores import require_unbiased, student_to_normal

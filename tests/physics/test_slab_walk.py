@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from services.core.slab.folder import Light
-from services.slab.model.dictionary import KNOTS, Material, henyey_greenstein
-from services.slab.model.forward import Block, render, run_block
-from services.slab.model.interface import Interface, fresnel
-from services.slab.model.single import single_scattering
+from services.slab.cell.dictionary import KNOTS, Material, henyey_greenstein
+from services.slab.cell.forward import Block, render, run_block
+from services.slab.cell.interface import Interface, fresnel
+from services.slab.cell.single import single_scattering
 from services.slab.solve.normal import derivative_rows
 from tests.support.shared_data import shared_path
 from tests.support.small_slab import small_rig

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.core.slab.folder import Cell, Glass
-from services.slab.model.interface import Interface
+from services.slab.cell.interface import Interface
 from services.slab.sphere.instrument import expected
 from services.slab.sphere.invert import interface_of
 from services.slab.sphere.records import Sphere, SphereFile, TotalsReading

@@ -10,10 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from services.core.slab.folder import SlabFolder, read_folder
+from services.slab.cell.dictionary import ANGLES_RAD, henyey_greenstein
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
 from services.slab.fit import fit_slab, write_results
-from services.slab.model.dictionary import ANGLES_RAD, henyey_greenstein
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
 from services.slab.options import SlabOptions
 from services.slab.results.result import SlabFit
 from tests.support.shared_data import shared_path

@@ -21,8 +21,8 @@ from services.core.settings import job_from_tree
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
 from services.core.store import open_stage
 from services.pipeline.stages import run_job, stages_of
+from services.slab.cell.dictionary import ANGLES_RAD, hg_values
 from services.slab.dictionaries.hg import COSINES
-from services.slab.model.dictionary import ANGLES_RAD, hg_values
 from services.slab.options import SlabOptions
 from services.slab.results.stored import IMAGES, StoredResult, read_result
 from services.slab.results.tabphase import tabphase_values

@@ -11,8 +11,8 @@ import pytest
 from services.core.slab.folder import read_folder
 from services.slab.dictionaries.chosen import ChosenDictionary
 from services.slab.fit import fit_images
-from services.slab.images import read_images
 from services.slab.options import SlabOptions
+from services.slab.read.images import read_images
 from services.slab.solve.coordinates import Knots
 from tests.support.small_slab import TRUTHS, write_cell
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from services.bench.slab.accuracy import spread_truths
-from services.slab.images import Measurements, shot_noise
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
+from services.slab.read.images import Measurements, shot_noise
 from services.slab.solve.start import start
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from services.bench.slab.cell import near_beam_folder
-from services.slab.images import Measurements, shot_noise
-from services.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
+from services.slab.cell.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
+from services.slab.read.images import Measurements, shot_noise
 from services.slab.solve.budget import Budget
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.gauss_newton import GaussNewton

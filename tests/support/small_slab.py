@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from services.core.slab.folder import SlabFolder
-from services.slab.model.dictionary import henyey_greenstein
-from services.slab.model.forward import render
-from services.slab.model.rig import Rig, rig_of
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.cell.forward import render
+from services.slab.cell.rig import Rig, rig_of
 from services.slab.results.result import Errors, Parameters, PhaseFunction, Quantity, SlabFit
 
 WAVELENGTH_NM = 532.0

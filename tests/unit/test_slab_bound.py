@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.slab.bound import Bound, bound_of
-from services.slab.model.dictionary import henyey_greenstein
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.design.bound import Bound, bound_of
 from services.slab.solve.uncertainty import slopes
 from tests.support.small_slab import small_rig
 

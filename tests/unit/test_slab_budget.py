@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.slab.images import Measurements
-from services.slab.model.dictionary import Material, henyey_greenstein
+from services.slab.cell.dictionary import Material, henyey_greenstein
+from services.slab.read.images import Measurements
 from services.slab.solve.budget import Budget
 from services.slab.solve.checkpoint import Checkpoint
 from services.slab.solve.coordinates import Knots

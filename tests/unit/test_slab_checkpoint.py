@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import Material, henyey_greenstein
+from services.slab.cell.dictionary import Material, henyey_greenstein
 from services.slab.solve.checkpoint import FILE, Checkpoint, CheckpointFile, CombinedRenders
 from services.slab.solve.mixture import Mixture
 from services.slab.solve.normal import DerivativeSums, ResidualSums

@@ -7,7 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from services.core.slab.folder import Beam, Light, PixelGrid, SlabCamera, SlabFolder
-from services.slab.diagnosis import (
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.cell.forward import render
+from services.slab.dictionaries.chosen import ChosenDictionary
+from services.slab.fit import fit_images
+from services.slab.options import SlabOptions
+from services.slab.read.diagnosis import (
     grid_faults,
     image_faults,
     max_power_per_sr,
@@ -15,12 +20,7 @@ from services.slab.diagnosis import (
     similarity_faults,
     standing_out,
 )
-from services.slab.dictionaries.chosen import ChosenDictionary
-from services.slab.fit import fit_images
-from services.slab.images import Measurements, shot_noise
-from services.slab.model.dictionary import henyey_greenstein
-from services.slab.model.forward import render
-from services.slab.options import SlabOptions
+from services.slab.read.images import Measurements, shot_noise
 from services.slab.solve.coordinates import Knots
 from tests.support.small_slab import description, small_rig
 

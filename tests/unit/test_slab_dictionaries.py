@@ -20,15 +20,15 @@ from services.core.records import JobSpec
 from services.core.results import Estimate
 from services.core.slab.dictionaries import DICTIONARIES
 from services.core.slab.folder import SlabFolder, read_folder
-from services.slab.diagnosis import misfit_faults
+from services.slab.cell.dictionary import ANGLES_RAD, cosine_moments, hg_values, tent_solid_angles
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
+from services.slab.cell.single import single_scattering
 from services.slab.dictionaries.chosen import ChosenDictionary, dictionary_of
 from services.slab.dictionaries.mie import scattered
 from services.slab.fit import fit_slab, write_results
-from services.slab.model.dictionary import ANGLES_RAD, cosine_moments, hg_values, tent_solid_angles
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
-from services.slab.model.single import single_scattering
 from services.slab.options import SlabOptions
+from services.slab.read.diagnosis import misfit_faults
 from services.slab.results.result import SlabFit
 from services.slab.results.stored import fingerprint
 from services.slab.solve.mixture import Mixture, Mixtures, unit_atoms

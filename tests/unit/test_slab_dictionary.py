@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import (
+from services.slab.cell.dictionary import (
     ANGLES_RAD,
     KNOTS,
     SPACING_RAD,
@@ -17,7 +17,7 @@ from services.slab.model.dictionary import (
     mixture,
     tent_solid_angles,
 )
-from services.slab.model.interface import Interface, fresnel
+from services.slab.cell.interface import Interface, fresnel
 
 
 def test_tents_have_the_solid_angles_that_were_derived() -> None:

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import KNOTS, Material, henyey_greenstein
-from services.slab.model.forward import Batches
+from services.slab.cell.dictionary import KNOTS, Material, henyey_greenstein
+from services.slab.cell.forward import Batches
 from services.slab.solve.normal import (
     UNKNOWNS,
     DerivativeSums,

@@ -15,9 +15,9 @@ from services.api.captures.contents import content_fault
 from services.core.errors import CaptureInputError
 from services.core.settings import UploadLimits
 from services.core.slab.folder import read_folder
-from services.slab.images import read_images
-from services.slab.model.rig import rig_of
+from services.slab.cell.rig import rig_of
 from services.slab.options import SlabOptions
+from services.slab.read.images import read_images
 from services.slab.results.stored import fingerprint
 from tests.support.raw_sensor import Sensor
 from tests.support.small_slab import WAVELENGTH_NM, description

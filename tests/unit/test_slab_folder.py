@@ -13,7 +13,7 @@ import pytest
 
 from services.core.errors import CaptureInputError
 from services.core.slab.folder import read_folder
-from services.slab.images import read_images, shot_noise
+from services.slab.read.images import read_images, shot_noise
 from tests.support.small_slab import WAVELENGTH_NM, description, write_folder
 
 Change = Callable[[dict[str, Any]], object]

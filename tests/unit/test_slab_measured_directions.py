@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import henyey_greenstein
+from services.slab.cell.dictionary import henyey_greenstein
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.measured_directions import broad_step, measured_directions, noise_ratio, step_matrix
 from services.slab.solve.normal import UNKNOWNS

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from services.core.slab.folder import SlabFolder
-from services.slab.images import Measurements, shot_noise
-from services.slab.model.dictionary import henyey_greenstein
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
-from services.slab.next_measurement import BESIDE_DEG, candidates, next_measurement
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
+from services.slab.design.next_measurement import BESIDE_DEG, candidates, next_measurement
+from services.slab.read.images import Measurements, shot_noise
 from tests.support.small_slab import WAVELENGTH_NM, description
 
 INDEX = 1.33

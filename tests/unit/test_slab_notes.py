@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from services.slab.images import Measurements
-from services.slab.model.dictionary import henyey_greenstein
-from services.slab.notes import notes_of
+from services.slab.cell.dictionary import henyey_greenstein
+from services.slab.read.images import Measurements
+from services.slab.results.notes import notes_of
 from services.slab.results.result import Errors
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.gauss_newton import Solution

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, henyey_greenstein
+from services.slab.cell.dictionary import ANGLES_RAD, KNOTS, Material, henyey_greenstein
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.prior import POLE_SCALE, Quadratic, precision, pull_covariance, second_differences, widened
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import KNOTS, henyey_greenstein
+from services.slab.cell.dictionary import KNOTS, henyey_greenstein
 from services.slab.solve.coordinates import MAX_LN_SCATTERING_CHANGE, Knots, reduced_scattering_slope
 
 MATERIAL = henyey_greenstein(5.0, 0.2, 0.1)

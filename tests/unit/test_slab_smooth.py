@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.slab.model.forward import Batches
-from services.slab.model.rig import Grid
+from services.slab.cell.forward import Batches
+from services.slab.cell.rig import Grid
 from services.slab.solve.normal import UNKNOWNS
 from services.slab.solve.smooth import smoother_of
 

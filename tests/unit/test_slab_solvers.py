@@ -9,7 +9,7 @@ from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.recovery import Truth
 from services.bench.slab.solvers import compared, run
 from services.core.errors import InputError
-from services.slab.model.dictionary import Material, henyey_greenstein
+from services.slab.cell.dictionary import Material, henyey_greenstein
 
 
 def test_a_row_tells_how_far_a_solution_is_from_the_truth() -> None:

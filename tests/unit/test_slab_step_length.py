@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import KNOTS, tent_solid_angles
+from services.slab.cell.dictionary import KNOTS, tent_solid_angles
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.mixture import Mixtures
 from services.slab.solve.normal import UNKNOWNS

@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from services.core.errors import CaptureInputError
 from services.core.slab.folder import SlabFolder
-from services.slab.model.interface import Interface
-from services.slab.through_beam import index_of
+from services.slab.cell.interface import Interface
+from services.slab.dictionaries.through_beam import index_of
 from tests.support.small_slab import WAVELENGTH_NM, description
 
 WIDTH_MM = 2.5

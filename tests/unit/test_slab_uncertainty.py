@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.slab.model.dictionary import ANGLES_RAD, KNOTS, henyey_greenstein
+from services.slab.cell.dictionary import ANGLES_RAD, KNOTS, henyey_greenstein
+from services.slab.dictionaries.through_beam import Index
 from services.slab.results.result import Errors, parameters_of, phase_of, with_believable_flags
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.gauss_newton import Solution
 from services.slab.solve.normal import UNKNOWNS
 from services.slab.solve.prior import Quadratic
 from services.slab.solve.uncertainty import Uncertainty, resolution_deg, uncertainty_of
-from services.slab.through_beam import Index
 from tests.support.small_slab import made_up_fit
 
 MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)

@@ -20,9 +20,9 @@ from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import FINE_RAD, NOISE, Truth, photographed, recovered
 from services.core.errors import InputError
-from services.slab.bound import bound_of
-from services.slab.model.dictionary import ANGLES_RAD, hg_values
-from services.slab.model.rig import rig_of
+from services.slab.cell.dictionary import ANGLES_RAD, hg_values
+from services.slab.cell.rig import rig_of
+from services.slab.design.bound import bound_of
 from services.slab.solve.uncertainty import slopes
 
 if TYPE_CHECKING:

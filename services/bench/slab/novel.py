@@ -20,9 +20,9 @@ from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import Keep, mie_truth
 from services.bench.slab.recovery import fitted, photographed, squared_share
 from services.core.slab.folder import SlabFolder
-from services.slab.model.dictionary import Material
-from services.slab.model.forward import render
-from services.slab.model.rig import rig_of
+from services.slab.cell.dictionary import Material
+from services.slab.cell.forward import render
+from services.slab.cell.rig import rig_of
 from services.slab.results.result import SlabFit
 
 if TYPE_CHECKING:

@@ -15,10 +15,10 @@ from services.bench import Row
 from services.bench.slab.plain_photons import plain_images
 from services.core.geometry import Record
 from services.core.slab.folder import SlabFolder
-from services.slab.bound import Bound, bound_of
+from services.slab.cell.dictionary import ANGLES_RAD, Material, tent_solid_angles
+from services.slab.cell.rig import rig_of
+from services.slab.design.bound import Bound, bound_of
 from services.slab.fit import fit_slab
-from services.slab.model.dictionary import ANGLES_RAD, Material, tent_solid_angles
-from services.slab.model.rig import rig_of
 from services.slab.options import SlabOptions
 from services.slab.results.result import SlabFit
 from services.slab.solve.uncertainty import slopes

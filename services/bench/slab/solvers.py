@@ -20,10 +20,10 @@ from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import FINE_RAD, NOISE, Truth
 from services.core.errors import InputError
-from services.slab.images import Measurements, shot_noise
-from services.slab.model.dictionary import ANGLES_RAD, Material
-from services.slab.model.forward import render
-from services.slab.model.rig import Rig, rig_of
+from services.slab.cell.dictionary import ANGLES_RAD, Material
+from services.slab.cell.forward import render
+from services.slab.cell.rig import Rig, rig_of
+from services.slab.read.images import Measurements, shot_noise
 from services.slab.solve.budget import Budget
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.gauss_newton import GaussNewton

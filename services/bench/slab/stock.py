@@ -21,10 +21,10 @@ from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import Truth, photographed
 from services.bench.slab.solvers import ABSORPTION_PER_MM, EFFORTS, QUICK_EFFORTS, SCATTERING_PER_MM, compared
 from services.bench.slab.stock_cell import matched_folder, medium_of, node_angles, scenes, turned
+from services.slab.cell.dictionary import Material, hg_values
+from services.slab.cell.rig import rig_of
 from services.slab.dictionaries.hg import COSINES
-from services.slab.images import Measurements, folded
-from services.slab.model.dictionary import Material, hg_values
-from services.slab.model.rig import rig_of
+from services.slab.read.images import Measurements, folded
 from services.slab.solve.budget import Budget
 from services.slab.solve.coordinates import Knots
 from services.slab.solve.gauss_newton import GaussNewton

@@ -19,9 +19,9 @@ from services.bench import Row
 from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import Keep
 from services.bench.slab.recovery import squared_share
-from services.slab.model.dictionary import Material, hg_values
-from services.slab.model.forward import render
-from services.slab.model.rig import Rig, rig_of
+from services.slab.cell.dictionary import Material, hg_values
+from services.slab.cell.forward import render
+from services.slab.cell.rig import Rig, rig_of
 from services.slab.solve.mixture import unit_atoms
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from services.core.choices import chosen
 from services.core.slab.dictionaries import DICTIONARIES
 from services.core.slab.folder import SlabFolder
+from services.slab.dictionaries.through_beam import index_of
 from services.slab.options import SlabOptions
 from services.slab.solve.coordinates import Coordinates
-from services.slab.through_beam import index_of
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from services.slab.cell.dictionary import hg_values
 from services.slab.dictionaries.chosen import ChosenDictionary, Sample
-from services.slab.model.dictionary import hg_values
 from services.slab.solve.mixture import Mixtures, unit_atoms
 
 COSINES = (-0.9, -0.75, -0.6, -0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import PlatformError
+from services.slab.cell.dictionary import ANGLES_RAD, KNOTS
 from services.slab.dictionaries.chosen import ChosenDictionary, Sample, Spheres
-from services.slab.model.dictionary import ANGLES_RAD, KNOTS
 from services.slab.solve.mixture import Mixtures, unit_atoms
 
 Array = NDArray[np.float64]

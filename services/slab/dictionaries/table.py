@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.files.tables import read_rows
+from services.slab.cell.dictionary import ANGLES_RAD
 from services.slab.dictionaries.chosen import ChosenDictionary, Sample
-from services.slab.model.dictionary import ANGLES_RAD
 from services.slab.solve.mixture import Mixtures, unit_atoms
 
 Array = NDArray[np.float64]

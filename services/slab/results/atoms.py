@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from services.slab.cell.dictionary import Material
 from services.slab.dictionaries.chosen import ChosenDictionary, Spheres
-from services.slab.model.dictionary import Material
 from services.slab.results.result import Quantity, SlabUnit
 from services.slab.solve.mixture import Mixture
 from services.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE, Uncertainty

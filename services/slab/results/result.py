@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -13,7 +14,8 @@ from services.core.geometry import Record
 from services.core.results import Figure, FitReport, Verdict
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY
 from services.core.verdict import MAX_ERROR, verdict_of
-from services.slab.model.dictionary import ANGLES_RAD, Material
+from services.slab.cell.dictionary import ANGLES_RAD, Material
+from services.slab.dictionaries.through_beam import Index
 from services.slab.solve.uncertainty import (
     LARGEST_COEFFICIENT_SHARE,
     Uncertainty,
@@ -21,7 +23,6 @@ from services.slab.solve.uncertainty import (
     resolution_deg,
     slopes,
 )
-from services.slab.through_beam import Index
 
 SlabUnit = Literal["1/mm", "1", "um"]
 
@@ -228,3 +229,18 @@ def _known(errors: Mapping[str, float | None]) -> dict[str, float]:
 
 def _wavelengths(fits: Sequence[SlabFit]) -> str:
     return ", ".join(f"{fit.wavelength_nm:g} nm" for fit in fits)
+
+
+@dataclass(frozen=True)
+class Wavelength:
+    """One wavelength's result, with its images (images, rows, columns)."""
+
+    fit: SlabFit
+    measured: NDArray[np.float64]
+    """NaN where a pixel was left out."""
+    predicted: NDArray[np.float64]
+    held_out: NDArray[np.bool_]
+    names: tuple[str, ...]
+    """Camera and light of each image."""
+    averaging: NDArray[np.float64] | None = None
+    """Averaging kernels of the phase function; see ``Uncertainty``."""

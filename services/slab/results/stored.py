@@ -16,9 +16,8 @@ from services.core.geometry import Record
 from services.core.slab.folder import read_folder
 from services.core.store import write_atomic, write_record
 from services.slab.dictionaries.table import table_file
-from services.slab.fit import Wavelength
 from services.slab.options import SlabOptions
-from services.slab.results.result import SlabFit
+from services.slab.results.result import SlabFit, Wavelength
 from services.transport.numerics import numerics_name
 
 RESULT, IMAGES = "fit.json", "images.npz"

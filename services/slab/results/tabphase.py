@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab.folder import Cell
-from services.slab.model.dictionary import ANGLES_RAD
+from services.slab.cell.dictionary import ANGLES_RAD
 from services.slab.results.result import SlabFit
 
 COSINES = 20_001

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.store import write_atomic
-from services.slab.model.dictionary import Material
+from services.slab.cell.dictionary import Material
 from services.slab.solve.mixture import Mixture
 from services.slab.solve.normal import DerivativeSums, ResidualSums
 

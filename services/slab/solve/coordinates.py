@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.model.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
+from services.slab.cell.dictionary import ANGLES_RAD, KNOTS, Material, cosine_moments, tent_solid_angles
 from services.slab.solve.measured_directions import measured_directions
 from services.slab.solve.normal import UNKNOWNS
 from services.slab.solve.prior import (

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.images import Measurements
-from services.slab.model.dictionary import Material
-from services.slab.model.forward import Blocks, render
-from services.slab.model.rig import Rig
+from services.slab.cell.dictionary import Material
+from services.slab.cell.forward import Blocks, render
+from services.slab.cell.rig import Rig
+from services.slab.read.images import Measurements
 from services.slab.solve.budget import Budget, Stage
 from services.slab.solve.checkpoint import Checkpoint, CheckpointFile, CombinedRenders
 from services.slab.solve.coordinates import Coordinates

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from services.slab.model.dictionary import KNOTS, Material, tent_solid_angles
+from services.slab.cell.dictionary import KNOTS, Material, tent_solid_angles
 from services.slab.solve.normal import UNKNOWNS
 from services.slab.solve.prior import Quadratic
 

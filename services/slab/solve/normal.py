@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.model.dictionary import KNOTS, Material, tent_solid_angles
-from services.slab.model.forward import Batches
+from services.slab.cell.dictionary import KNOTS, Material, tent_solid_angles
+from services.slab.cell.forward import Batches
 from services.slab.solve.weights import Weights
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.model.dictionary import ANGLES_RAD, KNOTS, SPACING_RAD, Material
+from services.slab.cell.dictionary import ANGLES_RAD, KNOTS, SPACING_RAD, Material
 from services.slab.solve.normal import UNKNOWNS
 
 Array = NDArray[np.float64]

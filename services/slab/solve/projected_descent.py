@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.images import Measurements
-from services.slab.model.dictionary import KNOTS, LARGEST_EXTINCTION_PER_MM, Material, mixture, tent_solid_angles
-from services.slab.model.forward import Blocks, render
-from services.slab.model.rig import Rig
+from services.slab.cell.dictionary import KNOTS, LARGEST_EXTINCTION_PER_MM, Material, mixture, tent_solid_angles
+from services.slab.cell.forward import Blocks, render
+from services.slab.cell.rig import Rig
+from services.slab.read.images import Measurements
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.model.forward import Batches
-from services.slab.model.rig import Grid
+from services.slab.cell.forward import Batches
+from services.slab.cell.rig import Grid
 
 Array = NDArray[np.float64]
 

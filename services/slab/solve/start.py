@@ -8,10 +8,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.images import Measurements
-from services.slab.model.dictionary import KNOTS, Material, henyey_greenstein, hg_values
-from services.slab.model.forward import Blocks, render
-from services.slab.model.rig import Rig
+from services.slab.cell.dictionary import KNOTS, Material, henyey_greenstein, hg_values
+from services.slab.cell.forward import Blocks, render
+from services.slab.cell.rig import Rig
+from services.slab.read.images import Measurements
 from services.slab.solve.normal import normal_equations
 from services.slab.solve.weights import independent_weights, smoothed_variance
 

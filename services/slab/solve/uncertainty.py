@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.model.dictionary import (
+from services.slab.cell.dictionary import (
     ANGLES_RAD,
     KNOTS,
     SPACING_RAD,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab.folder import Cell
-from services.slab.model.interface import Interface
+from services.slab.cell.interface import Interface
 from services.slab.sphere.instrument import Readings, expected
 from services.slab.sphere.records import SphereFile, TotalsReading
 from services.slab.sphere.results import (

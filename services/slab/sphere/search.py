@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 from scipy.optimize import brentq, least_squares
 
-from services.slab.model.interface import Interface
+from services.slab.cell.interface import Interface
 from services.slab.sphere.totals import Optics, Totals, slab_totals
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 from numpy.typing import NDArray
 
-from services.slab.model.interface import Interface
+from services.slab.cell.interface import Interface
 
 Array = NDArray[np.float64]
 

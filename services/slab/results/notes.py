@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.diagnosis import misfit_faults, sample_faults, similarity_faults, standing_out
-from services.slab.images import Measurements
-from services.slab.model.rig import Rig
+from services.slab.cell.rig import Rig
+from services.slab.read.diagnosis import misfit_faults, sample_faults, similarity_faults, standing_out
+from services.slab.read.images import Measurements
 from services.slab.results.result import Errors, Parameters, PhaseFunction, image_error, is_unlike
 from services.slab.solve.gauss_newton import Solution
 

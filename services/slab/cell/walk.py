@@ -13,10 +13,10 @@ import math
 import numpy as np
 from numba import njit
 
-from services.slab.model.dictionary import KNOTS, SPACING_RAD
-from services.slab.model.perspective import perspective_view
-from services.slab.model.streams import path_state, uniform
-from services.slab.model.tables import GUIDE
+from services.slab.cell.dictionary import KNOTS, SPACING_RAD
+from services.slab.cell.perspective import perspective_view
+from services.slab.cell.streams import path_state, uniform
+from services.slab.cell.tables import GUIDE
 
 MAX_SCATTERS = 8192
 """Number of scatterings at which a path ends; the weight that it still carries is reported."""

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.slab.folder import SlabFolder, SlabImage
-from services.slab.diagnosis import grid_faults, image_faults, max_power_per_sr, power_per_sr
-from services.slab.exposures import Merged, merged_images
-from services.slab.model.rig import Grid, grid_of
+from services.slab.cell.rig import Grid, grid_of
+from services.slab.read.diagnosis import grid_faults, image_faults, max_power_per_sr, power_per_sr
+from services.slab.read.exposures import Merged, merged_images
 
 Array = NDArray[np.float64]
 

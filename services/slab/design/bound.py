@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.images import shot_noise
-from services.slab.model.dictionary import Material
-from services.slab.model.forward import Blocks, render
-from services.slab.model.rig import Rig
+from services.slab.cell.dictionary import Material
+from services.slab.cell.forward import Blocks, render
+from services.slab.cell.rig import Rig
+from services.slab.read.images import shot_noise
 from services.slab.solve.coordinates import Knots, seen_poles
 from services.slab.solve.gauss_newton import quadratic_at
 from services.slab.solve.normal import normal_equations

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slab.model.dictionary import ANGLES_RAD, KNOTS, Material
+from services.slab.cell.dictionary import ANGLES_RAD, KNOTS, Material
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
 from services.core.robust import robust_sigma
 from services.core.slab.exposures import CameraCounts, SlabExposure
 from services.core.slab.folder import SlabFolder, SlabImage
-from services.slab.exposure_faults import require_consistent, shot_noise_fault
+from services.slab.read.exposure_faults import require_consistent, shot_noise_fault
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.float32]

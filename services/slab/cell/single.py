@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from services.slab.model.dictionary import KNOTS, SPACING_RAD, Material
-from services.slab.model.interface import Interface
-from services.slab.model.perspective import leaving_direction
-from services.slab.model.rig import Beam, Grid, Rig, Views
+from services.slab.cell.dictionary import KNOTS, SPACING_RAD, Material
+from services.slab.cell.interface import Interface
+from services.slab.cell.perspective import leaving_direction
+from services.slab.cell.rig import Beam, Grid, Rig, Views
 
 Array = NDArray[np.float64]
 

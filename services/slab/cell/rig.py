@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab.folder import Cell, Light, PixelGrid, SlabCamera, SlabFolder
-from services.slab.model.interface import Interface
+from services.slab.cell.interface import Interface
 
 Array = NDArray[np.float64]
 

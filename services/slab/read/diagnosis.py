@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY
 from services.core.slab.folder import Beam, Light, PixelGrid, SlabCamera
-from services.slab.model.dictionary import Material
+from services.slab.cell.dictionary import Material
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
-from services.slab.model.dictionary import KNOTS, Material
-from services.slab.model.interface import Interface
-from services.slab.model.rig import Rig, Views
-from services.slab.model.single import single_scattering
-from services.slab.model.tables import tables_of
+from services.slab.cell.dictionary import KNOTS, Material
+from services.slab.cell.interface import Interface
+from services.slab.cell.rig import Rig, Views
+from services.slab.cell.single import single_scattering
+from services.slab.cell.tables import tables_of
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -88,8 +88,8 @@ def run_block(block: Block) -> BlockSums:
     Raises:
         NonFiniteError: a sum is NaN or infinite.
     """
-    from services.slab.model.streams import block_key
-    from services.slab.model.walk import trace
+    from services.slab.cell.streams import block_key
+    from services.slab.cell.walk import trace
 
     rig, views = block.rig, block.rig.lights[block.light]
     images = np.zeros((len(views.images), rig.grid.pixels))

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.slab.folder import SlabCamera, SlabFolder, SlabImage
-from services.slab.bound import curvature_of
-from services.slab.diagnosis import THINNEST
-from services.slab.images import Measurements
-from services.slab.model.dictionary import KNOTS, Material
-from services.slab.model.forward import Blocks
-from services.slab.model.rig import rig_of
+from services.slab.cell.dictionary import KNOTS, Material
+from services.slab.cell.forward import Blocks
+from services.slab.cell.rig import rig_of
+from services.slab.design.bound import curvature_of
+from services.slab.read.diagnosis import THINNEST
+from services.slab.read.images import Measurements
 from services.slab.solve.measured_directions import measured_directions
 from services.slab.solve.prior import THICK, precision
 from services.slab.solve.uncertainty import phase_chain, slopes

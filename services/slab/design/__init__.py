@@ -1,0 +1,1 @@
+"""Designing a measurement: the smallest standard errors that images allow, and which further measurement helps most."""
