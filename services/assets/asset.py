@@ -37,7 +37,7 @@ from services.core.verdict import VERDICT, verdict_of
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.transport.scene.stain_uv import ToothStains
 
-SHIPPED = Path(__file__).parent / "shipped"
+SHIPPED = Path(__file__).parent / "mitsuba" / "shipped"
 NOT_CONVERGED = "NOT-CONVERGED.txt"
 """File in the asset of a fit that did not converge, with advice on what to do."""
 
