@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,9 @@ from services.core.store import StageWriter, open_stage, write_atomic, write_rec
 from services.core.verdict import verdict_of
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from services.anatomy.dentin_shape import DentinShape
     from services.core.geometry import Tooth
 
@@ -47,6 +51,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.assets.fit_pictures import report_pictures
     from services.assets.report import write_report
     from services.core.files.meshes import read_mesh
+    from services.transport.scene.rigid_moves import moved_camera, moved_light
     from services.transport.scene.stain_uv import read_stains
     from services.transport.thickness import fitted_thickness
 
@@ -68,12 +73,13 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         for light in prepared.lights
     )
     stains = read_stains(fit_folder)
+    move = found_pose(report, teeth)
     files = write_asset(
         writer.folder,
         report,
         teeth,
-        prepared.cameras,
-        lights,
+        tuple(moved_camera(camera, move) for camera in prepared.cameras),
+        tuple(moved_light(light, move) for light in lights),
         channels=channels,
         boundary=spec.boundary,
         ior=spec.ior,
@@ -123,6 +129,25 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         StageEvent(stage="export", kind="finished", done=1.0, message=f"Asset of {len(files)} files written.")
     )
     return manifest
+
+
+def found_pose(report: FitReport, teeth: Sequence[Tooth]) -> NDArray[np.float64]:
+    """Rigid transform (4, 4) by which the photographs put the scan elsewhere than the calibration does: the channels'
+    mean by their precision, and the identity where no fit estimated it.
+
+    The asset keeps the scan's own frame, so its cameras and lights are placed by this transform instead.
+    """
+    import numpy as np
+
+    from services.transport.scene.rigid_moves import SCAN, rigid
+
+    found = [own for own in report.instrument.values() if all(name in own for name in SCAN)]
+    if not found:
+        return np.eye(4)
+    values = np.array([[own[name].value for name in SCAN] for own in found])
+    precisions = np.array([[1 / (own[name].se or 1.0) ** 2 for name in SCAN] for own in found])
+    twist = (precisions * values).sum(axis=0) / precisions.sum(axis=0)
+    return rigid(twist, np.concatenate([tooth.outer.vertices_mm for tooth in teeth]).mean(axis=0))
 
 
 def fitted_teeth(

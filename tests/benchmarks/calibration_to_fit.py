@@ -45,9 +45,9 @@ from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import open_stage
 from services.fit.coordinates.instrument_errors import DEFAULT_MOVE_SE, DEFAULT_SE
-from services.fit.measurements.instrument.pose import rigid
 from services.fit.stage import run
 from services.transport.platform import prepare_device
+from services.transport.scene.rigid_moves import rigid
 from tests.benchmarks.calibrate_sessions import COUNTS, N_PLACES, found_rig, photographed_spheres, posed_cameras_of
 from tests.support.board_sessions import in_first_frame, tilted_places
 from tests.support.truths import SIDE_LIGHTS, Truth, read, write_capture

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from services.core.files.meshes import read_mesh, write_mesh
 from services.core.geometry import Mesh
 from services.fit.coordinates.instrument_errors import DEFAULT_MOVE_SE, DEFAULT_SE
-from services.fit.measurements.instrument.pose import rigid
+from services.transport.scene.rigid_moves import rigid
 
 Array = NDArray[np.float64]
 

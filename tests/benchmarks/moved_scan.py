@@ -33,10 +33,10 @@ from services.core.results import FitReport
 from services.core.stage import LocalContext
 from services.core.store import is_published, open_stage, write_atomic
 from services.fit.coordinates.instrument_errors import DEFAULT_SE
-from services.fit.measurements.instrument.pose import rigid
 from services.fit.stage import run
 from services.preprocess.stage import run as prepare
 from services.transport.platform import prepare_device
+from services.transport.scene.rigid_moves import rigid
 
 Array = NDArray[np.float64]
 

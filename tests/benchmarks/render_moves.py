@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Mesh
 from services.fit.coordinates.instrument_errors import DEFAULT_MOVE_SE
-from services.fit.measurements.instrument.pose import rigid
 from services.transport.optics.parameters import Medium, Tissue
+from services.transport.scene.rigid_moves import rigid
 from tests.benchmarks.instrument_errors import SUBJECT
 from tests.support.truths import SIDE_LIGHTS, Truth, read
 

@@ -31,7 +31,6 @@ from services.fit.coordinates.instrument_errors import (
 from services.fit.measurements.blocks import Block, BlockInstrument, read_block, write_block
 from services.fit.measurements.instrument.moves import move_covariance, write_moves
 from services.fit.measurements.instrument.photographs import error_derivatives, photographed
-from services.fit.measurements.instrument.pose import rigid
 from services.fit.passes.moves import by_scene
 from services.fit.solve.covariance import _prior_parts, uncertainty
 from services.fit.solve.curvature_noise import CurvatureNoise, curvature_noise
@@ -42,6 +41,7 @@ from services.fit.solve.recombination import Fault
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.scene.recipe import View, single_tooth
 from services.transport.scene.recipe_files import read_recipe
+from services.transport.scene.rigid_moves import rigid
 from tests.support.prepared import camera, sphere
 
 NAMES = ("gain.green", "light_gain.a", "light_gain.b", "flare.c0.green")

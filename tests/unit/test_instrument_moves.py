@@ -16,9 +16,9 @@ from services.core.results import PreparedManifest
 from services.fit.coordinates.instrument_errors import DEFAULT_MOVE_SE
 from services.fit.measurements.instrument.capture import instrument_of
 from services.fit.measurements.instrument.moves import move_covariance
-from services.fit.measurements.instrument.pose import rigid
 from services.transport.scene.recipe import single_tooth
 from services.transport.scene.recipe_files import read_recipe
+from services.transport.scene.rigid_moves import rigid
 from tests.support.prepared import camera, sphere
 
 Array = NDArray[np.float64]

@@ -19,12 +19,13 @@ from services.fit.coordinates.instrument_errors import errors_of
 from services.fit.measurements.blocks import Block, BlockInstrument, read_block, write_block
 from services.fit.measurements.instrument.motion import MAX_SHIFTED, shift_errors_px
 from services.fit.measurements.instrument.photographs import error_derivatives, photographed, placed
-from services.fit.measurements.instrument.pose import SCAN, brightenings, displacements, moved_camera, rigid
+from services.fit.measurements.instrument.pose import brightenings, displacements
 from services.fit.measurements.slopes import image_slopes, motions_of
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.solve.recombination import Fault
 from services.fit.stage import run
 from services.transport.scene.recipe import View, single_tooth
+from services.transport.scene.rigid_moves import SCAN, moved_camera, rigid
 from tests.support.fake_engine import FakeEngine
 from tests.support.prepared import SIZE, TRUTH, camera, lights, sphere, write_prepared
 

@@ -19,7 +19,6 @@ from services.fit.checks.identifiability import QUANTITIES, quantity_in_words
 from services.fit.coordinates.instrument_errors import DEFAULT_SE
 from services.fit.measurements.blocks import Block, BlockInstrument, BlockTask, write_block
 from services.fit.measurements.instrument.photographs import block_of, error_derivatives
-from services.fit.measurements.instrument.pose import rigid
 from services.fit.passes.derivatives import Differentiation
 from services.fit.passes.passes import StackProblem, TraceRow, trace_row
 from services.fit.solve.covariance import Uncertainty
@@ -30,6 +29,7 @@ from services.tasks.engine_host import EngineHost
 from services.transport.optics.parameters import Tissue
 from services.transport.scene.recipe import SceneRecipe, View
 from services.transport.scene.recipe_files import read_recipe, write_recipe
+from services.transport.scene.rigid_moves import rigid
 
 Array = NDArray[np.float64]
 

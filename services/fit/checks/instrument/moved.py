@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from services.core.results import Estimate
 from services.fit.coordinates.instrument_errors import COMMON_KINDS, InstrumentErrors, have_common_cause, kind_of_error
-from services.fit.measurements.instrument.pose import SCAN
 from services.fit.solve.recombination import Fault
+from services.transport.scene.rigid_moves import SCAN
 
 Array = NDArray[np.float64]
 

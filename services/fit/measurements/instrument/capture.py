@@ -25,10 +25,10 @@ from services.fit.measurements.blocks import BlockInstrument, BlockMotion
 from services.fit.measurements.instrument.irradiance import uncertainty_at_teeth
 from services.fit.measurements.instrument.motion import shift_errors_px
 from services.fit.measurements.instrument.moves import Move, is_dome_given_by_lights, move_covariance, write_moves
-from services.fit.measurements.instrument.pose import SCAN
 from services.fit.measurements.slopes import motions_of
 from services.fit.measurements.view_stack import ViewStack
 from services.transport.scene.recipe import SceneRecipe
+from services.transport.scene.rigid_moves import SCAN
 
 MAX_JAW_LIGHTS = 12
 """Largest number of lights under which a jaw's fit has a gain for each light. With more, each light's gain counts as

@@ -27,9 +27,9 @@ from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.files.content_files import StoredFile
 from services.core.geometry import Camera, Light
 from services.fit.coordinates.instrument_errors import DEFAULT_MOVE_SE
-from services.fit.measurements.instrument.pose import moved_camera, rigid
 from services.transport.scene.recipe import SceneRecipe
 from services.transport.scene.recipe_files import write_recipe
+from services.transport.scene.rigid_moves import moved_camera, rigid
 
 Array = NDArray[np.float64]
 

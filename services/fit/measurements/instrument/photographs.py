@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.fit.measurements.blocks import Block, BlockTask, read_block
-from services.fit.measurements.instrument.pose import SCAN, moved_camera, rigid, twist_of
+from services.transport.scene.rigid_moves import SCAN, moved_camera, rigid, twist_of
 
 Array = NDArray[np.float64]
 
