@@ -304,7 +304,7 @@ class JobSpec(Record):
         le=0.1,
         description=(
             "a fit has converged when what noise leaves open of its parameters changes the images by no more, "
-            "as a fraction; a smaller one goes on to smaller ±, as far as max_samples_per_pixel allows"
+            "as a fraction; a smaller one goes on to smaller standard errors, as far as max_samples_per_pixel allows"
         ),
     )
     search_candidates: Whole = Field(default=50_000, ge=100, description="table-search points per channel")

@@ -144,7 +144,8 @@ class Verdict(Record):
     headline: str = Field(description="one sentence, the worst first")
     converged: bool = Field(description="whether the numbers are those of a fit that ended where it should")
     doubtful: bool = Field(
-        default=False, description="of a fit that converged: whether the numbers may be farther off than their ±"
+        default=False,
+        description="of a fit that converged: whether the numbers may be farther off than their standard errors",
     )
     is_above_limit: bool = Field(
         description="whether an image error, fitted or held out, of some channel is above the limit"

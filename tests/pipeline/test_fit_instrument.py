@@ -180,7 +180,7 @@ def test_results_and_report_show_the_instrument(brighter: tuple[Path, FitReport]
     assert table["enamel.sigma_a"]["se_parts"] == report.parameters["green"]["enamel.sigma_a"].se_parts
     page = (root / "report.html").read_text()
     assert page.index("Assumed, as the calibration") < page.index("Error on held-out images")
-    assert "What each ± is made of" in page
+    assert "What each standard error is made of" in page
     assert "light_gain.l0" in page
 
 

@@ -126,7 +126,9 @@ def test_events_show_a_falling_loss_and_previews(finished: tuple[Path, FitReport
 
 def test_renders_around_the_answer_are_announced(finished: tuple[Path, FitReport, list[StageEvent]]) -> None:
     _, report, events = finished
-    announced = [k for k, e in enumerate(events) if e.kind == "log" and "renders around the answer" in e.message]
+    announced = [
+        k for k, e in enumerate(events) if e.kind == "log" and "the final uncertainty estimate begins" in e.message
+    ]
     last_step = max(k for k, e in enumerate(events) if e.kind == "step")
     assert announced
     assert announced[-1] > last_step

@@ -341,7 +341,8 @@ def test_an_uncertainty_that_no_fit_uses_is_told() -> None:
     assert told == (
         (
             "The calibration states how wrong camera.c0.rx and 1 more may be. No fit moves single cameras and lights: "
-            "of these errors the ± know at most the lights' distances, which count in their gains, and what moves all "
+            "of these errors the standard errors know at most the lights' distances, which count in their gains, and"
+            " what moves all "
             "lights as one."
         ),
     )

@@ -43,7 +43,7 @@ def test_a_good_fit_has_no_note() -> None:
 
 
 def test_a_fit_whose_paths_are_the_larger_part_of_its_error_asks_for_more() -> None:
-    assert "raise option effort for a smaller ±" in notes(path_variance=2.0)
+    assert "raise option effort for a smaller standard error" in notes(path_variance=2.0)
 
 
 def test_a_camera_that_stands_out_is_named_where_images_do_not_fit() -> None:

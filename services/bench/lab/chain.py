@@ -37,8 +37,8 @@ COARSE: Mapping[str, Any] = MappingProxyType(
 PIXELS_MM = 0.5
 """Edge at the teeth of the squares of pixels whose means are fitted: light spreads in a tooth at least as far."""
 MAX_SAMPLES = 512
-"""Most paths per pixel and pass. With 1,024 the chain takes 22 minutes on two cores in place of 13, and its ± are at
-most a quarter smaller."""
+"""Most paths per pixel and pass. With 1,024 the chain takes 22 minutes on two cores in place of 13, and its standard
+errors are at most a quarter smaller."""
 
 
 def calibrated(root: Path, report_step: Callable[[str], None]) -> None:

@@ -59,7 +59,9 @@ class Result(StrEnum):
 ADVICE = {
     Result.RUNNING: "The fit has not ended.",
     Result.CONVERGED: "",
-    Result.NOISE_LIMITED: "Further steps would be smaller than noise; raise max_samples_per_pixel for a smaller ±.",
+    Result.NOISE_LIMITED: (
+        "Further steps would be smaller than noise; raise max_samples_per_pixel for a smaller standard error."
+    ),
     Result.MAX_STEPS: "The fit still improved at its last step; raise max_steps.",
     Result.STALLED: (
         "No step along the gradient lowers the error; check that the mesh, the lights and the boundary model match the"

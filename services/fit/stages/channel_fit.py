@@ -301,7 +301,7 @@ class Stages(ABC, Generic[Optics]):
         def compute() -> dict[str, Any]:
             displaced = self._displaced_scene(domain.tissue_at(x, problem.base))
             prefix = message_prefix(self.files.channel, self.tooth)
-            self.log(f"{prefix}: renders around the answer tell its ±, which may take as long as all steps.")
+            self.log(f"{prefix}: the final uncertainty estimate begins, which may take as long as all steps.")
             held, fewer = self._held_cosines(domain), max(samples // CLOSING_DIVISOR, 1)
             sums = measure_closing(problem, x, whitened.transform, held, fewer, moves, shapes, displaced)
             return {

@@ -102,7 +102,8 @@ def next_measurement(
         return ""
     advice = (
         f"What would help most: {best}. The error of {worst} that the images' noise and smoothness leave, without the"
-        f" paths' noise that the ± hold too, would fall from {_percent(before[worst])} to {_percent(after[best])}."
+        f" paths' noise that the standard errors hold too, would fall from {_percent(before[worst])} to"
+        f" {_percent(after[best])}."
     )
     similar = [name for name, error in after.items() if name != best and error <= (1 + SIMILAR) * after[best]]
     return f"{advice} Nearly as much would come of this: {similar[0]}." if similar else advice

@@ -155,7 +155,9 @@ def similarity_faults(material: Material, width_mm: float, *, scattering: bool, 
         f"The images fix σs′, but not σs and g by themselves: at a σt·w of {thickness:.2g} light has forgotten its"
         " single deflections"
     )
-    return (f"{what}. Take σs, g and the phase function with their ± alone; to tell them apart, {remedy}.",)
+    return (
+        f"{what}. Take σs, g and the phase function with their standard errors alone; to tell them apart, {remedy}.",
+    )
 
 
 def standing_out(places: Sequence[tuple[str, str]], errors: Sequence[float]) -> str:
@@ -201,7 +203,8 @@ def misfit_faults(dictionary: str, misfit: float, misfit_se: float, values: int,
     if is_default:
         remedy = "check" if converged else "let the fit converge first, and then check"
         sentence = (
-            f"The images differ from the fit {times}, so its ± say too little: {remedy} their variances, and the cell,"
+            f"The images differ from the fit {times}, so its standard errors say too little: {remedy} their"
+            " variances, and the cell,"
             " the beam and the angles that the folder describes."
         )
     else:

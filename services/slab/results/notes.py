@@ -14,7 +14,8 @@ from services.slab.solve.gauss_newton import Solution
 Array = NDArray[np.float64]
 
 LARGE_PATH_VARIANCE = 1.0
-"""Variance by the paths, in units of that by the images, above which paths are the larger part of the ±."""
+"""Variance by the paths, in units of that by the images, above which paths are the larger part of the standard"
+" errors."""
 
 
 def notes_of(
@@ -54,7 +55,7 @@ def notes_of(
 
 
 def is_short_of_paths(solution: Solution) -> bool:
-    """Whether the noise of the paths is the larger part of the ±."""
+    """Whether the noise of the paths is the larger part of the standard errors."""
     return solution.path_variance > LARGE_PATH_VARIANCE
 
 
@@ -72,7 +73,8 @@ def _on_phase(phase: PhaseFunction) -> list[str]:
         finest, coarsest = min(widths_deg), max(widths_deg)
         notes.append(
             f"The images resolve structure of the phase function that is {finest:.0f} to {coarsest:.0f} degrees wide,"
-            " depending on the angle. Narrower structure, such as rings of spheres, is averaged, and each ± is that of"
+            " depending on the angle. Narrower structure, such as rings of spheres, is averaged, and each standard"
+            " error is that of"
             " the average."
         )
     return notes
@@ -87,7 +89,7 @@ def _on_solver(solution: Solution) -> list[str]:
     if is_short_of_paths(solution):
         notes.append(
             f"The fit spent its steps while the noise of its paths was {solution.path_variance:.2g} times that of the"
-            " images in variance; raise option effort for a smaller ±."
+            " images in variance; raise option effort for a smaller standard error."
         )
     if not solution.converged:
         notes.append(

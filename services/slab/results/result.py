@@ -102,7 +102,7 @@ class SlabFit(Record):
 
 MAX_TOLD_THICKNESS = 7.0
 """Optical thickness sigma_t w above which sigma_s, what contains it and the phase function are not called determined,
-whatever their ±. Fits at 5.4 were right within 1.2 standard errors, of those at 9.1 one was off by 4."""
+whatever their standard errors. Fits at 5.4 were right within 1.2 standard errors, of those at 9.1 one was off by 4."""
 TOLD_IN_THICK_CELLS = ("sigma_a", "sigma_s_reduced")
 
 

@@ -23,7 +23,7 @@ export interface Verdict {
   /** One sentence that names the worst fault first. */
   headline: string;
   converged: boolean;
-  /** Of a fit that converged: whether the numbers may be farther off than their ±. */
+  /** Of a fit that converged: whether the numbers may be farther off than their standard errors. */
   doubtful: boolean;
   is_above_limit: boolean;
   limit: number;

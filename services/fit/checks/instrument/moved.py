@@ -41,8 +41,8 @@ def pose_sentences(
         way, way_se, way_before = _along(value[millimetres], se[millimetres], prior[millimetres, millimetres])
         far = max(turn / turn_before, way / way_before)
         beyond = (
-            f" That is {far:.1f} times what the calibration states: check how the scan was registered, and the ± that"
-            " the registration states."
+            f" That is {far:.1f} times what the calibration states: check how the scan was registered, and the standard"
+            " error that the registration states."
             if far > FAR_Z
             else ""
         )
@@ -85,7 +85,8 @@ def shift_sentences(channel: str, faults: Sequence[Fault], errors: InstrumentErr
         told.add(photograph)
         yield (
             f"In {channel} {photograph} is shifted by {abs(fault.size):.2f} px, {abs(fault.z):.1f} times what its own"
-            f" error and the ± of its motion, {errors.se[fault.index]:.2g} px, allow together: the subject moved in it;"
+            f" error and the standard error of its motion, {errors.se[fault.index]:.2g} px, allow together: the"
+            " subject moved in it;"
             " take it again, or leave that light out (left_out_lights)."
         )
 

@@ -125,7 +125,8 @@ def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
         rest = f" and {len(unused) - 1} more" if unused[1:] else ""
         yield (
             f"The calibration states how wrong {unused[0]}{rest} may be. No fit moves single cameras and lights: "
-            "of these errors the ± know at most the lights' distances, which count in their gains, and what moves all "
+            "of these errors the standard errors know at most the lights' distances, which count in their gains, and"
+            " what moves all "
             "lights as one."
         )
 
