@@ -170,7 +170,7 @@ def level_word(level: float) -> int:
 
 
 def markdown_table() -> str:
-    """The map as a Markdown table, as printed in docs/use/registers.md."""
+    """The map as a Markdown table, as printed in REGISTERS.md."""
     rows = ["| register | space | address | count | unit | meaning |", "|---|---|---|---|---|---|"]
     rows += [f"| {r.name} | {r.space} | {r.address} | {r.count} | {r.unit} | {r.meaning} |" for r in TABLE]
     return "\n".join(rows)
