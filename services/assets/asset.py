@@ -3,6 +3,8 @@
 ::
 
     scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
+    scene.xml                  for ``mitsuba scene.xml``: of red, green and blue in one where the channels have these
+                               names, else the first channel's; not for the boundary model ``thin``
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
     gums.ply, cavity.ply       of a jaw
     surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
@@ -21,13 +23,24 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
-from services.assets.mitsuba.scene import nested_scene, with_square_pixels
+from services.assets.mitsuba.rgb import RGB, colour_scene
+from services.assets.mitsuba.scene import (
+    SceneDict,
+    large_film,
+    nested_scene,
+    sensor_dict,
+    shell_integrator,
+    with_square_pixels,
+)
 from services.assets.mitsuba.scene_xml import SceneParameter, write_scene
 from services.assets.stains import write_textures
+from services.core.errors import InputError
 from services.core.files.meshes import write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.records import Boundary
@@ -94,7 +107,8 @@ def write_asset(
             for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()
         }
 
-    first, shown = lights[0], tuple(with_square_pixels(camera) for camera in cameras)
+    first, scenes = lights[0], dict[str, SceneDict]()
+    shown = tuple(with_square_pixels(camera) for camera in cameras)
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
         intensity = SceneParameter("intensity", first.intensity[index])
@@ -110,13 +124,17 @@ def write_asset(
             scene = nested_scene(
                 files, tissue, shown, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained
             )
-        write_scene(folder / f"scene_{channel}.xml", scene)
+        scenes[channel] = scene | _large_cameras(shown, samples) | {"integrator": shell_integrator()}
+        write_scene(folder / f"scene_{channel}.xml", scenes[channel])
+    colour = "none" if boundary == "thin" else write_shell_scene(folder / "scene.xml", scenes)
 
     rig = {
         "units": "mm",
         "boundary": boundary,
         "channels": list(channels),
         "cameras": [camera.name for camera in cameras],
+        "camera_pixels": [camera.size for camera in cameras],
+        "scene.xml": colour,
         "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},
     }
     _write_json(folder / "rig.json", rig)
@@ -127,6 +145,30 @@ def write_asset(
     for name in ("render.py", "thin_boundary.py") if boundary == "thin" else ("render.py",):
         write_atomic(folder / name, (SHIPPED / name).read_bytes())
     return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
+
+
+def _large_cameras(cameras: Sequence[Camera], samples: SceneParameter) -> SceneDict:
+    # Films that are large enough to be looked at; their size is a parameter of the file.
+    found: SceneDict = {}
+    for k, camera in enumerate(cameras):
+        width, height = large_film(camera)
+        film = SceneParameter(f"width_{k}", width), SceneParameter(f"height_{k}", height)
+        found[f"camera_{camera.name}"] = sensor_dict(camera, samples, film)
+    return found
+
+
+def write_shell_scene(path: Path, scenes: dict[str, SceneDict]) -> str:
+    """Write the scene for ``mitsuba scene.xml``; return what it shows: ``rgb``, ``rgb of similar media`` where the
+    channels' phase functions differ, or the name of the one channel.
+    """
+    if set(RGB) <= scenes.keys():
+        with suppress(InputError):  # textures of single channels cannot be joined
+            joined = colour_scene([scenes[channel] for channel in RGB])
+            write_scene(path, joined.scene)
+            return "rgb" if joined.is_exact else "rgb of similar media"
+    channel, scene = next(iter(scenes.items()))
+    write_scene(path, scene)
+    return channel
 
 
 def tissue_of(table: dict[str, Estimate]) -> Tissue:

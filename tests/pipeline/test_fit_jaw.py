@@ -139,7 +139,7 @@ def test_export_names_every_tooth(finished: tuple[Path, FitReport, list[StageEve
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono")
-    scene = mi.load_file(str(root / "asset" / "scene_green.xml"), optimize=False)
+    scene = mi.load_file(str(root / "asset" / "scene_green.xml"), optimize=False, width_0=20, height_0=16)
     image = np.array(mi.render(scene, sensor=0, spp=16))
     assert np.isfinite(image).all()
     assert image.mean() > 0

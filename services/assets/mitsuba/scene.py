@@ -24,6 +24,10 @@ MAX_UNEVEN = 0.01
 """Largest relative difference of a camera's focal lengths along x and y: calibrations of square pixels leave a
 thousandth between them."""
 
+MIN_FILM_PIXELS = 512
+"""Least width or height, whichever is larger, of an exported scene's film: what a fit needs is too coarse to be looked
+at."""
+
 SceneDict = dict[str, Any]
 
 
@@ -57,8 +61,19 @@ def with_square_pixels(camera: Camera) -> Camera:
     return camera.model_copy(update={"K": ((mean, skew, cx), (zero, mean, cy), last)})
 
 
-def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
+def large_film(camera: Camera) -> tuple[int, int]:
+    """Width and height of a film of ``MIN_FILM_PIXELS``: the camera's size times a whole number."""
+    scale = -(-MIN_FILM_PIXELS // max(camera.size))
+    return camera.size[0] * scale, camera.size[1] * scale
+
+
+def sensor_dict(camera: Camera, samples: Any = 64, film: tuple[Any, Any] | None = None) -> SceneDict:
     """Pinhole camera with a box filter, so that a pixel is the mean radiance over its area.
+
+    Args:
+        camera: the camera.
+        samples: paths per pixel of the film.
+        film: width and height of the film; None for the camera's own.
 
     Raises:
         CaptureInputError: the camera has skew or pixels that are not square, which Mitsuba's perspective camera cannot
@@ -84,14 +99,21 @@ def sensor_dict(camera: Camera, samples: Any = 64) -> SceneDict:
         "far_clip": 1e5,
         "film": {
             "type": "hdrfilm",
-            "width": width,
-            "height": height,
+            "width": width if film is None else film[0],
+            "height": height if film is None else film[1],
             "pixel_format": "luminance",
             "component_format": "float32",
             "rfilter": {"type": "box"},
         },
         "sampler": {"type": "independent", "sample_count": samples},
     }
+
+
+def shell_integrator() -> SceneDict:
+    """Integrator of a scene that is exported: unlike ``prbvolpath`` it is no Python plug-in, so the ``mitsuba`` command
+    has it.
+    """
+    return {"type": "volpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH}
 
 
 def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> SceneDict:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from services.assets.mitsuba.rgb import Colour
 from services.assets.mitsuba.scene import SceneDict
 from services.core.store import write_atomic
 
@@ -31,6 +32,8 @@ TAGS = {
     "independent": "sampler",
     "box": "rfilter",
     "prbvolpath": "integrator",
+    "volpath": "integrator",
+    "volpathmis": "integrator",
     "point": "emitter",
 }
 """Kind of object of each plug-in that the scenes use."""
@@ -42,7 +45,7 @@ class SceneParameter:
     """Value that the user may set when loading: ``mi.load_file(path, name=value)``."""
 
     name: str
-    default: float
+    default: float | int
 
 
 def write_scene(path: Path, scene: SceneDict) -> None:
@@ -69,6 +72,8 @@ def _collect(node: Any, parameters: dict[str, float]) -> None:
 def _append(parent: ET.Element, name: str, value: Any, *, top: bool = False) -> None:
     if isinstance(value, dict) and value["type"] == "ref":
         ET.SubElement(parent, "ref", name=name, id=value["id"])
+    elif isinstance(value, dict) and value["type"] == "rgb":
+        _append(parent, name, value["value"])
     elif isinstance(value, dict):
         element = ET.SubElement(parent, TAGS[value["type"]], {"type": value["type"], "id" if top else "name": name})
         for key, child in value.items():
@@ -81,6 +86,8 @@ def _append(parent: ET.Element, name: str, value: Any, *, top: bool = False) -> 
         ET.SubElement(
             parent, "point", {"name": name} | {axis: _text(entry) for axis, entry in zip("xyz", value, strict=True)}
         )
+    elif isinstance(value, Colour):
+        ET.SubElement(parent, "rgb", name=name, value=", ".join(map(repr, value.values)))
     elif isinstance(value, SceneParameter):
         ET.SubElement(parent, VALUE_TAGS[type(value.default)], name=name, value=_text(value))
     else:

@@ -1,7 +1,7 @@
 """Render the measured tooth with Mitsuba 3: ``python render.py --camera c0 --light l0 --spp 256 --out tooth.exr``.
 
 Each colour channel is its own scene, because scattering differs per channel and Mitsuba's phase functions hold one
-number.
+number. The image has the photographs' pixels; ``--large`` writes the film's, which are at least 512 on an edge.
 """
 
 import argparse
@@ -14,20 +14,30 @@ import mitsuba as mi
 import numpy as np
 
 
-def render(folder: Path, camera: str, light: str, spp: int, seed: int = 0, variant: str = "llvm_ad_mono") -> np.ndarray:
-    """Linear radiance (H, W, C) of one camera under one light."""
+def render(
+    folder: Path,
+    camera: str,
+    light: str,
+    spp: int,
+    seed: int = 0,
+    variant: str = "llvm_ad_mono",
+    large: bool = False,
+) -> np.ndarray:
+    """Linear radiance (H, W, C) of one camera under one light, from so many paths per pixel of the result."""
     if mi.variant() != variant:
         mi.set_variant(variant)
     rig = json.loads((folder / "rig.json").read_text())
     if rig["boundary"] == "thin":
         runpy.run_path(str(folder / "thin_boundary.py"))["register"]()
+    sensor = rig["cameras"].index(camera)
+    width, height = rig["camera_pixels"][sensor]
+    film = {} if large else {f"width_{sensor}": width, f"height_{sensor}": height}
     x, y, z = rig["lights"][light]["position_mm"]
     planes = []
     for channel, intensity in zip(rig["channels"], rig["lights"][light]["intensity"], strict=True):
-        scene = mi.load_file(
-            str(folder / f"scene_{channel}.xml"), optimize=False, light_x=x, light_y=y, light_z=z, intensity=intensity
-        )
-        planes.append(np.array(mi.render(scene, sensor=rig["cameras"].index(camera), spp=spp, seed=seed))[..., 0])
+        given = {"light_x": x, "light_y": y, "light_z": z, "intensity": intensity} | film
+        scene = mi.load_file(str(folder / f"scene_{channel}.xml"), optimize=False, **given)
+        planes.append(np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed))[..., 0])
     return np.stack(planes, axis=-1)
 
 
@@ -44,11 +54,13 @@ def main() -> None:
     parser.add_argument("--camera", default=None, help="name in rig.json; default the first")
     parser.add_argument("--light", default=None, help="name in rig.json; default the first")
     parser.add_argument("--spp", type=int, default=256, help="paths per pixel")
+    parser.add_argument("--large", action="store_true", help="write the film's pixels and not the photographs'")
     parser.add_argument("--out", type=Path, default=Path("tooth.exr"), help="EXR file")
     options = parser.parse_args()
     folder = Path(__file__).resolve().parent
     rig = json.loads((folder / "rig.json").read_text())
-    image = render(folder, options.camera or rig["cameras"][0], options.light or next(iter(rig["lights"])), options.spp)
+    camera, light = options.camera or rig["cameras"][0], options.light or next(iter(rig["lights"]))
+    image = render(folder, camera, light, options.spp, large=options.large)
     write_image(image, options.out)
 
 
