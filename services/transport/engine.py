@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from services.transport.paths.walk import Walk
     from services.transport.scene.media import Media
 
-WIDEST_BORDER_MM = 5.0
-"""Largest accepted width of a smoothed border between enamel and dentin, mm."""
 LANE_BUDGET = 24_000_000
 """Largest number of float64 sums that a tally may hold, about 190 MB; larger requests are cut into slices of pixels."""
 
@@ -54,7 +52,7 @@ class Engine:
         Raises:
             PlatformError: no usable libLLVM.
             MeshError: a surface cannot bound a medium.
-            InputError: no usable light, or an index of refraction or border width out of its range.
+            InputError: no usable light, or an index of refraction out of its range.
         """
         require_surfaces(recipe)
         reach_mm = float(np.linalg.norm(recipe.vertices_mm(), axis=1).max())
@@ -62,11 +60,6 @@ class Engine:
         for name, ior, usual in (("ior", recipe.ior, "enamel, 1.631"), ("gums_ior", recipe.gums_ior, "gums, 1.33")):
             if not math.isfinite(ior) or ior < 1:
                 raise InputError(f"{name} = {ior:g} must be at least 1; give the index of refraction of {usual}.")
-        if not 0 <= recipe.border_width_mm <= WIDEST_BORDER_MM:
-            raise InputError(
-                f"border_width_mm = {recipe.border_width_mm:g} must lie in 0 (sharp) to {WIDEST_BORDER_MM:g};"
-                " correct it."
-            )
         prepare_device(threads, recipe.device)
         from services.transport.lighting.light_maps import LightMaps
         from services.transport.lighting.lights import PointLights
@@ -207,8 +200,8 @@ class Engine:
             tooth: index of the tooth whose dentin moves.
 
         Raises:
-            InputError: as ``images``; also for a scene without shape modes, a smoothed border, phase tables, and a
-                cotangent of another shape or not finite.
+            InputError: as ``images``; also for a scene without shape modes, phase tables, and a cotangent of another
+                shape or not finite.
             NonFiniteError: the result is NaN or infinite.
         """
         from services.transport.gradients.shape_gradient import ShapeGradients
@@ -218,11 +211,6 @@ class Engine:
             raise InputError(
                 f"Tooth {tooth} has no dentin with shape modes, so there is no gradient to its shape; build it from a"
                 " blend shape."
-            )
-        if self.recipe.border_width_mm > 0:
-            raise InputError(
-                f"border_width_mm = {self.recipe.border_width_mm:g}, and only a sharp border has this gradient; take"
-                " the Jacobian's."
             )
         if not 1 <= order <= 9 or samples < 1 or (photons is not None and photons < 1):
             raise InputError(

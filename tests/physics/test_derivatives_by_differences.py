@@ -71,15 +71,6 @@ SHAPE = Group(
 )
 """Group with dentin clearer than enamel: for both modes, Eq. 32 alone gives 2.5 times the derivative, with little
 noise."""
-
-GRADUAL = Group(
-    Tissue(Medium(1.5, 0.6, 0.9, 0.7, -0.3), Medium(1.2, 0.95, 0.3, 0.5, -0.2), (0.5, 0.4)),
-    {"shape.0": 512, "shape.1": 1024, "enamel.alpha": 256, "dentin.alpha": 384, "dentin.beta": 1024, "enamel.g1": 768},
-    2048,
-    lambda boundary: replace(recipe(boundary), border_width_mm=1.2),
-)
-"""Group in which albedo and phase function differ far more than extinction, so that their changes near the border
-dominate the derivative to its shape."""
 IN_A_MOUTH = Group(
     MOUTH,
     {
@@ -152,7 +143,6 @@ def standard_error(values: NDArray[np.float64]) -> float:
         ),
         pytest.param(MEDIA, "thin", id="media-thin", marks=pytest.mark.slow),
         pytest.param(SHAPE, "thin", id="shape-thin", marks=pytest.mark.slow),
-        pytest.param(GRADUAL, "matched", id="gradual-matched", marks=pytest.mark.slow),
         pytest.param(
             replace(
                 IN_A_MOUTH,

@@ -49,7 +49,7 @@ def test_a_stored_scene_reads_back_whole(tmp_path: Path, device: Device | None) 
         ToothSurfaces(sphere(2.0), stain_uv=np.ones((len(sphere(2.0).faces), 3, 2))),
     )
     scene = SceneRecipe(
-        teeth, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device, sphere(5.0), 1.4, sphere(9.0), 0.5
+        teeth, LIGHTS_MM, np.full(len(LIGHTS_MM), INTENSITY), "thin", 1.5, device, sphere(5.0), 1.4, sphere(9.0)
     )
     stored = read_recipe(write_recipe(tmp_path, scene))
     assert (stored.boundary, stored.ior, stored.device, stored.gums_ior) == ("thin", 1.5, device, 1.4)

@@ -18,7 +18,7 @@ from services.transport.paths.scores import Plan, Scatterings, Scores
 from services.transport.paths.stain_tally import StainTally
 from services.transport.paths.tally import Tally
 from services.transport.scene.geometry import Geometry
-from services.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
+from services.transport.scene.media import Media, PhaseFunction
 from services.transport.scene.stain_textures import FaceCrossing
 
 MAP_RELATIVE_ERROR = 0.1
@@ -275,32 +275,15 @@ class Connections:
         lengths_of = dict(zip(self.scores.sigma_media, lengths, strict=True))
         for which, score in enumerate(self.scores.complete(vertex.sums, vertex.scatterings, medium, terms, lengths_of)):
             tally.add_derivative(which, lane, slot, value * score, primary)
-        border_sums = vertex.border_sums
-        if isinstance(medium, Mixed) and self.plan.shape is not None:
-            change = self.scores.lobe_slope(
-                medium, PhaseFunction(self.media, medium).scores(LOBE_FIELDS, vertex.omega, direction)
-            )
-            motion = self.geometry.mixture_motion(vertex.point, self.plan.shape, active)
-            border_sums = [dr.fma(change, rate, total) for rate, total in zip(motion, border_sums, strict=True)]
         for mode in range(self.modes):
-            border_score = border_sums[mode] if border is None else border_sums[mode] + border[mode]
+            border_score = vertex.border_sums[mode] if border is None else vertex.border_sums[mode] + border[mode]
             factor = dr.select(vertex.primary, border_score, vertex.shape_factor[mode])
             tally.add_derivative(len(self.plan.scores) + mode, lane, slot, value * factor, active)
 
-    def _medium(self, vertex: Vertex) -> mi.UInt32 | Mixed:
+    def _medium(self, vertex: Vertex) -> mi.UInt32:
         """Medium in which a vertex scatters, or the wall (number ``media.count``) where it lies on the wall."""
-        wall = mi.UInt32(self.media.count)
-        if not self.geometry.mixing:
-            medium = self.geometry.medium(vertex.place)
-            return dr.select(vertex.wall[0], wall, medium) if vertex.wall else medium
-        mixed = self.geometry.mixed(vertex.point, vertex.place, mi.Bool(True))
-        if vertex.wall:
-            (on_wall,) = vertex.wall
-            mixed = Mixed(
-                dr.select(on_wall, wall, mixed.first), dr.select(on_wall, wall, mixed.second),
-                dr.select(on_wall, 1, mixed.share), dr.select(on_wall, 0, mixed.slope),
-            )  # fmt: skip
-        return mixed
+        medium = self.geometry.medium(vertex.place)
+        return dr.select(vertex.wall[0], mi.UInt32(self.media.count), medium) if vertex.wall else medium
 
     def _density(self, vertex: Vertex, direction: mi.Vector3f) -> mi.Float:
         """Phase function, or on a wall the diffuse reflection of a white surface, towards a direction, 1/sr."""

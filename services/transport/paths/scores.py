@@ -8,9 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from services.core.errors import InputError
-from services.transport.optics.free_flight import minus_log1m
-from services.transport.scene.media import Media, Mixed, Score
-from services.transport.scene.tables import NEARLY_ONE
+from services.transport.scene.media import Media, Score
 
 MAX_COUNTED = 3
 """Largest number of media for each of which a kernel counts the scatterings separately."""
@@ -66,7 +64,7 @@ class Scatterings:
 class Scores:
     """The accumulated d ln(path contribution) / d(parameter) of each lane, only for parameters that are free."""
 
-    def __init__(self, plan: Plan, media: Media, *, mixing: bool = False) -> None:
+    def __init__(self, plan: Plan, media: Media) -> None:
         self.plan, self.media = plan, media
         self.phase_fields = frozenset(s.field for s in plan.scores) & {"beta", "g1", "g2"}
         for s in plan.scores:
@@ -76,11 +74,9 @@ class Scores:
                     " derivatives."
                 )
         self.sigma_media = tuple(sorted({s.medium for s in plan.scores if s.field == "sigma"}))
-        # Where there are few media all are counted, where there are many only those whose albedo is free, and where
-        # media mix none.
-        self.mixing = mixing
-        self.counts_all = media.count <= MAX_COUNTED and not mixing
-        requested = set() if mixing else {s.medium for s in plan.scores if s.field == "alpha"}
+        # Where there are few media all are counted, and where there are many only those whose albedo is free.
+        self.counts_all = media.count <= MAX_COUNTED
+        requested = {s.medium for s in plan.scores if s.field == "alpha"}
         self.counted = tuple(range(1, media.count + 1)) if self.counts_all else tuple(sorted(requested))
 
     def zero(self) -> list[mi.Float]:
@@ -92,15 +88,8 @@ class Scores:
         rest = 0 if self.counts_all else 1
         return Scatterings([mi.UInt32(0) for _ in self.counted], [mi.Float(0)] * rest, [mi.UInt32(0)] * rest)
 
-    def scatter(self, scatterings: Scatterings, medium: mi.UInt32 | Mixed, active: mi.Bool) -> Scatterings:
+    def scatter(self, scatterings: Scatterings, medium: mi.UInt32, active: mi.Bool) -> Scatterings:
         """Scatterings with one more in each active lane."""
-        if isinstance(medium, Mixed):
-            log_alpha = -minus_log1m(dr.minimum(self.media.pick(self.media.absorbed, medium), NEARLY_ONE))
-            return Scatterings(
-                [],
-                [scatterings.others[0] + dr.select(active, log_alpha, 0)],
-                [scatterings.total[0] + dr.select(active, mi.UInt32(1), 0)],
-            )
         counts = [
             dr.select(active & (medium == k), count + 1, count)
             for k, count in zip(self.counted, scatterings.counts, strict=True)
@@ -146,39 +135,10 @@ class Scores:
             for s, total in zip(self.plan.scores, sums, strict=True)
         ]
 
-    def mixed_albedo(self, sums: list[mi.Float], medium: Mixed, active: mi.Bool) -> list[mi.Float]:
-        """Scores of the albedos where media mix: the medium's share over the mixture's albedo per scatter (Eq. 20)."""
-        inverse = dr.rcp(dr.maximum(1 - self.media.pick(self.media.absorbed, medium), 1 - NEARLY_ONE))
-        return [
-            total + dr.select(active, medium.share_of(s.medium) * inverse, 0) if s.field == "alpha" else total
-            for s, total in zip(self.plan.scores, sums, strict=True)
-        ]
-
-    def lobe_slope(self, medium: Mixed, terms: dict[str, mi.Float]) -> mi.Float:
-        """Derivative of ln(phase function) with respect to the distance q, per mm: differences of the two media's lobe
-        parameters times ``terms``, which holds all fields of the lobes (Eq. 19, corrected).
-        """
-        total = mi.Float(0)
-        for field, term in terms.items():
-            column = {"beta": self.media.beta, "g1": self.media.g1, "g2": self.media.g2}[field]
-            total = dr.fma(self.media.pick(column, medium.first) - self.media.pick(column, medium.second), term, total)
-        return total * medium.slope
-
-    def albedo_slope(self, medium: Mixed) -> mi.Float:
-        """Derivative of ln(albedo) with respect to the distance q, per mm (Eq. 21)."""
-        absorbed = self.media.absorbed
-        less = self.media.pick(absorbed, medium.second) - self.media.pick(absorbed, medium.first)
-        return less * medium.slope / dr.maximum(1 - self.media.pick(absorbed, medium), 1 - NEARLY_ONE)
-
     def deflection(
-        self, sums: list[mi.Float], medium: mi.UInt32 | Mixed, terms: dict[str, mi.Float], active: mi.Bool
+        self, sums: list[mi.Float], medium: mi.UInt32, terms: dict[str, mi.Float], active: mi.Bool
     ) -> list[mi.Float]:
         """Scores of the phase function's parameters after a change of direction: d ln f per scattering (Eq. 12, 13)."""
-        if isinstance(medium, Mixed):
-            return [
-                total + dr.select(active, medium.share_of(s.medium) * terms[s.field], 0) if s.field in terms else total
-                for s, total in zip(self.plan.scores, sums, strict=True)
-            ]
         return [
             dr.select(active & (medium == s.medium), total + terms[s.field], total) if s.field in terms else total
             for s, total in zip(self.plan.scores, sums, strict=True)
@@ -188,7 +148,7 @@ class Scores:
         self,
         sums: list[mi.Float],
         scatterings: Scatterings,
-        medium: mi.UInt32 | Mixed,
+        medium: mi.UInt32,
         terms: dict[str, mi.Float],
         lengths: dict[int, mi.Float],
     ) -> list[mi.Float]:
@@ -198,18 +158,13 @@ class Scores:
         whole = []
         for s, total in zip(self.plan.scores, sums, strict=True):
             value = total
-            if s.field == "alpha" and not self.mixing:
+            if s.field == "alpha":
                 value = (
                     mi.Float(scatterings.counts[self.counted.index(s.medium)]) * self.media.inverse_alpha[s.medium - 1]
                 )
             elif s.field == "sigma":
                 value = total - lengths.get(s.medium, mi.Float(0))
             elif s.field in terms:
-                last_term = (
-                    medium.share_of(s.medium) * terms[s.field]
-                    if isinstance(medium, Mixed)
-                    else dr.select(medium == s.medium, terms[s.field], 0)
-                )
-                value = total + last_term
+                value = total + dr.select(medium == s.medium, terms[s.field], 0)
             whole.append(value)
         return whole

@@ -20,7 +20,7 @@ from services.transport.paths.tally import Tally
 from services.transport.paths.walker import Flight, Walker
 from services.transport.scene.border import BorderScattering, inverse_cosine, no_crossing, offer
 from services.transport.scene.geometry import Geometry, SlabGeometry
-from services.transport.scene.media import LOBE_FIELDS, Media, Mixed, PhaseFunction
+from services.transport.scene.media import Media, PhaseFunction
 from services.transport.scene.stain_textures import FaceCrossing
 
 ROULETTE_WEIGHT = 0.1
@@ -42,7 +42,7 @@ class Walk:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
         self.ior = None if ior is None else dr.opaque(mi.Float, ior)
         media.two_lobes |= any(score.field == "beta" for score in plan.scores)
-        self.scores = Scores(plan, media, mixing=geometry.mixing)
+        self.scores = Scores(plan, media)
         self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.scores, self.ior)
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
@@ -231,38 +231,10 @@ class Walk:
         )
         walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
         walker.place = dr.select(crosses, behind, walker.place)
-        scattered_in: mi.UInt32 | Mixed = flight.medium
+        scattered_in = flight.medium
         if self.geometry.opaque:
             scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium)
-        if self.geometry.mixing:
-            scattered_in = self._mixed(walker, flight)
-            walker.sums = self.scores.mixed_albedo(walker.sums, scattered_in, flight.scatters | flight.bounces)
-            self._score_mixture(walker, self.scores.albedo_slope(scattered_in), flight.scatters)
         walker.scatterings = self.scores.scatter(walker.scatterings, scattered_in, flight.scatters | flight.bounces)
-
-    def _mixed(self, walker: Walker, flight: Flight) -> Mixed:
-        """Mixture of media in which the vertex at the end of a flight scatters."""
-        mixed = self.geometry.mixed(walker.origin, walker.place, flight.scatters)
-        if self.geometry.opaque:
-            wall = mi.UInt32(self.media.count)
-            mixed.first, mixed.second = (
-                dr.select(flight.bounces, wall, mixed.first),
-                dr.select(flight.bounces, wall, mixed.second),
-            )
-            mixed.share, mixed.slope = (
-                dr.select(flight.bounces, 1, mixed.share),
-                dr.select(flight.bounces, 0, mixed.slope),
-            )
-        return mixed
-
-    def _score_mixture(self, walker: Walker, change: mi.Float, active: mi.Bool) -> None:
-        """Score the border's motion at a scattering vertex by ``change``, the mixture's change per mm of distance."""
-        if self.plan.shape is not None:
-            motion = self.geometry.mixture_motion(walker.origin, self.plan.shape, active)
-            walker.border_sums = [
-                total + dr.select(active, change * rate, 0)
-                for total, rate in zip(walker.border_sums, motion, strict=True)
-            ]
 
     def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
         assert self.connections is not None
@@ -285,18 +257,13 @@ class Walk:
         walker.connection_step = dr.select(walker.connection_step == self.connections.period, 0, walker.connection_step)
 
     def _deflect(self, walker: Walker, flight: Flight) -> None:
-        medium = self._mixed(walker, flight) if self.geometry.mixing else flight.medium
-        phase, rng = PhaseFunction(self.media, medium), walker.rng
+        phase, rng = PhaseFunction(self.media, flight.medium), walker.rng
         u_lobe = rng.next_float32() if self.media.two_lobes else None
         u, v = rng.next_float32(), rng.next_float32()
         onward = phase.sample(walker.omega, u_lobe, u, v)
         walker.sums = self.scores.deflection(
-            walker.sums, medium, phase.scores(self.scores.phase_fields, walker.omega, onward), flight.scatters
+            walker.sums, flight.medium, phase.scores(self.scores.phase_fields, walker.omega, onward), flight.scatters
         )
-        if isinstance(medium, Mixed) and self.plan.shape is not None:
-            self._score_mixture(
-                walker, self.scores.lobe_slope(medium, phase.scores(LOBE_FIELDS, walker.omega, onward)), flight.scatters
-            )
         if self.geometry.opaque:
             diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(
                 mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))

@@ -110,13 +110,6 @@ class BorderScattering:
         self.sigma_a, self.sigma_b = (
             dr.select(index == 0, 0, media.pick(media.sigma_s, index)) for index in (index_a, index_b)
         )
-        if geometry.mixing:
-            # On the border itself both sides are the same mixture; only extinction jumps.
-            half = geometry.mixed(crossing.point, crossing.before, mi.Bool(True))
-            half.share = mi.Float(0.5)
-            self.phase_a = self.phase_b = PhaseFunction(media, half)
-            albedo = 1 - media.pick(media.absorbed, half)
-            self.sigma_a, self.sigma_b = (media.extinction(index) * albedo for index in (index_a, index_b))
 
     def __call__(self, direction: mi.Vector3f) -> mi.Float:
         """sigma_s,A f_A + sigma_s,B f_B: the importance of a light in this direction."""

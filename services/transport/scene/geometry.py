@@ -16,8 +16,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.transport.scene.media import Mixed
-
 ENAMEL, DENTIN = 1, 2
 """Numbers of the media of a single tooth."""
 RAY_EPSILON = 1e-5
@@ -56,8 +54,6 @@ class Geometry(Protocol):
     """Ray offset, mm."""
     opaque: bool
     """Whether any surface is opaque."""
-    mixing: bool
-    """Whether albedo and phase function change gradually across borders."""
     single: bool
     """Whether the scene is one tooth and nothing else, whose face mirrors only empty space to a camera."""
 
@@ -73,12 +69,6 @@ class Geometry(Protocol):
 
     def medium(self, place: mi.UInt32) -> mi.UInt32:
         """Index of the medium, 0 for empty space."""
-
-    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
-        """The media that mix at a point; called only where borders are gradual."""
-
-    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
-        """Change of the distance to a tooth's dentin with each of its shape modes, mm."""
 
     def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
         """Place after crossing the surface."""
@@ -105,7 +95,6 @@ class SlabGeometry:
     epsilon = 0.0
     opaque = False
     stained = False
-    mixing = False
     single = True
 
     def __init__(self, thicknesses_mm: Sequence[float | NDArray[np.float64]], *, moving_border: bool) -> None:
@@ -167,14 +156,6 @@ class SlabGeometry:
     def on_stain(self, hit: Hit, before: mi.UInt32, after: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - faces have none
         """No stains."""
         return mi.Bool(False)
-
-    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:  # noqa: ARG002 - borders are sharp everywhere
-        """The layer's own medium, because borders of a slab are sharp."""
-        return Mixed(self.medium(place), self.medium(place), mi.Float(1), mi.Float(0))
-
-    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:  # noqa: ARG002 - borders are sharp everywhere
-        """Zero for every mode, because no media mix."""
-        return [mi.Float(0) for _ in range(self.modes_of[tooth])]
 
     def depths(self, z: mi.Float, sigma: Sequence[mi.Float]) -> tuple[mi.Float, mi.Float]:
         """Optical depths from ``z`` inside straight to the lit and to the far face."""

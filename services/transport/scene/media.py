@@ -15,7 +15,6 @@ from services.transport.optics import phase
 from services.transport.optics.parameters import Medium
 from services.transport.scene.tables import PhaseTables
 
-LOBE_FIELDS = frozenset({"beta", "g1", "g2"})
 MAX_SELECTED = 3
 """Largest number of media among which kernels select by comparison; values of more media are gathered from a table."""
 
@@ -50,24 +49,6 @@ class Score:
     field: str
 
 
-@dataclass
-class Mixed:
-    """Two media mixed near a gradual border, or a single medium away from it."""
-
-    first: mi.UInt32
-    """Number of the enamel, or of the single medium where nothing is mixed."""
-    second: mi.UInt32
-    """Number of the dentin, or of the same single medium."""
-    share: mi.Float
-    """Share of the first medium."""
-    slope: mi.Float
-    """d share / d distance, per mm; 0 where nothing is mixed."""
-
-    def share_of(self, medium: int) -> mi.Float:
-        """Share of a lane's scattering that a medium has."""
-        return dr.select(self.first == medium, self.share, dr.select(self.second == medium, 1 - self.share, 0))
-
-
 class Media:
     """Parameters of media 1..M; index 0 is empty space."""
 
@@ -100,20 +81,17 @@ class Media:
         self.sigma_s = opaque(lambda m: m.sigma * m.alpha)
         self.log_alpha = opaque(lambda m: math.log(max(m.alpha, 1e-30)))
         self.inverse_alpha = opaque(lambda m: 1 / max(m.alpha, 1e-30))
-        self.absorbed = opaque(lambda m: 1 - m.alpha)
         self.beta = opaque(lambda m: m.beta)
         self.g1 = opaque(lambda m: m.g1)
         self.g2 = opaque(lambda m: m.g2)
         self._tables: dict[int, mi.Float] = {}
         if self.count > MAX_SELECTED:
-            columns = (self.sigma, self.sigma_s, self.log_alpha, self.absorbed, self.beta, self.g1, self.g2)
+            columns = (self.sigma, self.sigma_s, self.log_alpha, self.beta, self.g1, self.g2)
             self._tables = {id(column): dr.concat(column) for column in columns}
             dr.eval(self._tables)
 
-    def pick(self, values: list[mi.Float], index: mi.UInt32 | Mixed) -> mi.Float:
-        """Value of the medium with number ``index``, or of the mixture; arbitrary in empty space."""
-        if isinstance(index, Mixed):
-            return dr.lerp(self.pick(values, index.second), self.pick(values, index.first), index.share)
+    def pick(self, values: list[mi.Float], index: mi.UInt32) -> mi.Float:
+        """Value of the medium with number ``index``; arbitrary in empty space."""
         if self._tables:
             return dr.gather(mi.Float, self._tables[id(values)], dr.maximum(index, 1) - 1)
         result = values[-1]
@@ -129,7 +107,7 @@ class Media:
 class PhaseFunction:
     """The phase function of each lane's medium: one or two lobes or a table, as the scene needs."""
 
-    def __init__(self, media: Media, index: mi.UInt32 | Mixed) -> None:
+    def __init__(self, media: Media, index: mi.UInt32) -> None:
         self.index, self.tables, self.two_lobes = index, media.tables, media.two_lobes
         self.g1 = media.pick(media.g1, index)
         if self.two_lobes:
@@ -139,7 +117,7 @@ class PhaseFunction:
     def density(self, omega: mi.Vector3f, omega_out: mi.Vector3f) -> mi.Float:
         """Value of the phase function, 1/sr."""
         value = self._density_of_lobes(omega, omega_out)
-        if self.tables is None or isinstance(self.index, Mixed):
+        if self.tables is None:
             return value
         return dr.select(self.tables.known(self.index), self.tables.density(self.index, omega, omega_out), value)
 
@@ -154,7 +132,7 @@ class PhaseFunction:
         """Direction distributed as the phase function."""
         g = self.g1 if u_lobe is None else dr.select(u_lobe < self.beta, self.g1, self.g2)
         onward = phase.deflected(omega, g, phase.sample_deviation(g, u), v)
-        if self.tables is None or isinstance(self.index, Mixed):
+        if self.tables is None:
             return onward
         return dr.select(self.tables.known(self.index), self.tables.sample(self.index, omega, u, v), onward)
 

@@ -18,8 +18,6 @@ from services.core.geometry import Mesh
 from services.transport.optics.parameters import Stain
 from services.transport.scene.clearance import Clearance
 from services.transport.scene.geometry import RAY_EPSILON, Hit
-from services.transport.scene.media import Mixed
-from services.transport.scene.mixed_border import MixedBorder
 from services.transport.scene.names import media_numbers
 from services.transport.scene.nesting import require_nested
 from services.transport.scene.recipe import SceneRecipe
@@ -66,8 +64,6 @@ class MeshGeometry:
             ]
         )
         self._clearance = Clearance(self._fixed_mm, self._faces[: self.fixed_faces].astype(np.int32), solids_mm)
-        self.mixing = recipe.border_width_mm > 0 and bool(self._dentins)
-        self._border = MixedBorder(recipe.border_width_mm) if self.mixing else None
         self.textures: StainTextures | None = None
         self._stains: tuple[Stain | None, ...] = (None,) * self.teeth
         self._shapes: Shapes | None = None
@@ -87,8 +83,6 @@ class MeshGeometry:
                     for vertices, dentin in zip(moved, self._dentins.values(), strict=True)
                 ]
             )
-        if self._border is not None:
-            self._border.move(*self._dentin_now(moved))
         positions = mi.Float(points.reshape(-1).astype(np.float32))
         if self._shapes is None:
             mesh = mi.Mesh("teeth", len(points), len(self._faces))
@@ -110,40 +104,6 @@ class MeshGeometry:
         dr.eval(self._normals)
         changed, self._shapes = self._shapes is not None, shapes
         return changed
-
-    def _dentin_now(self, moved: list[NDArray[np.float64]]) -> tuple[Mesh, NDArray[np.float64]]:
-        """All dentin as one mesh, and the displacements (M, V, 3) of its vertices; a mode moves the dentin of its own
-        tooth alone.
-        """
-        first = np.cumsum([0] + [len(vertices) for vertices in moved])
-        dentins = list(self._dentins.values())
-        faces = np.concatenate(
-            [dentin.base.faces + offset for dentin, offset in zip(dentins, first, strict=False)]
-        ).astype(np.int32)
-        modes = np.zeros((max(self.modes_of), first[-1], 3))
-        for dentin, start in zip(dentins, first, strict=False):
-            modes[: len(dentin.modes_mm), start : start + len(dentin.base.vertices_mm)] = dentin.modes_mm
-        return Mesh(np.concatenate(moved), faces), modes
-
-    def mixed(self, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> Mixed:
-        """Mixture of enamel and dentin in a tooth; elsewhere the medium alone."""
-        assert self._border is not None
-        medium, tooth = self.medium(place), self.inside(place)
-        in_tooth = tooth < self.teeth
-        enamel = self.outer_medium(tooth)
-        share, slope = self._border.share(point, active & in_tooth)
-        pure = mi.Float(1)
-        return Mixed(
-            dr.select(in_tooth, enamel, medium),
-            dr.select(in_tooth, enamel + 1, medium),
-            dr.select(in_tooth, share, pure),
-            dr.select(in_tooth, slope, 0),
-        )
-
-    def mixture_motion(self, point: mi.Point3f, tooth: int, active: mi.Bool) -> list[mi.Float]:
-        """Change of the distance to dentin with each shape mode of a tooth, mm."""
-        assert self._border is not None
-        return self._border.motion(point, active)[: self.modes_of[tooth]]
 
     @property
     def stained(self) -> bool:

@@ -121,11 +121,6 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         if not 0 <= mouth.reflectance <= 1:
             raise InputError(f"cavity.reflectance = {mouth.reflectance:.10g} must lie in 0 to 1; correct it.")
         media.append(Medium(1.0, mouth.reflectance))
-    if recipe.border_width_mm > 0 and any(medium.table is not None for medium in media):
-        raise InputError(
-            f"border_width_mm = {recipe.border_width_mm:g} mixes lobes, and a medium has a phase table; make the border"
-            " sharp, or give it lobes."
-        )
     return media
 
 

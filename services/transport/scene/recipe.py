@@ -46,9 +46,6 @@ class SceneRecipe:
     gums_ior: float = 1.33
     cavity: Mesh | None = None
     """The wall of the mouth behind the teeth, an opaque diffuse surface; it need not be closed."""
-    border_width_mm: float = 0.0
-    """Width in mm of the border over which albedo and phase function change from enamel's to dentin's, half of it on
-    either side; 0 for a sharp border."""
     neighbours: tuple[ToothSurfaces, ...] = ()
     """Further teeth around a single one, of the same media; their dentin does not move."""
 

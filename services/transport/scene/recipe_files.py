@@ -15,6 +15,10 @@ from services.core.geometry import Mesh
 from services.core.records import Boundary, Device
 from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
+SHARP_BORDER_MM = np.array(0.0)
+"""Width of the borders between enamel and dentin, which are sharp. Nothing reads it: it stays in the file because fits
+find their checkpoints by the digests of the scenes."""
+
 
 def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
     """Store a recipe in ``folder``."""
@@ -43,7 +47,7 @@ def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
         boundary=np.array(recipe.boundary),
         ior=np.array(recipe.ior),
         gums_ior=np.array(recipe.gums_ior),
-        border_width_mm=np.array(recipe.border_width_mm),
+        border_width_mm=SHARP_BORDER_MM,
         device=np.array(recipe.device or ""),
         **arrays,
     )
@@ -78,5 +82,4 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
         gums=mesh("gums"),
         gums_ior=float(np.asarray(a["gums_ior"], dtype=float)),
         cavity=mesh("cavity"),
-        border_width_mm=float(np.asarray(a["border_width_mm"], dtype=float)),
     )
