@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Mesh
 from services.transport.platform import prepare_device
+from services.transport.scene.mitsuba_mesh import new_mesh
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,7 @@ class RayScene:
         first_vertex = np.cumsum([0] + [len(mesh.vertices_mm) for mesh in meshes])
         self._faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, first_vertex, strict=False)])
         self._vertices = vertices
-        surface = mi.Mesh("surface", len(vertices), len(self._faces))
-        params = mi.traverse(surface)
-        params["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).reshape(-1))
-        params["faces"] = mi.UInt32(np.ascontiguousarray(self._faces, dtype=np.uint32).reshape(-1))
-        params.update()
-        self._scene = mi.load_dict({"type": "scene", "surface": surface})
+        self._scene = mi.load_dict({"type": "scene", "surface": new_mesh("surface", vertices, self._faces)})
 
     def first_hits(self, origins_mm: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
         """Nearest hits of rays from ``origins_mm`` (N, 3) or (3,) along unit ``directions`` (N, 3); N may be 0."""

@@ -273,8 +273,8 @@ class _Problem:
         notes, least = [], 2 * MIN_THICKNESS / self.file.cell.width_mm
         if not found.is_solution and distance <= MAX_DISTANCE:
             notes.append(
-                "No slab of this width and index reads exactly so; the nearest one is given, which is off by less than"
-                f" {MAX_DISTANCE:g} of the readings' ±, so noise explains it."
+                "No slab of this width and index reads exactly so; the nearest one is given, whose readings lie less"
+                f" than {MAX_DISTANCE:g} standard errors from the measured ones, so noise explains it."
             )
         elif not found.is_solution:
             notes.append(
@@ -287,8 +287,9 @@ class _Problem:
             notes.append("The readings tell no scattering.")
         if extinction is None:
             notes.append(
-                f"g = {self.file.g:g} is what was given, not measured, and the ± do not hold its error: another g may"
-                " move the other numbers by more than their ±. The collimated transmittance would tell it."
+                f"g = {self.file.g:g} is what was given, not measured, and the standard errors do not hold its error:"
+                " another g may move the other numbers by more than their standard errors. The collimated transmittance"
+                " would tell it."
             )
         elif not found.is_solution and not MIN_G < 1 - reduced / max(extinction - absorption, 1e-12) < MAX_G:
             notes.append(

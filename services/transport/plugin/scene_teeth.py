@@ -14,6 +14,7 @@ from services.core.errors import InputError
 from services.core.geometry import Mesh
 from services.transport.scene.clearance import CELL_MM, Clearance
 from services.transport.scene.geometry import DENTIN, ENAMEL
+from services.transport.scene.mitsuba_mesh import faces_of, vertices_of
 
 CLEARANCE_CELLS = 4_000_000
 """Largest number of cells of a distance grid; a grid of more cells takes longer to build than it saves."""
@@ -104,17 +105,14 @@ def _state(scene: Any, shapes: ToothShapes) -> list[NDArray[Any]]:
         if by_id[name].is_emitter():
             raise InputError(f"Shape '{name}' is a light, which a tooth's surface cannot be; remove its emitter.")
     boxes = [(shape.bbox().min, shape.bbox().max) for shape in by_id.values()]
-    vertices = [np.array(mi.traverse(by_id[name])["vertex_positions"]) for name in (*shapes.enamel, *shapes.dentin)]
+    vertices = [vertices_of(by_id[name]) for name in (*shapes.enamel, *shapes.dentin)]
     return [np.array([shape.id() for shape in scene.shapes()]), _numbers(scene), np.array(boxes), *vertices]
 
 
 def _solid(shape: Any) -> Mesh:
-    arrays = mi.traverse(shape)
-    vertices = np.array(arrays["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    faces = np.array(arrays["faces"]).reshape(-1, 3)
     # Merge vertices that were split for texture seams or normals.
-    welded, index = np.unique(vertices, axis=0, return_inverse=True)
-    faces = index.reshape(-1)[faces].astype(np.int32)
+    welded, index = np.unique(vertices_of(shape).astype(np.float64), axis=0, return_inverse=True)
+    faces = index.reshape(-1)[faces_of(shape)].astype(np.int32)
     mesh = Mesh(welded, faces[:, ::-1] if shape.has_flipped_normals() else faces)
     mesh.require_solid(f"'{shape.id()}'", extent_mm=(0.0, np.inf))
     return mesh

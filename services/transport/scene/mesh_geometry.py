@@ -18,6 +18,7 @@ from services.core.geometry import Mesh
 from services.transport.optics.parameters import Stain
 from services.transport.scene.clearance import Clearance
 from services.transport.scene.geometry import RAY_EPSILON, Hit
+from services.transport.scene.mitsuba_mesh import move_vertices, new_mesh
 from services.transport.scene.names import media_numbers
 from services.transport.scene.nesting import require_nested
 from services.transport.scene.recipe import SceneRecipe
@@ -83,18 +84,12 @@ class MeshGeometry:
                     for vertices, dentin in zip(moved, self._dentins.values(), strict=True)
                 ]
             )
-        positions = mi.Float(points.reshape(-1).astype(np.float32))
         if self._shapes is None:
-            mesh = mi.Mesh("teeth", len(points), len(self._faces))
-            arrays = mi.traverse(mesh)
-            arrays["faces"] = mi.UInt32(self._faces.reshape(-1))
-            arrays["vertex_positions"] = positions
-            arrays.update()
+            mesh = new_mesh("teeth", points, self._faces)
             self.scene = mi.load_dict({"type": "scene", "teeth": mesh}, optimize=False)
             self._parameters = mi.traverse(self.scene)
         else:
-            self._parameters["teeth.vertex_positions"] = positions
-            self._parameters.update()
+            move_vertices(self._parameters, "teeth", points)
         corners = points[self._faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
