@@ -28,7 +28,7 @@ from pydantic import ValidationError
 from services.core.errors import StoreError
 from services.core.geometry import Record
 from services.core.results import FrameRecord
-from services.core.store import StageWriter, create_array, image_pieces, write_atomic
+from services.core.store import StageWriter, create_array, image_pieces, sync_to_disk, write_atomic
 
 ARRAY = "capture.zarr"
 JOURNAL = "journal.jsonl"
@@ -135,7 +135,7 @@ class FrameStore:
         pieces = (1, 1, *shard, shape[4]), "uint16", DIMENSIONS, (1, 1, *chunk, shape[4])
         create_array(self._folder, ARRAY, shape, *pieces)
         _digest_durably(self._folder / ARRAY, "zarr.json")
-        _fsync(self._writer.root)
+        sync_to_disk(self._writer.root)
 
 
 def _intact(folder: Path, header: str) -> Iterator[Acknowledged]:
@@ -165,17 +165,9 @@ def _digest_durably(array: Path, name: str) -> tuple[int, str]:
     """Fsync a file and every folder from it up to the array; return the file's size in bytes and its SHA-256."""
     path = array / name
     for entry in [path, *path.parents[: len(Path(name).parts)]]:
-        _fsync(entry)
+        sync_to_disk(entry)
     content = path.read_bytes()
     return len(content), hashlib.sha256(content).hexdigest()
-
-
-def _fsync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _link_shards(source: Path, target: Path, line: Acknowledged) -> None:

@@ -76,7 +76,16 @@ def write_atomic(path: Path, content: bytes) -> None:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
         raise
-    _fsync_folder(path.parent)
+    sync_to_disk(path.parent)
+
+
+def sync_to_disk(path: Path) -> None:
+    """Make a file's content, or the names in a folder, survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_record(path: Path, record: Record) -> None:
@@ -164,7 +173,7 @@ class StageWriter:
                 discard(retired)
                 final.rename(retired)
             self.folder.rename(final)
-            _fsync_folder(self.root)
+            sync_to_disk(self.root)
         discard(retired)
         return final
 
@@ -175,7 +184,7 @@ def withdraw(root: Path, stage: str) -> None:
     discard(retired)
     if published.exists():
         published.rename(retired)
-        _fsync_folder(Path(root))
+        sync_to_disk(Path(root))
         discard(retired)
 
 
@@ -371,11 +380,3 @@ def translate_disk_errors(root: Path) -> Iterator[None]:
 def _sha256(path: Path) -> str:
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _fsync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

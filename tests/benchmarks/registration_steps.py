@@ -27,13 +27,13 @@ import numpy as np
 from services.anatomy.scans.scan import LabelledScan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.anatomy.templates.jaw import build_jaw
-from services.calibrate.registration.landmarks import pose_from_landmarks
 from services.calibrate.registration.outlines import outline_misfit_mm, pose_from_outlines
 from services.calibrate.registration.photographs import crop_to_points
 from services.calibrate.registration.pose import PoseStep, RigidPose
 from services.calibrate.registration.register import REACH_MM
 from services.core.geometry import Mesh
 from services.phantom.lab.scan import scan_of
+from tests.support.landmark_pose import pose_from_landmarks
 from tests.support.photographed_mouth import Mouth, clicks_on, photographed_mouth
 
 FIRST_SUBJECT = 2600

@@ -5,6 +5,7 @@ no code, and to stock Mitsuba.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,17 +13,20 @@ import pytest
 from services.bench.slab.cell import near_beam_folder
 from services.bench.slab.dispersions import COLOURS, DIAMETERS_NM, mie_truth, truths
 from services.bench.slab.plain_photons import BATCHES, plain_images
-from services.bench.slab.stock_cell import RENDERS, matched_folder, medium_of, stock_images
+from services.bench.slab.stock_cell import matched_folder, medium_of, scenes, turned
 from services.core.slab.folder import SlabFolder
 from services.slab.cell.dictionary import henyey_greenstein
 from services.slab.cell.forward import render
 from services.slab.cell.rig import rig_of
+from services.transport.platform import prepare_device
 from tests.support.slab_tables import rows_of
 from tests.support.small_slab import WAVELENGTH_NM, description
 from tests.support.z_scores import require_unbiased, student_to_normal
 
 G = 0.5
 KERNEL_BATCHES = 8
+RENDERS = 8
+"""Number of independent renders of an image by stock Mitsuba, whose scatter gives its variance."""
 
 
 def henyey_greenstein_shape(angles_rad: np.ndarray) -> np.ndarray:
@@ -64,13 +68,31 @@ def test_every_dispersion_is_diluted_to_where_a_cell_tells_most() -> None:
     assert [one.thickness > 5 for one in every[9:]] == [True] * 3
 
 
+def stock_images(folder: SlabFolder, medium: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Images by stock Mitsuba in the folder's order, and their means' variances, both (images, rows, columns)."""
+    prepare_device()
+    import mitsuba as mi
+
+    means, variances = [], []
+    for number, (scene, front) in enumerate(scenes(folder, medium, "volpath")):
+        renders = np.stack(
+            [
+                np.array(mi.render(scene, spp=2**16 // RENDERS, seed=1 + RENDERS * number + k))[..., 0]
+                for k in range(RENDERS)
+            ]
+        ).astype(np.float64)
+        means.append(turned(renders.mean(axis=0), front=front))
+        variances.append(turned(renders.var(axis=0, ddof=1), front=front) / RENDERS)
+    return np.stack(means), np.stack(variances)
+
+
 @pytest.mark.slow
 def test_images_of_a_matched_cell_agree_with_stock_mitsuba() -> None:
     told = matched_folder()
     # The cameras are on both faces; one of them looks 3 degrees beside the beam.
     folder = told.model_copy(update={"images": tuple(told.images[k] for k in (1, 3, 4))})
     plain, of_plain = plain_images(folder, 1.02, 1 / 1.02, henyey_greenstein_shape, photons=1_000_000, seed=5)
-    stock, of_stock = stock_images(folder, medium_of(1.02, 1 / 1.02, henyey_greenstein_shape), 2**16, seed=1)
+    stock, of_stock = stock_images(folder, medium_of(1.02, 1 / 1.02, henyey_greenstein_shape))
     # Whole images and parts of the rows through the beam's centre test scale, position and orientation.
     middle = slice(5, 7)
     parts = [(slice(None), slice(None)), (middle, slice(0, 4)), (middle, slice(4, 8)), (middle, slice(8, 12))]

@@ -7,7 +7,10 @@ import pytest
 import trimesh
 
 from services.anatomy.distance import SignedDistanceGrid, SurfaceDistance
-from services.anatomy.templates.incisor import CROWN_MM, Incisor, build_incisor, cervix_height_mm, enamel_thickness_mm
+from services.anatomy.templates.incisor import CROWN_MM, ROOT_STUB_MM, Incisor, build_incisor, enamel_thickness_mm
+
+CERVIX_MM = -(CROWN_MM - ROOT_STUB_MM) / 2
+"""Height of the cervical line in the centred frame, mm."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +44,7 @@ def test_mesh_is_smooth_and_of_the_stated_size(incisor: Incisor) -> None:
 
 def test_dimensions_are_wheelers_averages(incisor: Incisor) -> None:
     # Rows are up to 0.4 mm apart, diameters change by at most 0.7 mm per mm of height: 0.15 mm.
-    height = incisor.outer.vertices_mm[:, 2] - cervix_height_mm()
+    height = incisor.outer.vertices_mm[:, 2] - CERVIX_MM
 
     def diameter(axis: int, at_mm: float) -> float:
         near = np.abs(height - at_mm) < 0.25
@@ -58,7 +61,7 @@ def test_labial_enamel_follows_the_thickness_model(incisor: Incisor) -> None:
     # The shortest distance is at most the thickness along the normal; the curvature of the wall makes a difference of
     # up to 0.05 mm.
     distance = SurfaceDistance(incisor.dentin).closest(incisor.outer.vertices_mm)[1]
-    height = incisor.outer.vertices_mm[:, 2] - cervix_height_mm()
+    height = incisor.outer.vertices_mm[:, 2] - CERVIX_MM
     labial = (
         (np.abs(incisor.outer.vertices_mm[:, 0]) < 0.8)
         & (incisor.outer.vertices_mm[:, 1] > 0)

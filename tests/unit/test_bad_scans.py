@@ -15,13 +15,14 @@ import pytest
 from services.anatomy.scans.roots import close_crown
 from services.anatomy.scans.scan import LabelledScan, read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
-from services.calibrate.registration.landmarks import Click, pose_from_landmarks
+from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.register import ScannedTeeth, require_on_their_teeth
 from services.core.errors import InputError
 from services.core.files import scans
 from services.core.geometry import Mesh
 from services.phantom.dome_rig import dome_cameras
 from tests.support.labelled_scan import bumps, universal, write_labelled_ply, write_vtp
+from tests.support.landmark_pose import pose_from_landmarks
 
 FOUR = bumps({12: (-12.5, -6.0), 11: (-4.5, 0.0), 21: (4.5, 0.0), 22: (12.5, -6.0)})
 CAMERAS = {camera.name: camera for camera in dome_cameras(2, 0.2, (FOUR.mesh,))}

@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from services.calibrate.registration.appearance import learn_appearance
 from services.calibrate.registration.contours import tooth_contours
-from services.calibrate.registration.landmarks import CLICK_MM, Click, pose_from_landmarks
+from services.calibrate.registration.landmarks import CLICK_MM, Click
 from services.calibrate.registration.outlines import View, pose_from_outlines
 from services.calibrate.registration.pose import RigidPose, pixel_derivatives
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Mesh
 from services.phantom.dome_rig import dome_cameras
 from tests.support import patient_photos
+from tests.support.landmark_pose import pose_from_landmarks
 from tests.support.photographed_mouth import clicks_on, photographed_mouth
 from tests.support.shared_data import shared_path
 

@@ -10,12 +10,13 @@ import pytest
 from services.anatomy.visibility import visible_surfaces
 from services.calibrate.registration.appearance import learn_appearance
 from services.calibrate.registration.edges import edges_in_light
-from services.calibrate.registration.landmarks import Click, pose_from_landmarks
+from services.calibrate.registration.landmarks import Click
 from services.calibrate.registration.outlines import View, pose_from_outlines
 from services.calibrate.registration.pose import RigidPose
 from services.core.geometry import Camera, Mesh
 from services.phantom.lab.mouth import landmarks_mm, true_mouth
 from services.phantom.lab.rig import RigSize, true_rig
+from tests.support.landmark_pose import pose_from_landmarks
 
 TOOTH, GUMS, DARK = np.array([0.75, 0.66, 0.52]), np.array([0.50, 0.24, 0.22]), np.array([0.01, 0.01, 0.01])
 SIZE, RADIUS, CENTRE = 80, 24.3, np.array([40.2, 39.7])

@@ -85,11 +85,6 @@ def build_incisor(columns: int = 40) -> Incisor:
     return Incisor(_moved(crown, shift), _moved(core, shift), _moved(_gum_collar(columns), shift))
 
 
-def cervix_height_mm() -> float:
-    """Height of the cervical line in the centred frame; add it to a height above the cervix to get z."""
-    return -(CROWN_MM - ROOT_STUB_MM) / 2
-
-
 def _outer_profile(height_mm: NDArray[np.float64]) -> Profile:
     # Half axes along x and y, and labial offset of the centre line, interpolated monotonically between the measured
     # heights, so that no waist appears.

@@ -6,7 +6,6 @@ first one that is used makes an administrator's token and ends all of them. The 
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import secrets
 import time
@@ -16,7 +15,7 @@ import sqlalchemy as sql
 from pydantic import SecretStr
 
 from services.api.auth.audit import AuditedAction
-from services.api.auth.tokens import IssuedToken, Scope, insert_token, token_table
+from services.api.auth.tokens import IssuedToken, Scope, hash_of, insert_token, token_table
 from services.client.errors import SetupLinkError
 from services.core.settings import ServerSettings
 from services.pipeline.database import metadata, writing
@@ -52,7 +51,7 @@ class SetupLinks:
                 return None
             connection.execute(setup_link_table.delete().where(setup_link_table.c.expires_s <= self._clock()))
             connection.execute(
-                setup_link_table.insert().values(sha256=_hash(secret), expires_s=self._clock() + LIFETIME_S)
+                setup_link_table.insert().values(sha256=hash_of(secret), expires_s=self._clock() + LIFETIME_S)
             )
         return SecretStr(secret)
 
@@ -63,7 +62,7 @@ class SetupLinks:
             SetupLinkError: the link was used, has expired or is unknown, or a token exists already; the message does
                 not say which.
         """
-        presented = _hash(secret)
+        presented = hash_of(secret)
         with writing(self._engine) as connection:
             stored_hashes = connection.scalars(
                 sql.select(setup_link_table.c.sha256).where(setup_link_table.c.expires_s > self._clock())
@@ -97,7 +96,3 @@ def setup_address(settings: ServerSettings, port: int) -> str:
 
 def _has_token(connection: sql.Connection) -> bool:
     return connection.execute(sql.select(token_table.c.id).limit(1)).first() is not None
-
-
-def _hash(secret: str) -> str:
-    return hashlib.sha256(secret.encode("utf-8", "surrogateescape")).hexdigest()

@@ -150,7 +150,7 @@ class _Credential(NamedTuple):
 
     @classmethod
     def of(cls, presented: str | None = None, session_of: str | None = None) -> Self:
-        return cls(None if presented is None else _hash(presented), session_of)
+        return cls(None if presented is None else hash_of(presented), session_of)
 
 
 class _TrustedToken(NamedTuple):
@@ -277,7 +277,7 @@ class Tokens:
             UnauthenticatedError: the token is malformed, unknown, expired or revoked; the message does not say which.
         """
         revocations, row = self._revocations, self._find(public_id(presented) or "")
-        is_same = hmac.compare_digest(_hash(presented), row["sha256"] if row else _hash(""))
+        is_same = hmac.compare_digest(hash_of(presented), row["sha256"] if row else hash_of(""))
         if row is None or not is_same or not _is_valid(row, self._clock()):
             raise UnauthenticatedError("This token is unknown, expired or revoked; ask an administrator for a new one.")
         self._note_use(row)
@@ -344,7 +344,7 @@ def insert_token(
         "id": token_id,
         "name": name,
         "scopes": " ".join(scopes),
-        "sha256": _hash(secret.get_secret_value()),
+        "sha256": hash_of(secret.get_secret_value()),
         "created_s": now_s,
     }
     row |= {"expires_s": expires_s, "revoked_s": None, "last_used_s": None, "group": group}
@@ -362,8 +362,9 @@ def public_id(credential: str) -> str | None:
     return match[1] if match else None
 
 
-def _hash(token: str) -> str:
-    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
+def hash_of(secret: str) -> str:
+    """SHA-256 of a secret, hexadecimal; the database holds no secret itself."""
+    return hashlib.sha256(secret.encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def _is_valid(row: Any, now: float) -> bool:

@@ -18,6 +18,7 @@ from types import TracebackType
 from typing import Self
 
 from services.core.errors import DiskFullError
+from services.core.store import sync_to_disk
 
 Write = Callable[[int, memoryview], int]
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -56,14 +57,14 @@ class PartialFile:
             while rest:
                 rest = rest[self._write(self._descriptor, rest) :]
         except OSError as problem:
-            raise _disk_full(problem) from problem
+            raise disk_full(problem) from problem
 
     def sync(self) -> None:
         """Return once all written bytes would survive a power cut."""
         try:
             os.fsync(self._descriptor)
         except OSError as problem:
-            raise _disk_full(problem) from problem
+            raise disk_full(problem) from problem
 
 
 class Blobs:
@@ -132,14 +133,11 @@ class Blobs:
 def sync_folders(*folders: Path) -> None:
     """Make the names in these folders survive a power cut."""
     for folder in folders:
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync_to_disk(folder)
 
 
-def _disk_full(problem: OSError) -> Exception:
+def disk_full(problem: OSError) -> Exception:
+    """The error to raise for one of the file system: one that says that the disk is full where that is the cause."""
     if problem.errno in _FULL:
         return DiskFullError(
             "The server's disk is full; free some space there and send again, what was acknowledged is kept."

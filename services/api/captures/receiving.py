@@ -8,7 +8,6 @@ are kept.
 from __future__ import annotations
 
 import asyncio
-import errno
 import hashlib
 import hmac
 from collections.abc import AsyncIterator
@@ -17,12 +16,12 @@ from dataclasses import dataclass
 
 from starlette.requests import ClientDisconnect
 
-from services.api.captures.blobs import PartialFile
+from services.api.captures.blobs import PartialFile, disk_full
 from services.api.captures.uploads import Upload, Uploads
 from services.api.http.awaited_threads import in_thread
 from services.client.errors import ChecksumError, TooLargeError
 from services.client.tus import Checksum
-from services.core.errors import DentineError, DiskFullError
+from services.core.errors import DentineError
 
 BLOCK_BYTES = 2**20
 RECORD_BYTES = 64 * 2**20
@@ -95,11 +94,7 @@ def _open(uploads: Uploads, upload: Upload, opened: ExitStack) -> PartialFile:
     try:
         return opened.enter_context(uploads.open_partial(upload))
     except OSError as problem:
-        if problem.errno in {errno.ENOSPC, errno.EDQUOT}:
-            raise DiskFullError(
-                "The server's disk is full; free some space there and send again, what was acknowledged is kept."
-            ) from problem
-        raise
+        raise disk_full(problem) from problem
 
 
 class _UploadWriter:

@@ -27,8 +27,6 @@ distance of its nodes is a 70th of the beam's size, and it stands behind all cam
 COSINES = 20_001
 """Number of nodes of the phase function's table."""
 MAX_ORDER = 256
-RENDERS = 8
-"""Number of independent renders of an image, whose scatter gives its variance."""
 
 
 def matched_folder() -> SlabFolder:
@@ -42,38 +40,6 @@ def matched_folder() -> SlabFolder:
         beam={"profile": "gaussian", "sigma_mm": 1.0},
         pixels={"x_mm": [-6.0, 6.0], "y_mm": [-6.0, 6.0], "columns": 12, "rows": 12},
     )
-
-
-def stock_images(
-    folder: SlabFolder, medium: dict[str, Any], samples: int, seed: int, done: Callable[[int], None] | None = None
-) -> tuple[Array, Array]:
-    """Return images in the folder's order and the variances of their means, both (images, rows, columns).
-
-    Args:
-        folder: description of the cell, its lights, cameras and images.
-        medium: Mitsuba dictionary of the medium, as ``medium_of`` returns it.
-        samples: paths per pixel, in all renders of an image together.
-        seed: seed of the first render.
-        done: called with the number of each finished image.
-    """
-    from services.transport.platform import prepare_device
-
-    prepare_device()
-    import mitsuba as mi
-
-    means, variances = [], []
-    for number, (scene, front) in enumerate(scenes(folder, medium, "volpath")):
-        renders = np.stack(
-            [
-                np.array(mi.render(scene, spp=max(1, samples // RENDERS), seed=seed + RENDERS * number + k))[..., 0]
-                for k in range(RENDERS)
-            ]
-        ).astype(np.float64)
-        means.append(turned(renders.mean(axis=0), front=front))
-        variances.append(turned(renders.var(axis=0, ddof=1), front=front) / RENDERS)
-        if done is not None:
-            done(number)
-    return np.stack(means), np.stack(variances)
 
 
 def scenes(folder: SlabFolder, medium: dict[str, Any], integrator: str) -> Iterator[tuple[Any, bool]]:

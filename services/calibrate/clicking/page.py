@@ -22,7 +22,7 @@ from services.core.errors import CaptureInputError
 from services.core.files.scans import read_scan_file
 from services.core.geometry import Mesh
 from services.core.pages.page import page_template
-from services.core.raw.folder import DESCRIPTION, read_raw_folder
+from services.core.raw.folder import read_raw_folder, scan_of
 from services.core.raw.records import RawFolder
 from services.core.store import write_atomic
 
@@ -66,9 +66,7 @@ def write_clicking_page(root: Path, out: Path | None = None) -> Path:
 
 
 def _scan(root: Path, folder: RawFolder) -> dict[str, Any]:
-    scan = folder.scan
-    if scan is None:
-        raise CaptureInputError(f"{root / DESCRIPTION} names no scan; add [scan] with its file, units and jaw.")
+    scan = scan_of(root, folder)
     mesh = compact(read_scan_file(root / scan.file).mesh)
     mesh = Mesh(MM_PER_UNIT[scan.units] * mesh.vertices_mm, mesh.faces)
     if not (len(mesh.faces) and np.isfinite(mesh.vertices_mm).all()):

@@ -59,32 +59,17 @@ class Click:
     """Position in the photograph (2,), pixel centres at half-integers."""
 
 
-def pose_from_landmarks(
+def fit_landmarks(
     cameras: Mapping[str, Camera], clicks: Sequence[Click], centre_mm: Floats, click_mm: float = CLICK_MM
-) -> PoseStep:
-    """Fit the scan's pose to the clicked points, without the wrong ones.
+) -> tuple[PoseStep, str | None]:
+    """Fit the scan's pose to the clicked points, without the wrong ones; an implausible pose is returned too, so that a
+    picture of it can be shown.
 
     Args:
         cameras: cameras by name.
         clicks: clicks of all cameras.
         centre_mm: centre of the teeth in the scan (3,), about which the covariance's rotations are.
         click_mm: standard error of a click at the teeth.
-
-    Raises:
-        CaptureInputError: the clicks are too few, lie on one line, or contradict each other so much that the pose is
-            not plausible.
-    """
-    step, contradiction = fit_landmarks(cameras, clicks, centre_mm, click_mm)
-    if contradiction is not None:
-        raise CaptureInputError(contradiction)
-    return step
-
-
-def fit_landmarks(
-    cameras: Mapping[str, Camera], clicks: Sequence[Click], centre_mm: Floats, click_mm: float = CLICK_MM
-) -> tuple[PoseStep, str | None]:
-    """Fit the scan's pose as ``pose_from_landmarks`` does, but return an implausible pose too, so that a picture of it
-    can be shown.
 
     Returns:
         The pose, and a sentence that says why it is not plausible; None where it is plausible.

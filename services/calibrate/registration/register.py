@@ -29,7 +29,7 @@ from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Matrix4, Mesh, teeth_folder
-from services.core.raw.folder import DESCRIPTION, read_raw_folder
+from services.core.raw.folder import DESCRIPTION, read_raw_folder, scan_of
 from services.core.raw.records import RawFolder
 from services.core.raw.registration import REGISTRATION, Registration, RegistrationStep
 from services.core.store import read_record, write_atomic, write_record
@@ -133,9 +133,7 @@ def scanned_teeth(root: Path, folder: RawFolder) -> ScannedTeeth:
         CaptureInputError: the folder names no scan, or the scan cannot be used.
         MeshError: the scan cannot be made solid.
     """
-    scan = folder.scan
-    if scan is None:
-        raise CaptureInputError(f"{root / DESCRIPTION} names no scan; add [scan] with its file, units and jaw.")
+    scan = scan_of(root, folder)
     if scan.jaw == "both":
         raise CaptureInputError(f"Scan {scan.file} is of both jaws; export the jaw that is photographed alone.")
     points_mm = {

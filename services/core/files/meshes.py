@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, MeshError
-from services.core.files.surface_files import read_surface
+from services.core.files.surface_files import read_surface, require_file, require_triangles
 from services.core.geometry import Mesh, Tooth, teeth_folder
 
 FDI_NUMBERS = frozenset(
@@ -31,17 +31,13 @@ def read_mesh(path: Path) -> Mesh:
     Raises:
         CaptureInputError: the file is absent or no triangle mesh.
     """
-    if not path.is_file():
-        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
+    require_file(path)
     try:
         surface = read_surface(path)
         vertices, faces = surface.vertices, surface.faces
     except Exception as problem:
         raise CaptureInputError(f"Mesh file {path} cannot be read ({problem}); export it again as PLY.") from problem
-    if len(faces) == 0:
-        raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise CaptureInputError(f"Mesh file {path} has a triangle of points that it does not hold; export it again.")
+    require_triangles(path, faces, len(vertices))
     used, corner = np.unique(faces, return_inverse=True)
     welded, index = np.unique(vertices[used], axis=0, return_inverse=True)
     return Mesh(welded, index.reshape(-1)[corner.reshape(-1, 3)].astype(np.int32), len(vertices) - len(used))

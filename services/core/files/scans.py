@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.files.json_text import parse_json
-from services.core.files.surface_files import read_surface
+from services.core.files.surface_files import read_surface, require_file, require_triangles
 from services.core.files.tables import read_text
 from services.core.files.vtk_polydata import read_polydata
 from services.core.geometry import Mesh
@@ -47,14 +47,10 @@ def read_scan_file(path: Path) -> ScanFile:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise CaptureInputError(f"Scan {path} is neither .vtp, .ply, .stl nor .obj; export it as one of these.")
-    if not path.is_file():
-        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
+    require_file(path)
     require_few_triangles(path, _declared_triangles(path))
     found = _read_polydata(path) if suffix == ".vtp" else _read_by_trimesh(path)
-    if len(found.mesh.faces) == 0:
-        raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
-    if found.mesh.faces.min() < 0 or found.mesh.faces.max() >= len(found.mesh.vertices_mm):
-        raise CaptureInputError(f"Mesh file {path} has a triangle of points that it does not hold; export it again.")
+    require_triangles(path, found.mesh.faces, len(found.mesh.vertices_mm))
     require_few_triangles(path, len(found.mesh.faces))
     return found
 

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.errors import CaptureInputError
+
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
 
 
@@ -25,6 +27,28 @@ class Surface:
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     elements: Mapping[str, Any] = field(default_factory=dict)
+
+
+def require_file(path: Path) -> None:
+    """Refuse a mesh file that is absent.
+
+    Raises:
+        CaptureInputError: no file is there.
+    """
+    if not path.is_file():
+        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
+
+
+def require_triangles(path: Path, faces: NDArray[np.integer[Any]], vertices: int) -> None:
+    """Refuse the triangles (F, 3) of a file of so many vertices where there are none, or where a corner is no vertex.
+
+    Raises:
+        CaptureInputError: the message names the file.
+    """
+    if len(faces) == 0:
+        raise CaptureInputError(f"Mesh file {path} holds no triangle; export the surface, not a point cloud.")
+    if faces.min() < 0 or faces.max() >= vertices:
+        raise CaptureInputError(f"Mesh file {path} has a triangle of points that it does not hold; export it again.")
 
 
 def read_surface(path: Path) -> Surface:

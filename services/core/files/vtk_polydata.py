@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
+from services.core.files.surface_files import require_file
 
 NUMBER_TYPES = {
     f"{kind}{bits}": f"{letter}{bits // 8}"
@@ -58,8 +59,7 @@ def read_polydata(path: Path) -> PolyData:
     Raises:
         CaptureInputError: the file is absent, truncated, of another VTK type, or has polygons that are no triangles.
     """
-    if not path.is_file():
-        raise CaptureInputError(f"Mesh file {path} does not exist; put the exported mesh there.")
+    require_file(path)
     try:
         return _polydata(path, path.read_bytes())
     except (expat.ExpatError, KeyError, ValueError, IndexError, zlib.error, binascii.Error) as problem:

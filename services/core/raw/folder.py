@@ -55,6 +55,17 @@ def read_raw_folder(root: Path) -> RawFolder:
     return folder
 
 
+def scan_of(root: Path, folder: RawFolder) -> ScanFile:
+    """The scan that a raw folder names.
+
+    Raises:
+        CaptureInputError: it names none.
+    """
+    if folder.scan is None:
+        raise CaptureInputError(f"{root / DESCRIPTION} names no scan; add [scan] with its file, units and jaw.")
+    return folder.scan
+
+
 def parse_raw_folder(content: bytes, origin: str) -> RawFolder:
     """Parse the content of ``raw.toml``; whether the files it names exist is not checked.
 

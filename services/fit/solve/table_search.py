@@ -23,6 +23,8 @@ REDUCED_DENSITIES = (0.2, 0.4, 0.7, 1.1, 1.6, 2.3, 3.3, 4.8)
 the reduced coefficient and not in sigma, so that every render costs no more than needed."""
 ANISOTROPIES = (0.0, 0.7)
 """Mean cosines g of the table's renders."""
+STARTS = 3
+"""Largest number of candidates from which fits start."""
 KAPPA = (1.0, 3.0)
 """Range of -log10(1 - alpha). The upper limit is where absorption becomes invisible; beyond it the fit would start on a
 plateau."""
@@ -136,6 +138,6 @@ def search_node(
     return tuple(sorted(found, key=lambda c: c.score))
 
 
-def best(per_node: Sequence[Sequence[Candidate]], count: int = 3) -> tuple[Candidate, ...]:
+def best(per_node: Sequence[Sequence[Candidate]]) -> tuple[Candidate, ...]:
     """The best candidates, at most one per node, best first."""
-    return tuple(sorted((node[0] for node in per_node if node), key=lambda c: c.score)[:count])
+    return tuple(sorted((node[0] for node in per_node if node), key=lambda c: c.score)[:STARTS])

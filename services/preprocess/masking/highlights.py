@@ -106,9 +106,8 @@ def highlight_mask(
     cosines: Image,
     normal: Image,
     light_colour: tuple[float, ...],
-    options: HighlightOptions | None = None,
 ) -> BoolArray:
-    """Mask (H, W) of pixels that a surface reflection brightens by more than ``options.tolerated``.
+    """Mask (H, W) of pixels that a surface reflection brightens by more than ``HighlightOptions.tolerated``.
 
     Args:
         radiance, variance: (H, W, C), linear radiance and its variance.
@@ -117,11 +116,10 @@ def highlight_mask(
         cosines: (H, W) from ``half_cosines``.
         normal: (H, W, 3), outward.
         light_colour: the light's intensity per channel (C,).
-        options: thresholds; None for the defaults.
     """
     import cv2
 
-    o = options or HighlightOptions()
+    o = HighlightOptions()
     cone = np.float32(np.cos(np.radians(o.cone_deg)))
     is_near = cosines > cone
     near, saturated_near = usable & is_near, saturated & is_near

@@ -133,7 +133,6 @@ def shadow_confidence(
     facing: Image,
     visible: NDArray[np.bool_],
     pixel_mm: float,
-    rule: ShadowRule | None = None,
 ) -> Image:
     """Probability (L, H, W) that each pixel lies in each light's shadow; 0 where it cannot be judged.
 
@@ -143,11 +142,10 @@ def shadow_confidence(
         facing: (L, H, W), cosine of the angle between normal and light.
         visible: (H, W), pixels that show a tooth.
         pixel_mm: size of a pixel on the tooth.
-        rule: parameters; None for the defaults.
     """
     from scipy.stats import norm
 
-    rule = rule or ShadowRule()
+    rule = ShadowRule()
     # Expect brightness in proportion to the irradiance, a part of it blurred by the spread of light inside the tooth;
     # smooth it and the image alike
     inside = np.stack([_spread(layer, visible, rule.spread_mm / pixel_mm) for layer in irradiance])

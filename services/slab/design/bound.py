@@ -61,9 +61,7 @@ def bound_of(
     noise: float,
     variances: Array | None = None,
     seed: int = 1,
-    scale: float | Array | None = None,
     paths: int | None = None,
-    blocks: Blocks = map,
 ) -> Bound:
     """The bound from images with shot noise.
 
@@ -71,12 +69,11 @@ def bound_of(
         noise: standard deviation of a pixel that has its image's mean, as a share of it.
         variances: variances of the measurement beside its shot noise (images, values), such as a reference's own.
         paths: paths per batch and light, instead of ``PATHS``.
-        scale: scale of the smoothness prior, per rad2; by default the loosest that a fit may choose.
     """
-    quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths, blocks=blocks)
+    quadratic = curvature_of(rig, material, noise=noise, variances=variances, seed=seed, paths=paths)
     x = Knots().unknowns(material)
-    if scale is None:
-        scale = sharp_scales(material, seen_poles(quadratic))[-1]
+    # The scale of the smoothness prior, per rad2, is the loosest that a fit may choose.
+    scale = sharp_scales(material, seen_poles(quadratic))[-1]
     chosen, alone = (covariance_of(quadratic, precision(one)) for one in (scale, flag_scales()))
     uncertainty = Uncertainty(chosen, alone, (chosen, alone))
     return Bound(uncertainty, -uncertainty.covariance @ precision(scale) @ x)
