@@ -56,6 +56,17 @@ def test_a_stored_scene_reads_back_whole(tmp_path: Path, device: Device | None) 
     np.testing.assert_equal(asdict(stored), asdict(scene))
 
 
+def test_a_stored_scene_holds_what_it_always_held(tmp_path: Path) -> None:
+    # Fits find their checkpoints by the digests of their scenes, and a digest is of these arrays in this order.
+    scene = SceneRecipe((ToothSurfaces(sphere(2.0)),), LIGHTS_MM, np.ones(len(LIGHTS_MM)))
+    arrays = write_recipe(tmp_path, scene).load()
+    assert list(arrays) == [
+        "teeth", "neighbours", "light_positions", "light_intensities", "boundary", "ior", "gums_ior", "border_width_mm",
+        "device", "outer0_vertices", "outer0_faces",
+    ]  # fmt: skip
+    assert arrays["border_width_mm"] == np.array(0.0)
+
+
 @pytest.mark.parametrize("missing", ["gums", "cavity", "dentin"])
 def test_what_a_scene_lacks_stays_absent(tmp_path: Path, missing: str) -> None:
     whole = SceneRecipe(
