@@ -146,7 +146,7 @@ def find_corners(eight_bit: NDArray[np.uint8]) -> Floats | None:
     import cv2
 
     detector = cv2.mcc.CCheckerDetector.create()
-    if not detector.process(eight_bit, cv2.mcc.MCC24 if hasattr(cv2.mcc, "MCC24") else 0):
+    if not detector.process(eight_bit, cv2.mcc.MCC24):
         return None
     found = np.asarray(detector.getBestColorChecker().getColorCharts(), dtype=np.float64).reshape(24, 4, 2).mean(axis=1)
     return np.asarray(found[[0, 5, 23, 18]] + 0.5)
