@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -45,6 +46,12 @@ class StageContext(Protocol):
         """Raise JobCancelledError once a cancellation was requested. Call between frames and between steps."""
 
 
+def raise_if(is_cancelled: Callable[[], bool]) -> None:
+    """Raise JobCancelledError once ``is_cancelled()``, which is ``exists`` of the job's flag file as a rule."""
+    if is_cancelled():
+        raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
+
+
 class LocalContext:
     """A context without a server: events go to a callback, cancel is a flag file in the job's folder."""
 
@@ -60,5 +67,4 @@ class LocalContext:
 
     def raise_if_cancelled(self) -> None:
         """Raise JobCancelledError once the flag file exists in the job's folder."""
-        if (self.root / CANCEL_FLAG).exists():
-            raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
+        raise_if((self.root / CANCEL_FLAG).exists)

@@ -20,7 +20,7 @@ from services.preprocess.raw.memory_budget import GIB
 from services.preprocess.raw.source import RawSource
 from services.preprocess.rig import RigSource
 from services.preprocess.source import Source
-from services.preprocess.tasks.executors import local_threads
+from services.tasks.executors import threads_here
 
 
 def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
@@ -41,7 +41,7 @@ def open_source(spec: JobSpec, root: Path, *, verify: bool = True) -> Source:
             spec.sensor_noise_relative,
             spec.sensor_noise_floor,
             teeth_root(spec.capture, root),
-            spec.memory_gib * GIB / local_threads(),
+            spec.memory_gib * GIB / threads_here(),
             spec.motion,
         )
         return _calibrated(raw, raw.calibration, "of the raw folder" if spec.calibration is None else "", spec)

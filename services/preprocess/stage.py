@@ -6,9 +6,10 @@ import importlib
 
 from services.core.errors import SettingsError
 from services.core.installed import require_packages
+from services.core.placement import WEIGHTS
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
-from services.core.stage import StageContext, StageEvent
+from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
 from services.core.store import StageWriter
 
 PACKAGES = ("cv2", "imagecodecs", "jinja2", "rtree", "tifffile")
@@ -22,7 +23,7 @@ def check() -> None:
         PlatformError: a package is missing.
     """
     require_packages(PACKAGES, "preprocess")
-    for module in ("opening", "tasks.blocks", "tasks.plan", "tasks.progress", "tasks.executors", "tasks.summary"):
+    for module in ("opening", "tasks.blocks", "tasks.plan", "tasks.progress", "tasks.summary"):
         importlib.import_module(f"services.preprocess.{module}")
 
 
@@ -43,11 +44,11 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     from services.preprocess.opening import open_source
     from services.preprocess.subject import read_subject
     from services.preprocess.tasks.attempt_files import STAGE, AttemptFiles
-    from services.preprocess.tasks.blocks import Block, blocks_of, images_of
-    from services.preprocess.tasks.executors import open_executor
+    from services.preprocess.tasks.blocks import Block, blocks_of, calls_of, images_of
     from services.preprocess.tasks.plan import create_arrays, digest_of_inputs, held_out_images
     from services.preprocess.tasks.progress import Progress
     from services.preprocess.tasks.summary import summarise
+    from services.tasks.executors import executor
 
     # Check everything that needs no pixel
     source = open_source(spec, context.root)
@@ -73,31 +74,33 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
 
     lights = [source.lights_of(k) for k in range(len(cameras))]
     progress = Progress(context, sum(len(own) for own in lights), len(cameras))
-    with open_executor(spec.priority, context.raise_if_cancelled) as executor:
+    flag, prefix = context.root / CANCEL_FLAG, f"block-{context.attempt}"
+    with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
+        threads = run_on.threads()
         unlocated = [k for k, camera in enumerate(cameras) if files.view(k, camera) is None]
-        for _ in executor.run([Block(spec, files, "locate", k) for k in unlocated]):
+        for _ in run_on.as_completed(calls_of(Block(spec, files, "locate", k) for k in unlocated)):
             context.raise_if_cancelled()
         frames = [
             [one for one in source.matched_frames(k) if one not in files.motions(k, source.matched_frames(k))]
             for k in range(len(cameras))
         ]
-        for _ in executor.run(blocks_of(spec, files, "match", frames, executor.threads)):
+        for _ in run_on.as_completed(calls_of(blocks_of(spec, files, "match", frames, threads))):
             context.raise_if_cancelled()
         # Run comparing and developing together, as neither needs the other. Comparisons come first, because a camera's
         # whole comparison is one block
         uncompared = [k for k in range(len(cameras)) if source.measures_motion and files.flow(k) is None]
         compare = [Block(spec, files, "compare", k) for k in uncompared]
         missing = [[j for j in own if files.image(k, j) is None] for k, own in enumerate(lights)]
-        progress.begin(sum(len(own) for own in missing), executor.threads)
-        develop = blocks_of(spec, files, "develop", missing, executor.threads)
-        for block in executor.run([*compare, *develop]):
+        progress.begin(sum(len(own) for own in missing), threads)
+        develop = blocks_of(spec, files, "develop", missing, threads)
+        for block in run_on.as_completed(calls_of([*compare, *develop])):
             for done in images_of(block, files):
                 progress.report_image(done)
             context.raise_if_cancelled()
         if spec.shadows:
             unshaded = [k for k, own in enumerate(lights) if not all(files.is_shaded(k, j) for j in own)]
             progress.begin_shading(len(unshaded))
-            for _ in executor.run([Block(spec, files, "shade", k) for k in unshaded]):
+            for _ in run_on.as_completed(calls_of(Block(spec, files, "shade", k) for k in unshaded)):
                 context.raise_if_cancelled()
 
     manifest, known = summarise(files, source, subject, held_out, masks.digest, context)

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from services.core.errors import JobCancelledError
 from services.core.slab.folder import SlabFolder, read_folder
+from services.core.stage import raise_if
 from services.slab.cell.dictionary import KNOTS
 from services.slab.cell.forward import Block, Blocks, BlockSums
 from services.slab.dictionaries.chosen import dictionary_of
@@ -85,7 +85,7 @@ def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
 
     def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> Iterator[BlockSums]:
         for block in some:
-            _raise_if_cancelled(task.flag)
+            raise_if(task.flag.exists)
             yield trace(block)
 
     return fit_wavelength(task, blocks)
@@ -97,7 +97,7 @@ def blocks_task(
     """Trace some blocks of paths, one after the other."""
     sums = []
     for block in blocks:
-        _raise_if_cancelled(flag)
+        raise_if(flag.exists)
         sums.append(trace(block))
     return sums
 
@@ -129,7 +129,7 @@ def _spread(run_on: Executor, task: WavelengthTask, block_bytes: int) -> Blocks:
     numbers = itertools.count()
 
     def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> list[BlockSums]:
-        _raise_if_cancelled(task.flag)
+        raise_if(task.flag.exists)
         name = f"{task.wavelength_nm:g}-{next(numbers)}"
         size = max(1, min(len(some) // (TASKS_PER_THREAD * run_on.threads()), MAX_TRAVELLING_BYTES // block_bytes))
         pending = [
@@ -144,8 +144,3 @@ def _spread(run_on: Executor, task: WavelengthTask, block_bytes: int) -> Blocks:
 def _block_bytes(folder: SlabFolder) -> int:
     """Largest size of a block's sums."""
     return len(folder.cameras) * folder.pixels.columns * folder.pixels.rows * (8 + 4 * (KNOTS + 1))
-
-
-def _raise_if_cancelled(flag: Path) -> None:
-    if flag.exists():
-        raise JobCancelledError("The job was cancelled on request; what it had published is kept.")

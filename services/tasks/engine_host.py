@@ -24,8 +24,9 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, Protocol
 
-from services.core.errors import JobCancelledError, WorkerLostError
+from services.core.errors import WorkerLostError
 from services.core.files.content_files import StoredFile
+from services.core.stage import raise_if
 from services.tasks.engine_process import EngineProcess
 
 ENGINE = "services.transport.engine:Engine"
@@ -116,13 +117,13 @@ class ChildHost:
         request = pickle.dumps((method, recipe, args, options))
         with self._turn(is_cancelled):
             for is_last in (False, True):
-                _raise_if(is_cancelled)
+                raise_if(is_cancelled)
                 self._require_open()
                 self._process = process = self._process or self._start()
                 try:
                     process.pipe.send_bytes(request)
                     while not process.pipe.poll(WATCH_S):
-                        _raise_if(is_cancelled)
+                        raise_if(is_cancelled)
                         self._require_open()
                         process.check_memory()
                     succeeded, value = pickle.loads(process.pipe.recv_bytes())  # noqa: S301 - from our own child over our own pipe
@@ -153,7 +154,7 @@ class ChildHost:
     def _turn(self, is_cancelled: Callable[[], bool]) -> Iterator[None]:
         """Have the child for one call, once no other call has it."""
         while not self._lock.acquire(timeout=WATCH_S):
-            _raise_if(is_cancelled)
+            raise_if(is_cancelled)
         try:
             yield
         finally:
@@ -176,11 +177,6 @@ class ChildHost:
         if self._process is not None:
             self._process.end()
             self._process = None
-
-
-def _raise_if(is_cancelled: Callable[[], bool]) -> None:
-    if is_cancelled():
-        raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 from distributed import WorkerPlugin
 
-from services.core.errors import JobCancelledError
+from services.core.stage import raise_if
 from services.tasks.engine_host import (
     ENGINE,
     WATCH_S,
@@ -31,7 +31,7 @@ Task = Callable[..., Any]
 Call = tuple[str, Task, tuple[Any, ...]]
 """Arguments of ``submit``: a key, a task and its arguments."""
 TASKS_AHEAD = 2
-"""Number of a fit's tasks that are with the workers at once, per worker thread: one runs, and the next follows without
+"""Number of a job's tasks that are with the workers at once, per worker thread: one runs, and the next follows without
 delay."""
 
 
@@ -47,7 +47,7 @@ class Executor(Protocol):
     def as_completed(self, calls: Sequence[Call]) -> Iterator[Any]:
         """Run tasks that depend on no other task, and yield the result of each as soon as it has ended.
 
-        Raises what a task raised.
+        Raises what a task raised; tasks that have not begun by then, or when the caller asks for no more, never run.
         """
 
     def threads(self, expected: int = 1) -> int:
@@ -83,15 +83,15 @@ class LocalExecutor:
 class DaskExecutor:
     """Executor on any Dask worker that has the needed resources; all tasks of a worker share its one child process.
 
-    Only a few tasks are with the workers at a time, so that tasks of another fit run in between; see ``fair_shares``.
+    Only a few tasks are with the workers at a time, so that tasks of another job run in between; see ``fair_shares``.
 
     Args:
         client: connection to the scheduler.
         factory: the engine, as ``module:class``.
-        prefix: begins the keys of this fit's tasks.
+        prefix: begins the keys of this job's tasks.
         flag: file whose existence cancels the tasks.
         resources: Dask resources that a worker must have to run the tasks.
-        share: worker time that this fit has used.
+        share: worker time that this job has used.
     """
 
     def __init__(
@@ -135,41 +135,48 @@ class DaskExecutor:
     def _ending(self, pending: Sequence[_Planned]) -> Iterator[_Planned]:
         """Yield tasks as they end, and send waiting tasks meanwhile."""
         most, missing = TASKS_AHEAD * self.threads(), set(pending)
-        while missing:
-            while self._waiting and len(self._running) < most:
-                self._send(self._waiting.popleft())
-            self._levels.publish()
-            for future in self._next_ended():
-                planned = self._running.pop(future)
-                if future.status != "finished":
-                    future.result()  # raises
-                if planned in missing:  # else its result goes to another task, which counts its time
-                    missing.remove(planned)
-                    planned.timed = future.result()
-                    self._share.end(planned.timed.seconds, planned.timed.tasks)
-                    yield planned
+        try:
+            while missing:
+                while self._waiting and len(self._running) < most:
+                    self._send(self._waiting.popleft())
+                assert self._running, "a task that was given up is awaited"
+                self._levels.publish()
+                for future in self._next_ended():
+                    planned = self._running.pop(future)
+                    if future.status != "finished":
+                        future.result()  # raises
+                    if planned in missing:  # else its result goes to another task, which counts its time
+                        missing.remove(planned)
+                        planned.timed = future.result()
+                        self._share.end(planned.timed.seconds, planned.timed.tasks)
+                        yield planned
+        finally:
+            if missing:
+                self._give_up()
 
     def _next_ended(self) -> Iterable[Any]:
         """Wait until at least one task has ended, and return those that have.
 
         Raises:
-            JobCancelledError: the job was cancelled. Its tasks may wait behind long ones of other jobs, so they are
-                given up here and do not begin any more.
+            JobCancelledError: the job was cancelled; its tasks may wait behind long ones of other jobs.
         """
         from distributed import wait
 
         while True:
-            try:
-                _raise_if_cancelled(self._flag)
-            except JobCancelledError:
-                self._client.cancel(list(self._running))
-                raise
+            raise_if(self._flag.exists)
             with suppress(TimeoutError):
                 ended: Iterable[Any] = wait(list(self._running), WATCH_S, return_when="FIRST_COMPLETED").done
                 return ended
 
+    def _give_up(self) -> None:
+        """Let no task begin that has not begun yet."""
+        self._waiting.clear()
+        if self._running:
+            self._client.cancel(list(self._running))
+            self._running.clear()
+
     def close(self) -> None:
-        """Release this fit's place among those that share the workers."""
+        """Release this job's place among those that share the workers."""
         self._levels.leave()
 
     def _send(self, planned: _Planned) -> None:
@@ -193,7 +200,7 @@ class DaskExecutor:
 
 @dataclass(eq=False)
 class _Planned:
-    """A task of a fit, from its submission to its result."""
+    """A task of a job, from its submission to its result."""
 
     key: str
     task: Task
@@ -238,17 +245,12 @@ async def _prepare_worker(worker: Any, factory: str) -> _EnginePlugin:
     return plugin
 
 
-def _raise_if_cancelled(flag: Path) -> None:
-    if flag.exists():
-        raise JobCancelledError("The job was cancelled on request; what it had published is kept.")
-
-
 def run_on_worker(factory: str, flag: Path, task: Task, *args: Any) -> Timed:
     """Run a task with its worker's child process, until ``flag`` exists."""
     from distributed import get_worker
     from distributed.utils import sync
 
-    _raise_if_cancelled(flag)
+    raise_if(flag.exists)
     worker = get_worker()
     plugin: _EnginePlugin = sync(worker.loop, _prepare_worker, worker, factory)
     began_s, earlier = time.monotonic(), [arg for arg in args if isinstance(arg, Timed)]
@@ -256,6 +258,16 @@ def run_on_worker(factory: str, flag: Path, task: Task, *args: Any) -> Timed:
     value = task(CancellableHost(plugin.host, flag), *values)
     seconds = time.monotonic() - began_s
     return Timed(value, seconds + sum(one.seconds for one in earlier), 1 + sum(one.tasks for one in earlier))
+
+
+def threads_here() -> int:
+    """Number of tasks that may run in this process at once and share its memory: its Dask worker's threads, or 1."""
+    from distributed import get_worker
+
+    try:
+        return max(1, int(get_worker().state.nthreads))
+    except ValueError:
+        return 1
 
 
 class EnclosingTask(NamedTuple):
@@ -289,7 +301,7 @@ def executor(flag: Path, factory: str = ENGINE, prefix: str = "fit", weight: flo
         flag: file whose existence cancels the rendering on the workers.
         factory: the engine, as ``module:class``.
         prefix: follows the enclosing task's key in the keys of the tasks.
-        weight: share of the workers' time relative to other fits'.
+        weight: share of the workers' time relative to other jobs'.
     """
     enclosing = _enclosing_task()
     if enclosing is None:

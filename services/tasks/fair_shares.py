@@ -1,10 +1,10 @@
-"""Fair sharing of the workers between running fits: the fit that used less worker time recently goes first.
+"""Fair sharing of the workers between running jobs: the job that used less worker time recently goes first.
 
-Decay-usage scheduling (J. Kay and P. Lauder, A Fair Share Scheduler, Communications of the ACM 31(1), 1988): each fit
+Decay-usage scheduling (J. Kay and P. Lauder, A Fair Share Scheduler, Communications of the ACM 31(1), 1988): each job
 sums the worker time of its tasks, with exponential decay, and gives its next task a priority that falls with this sum.
-Priorities are compared in the queues of the workers, so no server has to tell a fit how many others there are. Each fit
-publishes its level in the scheduler's metadata, and a new fit begins at the lowest published level, because otherwise
-it would have the workers alone until its use had caught up. A fit that is alone gets all workers.
+Priorities are compared in the queues of the workers, so no server has to tell a job how many others there are. Each job
+publishes its level in the scheduler's metadata, and a new job begins at the lowest published level, because otherwise
+it would have the workers alone until its use had caught up. A job that is alone gets all workers.
 """
 
 from __future__ import annotations

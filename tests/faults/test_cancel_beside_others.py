@@ -22,7 +22,6 @@ from services.core.stage import CANCEL_FLAG, StageContext
 from services.pipeline.event_log import EventAddress, folder_events
 from services.pipeline.following import follow_stage
 from services.pipeline.stage_task import StageTask
-from services.preprocess.tasks import executors as of_blocks
 from services.tasks.engine_host import ChildHost
 from services.tasks.executors import DaskExecutor
 from tests.support.small_system import PATIENCE_S
@@ -119,22 +118,36 @@ def test_a_cancelled_fit_does_not_wait_for_the_tasks_before_its_own(client: Clie
     assert not (tmp_path / "never").exists(), "a task of the cancelled fit began"
 
 
-def test_a_cancelled_preparation_does_not_wait_for_its_blocks(client: Client, tmp_path: Path) -> None:
-    begun = tmp_path / "block"
+def test_a_cancelled_job_does_not_wait_for_its_running_tasks(client: Client, tmp_path: Path) -> None:
+    begun, flag = tmp_path / "block", tmp_path / "cancel"
+    run_on = DaskExecutor(client, ENGINE, "running", flag)
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(list, run_on.as_completed([("linger", linger, (str(begun),))]))
+        wait_until(begun.exists)
+        flag.touch()
+        try:
+            with pytest.raises(JobCancelledError):
+                waiting.result(PATIENCE_S / 2)
+        finally:
+            begun.with_suffix(".release").touch()
 
-    def block() -> None:
-        linger(None, str(begun))
 
-    def raise_once_begun() -> None:
-        if begun.exists():
-            raise JobCancelledError("Cancelled.")
+def refuse(_host: object, first: str) -> None:
+    wait_until(Path(first).exists)
+    raise ValueError("It cannot be read.")
 
-    run_on = of_blocks.DaskExecutor(client, "prepare", {}, "normal", raise_once_begun)
-    try:
-        with pytest.raises(JobCancelledError):
-            list(run_on.run([block]))
-    finally:
-        begun.with_suffix(".release").touch()
+
+def test_after_an_exception_no_task_begins_that_has_not_begun(client: Client, tmp_path: Path) -> None:
+    names = [tmp_path / f"task-{k}" for k in range(8)]
+    run_on = DaskExecutor(client, ENGINE, "refused", tmp_path / "no")
+    calls = [("refuse", refuse, (str(names[0]),)), *((one.name, linger, (str(one),)) for one in names)]
+    with pytest.raises(ValueError, match="cannot be read"):
+        list(run_on.as_completed(calls))
+    for one in names:
+        one.with_suffix(".release").touch()
+    # The worker has two threads. A task that is sent now begins after those that were under way.
+    assert run_on.gather([run_on.submit("last", lambda _host: 1)]) == [1]
+    assert not any(one.exists() for one in names[3:])
 
 
 def test_a_cancelled_call_leaves_the_kernel_that_it_waits_for(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ Each image's shards are written by one block at a time.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from services.preprocess.subject import NO_SURFACE, Subject, read_subject
 from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone
 from services.preprocess.tasks.shade import shade
+from services.tasks.executors import Call
 
 NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)
 """Mask bits of pixels that are left out of an image's brightness levels and noise."""
@@ -120,6 +121,17 @@ def blocks_of(
         for camera, own in enumerate(items)
         for k in range(0, len(own), size)
     )
+
+
+def block_task(_host: Any, block: Block) -> Block:
+    """Run a block as a task, which needs no engine; returns the block."""
+    block()
+    return block
+
+
+def calls_of(blocks: Iterable[Block]) -> list[Call]:
+    """Arguments with which an executor runs blocks."""
+    return [(f"{block.step}-{block.camera}", block_task, (block,)) for block in blocks]
 
 
 def images_of(block: Block, files: AttemptFiles) -> Iterator[ImageDone]:
