@@ -65,12 +65,12 @@ def sphere_command(
 
 def progress(total: int, clock: Callable[[], float] = time.monotonic) -> Callable[[int], None]:
     """A function that is told how many readings are done, and tells it on standard error every few seconds."""
-    told = clock()
+    reported = clock()
 
     def tell(done: int) -> None:
-        nonlocal told
-        if done < total and clock() - told >= PROGRESS_S:
-            told = clock()
+        nonlocal reported
+        if done < total and clock() - reported >= PROGRESS_S:
+            reported = clock()
             print(f"{done} of {total} readings done", file=sys.stderr, flush=True)
 
     return tell
@@ -102,8 +102,8 @@ def _line(fitted: Fitted) -> str:
 
 def _off(fit: SphereFit) -> str:
     pairs = [("R", fit.R_fitted, fit.R), ("T", fit.T_fitted, fit.T)]
-    told = [f"{name} {own:.4f} and not {one:.4f}" for name, own, one in pairs if own is not None and one is not None]
-    return f", which would read {', '.join(told)}"
+    unlike = [f"{name} {own:.4f} and not {one:.4f}" for name, own, one in pairs if own is not None and one is not None]
+    return f", which would read {', '.join(unlike)}"
 
 
 def _value(one: SphereQuantity) -> str:

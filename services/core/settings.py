@@ -262,9 +262,9 @@ def read_settings(environment: Mapping[str, str], prefix: str = "DENTINE__") -> 
     except ValidationError as problem:
         first = problem.errors()[0]
         name = prefix + "__".join(str(part).upper() for part in first["loc"])
-        told = words_of(first)
-        remedy = "" if "; " in told else "; correct or remove the variable"
-        raise SettingsError(f"Setting {name}: {told}{remedy}.") from problem
+        words = words_of(first)
+        remedy = "" if "; " in words else "; correct or remove the variable"
+        raise SettingsError(f"Setting {name}: {words}{remedy}.") from problem
 
 
 def read_job(path: Path) -> JobSpec:

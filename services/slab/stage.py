@@ -47,11 +47,11 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     context.raise_if_cancelled()
     root, folder = _folder(spec)
     options = SlabOptions.model_validate(spec.model_dump(include={"seed", *SLAB_OPTIONS}))
-    told = set[str]()
+    reported = set[str]()
     for wavelength_nm in folder.wavelengths_nm:  # report a fault in the last one before the first has cost its time
         dictionary_of(root, folder, wavelength_nm, options)
         for fault in read_images(root, folder, wavelength_nm).faults:
-            told.add(message := f"{wavelength_nm:g} nm: {fault}")
+            reported.add(message := f"{wavelength_nm:g} nm: {fault}")
             context.report(StageEvent(stage="fit", kind="log", message=message))
     writer = StageWriter(context.root, "fit", context.attempt)
     flag = context.root / CANCEL_FLAG
@@ -81,7 +81,7 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
         assert stored is not None
         fits.append(stored.fit)
         for message in (f"{result_folder.name} nm: {note}" for note in stored.fit.notes):
-            if message not in told:
+            if message not in reported:
                 context.report(StageEvent(stage="fit", kind="log", message=message))
         write_atomic(writer.folder / f"{result_folder.name}.npz", (result_folder / IMAGES).read_bytes())
     report = SlabReport(fits=tuple(fits))

@@ -181,12 +181,12 @@ def doubts_of(misfit_mm: float) -> tuple[str, ...]:
     """
     if misfit_mm <= DOUBTFUL_MISFIT_MM:
         return ()
-    told = (
+    note = (
         f"The scan's teeth lie {misfit_mm:.2f} mm from the photographs' outlines in the median, and teeth in a"
         f" calibrated rig within {DOUBTFUL_MISFIT_MM:g} mm; see in the overlay pictures whether the scan is of this"
         " person and as the teeth are now, and whether the calibration is this rig's."
     )
-    return (told,)
+    return (note,)
 
 
 def _require_agreement(contradiction: str | None) -> None:

@@ -97,9 +97,9 @@ def import_folder(
         raise CaptureInputError(f"{root / DESCRIPTION} exists; remove it, or edit it by hand.")
     listing = photographs_in(root)
     if not listing.photographs:
-        told = f"put {', '.join(sorted(IMAGES - CAMERA_RAW))} or camera raw files there"
+        remedy = f"put {', '.join(sorted(IMAGES - CAMERA_RAW))} or camera raw files there"
         seen = "".join(f" ({note[:-1]})" for note in listing.notes)
-        raise CaptureInputError(f"{root} holds no photograph of counts{seen}; {told}.")
+        raise CaptureInputError(f"{root} holds no photograph of counts{seen}; {remedy}.")
     if calibration is not None:
         read_record(calibration, Calibration)
     interpreted = {file: named_frame(file, {word.lower() for word in ignored}) for file in listing.photographs}

@@ -48,8 +48,8 @@ def note_on_dropped(meshes: Mapping[str, Mesh]) -> str | None:
     dropped = {name: mesh.dropped_vertices for name, mesh in meshes.items() if mesh.dropped_vertices}
     if not dropped:
         return None
-    told = ", ".join(f"{count} of {name}" for name, count in dropped.items())
-    return f"Vertices that no triangle uses are left out: {told}."
+    counts = ", ".join(f"{count} of {name}" for name, count in dropped.items())
+    return f"Vertices that no triangle uses are left out: {counts}."
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:

@@ -19,8 +19,8 @@ R = TypeVar("R", bound=BaseModel)
 
 def remedied(error: ErrorDetails) -> str:
     """What is wrong with a value, with a remedy after a semicolon."""
-    told = words_of(error)
-    return told if "; " in told else f"{told}; correct it"
+    words = words_of(error)
+    return words if "; " in words else f"{words}; correct it"
 
 
 def parse_record(content: bytes, kind: type[R], origin: str) -> R:

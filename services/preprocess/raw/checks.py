@@ -133,11 +133,12 @@ def _is_empty(root: Path, frames: tuple[RawFrame, RawFrame], exposures: tuple[Ex
     least = _least_counts(first)
     blocks = [_block_means(one.signal) for one in exposures]
     expected = [blocks[1] * first.factor / second.factor, blocks[0] * second.factor / first.factor]
-    for own, told, frame, other in zip(blocks, expected, frames, reversed(frames), strict=True):
-        if own.max() < least and told.max() >= SURELY_COUNTED * least:
+    for own, predicted, frame, other in zip(blocks, expected, frames, reversed(frames), strict=True):
+        if own.max() < least and predicted.max() >= SURELY_COUNTED * least:
             raise CaptureInputError(
                 f"Frame {root / frame.file} ({frame.label}) is empty: it counts nothing above its black, where"
-                f" {other.file} lets expect {told.max():.3g} counts; take it again with the light on, or correct its"
+                f" {other.file} lets expect {predicted.max():.3g} counts; take it again with the light on, or"
+                " correct its"
                 " kind, exposure_s, gain or level."
             )
     return bool(blocks[0].max() < least)
@@ -173,14 +174,14 @@ def _log_brightness_ratio(first: Exposure, signal: Image, headroom: Image, facto
         return None
     clip_counts = np.float32(CLIP_SHARE * full)
     expected = np.minimum(first.signal * np.float32(factor / first.factor), clip_counts)
-    told, seen = _block_means(expected), _block_means(np.minimum(signal, clip_counts))
-    if min(one.mean(axis=(0, 1)).min() for one in (told, seen)) < MIN_MEAN_SHARE * full:
+    predicted, seen = _block_means(expected), _block_means(np.minimum(signal, clip_counts))
+    if min(one.mean(axis=(0, 1)).min() for one in (predicted, seen)) < MIN_MEAN_SHARE * full:
         return None
     least = _least_counts(first)
     counted = (_block_means(first.signal) >= least) & (_block_means(signal) >= least)
     if not counted.any(axis=(0, 1)).all():
         return None
-    return np.asarray(np.log((seen * counted).sum(axis=(0, 1)) / (told * counted).sum(axis=(0, 1))))
+    return np.asarray(np.log((seen * counted).sum(axis=(0, 1)) / (predicted * counted).sum(axis=(0, 1))))
 
 
 def _is_correlated(first: Exposure, second: Exposure) -> bool:

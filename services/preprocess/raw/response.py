@@ -93,13 +93,13 @@ class Linearity:
 
     def verdict(self) -> str:
         """What is done to the counts, and why."""
-        told = self.left_out
-        if told is None:
+        unseen = self.left_out
+        if unseen is None:
             return (
                 "its counts are taken as they are, as no curve can be tested on these frames; two steps of exposures of"
                 " enough light would allow it"
             )
-        change = f"from {told.plain:.2%} to {told.curved:.2%} off"
+        change = f"from {unseen.plain:.2%} to {unseen.curved:.2%} off"
         if self.is_linear:
             return (
                 f"its counts are taken as they are, as a curve brings exposures that it was not fitted to {change},"
@@ -134,10 +134,10 @@ def measure_linearity(series: Sequence[Series], full: float) -> Linearity:
         return Linearity(np.empty(0), (0.0, 0.0), full)
     ratios = np.exp(np.concatenate([pair.observed for pair in pairs]))
     curve = _curve(pairs)
-    told = _left_out(pairs) if curve else None
-    if curve is None or told is None or not told.is_better:
-        return Linearity(ratios, (0.0, 0.0), full, told)
-    return Linearity(ratios, curve, full, told)
+    unseen = _left_out(pairs) if curve else None
+    if curve is None or unseen is None or not unseen.is_better:
+        return Linearity(ratios, (0.0, 0.0), full, unseen)
+    return Linearity(ratios, curve, full, unseen)
 
 
 @dataclass(frozen=True)
@@ -173,13 +173,13 @@ def _left_out(pairs: Sequence[_Pair]) -> LeftOut | None:
         curve = _curve(others)
         if curve is None:
             return None
-        observed, told = pair.observed, _log_factor(pair.x, curve) - _log_factor(pair.y, curve)
-        medians.append([float(np.median(np.abs(one))) for one in (observed, observed - told)])
+        observed, predicted = pair.observed, _log_factor(pair.x, curve) - _log_factor(pair.y, curve)
+        medians.append([float(np.median(np.abs(one))) for one in (observed, observed - predicted)])
         # Blocks that neither hypothesis explains, such as those with an edge, count little.
-        rest = np.minimum(np.abs(observed), np.abs(observed - told))
+        rest = np.minimum(np.abs(observed), np.abs(observed - predicted))
         weight = 1 / (1 + (rest / (robust_sigma(rest) + SMALLEST_DEVIATION)) ** 2)
-        power = float(np.sum(weight * told**2))
-        shares.append(float(np.sum(weight * told * observed)) / max(power, SMALLEST_DEVIATION**2))
+        power = float(np.sum(weight * predicted**2))
+        shares.append(float(np.sum(weight * predicted * observed)) / max(power, SMALLEST_DEVIATION**2))
         weights.append(power)
     if len(shares) < 2 or not any(weights):
         return None

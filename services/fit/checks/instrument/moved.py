@@ -78,11 +78,11 @@ def shift_sentences(channel: str, faults: Sequence[Fault], errors: InstrumentErr
             " preparation's motion."
         )
         return
-    told = set[str]()
+    named = set[str]()
     for fault in own:
-        if (photograph := _photograph(errors, fault)) in told:
+        if (photograph := _photograph(errors, fault)) in named:
             continue
-        told.add(photograph)
+        named.add(photograph)
         yield (
             f"In {channel} {photograph} is shifted by {abs(fault.size):.2f} px, {abs(fault.z):.1f} times what its own"
             f" error and the standard error of its motion, {errors.se[fault.index]:.2g} px, allow together: the"
