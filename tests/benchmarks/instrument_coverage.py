@@ -5,8 +5,8 @@ python -m tests.benchmarks.instrument_coverage --seeds 5 --json instrument_cover
 
 What gain, lights, flares and moves of scan and dome do to the photographs comes from stock Mitsuba (``render_moves``).
 How a fit's solution responds to them, and the ± that must contain it, come from the fit's own noisy derivatives: its
-closing measurement is made once more with stock's changes of the images in place of its own. In each draw the errors
-are normal with the standard errors that the fit assumes, and the rest of the solution's error is normal with the
+final uncertainty estimate is made once more with stock's changes of the images in place of its own. In each draw the
+errors are normal with the standard errors that the fit assumes, and the rest of the solution's error is normal with the
 covariance that the fit states for photographs, rendering and what else is not the instrument's. The images are linear
 in all of these. ``shift_over_se`` is the linear prediction of ``instrument_errors``: how far one standard error of each
 error of the instrument moves each quantity, over the quantity's ±.
@@ -109,7 +109,7 @@ class Changes:
 
 @dataclass
 class Recorder:
-    """Stands between a fit and its closing measurement, and keeps what the draws need of the last one."""
+    """Stands between a fit and its final uncertainty estimate, and keeps what the draws need of the last one."""
 
     changes: Changes
     shifts: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -127,7 +127,8 @@ class Recorder:
     def measure(
         self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any, *more: Any
     ) -> ClosingSums:
-        """The closing measurement with the fit's own changes, which is returned, and with stock's, which is kept."""
+        """The final uncertainty estimate with the fit's own changes, which is returned, and with stock's, which is
+        kept."""
         errors = problem.domain.errors.names
         self.names = (*errors, *self.changes.moves)
         self.information = np.zeros((len(moves), len(moves)))

@@ -1,4 +1,4 @@
-"""The closing measurement's images of displaced dentin are those of the displaced surface itself."""
+"""The final uncertainty estimate's images of displaced dentin are those of the displaced surface itself."""
 
 from __future__ import annotations
 

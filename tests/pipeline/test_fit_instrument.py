@@ -88,7 +88,7 @@ def test_a_gain_that_is_off_is_in_the_errors(brighter: tuple[Path, FitReport], t
     alone = fit(tmp_path, gains=(1.02,) * 6, scan_se=STILL, instrument="off")
     assert max(map(abs, off(alone).values())) > 4
     assert not alone.instrument
-    assert alone.instrument_told[0].startswith("The ± take the instrument for perfect")
+    assert alone.instrument_told[0].startswith("The standard errors take the instrument for perfect")
 
 
 @pytest.mark.dear("two precise fits, whose difference is small beside their noise otherwise")

@@ -1,5 +1,5 @@
-"""The ± of whole fits is correct: 95 % intervals contain the truth, with errors from sensor noise to a mean cosine that
-was held at another value.
+"""The standard errors of whole fits are correct: 95 % intervals contain the truth, with errors from sensor noise to a
+mean cosine that was held at another value.
 """
 
 from __future__ import annotations

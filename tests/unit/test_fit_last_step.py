@@ -1,4 +1,4 @@
-"""The step after the closing measurement: which steps are taken, for made-up promises and comparisons."""
+"""The step after the final uncertainty estimate: which steps are taken, for made-up promises and comparisons."""
 
 from __future__ import annotations
 

@@ -218,7 +218,7 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     assert "Images hardly show a gain that is farther off" in assumed
     off = spec.model_copy(update={"instrument": "off"})
     assert instrument_sentences(off, {"green": InstrumentErrors()}, {}, ())[0].startswith(
-        "The ± take the instrument for perfect"
+        "The standard errors take the instrument for perfect"
     )
 
 

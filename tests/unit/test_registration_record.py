@@ -1,4 +1,6 @@
-"""The ± of a registered pose is passed on to all who use its teeth, together with the calibration's own."""
+"""The standard errors of a registered pose are passed on to all who use its teeth, together with the
+calibration's own.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The ± of a slab's fit: from the observed noise of the gradient, and from the distance to the minimum where a fit
-ended early.
+"""The standard errors of a slab's fit: from the observed noise of the gradient, and from the distance to the minimum
+where a fit ended early.
 """
 
 from __future__ import annotations

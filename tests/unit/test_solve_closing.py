@@ -74,7 +74,8 @@ class Linear:
 
 
 def fitted(problem: Linear, *, measured: bool, offset: float) -> tuple[np.ndarray, Uncertainty]:
-    # A Newton step with the curvature that ``similar`` gives, the equations moved there, then the closing measurement.
+    # A Newton step with the curvature that ``similar`` gives, the equations moved there, then the final uncertainty
+    # estimate.
     photo = problem.photograph(offset)
     start = problem.truth + 0.05
     equations = problem.equations(start, photo)

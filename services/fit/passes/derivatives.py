@@ -50,7 +50,7 @@ DIFFERENCE_STEPS: Mapping[str, DifferenceStep] = MappingProxyType(
 derivative hardly changes the zero of J'Wr, and so the solution."""
 
 COSINE_STEP = DifferenceStep(0.35, 0.35, 4)
-"""Reach of a cosine in the closing measurement, which needs the derivative itself."""
+"""Reach of a cosine in the final uncertainty estimate, which needs the derivative itself."""
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,8 @@ def differentiation(
     """
     x, tissue = x[: domain.tissue_count], domain.tissue_at(x, base)
     # Scores of extinction are noisy, so a single tooth in similar media uses differences instead. A jaw keeps scores,
-    # because one pass gives those of all teeth, and so do the images' own media, because the closing measurement needs
-    # derivatives.
+    # because one pass gives those of all teeth, and so do the images' own media, because the final uncertainty
+    # estimate needs derivatives.
     differing = WITHOUT_SCORES if jacobian_g is None or isinstance(base, Mouth) else WITHOUT_SCORES | {"sigma"}
     is_secant = [c.kind in differing for c in domain.coordinates]
     own = tuple(

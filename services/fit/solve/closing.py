@@ -1,5 +1,5 @@
-"""The closing measurement, made once where a fit ends: the solution's true response to the data, and the error that
-held mean cosines g cause.
+"""The final uncertainty estimate, made once where a fit ends: the solution's true response to the data, and the error
+that held mean cosines g cause.
 
 A fit with Jacobians J~ of similar media solves J~'W r(x) + Lambda (x - m) = 0, an estimating equation whose instruments
 J~ are not the derivatives J of its images. Its solution responds to the data by M^-1 J~'W, M = J~'W J + Lambda, and not
@@ -188,7 +188,7 @@ def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors
     these equations F and G are zero, and for those at the solution they are not.
 
     Args:
-        sums: the closing measurement.
+        sums: the final uncertainty estimate.
         prior: whitened precision T' Lambda T, which is added to the measured data.
         relation: kind of each entry (F, F); entries of one kind are assumed to have one variance tau^2.
         errors: number of coordinates, the last of all, that are instrument errors.

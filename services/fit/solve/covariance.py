@@ -152,8 +152,8 @@ class Pooled:
 
 def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
     # Weight two gradients by their noise: the solver's pooled one, carried by the measured response instead of its own
-    # curvature, and that of the closing measurement. The difference of the two ways of carrying counts as error of its
-    # own size, because images are linear over short distances only.
+    # curvature, and that of the final uncertainty estimate. The difference of the two ways of carrying counts as error
+    # of its own size, because images are linear over short distances only.
     carried = np.asarray(np.linalg.solve(t, equations.carried + np.zeros(len(t))), dtype=np.float64)
     correction = solved.excess @ carried
     known, known_noise = (
@@ -246,7 +246,7 @@ class ClosingModel:
 
 
 def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> ClosingModel:
-    """Quadratic model at x, where the closing measurement was made."""
+    """Quadratic model at x, where the final uncertainty estimate was made."""
     whitened = whitening(domain, equations)
     t = whitened.transform
     solved = response(sums, t.T @ domain.precision @ t, domain.relation, len(domain.errors.names))
@@ -270,11 +270,11 @@ def uncertainty(
     The returned x is the solution, moved where the prior of the instrument's errors is used in full.
 
     Args:
-        sums: the closing measurement, made at ``x - step`` in the whitened coordinates of these equations; None where
-            Jacobians are the images' own.
-        step: the step (F,) that the fit made after the closing measurement.
-        moved: kind, ``shape``, ``teeth`` or ``dome``, of each of the last changes of the closing measurement; the
-            earlier changes are those of held mean cosines.
+        sums: the final uncertainty estimate, made at ``x - step`` in the whitened coordinates of these equations; None
+            where Jacobians are the images' own.
+        step: the step (F,) that the fit made after the final uncertainty estimate.
+        moved: kind, ``shape``, ``teeth`` or ``dome``, of each of the last changes of the final uncertainty estimate;
+            the earlier changes are those of held mean cosines.
         part_count: number of objects that the fit treats as separate in the images, such as the teeth of a jaw.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0

@@ -40,9 +40,9 @@ SLOPE_ERROR = 0.5
 """Relative error of the change that Jacobians of similar media predict for one tooth's exact images, however short the
 step; the errors of several teeth are independent."""
 CLOSING_DIVISOR = 2
-"""Divisor of the paths for the closing measurement, which is combined with all equations of the exact steps."""
+"""Divisor of the paths for the final uncertainty estimate, which is combined with all equations of the exact steps."""
 CLOSING_TRIALS = 2
-"""Number of lengths that are tried for the step after the closing measurement."""
+"""Number of lengths that are tried for the step after the final uncertainty estimate."""
 CLOSING_MIN_SHARE = 0.1
 """Shortest length that is tried, as a share of the one before."""
 REPEAT_STAGE = "again"
@@ -53,8 +53,8 @@ MIN_SAMPLES = 4
 
 
 def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_count: int, samples: int) -> Array:
-    """The step (F,) from x by the closing measurement, possibly shortened; zeros where its predicted gain is within
-    noise or no length is better.
+    """The step (F,) from x by the final uncertainty estimate, possibly shortened; zeros where its predicted gain is
+    within noise or no length is better.
 
     Args:
         part_count: number of objects that the images tell apart; the errors of their predicted changes are independent.
@@ -133,14 +133,14 @@ class Stages(ABC, Generic[Optics]):
 
     @abstractmethod
     def _held_cosines(self, domain: Domain) -> HeldCosines:
-        """Mean cosines that this domain holds, as input of the closing measurement."""
+        """Mean cosines that this domain holds, as input of the final uncertainty estimate."""
 
     def _held_shapes(self) -> HeldShapes:
         """Shapes of the dentin that this fit holds though they have an error."""
         return ()
 
     def _displaced_scene(self, tissue: Optics) -> DisplacedScene | None:  # noqa: ARG002 - for those that have one
-        """Scene whose dentin also moves as no fitted shape can, as input of the closing measurement."""
+        """Scene whose dentin also moves as no fitted shape can, as input of the final uncertainty estimate."""
         return None
 
     @property

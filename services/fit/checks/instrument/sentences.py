@@ -68,17 +68,23 @@ def instrument_sentences(
     """
     if spec.instrument == "off":
         return (
-            "The ± take the instrument for perfect, as instrument = 'off' says: gain, lights and flare may be wrong.",
+            (
+                "The standard errors take the instrument for perfect, as instrument = 'off' says: gain, lights and flare"
+                " may be wrong."
+            ),
         )
     if not any(own.names for own in errors.values()):
         return (
             (
-                f"The ± take the instrument for perfect: a fit of the solver {spec.solver} does not know its gain,"
+                f"The standard errors take the instrument for perfect: a fit of the solver {spec.solver} does not"
+                " know its gain,"
                 " lights and flare."
             ),
         )
     unmoved = (
-        ("The ± of a fit with two lobes take the dome to stand where the calibration says.",) if spec.lobes == 2 else ()
+        ("The standard errors of a fit with two lobes take the dome to stand where the calibration says.",)
+        if spec.lobes == 2
+        else ()
     )
     return (
         *_assumed(assumed, errors),
@@ -101,7 +107,8 @@ def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> 
         )
         yield (
             f"Assumed, as the calibration does not state how wrong it may be: {listed}. "
-            "The ± depend on these; state them as uncertainty in capture.json, or in a raw folder's calibration.json."
+            "The standard errors depend on these; state them as uncertainty in capture.json, or in a raw folder's"
+            " calibration.json."
             f"{gain}"
         )
 
@@ -134,7 +141,8 @@ def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
 def _exact_lights(errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
     if not any(kind_of_error(name) == "light_gain" for own in errors.values() for name in own.names):
         yield (
-            "The ± take single lights for as bright as the calibration says: under so many a jaw's fit knows their"
+            "The standard errors take single lights for as bright as the calibration says: under so many a jaw's fit"
+            " knows their"
             " common gain alone."
         )
 
@@ -155,7 +163,7 @@ def _faults(
                 f"In {channel} the images put {len(own)} gains of lights and flares off, most of all"
                 f" {names[worst.index]} by {100 * worst.size:+.1f} %, {abs(worst.z):.1f} times what it may be: so many"
                 " have one cause: what the model leaves out, photographs under wrong names, or a scan in another"
-                f" place. The ± do not contain it.{alone} {options}"
+                f" place. The standard errors do not contain it.{alone} {options}"
             )
             continue
         for fault in own:
