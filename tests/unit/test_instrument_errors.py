@@ -248,7 +248,7 @@ def test_an_error_that_the_calibration_states_is_not_told_as_assumed() -> None:
     names = assumed_names(errors, ())
     assert names == ("light_gain.a", "flare.c0.green")
     (told,) = instrument_sentences(JobSpec.model_validate({"capture": "c"}), errors, {}, names, stated)
-    assert "may be: 1 % for light_gain.a and 0.3 % for flare. The ±" in told
+    assert "may be: 1 % for light_gain.a and 0.3 % for flare. The standard errors" in told
 
 
 def test_a_move_of_the_teeth_is_one_of_cameras_and_lights_the_other_way(tmp_path: Path) -> None:

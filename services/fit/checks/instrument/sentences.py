@@ -69,7 +69,8 @@ def instrument_sentences(
     if spec.instrument == "off":
         return (
             (
-                "The standard errors take the instrument for perfect, as instrument = 'off' says: gain, lights and flare"
+                "The standard errors take the instrument for perfect, as instrument = 'off' says: gain, lights and"
+                " flare"
                 " may be wrong."
             ),
         )
