@@ -15,11 +15,11 @@ from services.core.raw.registration import teeth_root
 from services.core.records import JobSpec
 from services.core.results import CaptureManifest
 from services.core.store import open_stage, read_record
-from services.preprocess.folder import FolderSource
+from services.preprocess.captures.folder import FolderSource
+from services.preprocess.captures.rig import RigSource
 from services.preprocess.raw.memory_budget import GIB
 from services.preprocess.raw.source import RawSource
-from services.preprocess.rig import RigSource
-from services.preprocess.source import Source
+from services.preprocess.views.source import Source
 from services.tasks.executors import threads_here
 
 

@@ -42,12 +42,12 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     from services.preprocess.masking.masks import HandMasks
     from services.preprocess.masking.valid import require_plausible_scale
     from services.preprocess.opening import open_source
-    from services.preprocess.subject import read_subject
     from services.preprocess.tasks.attempt_files import STAGE, AttemptFiles
     from services.preprocess.tasks.blocks import Block, blocks_of, calls_of, images_of
     from services.preprocess.tasks.plan import create_arrays, digest_of_inputs, held_out_images
     from services.preprocess.tasks.progress import Progress
     from services.preprocess.tasks.summary import summarise
+    from services.preprocess.views.subject import read_subject
     from services.tasks.executors import executor
 
     # Check everything that needs no pixel

@@ -30,8 +30,8 @@ from services.core.geometry import Camera, Light, Mesh
 from services.core.records import MaskBit
 from services.core.store import write_atomic
 from services.preprocess.masking.valid import valid_bits
-from services.preprocess.projection import project
-from services.preprocess.source import LightImage
+from services.preprocess.views.projection import project
+from services.preprocess.views.source import LightImage
 
 MATTE = "matte"
 ROUGHNESS = (0.05, 0.1, 0.2, 0.3)

@@ -25,10 +25,10 @@ from services.anatomy.templates.jaw import build_jaw
 from services.core.geometry import Camera, Light, Mesh
 from services.core.store import write_atomic
 from services.phantom.dome_rig import dome_cameras, dome_lights
-from services.preprocess.projection import project
 from services.preprocess.stabilisation.motion import MIN_REACH_PX
 from services.preprocess.stabilisation.null_hypothesis import decided
 from services.preprocess.stabilisation.outline import OutlineMatcher
+from services.preprocess.views.projection import project
 from tests.benchmarks.render_truths import CASES
 from tests.support.truths import read
 

@@ -21,7 +21,7 @@ from services.core.records import FolderCapture, JobSpec
 from services.core.results import PreparedManifest
 from services.core.stage import LocalContext
 from services.core.store import StoredArray, is_published, open_stage, read_record, write_atomic, write_record
-from services.preprocess.quality import QualityReport
+from services.preprocess.quality.images import QualityReport
 from tests.support.raw_captures import write_raw_capture
 from tests.support.raw_sensor import Sensor
 

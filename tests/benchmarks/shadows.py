@@ -30,7 +30,7 @@ from services.core.records import FolderCapture, JobSpec, MaskBit
 from services.core.stage import LocalContext
 from services.core.store import read_record, write_atomic
 from services.preprocess import stage
-from services.preprocess.projection import project
+from services.preprocess.views.projection import project
 from services.transport.platform import prepare_device
 
 NOISE_RELATIVE, NOISE_FLOOR = 0.01, 0.002

@@ -20,10 +20,10 @@ from services.core.records import JobSpec, MaskBit
 from services.core.results import PreparedManifest
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import open_stage, read_record
-from services.preprocess.projection import Footprint, project
-from services.preprocess.quality import QualityReport
+from services.preprocess.quality.images import QualityReport
 from services.preprocess.stabilisation.stabilise import warp
 from services.preprocess.stage import run
+from services.preprocess.views.projection import Footprint, project
 from tests.support.rig_capture import Rendered, write_capture
 
 LIGHTS = 8

@@ -27,10 +27,10 @@ from services.core.placement import STAGES, UNLIMITED
 from services.core.records import JobSpec
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import StageWriter, write_atomic
-from services.preprocess.quality import write_picture
-from services.preprocess.scratch import write_array
+from services.preprocess.quality.images import write_picture
 from services.preprocess.stage import run
 from services.preprocess.tasks import attempt_files, blocks
+from services.preprocess.views.scratch import write_array
 from tests.support.folder_captures import write_folder, write_tree
 
 KILLS = 50

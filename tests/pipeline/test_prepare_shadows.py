@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from services.core.files.meshes import write_mesh
 from services.core.records import MaskBit
-from services.preprocess.masking.shadows import expected_irradiance
 from services.preprocess.masking.valid import valid_bits
-from services.preprocess.projection import project
-from services.preprocess.quality import QualityReport
-from services.preprocess.source import Bits
+from services.preprocess.quality.images import QualityReport
 from services.preprocess.tasks import blocks
 from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.blocks import Block
+from services.preprocess.views.direct_light import expected_irradiance
+from services.preprocess.views.projection import project
+from services.preprocess.views.source import Bits
 from tests.support.folder_captures import prepare
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 

@@ -17,15 +17,15 @@ from services.core.geometry import Camera, Light
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.fullness import Fullness, piled_up
 from services.core.records import FolderCapture, ImageEntry, MaskBit
-from services.preprocess.folder import FolderSource
+from services.preprocess.captures.folder import FolderSource
 from services.preprocess.raw.camera import CameraFrames
-from services.preprocess.window import Window
+from services.preprocess.views.window import Window
 from tests.support.dng_files import write_dng
 from tests.support.raw_folders import Tree, write_toml
 from tests.support.raw_sensor import Sensor
 
 if TYPE_CHECKING:
-    from services.preprocess.source import View
+    from services.preprocess.views.source import View
 
 SIZE = (96, 64)
 SENSOR = Sensor(bits=12, black=64, counts_per_electron=0.5)

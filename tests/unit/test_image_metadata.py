@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from services.core.files.image_metadata import metadata_fault, plain_png
 from services.core.pages.pictures import png16_bytes, png_bytes
-from services.preprocess.quality import write_picture
+from services.preprocess.quality.images import write_picture
 from tests.support.told_images import XMP, Image, PngInfo, exif, told_png, with_text, written
 from tests.unit.test_image_headers import exr, exr_part
 

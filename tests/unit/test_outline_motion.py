@@ -9,12 +9,12 @@ import pytest
 
 from services.core.geometry import Camera, Light
 from services.core.results import FrameRecord
-from services.preprocess.projection import Footprint, project
-from services.preprocess.source import View
 from services.preprocess.stabilisation.motion import MIN_REACH_PX, Displacement, Scene, ViewMotion
 from services.preprocess.stabilisation.null_hypothesis import MOVED_PX, decided
 from services.preprocess.stabilisation.outline import OutlineMatcher, OutlineShift
-from services.preprocess.window import Window
+from services.preprocess.views.projection import Footprint, project
+from services.preprocess.views.source import View
+from services.preprocess.views.window import Window
 from tests.support.truths import Truth, read
 
 AGREED = ((0.0, 0.0), (0.0, 0.0))

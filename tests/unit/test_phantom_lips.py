@@ -13,7 +13,7 @@ from services.core.geometry import Mesh
 from services.phantom.dome_rig import dome_cameras
 from services.phantom.jaw import JawSurfaces, jaw_surfaces
 from services.phantom.lips import LIP_RADIUS_MM, lips_and_retractor
-from services.preprocess.projection import project
+from services.preprocess.views.projection import project
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.preprocess.quality_flow import camera_flow, write_flow
-from services.preprocess.stabilisation.flow_comparison import FlowComparison, compare_flow
+from services.preprocess.quality.flow import camera_flow, write_flow
+from services.preprocess.views.flow_comparison import FlowComparison, compare_flow
 
 SHIFT_PX = (2.5, -1.0)
 HEIGHT, WIDTH, MARGIN = 120, 160, 12

@@ -10,7 +10,7 @@ from services.core.files.meshes import read_teeth
 from services.core.geometry import Camera, Mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
-from services.preprocess.projection import project
+from services.preprocess.views.projection import project
 from tests.support.shared_data import shared_path
 
 CAMERA = Camera(

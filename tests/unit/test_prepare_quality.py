@@ -11,7 +11,7 @@ import pytest
 from services.core.records import JobSpec
 from services.core.stage import LocalContext
 from services.core.store import read_record
-from services.preprocess.quality import STOPS, QualityReport, by_stop
+from services.preprocess.quality.images import STOPS, QualityReport, by_stop
 from services.preprocess.stage import run
 from tests.support.folder_captures import write_folder
 

@@ -8,7 +8,7 @@ import pytest
 from services.core.geometry import Camera, Light
 from services.core.records import FolderCapture
 from services.core.results import CaptureManifest, FrameRecord
-from services.preprocess.radiometry import Merge, Radiometry
+from services.preprocess.captures.radiometry import Merge, Radiometry
 
 BLACK, BITS, PER_COUNT = 64, 12, 2e-3
 

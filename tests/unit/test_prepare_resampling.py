@@ -8,10 +8,10 @@ import numpy as np
 
 from services.core.records import FolderCapture, MaskBit
 from services.core.results import CaptureManifest, FrameRecord
-from services.preprocess.radiometry import Radiometry
-from services.preprocess.rig import _image
+from services.preprocess.captures.radiometry import Radiometry
+from services.preprocess.captures.rig import _image
 from services.preprocess.stabilisation.motion import Displacement
-from services.preprocess.window import Window
+from services.preprocess.views.window import Window
 
 SHAPE = (6, 12)
 BLACK, COUNTS = 64, 1064

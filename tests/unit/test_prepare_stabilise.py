@@ -11,11 +11,11 @@ import pytest
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
 from services.core.results import FrameRecord
-from services.preprocess.projection import Footprint
-from services.preprocess.source import View
 from services.preprocess.stabilisation.motion import Scene, ViewMotion, jaws, stored_step
 from services.preprocess.stabilisation.stabilise import TERMS, Aligner, Image, SurfaceFlow, interpolate, warp
-from services.preprocess.window import Window
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.source import View
+from services.preprocess.views.window import Window
 from tests.support.shared_data import shared_path
 
 

@@ -14,7 +14,7 @@ from services.core.geometry import Camera, Mesh
 from services.core.raw.registration import REGISTRATION
 from services.core.records import JobSpec
 from services.fit.measurements.observations import read_observations
-from services.preprocess.subject import read_subject
+from services.preprocess.views.subject import read_subject
 from tests.support.folder_captures import prepare, write_folder
 
 CAMERA = Camera(

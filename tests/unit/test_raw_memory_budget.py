@@ -13,10 +13,10 @@ from services.core.errors import SettingsError
 from services.core.raw.records import RawCamera
 from services.preprocess.raw.memory_budget import GIB, PROCESS_BYTES, MemoryBudget, strips
 from services.preprocess.raw.source import RawSource
-from services.preprocess.source import LightImage, MatchedFrame
 from services.preprocess.stabilisation.stabilise import TERMS
-from services.preprocess.subject import read_subject
-from services.preprocess.window import Window
+from services.preprocess.views.source import LightImage, MatchedFrame
+from services.preprocess.views.subject import read_subject
+from services.preprocess.views.window import Window
 from tests.support.mouth import write_mouth
 from tests.support.raw_captures import write_raw_capture
 from tests.support.raw_sensor import Sensor

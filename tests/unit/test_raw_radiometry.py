@@ -14,7 +14,7 @@ from services.core.raw.records import Mosaic
 from services.preprocess.raw.demosaic import demosaic, demosaic_variance
 from services.preprocess.raw.lens import Lens, Sampler, fitted_vignetting
 from services.preprocess.raw.response import Series, measure_linearity
-from services.preprocess.window import Window
+from services.preprocess.views.window import Window
 from tests.support.raw_sensor import Sensor, taken_through
 
 SHAPE = (250, 400, 1)

@@ -12,7 +12,7 @@ from services.anatomy.scans.scan import read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Mesh
-from services.preprocess.subject import read_subject
+from services.preprocess.views.subject import read_subject
 from tests.support.labelled_scan import bumps, write_labelled_ply
 
 FAR = np.full((40, 3), 900.0)

@@ -93,10 +93,10 @@ def _steps(scene: Scene) -> tuple[dict[str, tuple[Work, Work | None]], float]:
     from services.preprocess.masking.masks import HandMasks
     from services.preprocess.masking.valid import valid_bits
     from services.preprocess.opening import open_source
-    from services.preprocess.subject import read_subject
     from services.preprocess.tasks.attempt_files import STAGE, AttemptFiles
     from services.preprocess.tasks.blocks import ImageWriter
     from services.preprocess.tasks.plan import create_arrays
+    from services.preprocess.views.subject import read_subject
 
     source = open_source(JobSpec(capture=scene.root), scene.root)
     subject = read_subject(source.root, whole=False)

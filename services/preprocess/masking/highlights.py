@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Light
 from services.preprocess.masking.lobe import PROFILE_DEG, LobeProfile
 from services.preprocess.masking.shading import Shading, fit_shading, lit_pixels, lobe_explains_light
-from services.preprocess.projection import Footprint
-from services.preprocess.window import bands
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.window import bands
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]

@@ -9,8 +9,8 @@ from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Tooth
 from services.core.records import MaskBit
 from services.preprocess.masking.highlights import half_cosines, highlight_mask
-from services.preprocess.projection import Footprint
-from services.preprocess.source import LightImage
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.source import LightImage
 
 
 def valid_bits(

@@ -25,8 +25,8 @@ from services.preprocess.raw.demosaic import demosaic
 from services.preprocess.raw.ends import end_notes, ends_of
 from services.preprocess.raw.lens import Lens, fitted_vignetting
 from services.preprocess.raw.response import NEAR_FULL, Linearity, Series, measure_linearity
-from services.preprocess.scratch import cached_array
-from services.preprocess.window import Window
+from services.preprocess.views.scratch import cached_array
+from services.preprocess.views.window import Window
 
 Image = NDArray[np.float32]
 MEASURES = "measures.json"

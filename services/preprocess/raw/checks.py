@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.core.errors import CaptureInputError
 from services.core.raw.merge import Exposure
 from services.core.raw.records import RawFolder, RawFrame
-from services.preprocess.colours import FrameColour
+from services.preprocess.views.colours import FrameColour
 
 Image = NDArray[np.float32]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera
-from services.preprocess.window import BORDER_TOLERANCE_PX, Window
+from services.preprocess.views.window import BORDER_TOLERANCE_PX, Window
 
 Image = NDArray[np.float32]
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from services.core.errors import SettingsError
 from services.core.raw.records import RawCamera
-from services.preprocess.window import Window
+from services.preprocess.views.window import Window
 
 GIB = 2**30
 PROCESS_BYTES = 400 * 2**20

@@ -14,13 +14,13 @@ from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFrame
 from services.core.records import Motion
 from services.core.results import FrameRecord
+from services.preprocess.captures.rig import MIN_TRACKING
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import missing_exposures
 from services.preprocess.raw.view import RawView
-from services.preprocess.rig import MIN_TRACKING
-from services.preprocess.source import FootprintIn, LightImage, MatchedFrame, Motions, View
-from services.preprocess.stabilisation.flow_comparison import FlowComparison
 from services.preprocess.stabilisation.motion import Scene, ViewMotion, frames_to_match, group_exposures, jaws
+from services.preprocess.views.flow_comparison import FlowComparison
+from services.preprocess.views.source import FootprintIn, LightImage, MatchedFrame, Motions, View
 
 
 class RawSource:

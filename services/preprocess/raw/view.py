@@ -13,15 +13,15 @@ from services.core.raw.frames import Counts
 from services.core.raw.merge import Exposure, merge
 from services.core.raw.records import RawFrame
 from services.core.records import MaskBit
+from services.preprocess.captures.rig import STILL_PX
 from services.preprocess.raw.camera import CameraFrames
 from services.preprocess.raw.checks import colour_of, require_like_exposures
 from services.preprocess.raw.demosaic import channel_means, demosaic, demosaic_variance, spoiled
 from services.preprocess.raw.lens import MOSAIC_PERIOD, Sampler
 from services.preprocess.raw.memory_budget import MemoryBudget, strips
-from services.preprocess.rig import STILL_PX
-from services.preprocess.source import Image, LightImage, View
 from services.preprocess.stabilisation.motion import Displacement, ViewMotion, is_uncertain, largest_error_px
-from services.preprocess.window import Window, bands_of
+from services.preprocess.views.source import Image, LightImage, View
+from services.preprocess.views.window import Window, bands_of
 
 BoolArray = NDArray[np.bool_]
 Values = tuple[Image, Image, BoolArray, BoolArray]

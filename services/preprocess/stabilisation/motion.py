@@ -13,13 +13,13 @@ from services.core.errors import CaptureInputError, SettingsError
 from services.core.geometry import Light
 from services.core.records import Motion
 from services.core.results import FrameRecord
-from services.preprocess.projection import Footprint
-from services.preprocess.source import FootprintIn, MatchedFrame, Motions, MotionSource, View
-from services.preprocess.stabilisation.flow_comparison import FlowComparison, compare_flow
 from services.preprocess.stabilisation.null_hypothesis import decided
 from services.preprocess.stabilisation.outline import OutlineMatcher
 from services.preprocess.stabilisation.stabilise import TERMS, Aligner, FloatArray, SurfaceFlow, interpolate
-from services.preprocess.window import Window
+from services.preprocess.views.flow_comparison import FlowComparison, compare_flow
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.source import FootprintIn, MatchedFrame, Motions, MotionSource, View
+from services.preprocess.views.window import Window
 
 Image = NDArray[np.float32]
 # Largest accepted median displacement, as a fraction of a jaw's shorter side: beyond it the coarse-to-fine alignment

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera
-from services.preprocess.masking.shadows import expected_irradiance
-from services.preprocess.projection import Footprint
 from services.preprocess.stabilisation.stabilise import reduce_grey
 from services.preprocess.stabilisation.surface_samples import ARCS, BAND_PX, SurfaceSamples, surroundings
+from services.preprocess.views.direct_light import expected_irradiance
+from services.preprocess.views.projection import Footprint
 
 FloatArray = NDArray[np.float64]
 Indices = tuple[NDArray[np.intp], NDArray[np.intp]]

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.robust import robust_sigma
-from services.preprocess.projection import Footprint
-from services.preprocess.scratch import cached_array
-from services.preprocess.window import bands
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.scratch import cached_array
+from services.preprocess.views.window import bands
 
 Image = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]

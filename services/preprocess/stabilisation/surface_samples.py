@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera
-from services.preprocess.projection import Footprint
-from services.preprocess.window import Window
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.window import Window
 
 Image = NDArray[np.float32]
 

@@ -27,10 +27,10 @@ import zarr
 from services.core.files.object_store import RemoteFolder, StoredObject, discard, new_remote_folder, remote_folder
 from services.core.geometry import Camera, Record
 from services.core.store import StageWriter, writable_array, write_atomic, write_record
-from services.preprocess.projection import Footprint
-from services.preprocess.scratch import write_array
-from services.preprocess.source import Motions, View
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone, StoredFile, ViewDone
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.scratch import write_array
+from services.preprocess.views.source import Motions, View
 
 R = TypeVar("R", bound=Record)
 STAGE = "prepared"

@@ -21,18 +21,18 @@ import numpy as np
 
 from services.core.records import JobSpec, MaskBit
 from services.core.stage import LocalContext
-from services.preprocess.brightness import measure_light
 from services.preprocess.masking.masks import HandMasks
 from services.preprocess.masking.valid import require_visible_teeth, valid_bits
 from services.preprocess.opening import open_source
-from services.preprocess.quality import assess, by_stop, write_picture
-from services.preprocess.quality_flow import camera_flow, write_flow
-from services.preprocess.source import Bits, LightImage, Motions, Source, View
+from services.preprocess.quality.brightness import measure_light
+from services.preprocess.quality.flow import camera_flow, write_flow
+from services.preprocess.quality.images import assess, by_stop, write_picture
 from services.preprocess.stabilisation.motion import stored_step
-from services.preprocess.subject import NO_SURFACE, Subject, read_subject
 from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone
 from services.preprocess.tasks.shade import shade
+from services.preprocess.views.source import Bits, LightImage, Motions, Source, View
+from services.preprocess.views.subject import NO_SURFACE, Subject, read_subject
 from services.tasks.executors import Call
 
 NO_VALUE = np.uint16(MaskBit.SATURATED | MaskBit.NOT_FINITE | MaskBit.UNLIT | MaskBit.MOTION)

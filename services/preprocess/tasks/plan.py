@@ -9,8 +9,8 @@ from services.core.errors import SettingsError
 from services.core.records import JobSpec
 from services.core.store import create_array, image_pieces
 from services.preprocess.masking.masks import HandMasks
-from services.preprocess.source import Source
 from services.preprocess.stabilisation.motion import stored_step
+from services.preprocess.views.source import Source
 
 FORMAT = 10
 """Version of the prepared store and of the work files that one attempt leaves for the next. Raise it whenever either

@@ -9,11 +9,11 @@ from pydantic import Field
 
 from services.core.files.object_store import StoredObject
 from services.core.geometry import Record
-from services.preprocess.brightness import ImageLight
-from services.preprocess.colours import FrameColour
-from services.preprocess.quality import CameraFlow, ImageQuality
-from services.preprocess.source import MatchedFrame
-from services.preprocess.window import Window
+from services.preprocess.quality.brightness import ImageLight
+from services.preprocess.quality.images import CameraFlow, ImageQuality
+from services.preprocess.views.colours import FrameColour
+from services.preprocess.views.source import MatchedFrame
+from services.preprocess.views.window import Window
 
 
 class ViewDone(Record):

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from services.core.geometry import Camera, Light
 from services.core.records import MaskBit
 from services.core.stage import StageContext
-from services.preprocess.masking.shadows import expected_irradiance, is_unoccluded, shadow_confidence
-from services.preprocess.projection import Footprint
-from services.preprocess.quality import assess, write_picture
-from services.preprocess.source import Image, Source, View
-from services.preprocess.subject import Subject
+from services.preprocess.masking.shadows import shadow_confidence
+from services.preprocess.quality.images import assess, write_picture
 from services.preprocess.tasks.attempt_files import AttemptFiles
+from services.preprocess.views.direct_light import expected_irradiance, is_unoccluded
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.source import Image, Source, View
+from services.preprocess.views.subject import Subject
 
 PIXEL_MM = 0.25
 """Approximate pixel size, mm on the tooth, to which images are averaged before shadows are searched. It is finer than a

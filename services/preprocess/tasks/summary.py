@@ -12,14 +12,14 @@ from services.core.geometry import teeth_folder
 from services.core.results import PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import write_record
-from services.preprocess.brightness import Brightness
-from services.preprocess.colours import require_like_colours
-from services.preprocess.quality import QualityReport, moved_note, unusable_note
-from services.preprocess.quality_page import write_page
-from services.preprocess.source import Source
-from services.preprocess.subject import Subject
+from services.preprocess.quality.brightness import Brightness
+from services.preprocess.quality.images import QualityReport, moved_note, unusable_note
+from services.preprocess.quality.page import write_page
 from services.preprocess.tasks.attempt_files import AttemptFiles
 from services.preprocess.tasks.records import ImageDone
+from services.preprocess.views.colours import require_like_colours
+from services.preprocess.views.source import Source
+from services.preprocess.views.subject import Subject
 
 Known = dict[str, tuple[int, str]]
 """Path of a file in the store -> its size in bytes and its SHA-256."""

@@ -9,7 +9,7 @@ import pytest
 
 from services.core.errors import SettingsError
 from services.preprocess.raw.source import RawSource
-from services.preprocess.subject import read_subject
+from services.preprocess.views.subject import read_subject
 from tests.support.mouth import write_mouth
 from tests.support.raw_captures import write_raw_capture
 from tests.support.raw_sensor import Sensor

@@ -12,10 +12,10 @@ import zarr
 
 from services.core.results import PreparedManifest
 from services.core.store import read_record
-from services.preprocess.quality import QualityReport
+from services.preprocess.captures.rig import STILL_PX
+from services.preprocess.quality.images import QualityReport
 from services.preprocess.raw.source import RawSource
-from services.preprocess.rig import STILL_PX
-from services.preprocess.subject import read_subject
+from services.preprocess.views.subject import read_subject
 from tests.support.folder_captures import prepare
 from tests.support.mouth import smooth_image, write_mouth
 from tests.support.raw_captures import write_raw_capture

@@ -15,9 +15,9 @@ from services.core.errors import CaptureInputError
 from services.core.files.meshes import note_on_dropped, read_mesh, read_teeth
 from services.core.geometry import Camera, Mesh, Tooth
 from services.core.raw.registration import REGISTRATION
-from services.preprocess.projection import Footprint, project
-from services.preprocess.source import View
-from services.preprocess.window import window_of
+from services.preprocess.views.projection import Footprint, project
+from services.preprocess.views.source import View
+from services.preprocess.views.window import window_of
 
 NO_SURFACE = -1
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from services.core.pages.page import page_template
 from services.core.store import write_atomic
-from services.preprocess.quality import STOPS, CameraFlow, ImageQuality
+from services.preprocess.quality.images import STOPS, CameraFlow, ImageQuality
 
-TEMPLATE = Path(__file__).parent / "quality.html.j2"
+TEMPLATE = Path(__file__).parent / "page.html.j2"
 WIDTH, HEIGHT = 320, 120
 """Width and height of a chart on the page, pixels."""
 

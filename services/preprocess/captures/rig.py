@@ -14,10 +14,7 @@ from services.core.errors import CaptureInputError
 from services.core.records import MaskBit, Motion
 from services.core.results import CaptureManifest, FrameRecord
 from services.core.store import MANIFEST, StoredArray
-from services.preprocess.radiometry import Merge, Radiometry
-from services.preprocess.scratch import cached_array
-from services.preprocess.source import FootprintIn, Image, LightImage, MatchedFrame, Motions, View
-from services.preprocess.stabilisation.flow_comparison import FlowComparison
+from services.preprocess.captures.radiometry import Merge, Radiometry
 from services.preprocess.stabilisation.motion import (
     Displacement,
     Scene,
@@ -27,7 +24,10 @@ from services.preprocess.stabilisation.motion import (
     jaws,
     largest_error_px,
 )
-from services.preprocess.window import BORDER_TOLERANCE_PX, Window, bands
+from services.preprocess.views.flow_comparison import FlowComparison
+from services.preprocess.views.scratch import cached_array
+from services.preprocess.views.source import FootprintIn, Image, LightImage, MatchedFrame, Motions, View
+from services.preprocess.views.window import BORDER_TOLERANCE_PX, Window, bands
 
 # Largest median displacement, pixels, that is left in a frame, because resampling would blur more than it aligns
 STILL_PX = 0.1

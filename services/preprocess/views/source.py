@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera
 from services.core.records import FolderCapture
-from services.preprocess.colours import FrameColour
-from services.preprocess.projection import Footprint
-from services.preprocess.stabilisation.flow_comparison import FlowComparison
-from services.preprocess.window import Window
+from services.preprocess.views.colours import FrameColour
+from services.preprocess.views.flow_comparison import FlowComparison
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.window import Window
 
 Image = NDArray[np.float32]
 Bits = NDArray[np.uint16]

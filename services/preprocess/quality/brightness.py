@@ -11,8 +11,8 @@ from pydantic import Field
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Light, Record
-from services.preprocess.projection import Footprint
-from services.preprocess.source import LightImage, View
+from services.preprocess.views.projection import Footprint
+from services.preprocess.views.source import LightImage, View
 
 PLAUSIBLE = (1e-3, 10.0)
 """Smallest and largest plausible ratio of the teeth's radiance to that of a white diffuser in their place. Real teeth

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.preprocess.quality import PICTURE_PX, CameraFlow
-from services.preprocess.stabilisation.flow_comparison import FlowComparison
+from services.preprocess.quality.images import PICTURE_PX, CameraFlow
+from services.preprocess.views.flow_comparison import FlowComparison
 
 Image = NDArray[np.float32]
 MIN_SCALE_PX = 0.5

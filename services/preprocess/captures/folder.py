@@ -15,9 +15,9 @@ from services.core.files.arrays import as_float32, map_radiance
 from services.core.raw.fullness import piled_up
 from services.core.records import FolderCapture, ImageEntry, MaskBit
 from services.core.store import read_record
-from services.preprocess.source import FootprintIn, Image, LightImage, MatchedFrame, Motions, View
-from services.preprocess.stabilisation.flow_comparison import FlowComparison
-from services.preprocess.window import bands
+from services.preprocess.views.flow_comparison import FlowComparison
+from services.preprocess.views.source import FootprintIn, Image, LightImage, MatchedFrame, Motions, View
+from services.preprocess.views.window import bands
 
 # Largest share of the covered pixels that may be non-finite. Dead pixels are only masked, even where they are all of
 # one tooth in a jaw; above this share the file is taken to be broken

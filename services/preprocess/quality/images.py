@@ -11,7 +11,7 @@ from pydantic import Field
 
 from services.core.geometry import Record
 from services.core.records import MaskBit
-from services.preprocess.source import Image, MotionSource
+from services.preprocess.views.source import Image, MotionSource
 
 PICTURE_PX = 480
 """Longest side of a picture, pixels."""

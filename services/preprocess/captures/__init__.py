@@ -1,0 +1,1 @@
+"""Folders of linear images, and captures of the rig, as sources."""
