@@ -32,7 +32,7 @@ from services.slab.results.result import (
     with_believable_flags,
 )
 from services.slab.solve.budget import Budget
-from services.slab.solve.checkpoint import CheckpointFile
+from services.slab.solve.checkpoint import Checkpoints
 from services.slab.solve.gauss_newton import GaussNewton
 from services.slab.solve.normal import Each
 from services.slab.solve.start import start
@@ -70,13 +70,13 @@ def fit_images(
     options: SlabOptions,
     blocks: Blocks,
     dictionary: ChosenDictionary,
-    checkpoint_file: CheckpointFile | None = None,
+    checkpoints: Checkpoints | None = None,
     each: Each = map,
 ) -> Wavelength:
     """Fit the images of one wavelength by the dictionary that the options name; see ``fit_slab``.
 
     Args:
-        checkpoint_file: file from which an interrupted fit continues, and which stores its state before each of the
+        checkpoints: state from which an interrupted fit continues, and which is stored before each of the
             last steps.
         each: function that computes with batch after batch in this process, such as that of a pool of threads.
     """
@@ -90,7 +90,7 @@ def fit_images(
         _budget(options, dictionary),
         blocks,
         dictionary.coordinates,
-        checkpoint_file=checkpoint_file,
+        checkpoints=checkpoints,
         each=each,
     )
     solution = solver.solve(lambda: start(rig, measured, options.seed, blocks))

@@ -21,10 +21,11 @@ from services.slab.dictionaries.chosen import dictionary_of
 from services.slab.fit import fit_images
 from services.slab.options import SlabOptions
 from services.slab.read.images import read_images
-from services.slab.results.stored import fingerprint, read_result, store_result
-from services.slab.solve.checkpoint import Checkpoint, CheckpointFile
+from services.slab.results.stored import FIT, fingerprint, open_journal, store_result
+from services.slab.solve.checkpoint import Checkpoint, Checkpoints
 from services.slab.solve.normal import Each
 from services.tasks.executors import Executor
+from services.tasks.journal import Journal
 
 MAX_TRAVELLING_BYTES = 32 * 2**20
 """Largest size of the sums that a task may send to another worker: their paths take seconds, in which any network
@@ -33,6 +34,10 @@ between workers carries ten times that. Where one block's are larger, they stay 
 TASKS_PER_THREAD = 4
 """Number of tasks into which a render's blocks are divided, per thread of the workers: each task costs some
 milliseconds, and several per thread keep all threads busy until the end."""
+
+
+def unguarded() -> None:
+    """Let every write pass."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,12 @@ class WavelengthTask:
     """Folder in which the result is stored."""
     flag: Path
     """File whose existence means that the job is cancelled."""
+    guard: Callable[[], None] = unguarded
+    """Called before every write; raises when this attempt has lost the right to write."""
+
+    def journal(self) -> Journal:
+        """The wavelength's journal, continued where an earlier attempt stopped."""
+        return open_journal(self.place, fingerprint(self.root, self.wavelength_nm, self.options), self.guard)
 
 
 CheckpointCallback = Callable[[float, Checkpoint], None]
@@ -111,16 +122,14 @@ def fit_wavelength(
     """Fit one wavelength into its folder, unless an earlier attempt has; a fit that was cut short continues before the
     last step that it saved.
     """
-    digest = fingerprint(task.root, task.wavelength_nm, task.options)
-    stored = read_result(task.place)
-    if stored is None or stored.of != digest:
+    journal = task.journal()
+    if FIT not in journal.entries:
         folder = read_folder(task.root)
         measured = read_images(task.root, folder, task.wavelength_nm)
         dictionary = dictionary_of(task.root, folder, task.wavelength_nm, task.options)
-        checkpoint_file = CheckpointFile(task.place, digest, on_checkpoint)
-        fit = fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary, checkpoint_file, each)
-        store_result(task.place, digest, fit)
-        checkpoint_file.remove()
+        checkpoints = Checkpoints(journal, on_checkpoint)
+        fit = fit_images(folder, task.wavelength_nm, measured, task.options, blocks, dictionary, checkpoints, each)
+        store_result(journal, fit)
     return task.place
 
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from services.slab.solve.checkpoint import Checkpoint
 
 CHECKPOINT = "fit-checkpoint"
-"""Folder within the job's folder, with one folder per wavelength: its result once it is done, until then the state of
-its fit, from which a new attempt continues."""
+"""Folder within the job's folder, with one folder per wavelength. Its journal has the result once that is done, and
+until then the state of the fit, from which a new attempt continues."""
 
 
 def run(spec: JobSpec, context: StageContext) -> SlabReport:
@@ -39,7 +39,7 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     from services.slab.options import SlabOptions
     from services.slab.read.images import read_images
     from services.slab.results.result import SlabReport
-    from services.slab.results.stored import IMAGES, read_result
+    from services.slab.results.stored import copy_result_images, read_result
     from services.slab.schedule import WavelengthTask, run_wavelengths
     from services.tasks.executors import executor
 
@@ -57,7 +57,13 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
     flag = context.root / CANCEL_FLAG
     result_folders = {nm: context.root / CHECKPOINT / f"{nm:g}" for nm in folder.wavelengths_nm}
     prefix = hashlib.sha256(f"{context.root}/{context.attempt}".encode()).hexdigest()[:12]
-    tasks = [WavelengthTask(root, nm, options, result_folder, flag) for nm, result_folder in result_folders.items()]
+    tasks = [
+        WavelengthTask(root, nm, options, result_folder, flag, writer.require_lease)
+        for nm, result_folder in result_folders.items()
+    ]
+    for task in tasks:
+        for note in task.journal().notes:
+            context.report(StageEvent(stage="fit", kind="log", message=f"{task.wavelength_nm:g} nm: {note}"))
 
     def report_checkpoint(wavelength_nm: float, checkpoint: Checkpoint) -> None:
         where = f"before step {checkpoint.step + 1} of stage {checkpoint.stage + 1}"
@@ -66,24 +72,22 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
 
     with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
         for number, result_folder in enumerate(run_wavelengths(run_on, tasks, spec.workers, report_checkpoint), 1):
-            stored = read_result(result_folder)
-            assert stored is not None
-            progress = {"wavelength_nm": stored.fit.wavelength_nm, "wavelengths": len(result_folders)}
+            fit = read_result(result_folder)
+            assert fit is not None
+            progress = {"wavelength_nm": fit.wavelength_nm, "wavelengths": len(result_folders)}
             done = number / len(result_folders)
             context.report(
-                StageEvent(
-                    stage="fit", kind="progress", done=done, message=_progress_message(stored.fit), data=progress
-                )
+                StageEvent(stage="fit", kind="progress", done=done, message=_progress_message(fit), data=progress)
             )
     fits = []
     for result_folder in result_folders.values():
-        stored = read_result(result_folder)
-        assert stored is not None
-        fits.append(stored.fit)
-        for message in (f"{result_folder.name} nm: {note}" for note in stored.fit.notes):
+        fit = read_result(result_folder)
+        assert fit is not None
+        fits.append(fit)
+        for message in (f"{result_folder.name} nm: {note}" for note in fit.notes):
             if message not in reported:
                 context.report(StageEvent(stage="fit", kind="log", message=message))
-        write_atomic(writer.folder / f"{result_folder.name}.npz", (result_folder / IMAGES).read_bytes())
+        copy_result_images(result_folder, writer.folder / f"{result_folder.name}.npz")
     report = SlabReport(fits=tuple(fits))
     writer.publish(report)
     verdict = report.verdict()

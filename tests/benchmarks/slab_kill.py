@@ -27,6 +27,7 @@ from typing import Any
 
 import psutil
 
+from services.tasks.journal import read_entries
 from tests.support.small_slab import TRUTHS, write_cell
 
 RESULTS = ("parameters.json", "phase.json", "errors.json")
@@ -76,7 +77,7 @@ def one_time(job: Path, out: Path, after_s: float, victim: str, draw: random.Ran
     with suppress(subprocess.TimeoutExpired):
         process.wait(timeout=after_s)
         return None
-    done = len(list(out.glob("fit-checkpoint/*/fit.json")))
+    done = sum("fit" in read_entries(one) for one in out.glob("fit-checkpoint/*/journal.jsonl"))
     struck = strike(process, victim, draw)
     code = process.wait(timeout=PATIENCE_S)
     if not struck:

@@ -24,7 +24,8 @@ from services.pipeline.stages import run_job, stages_of
 from services.slab.cell.dictionary import ANGLES_RAD, hg_values
 from services.slab.dictionaries.hg import COSINES
 from services.slab.options import SlabOptions
-from services.slab.results.stored import IMAGES, StoredResult, read_result
+from services.slab.results.result import SlabFit
+from services.slab.results.stored import JOURNAL, read_result
 from services.slab.results.tabphase import tabphase_values
 from services.slab.schedule import WavelengthTask, run_wavelengths
 from services.slab.solve.checkpoint import Checkpoint
@@ -163,7 +164,9 @@ def test_a_new_attempt_takes_the_wavelengths_that_are_done(job: Path, spec: JobS
 def test_a_wavelength_whose_result_is_torn_is_fitted_again_to_the_last_digit(
     job: Path, spec: JobSpec, tmp_path: Path
 ) -> None:
-    (copied_checkpoint(job, tmp_path) / CHECKPOINT / "532" / "fit.json").write_text("{")
+    journal = copied_checkpoint(job, tmp_path) / CHECKPOINT / "532" / JOURNAL
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(lines[0] + lines[-2][:-9])
     again = run(spec, LocalContext(tmp_path, attempt=2)).fits[0]
     assert json.loads(again.parameters.model_dump_json()) == stored_fits(job)[0]["parameters"]
     assert again.core_seconds != stored_fits(job)[0]["core_seconds"]
@@ -205,8 +208,9 @@ def test_many_workers_go_on_with_a_cut_wavelength_and_give_the_answer_of_one(
     result = read_result(task.place)
     assert result is not None
     for name in ("parameters", "phase", "errors"):
-        assert json.loads(getattr(result.fit, name).model_dump_json()) == stored_fits(job)[0][name]
-    assert {one.name for one in task.place.iterdir()} == {"fit.json", IMAGES}
+        assert json.loads(getattr(result, name).model_dump_json()) == stored_fits(job)[0][name]
+    (images,) = task.place.glob("fit-*.npz")
+    assert {one.name for one in task.place.iterdir()} == {JOURNAL, images.name}
 
 
 def test_sums_too_large_to_travel_stay_on_their_worker(folder: Path, tmp_path: Path) -> None:
@@ -236,15 +240,12 @@ def test_a_wavelength_is_told_before_the_next_one_is_fitted(
             if event.kind == "progress":
                 order.append(f"told {event.data['wavelength_nm']:g} at {event.done}")
 
-    def stored_result(place: Path) -> StoredResult:
-        wavelength_nm = float(place.name)
-        place.mkdir(parents=True, exist_ok=True)
-        (place / IMAGES).touch()
-        fit = made_up_fit(wavelength_nm)
-        return StoredResult(of="", fit=fit)
+    def stored_result(place: Path) -> SlabFit:
+        return made_up_fit(float(place.name))
 
     monkeypatch.setattr("services.slab.schedule.fit_wavelength", fit)
     monkeypatch.setattr("services.slab.results.stored.read_result", stored_result)
+    monkeypatch.setattr("services.slab.results.stored.copy_result_images", lambda *_: None)
     run(JobSpec(kind="slab", capture=root), Told(tmp_path / "job"))
     assert order == ["fitted 532", "told 532 at 0.5", "fitted 635", "told 635 at 1.0"]
 

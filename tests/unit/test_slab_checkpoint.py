@@ -1,4 +1,4 @@
-"""The state of a slab's fit, kept in a file: read back to the last digit, and ignored where the file is cut off or
+"""The state of a slab's fit, kept in a journal: read back to the last digit, and ignored where its file is cut off or
 belongs to another fit.
 """
 
@@ -11,14 +11,20 @@ import numpy as np
 import pytest
 
 from services.slab.cell.dictionary import Material, henyey_greenstein
-from services.slab.solve.checkpoint import FILE, Checkpoint, CheckpointFile, CombinedRenders
+from services.slab.solve.checkpoint import Checkpoint, Checkpoints, CombinedRenders
 from services.slab.solve.mixture import Mixture
 from services.slab.solve.normal import DerivativeSums, ResidualSums
+from services.tasks.journal import Journal
 
 
 def checkpoint(material: Material, combined: CombinedRenders | None = None) -> Checkpoint:
     noise = tuple(np.random.default_rng(k).random((4, 2, 2)) for k in range(11))
     return Checkpoint(material, 1, 2, 7, True, 12, 345_678, noise, np.arange(12.0).reshape(3, 4), combined)
+
+
+def in_journal(folder: Path, fingerprint: str, written: list[Checkpoint] | None = None) -> Checkpoints:
+    """The checkpoints in a folder's journal; each that is written is appended to ``written``."""
+    return Checkpoints(Journal(folder / "journal.jsonl", fingerprint), ([] if written is None else written).append)
 
 
 def parts(one: object) -> list[np.ndarray]:
@@ -53,26 +59,46 @@ def test_a_checkpoint_is_read_as_it_was_written(
     material: Material, combined: CombinedRenders | None, tmp_path: Path
 ) -> None:
     written_states: list[Checkpoint] = []
-    file, written = CheckpointFile(tmp_path / "532", "mark", written_states.append), checkpoint(material, combined)
-    assert file.read() is None
-    file.write(written)
-    read = file.read()
+    checkpoints, written = in_journal(tmp_path, "mark", written_states), checkpoint(material, combined)
+    assert checkpoints.read() is None
+    checkpoints.write(written)
+    read = in_journal(tmp_path, "mark").read()
     assert read is not None
     assert same(read, written)
     assert written_states == [written]
-    file.remove()
-    assert file.read() is None
+
+
+def test_only_the_newest_state_is_kept(tmp_path: Path) -> None:
+    checkpoints = in_journal(tmp_path, "mark")
+    for material in (MEDIUM, henyey_greenstein(2.4, 0.6, 0.05)):
+        checkpoints.write(checkpoint(material))
+    assert len(list(tmp_path.glob("*.npz"))) == 1
+    read = in_journal(tmp_path, "mark").read()
+    assert read is not None
+    assert same(read, checkpoint(henyey_greenstein(2.4, 0.6, 0.05)))
 
 
 def test_a_checkpoint_of_another_fit_is_not_read(tmp_path: Path) -> None:
-    CheckpointFile(tmp_path, "mark").write(checkpoint(MEDIUM))
-    assert CheckpointFile(tmp_path, "other").read() is None
+    in_journal(tmp_path, "mark").write(checkpoint(MEDIUM))
+    assert in_journal(tmp_path, "other").read() is None
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
-def test_a_torn_file_is_not_read(share: float, tmp_path: Path) -> None:
-    file = CheckpointFile(tmp_path, "mark")
-    file.write(checkpoint(MEDIUM))
-    content = (tmp_path / FILE).read_bytes()
-    (tmp_path / FILE).write_bytes(content[: int(share * len(content))])
-    assert file.read() is None
+def test_torn_arrays_are_set_aside_with_a_word_and_written_again(share: float, tmp_path: Path) -> None:
+    in_journal(tmp_path, "mark").write(checkpoint(MEDIUM))
+    (file,) = tmp_path.glob("*.npz")
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    again = in_journal(tmp_path, "mark")
+    assert again.read() is None
+    assert again.journal.notes == [f"{file.name} is missing or altered; what it held is computed again."]
+    again.write(checkpoint(MEDIUM))
+    assert file.read_bytes() == content
+    assert in_journal(tmp_path, "mark").read() is not None
+
+
+def test_a_checkpoint_of_version_0_1_0_begins_anew(tmp_path: Path) -> None:
+    (tmp_path / "steps.npz").write_bytes(b"PK")
+    checkpoints = in_journal(tmp_path, "mark")
+    assert checkpoints.read() is None
+    assert checkpoints.journal.notes == []

@@ -111,11 +111,8 @@ class Attempt:
         journal = Journal(
             folder / "journal.jsonl", fingerprint(self.spec, self.engine, files), self.writer.require_lease
         )
-        if journal.set_aside is not None:
-            self.log(
-                f"The checkpoint is damaged or of another job, data or numerics: it is kept as {journal.set_aside.name}"
-                " and this fit starts anew."
-            )
+        for note in journal.notes:
+            self.log(note)
         if journal.resumed:
             self.log(f"Attempt {self.context.attempt} continues after {journal.resumed} recorded results.")
         return journal

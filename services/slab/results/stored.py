@@ -1,36 +1,35 @@
-"""The stored result of a finished wavelength: its fit, its images, and the fingerprint of its data and options."""
+"""The stored result of a finished wavelength: its fit, its images, and the fingerprint of its data and options, in the
+wavelength's journal.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import io
+import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from services.core.geometry import Record
 from services.core.slab.folder import read_folder
-from services.core.store import write_atomic, write_record
+from services.core.store import write_atomic
 from services.slab.dictionaries.table import table_file
 from services.slab.options import SlabOptions
 from services.slab.results.result import SlabFit, Wavelength
+from services.slab.solve.checkpoint import STEP
+from services.tasks.journal import Journal, read_arrays, read_entries
 from services.transport.numerics import numerics_name
 
-RESULT, IMAGES = "fit.json", "images.npz"
+JOURNAL = "journal.jsonl"
+"""Name of the journal in a wavelength's folder."""
+FIT = "fit"
+"""Key of the result in the journal."""
 LATER_OPTIONS = ("dictionary", "particle_index", "particle_absorption")
 """Options that version 0.1.0 did not have."""
-
-
-class StoredResult(Record):
-    """Content of ``fit.json`` in a wavelength's folder; it is written last, so a folder that has it is whole."""
-
-    of: str
-    """Identifies data and options; see ``fingerprint``."""
-    fit: SlabFit
 
 
 @dataclass(frozen=True)
@@ -65,31 +64,40 @@ def fingerprint(root: Path, wavelength_nm: float, options: SlabOptions) -> str:
     return digest.hexdigest()
 
 
-def store_result(place: Path, digest: str, wavelength: Wavelength) -> None:
-    """Write a wavelength's result into its folder."""
-    place.mkdir(parents=True, exist_ok=True)
-    stream = io.BytesIO()
-    np.savez_compressed(
-        stream,
+def open_journal(place: Path, digest: str, guard: Callable[[], None]) -> Journal:
+    """Journal of a wavelength, in its folder; see ``Journal``."""
+    return Journal(place / JOURNAL, digest, guard)
+
+
+def store_result(journal: Journal, wavelength: Wavelength) -> None:
+    """Record a wavelength's result, after which the state of its fit is not needed any more."""
+    journal.put(
+        FIT,
+        json.loads(wavelength.fit.model_dump_json()),
         measured=wavelength.measured,
         predicted=wavelength.predicted,
         held_out=wavelength.held_out,
         names=np.array(wavelength.names),
     )
-    write_atomic(place / IMAGES, stream.getvalue())
-    write_record(place / RESULT, StoredResult(of=digest, fit=wavelength.fit))
+    journal.forget(STEP)
 
 
-def read_result(place: Path) -> StoredResult | None:
-    """The result stored in a folder; None where the folder holds no whole result."""
-    try:
-        return StoredResult.model_validate_json((place / RESULT).read_bytes())
-    except (FileNotFoundError, ValidationError):
-        return None
+def read_result(place: Path) -> SlabFit | None:
+    """The result in a wavelength's folder; None where it has none."""
+    value = read_entries(place / JOURNAL).get(FIT)
+    return None if value is None else SlabFit.model_validate_json(json.dumps(value))
+
+
+def copy_result_images(place: Path, path: Path) -> None:
+    """Write the images of the result in a wavelength's folder into a file of their own."""
+    arrays: dict[str, Any] = read_arrays(place / JOURNAL, FIT)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    write_atomic(path, stream.getvalue())
 
 
 def read_result_images(path: Path) -> Images:
-    """Images as ``store_result`` wrote them."""
+    """Images as ``copy_result_images`` wrote them."""
     with np.load(path, allow_pickle=False) as arrays:
         return Images(
             arrays["measured"], arrays["predicted"], arrays["held_out"], tuple(str(name) for name in arrays["names"])

@@ -4,24 +4,22 @@ digits.
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.store import write_atomic
 from services.slab.cell.dictionary import Material
 from services.slab.solve.mixture import Mixture
 from services.slab.solve.normal import DerivativeSums, ResidualSums
+from services.tasks.journal import Journal
 
 Array = NDArray[np.float64]
 
-FILE = "steps.npz"
+STEP = "step"
+"""Key of the state in the journal."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +54,16 @@ class Checkpoint:
 
 
 @dataclass(frozen=True)
-class CheckpointFile:
-    """The file that stores the newest state of one wavelength's fit in a folder."""
+class Checkpoints:
+    """The newest state of one wavelength's fit, in the wavelength's journal."""
 
-    folder: Path
-    fingerprint: str
-    """Fingerprint of all that the result depends on; a state with another fingerprint is not read."""
+    journal: Journal
     on_write: Callable[[Checkpoint], None] = lambda _: None
     """Called with each state that is stored."""
 
     def write(self, checkpoint: Checkpoint) -> None:
         """Store a state in place of the one before."""
-        arrays: dict[str, Any] = {name: np.array(getattr(checkpoint, name)) for name in _NUMBERS}
-        arrays |= _numbered("path_noise", checkpoint.path_noise) | {"multiple": checkpoint.multiple}
+        arrays: dict[str, Any] = _numbered("path_noise", checkpoint.path_noise) | {"multiple": checkpoint.multiple}
         if (combined := checkpoint.combined) is not None:
             arrays |= _numbered("joined_noise", combined.path_noise)
             arrays |= {
@@ -82,30 +77,19 @@ class CheckpointFile:
             }
         for field in fields(checkpoint.material):
             arrays[f"material_{field.name}"] = np.asarray(getattr(checkpoint.material, field.name))
-        stream = io.BytesIO()
-        np.savez(stream, of=np.array(self.fingerprint), **arrays)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(self.folder / FILE, stream.getvalue())
+        self.journal.put(STEP, {name: np.asarray(getattr(checkpoint, name)).item() for name in _NUMBERS}, **arrays)
         self.on_write(checkpoint)
 
     def read(self) -> Checkpoint | None:
-        """The newest state; None where the folder holds no whole state of this fit."""
-        try:
-            with np.load(io.BytesIO((self.folder / FILE).read_bytes()), allow_pickle=False) as content:
-                arrays = dict(content)
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        """The newest state; None where the journal has none."""
+        numbers: dict[str, Any] | None = self.journal.entries.get(STEP)
+        if numbers is None:
             return None
-        if str(arrays.pop("of", "")) != self.fingerprint:
-            return None
-        numbers: dict[str, Any] = {name: arrays[name].item() for name in _NUMBERS}
+        arrays: dict[str, Any] = self.journal.arrays(STEP)
         noise = _of_numbered("path_noise", arrays)
         return Checkpoint(
             _material(arrays), path_noise=noise, multiple=arrays["multiple"], combined=_combined(arrays), **numbers
         )
-
-    def remove(self) -> None:
-        """Delete the file, because the fit is done."""
-        (self.folder / FILE).unlink(missing_ok=True)
 
 
 _NUMBERS = ("stage", "step", "steps", "is_converged", "renders", "paths")

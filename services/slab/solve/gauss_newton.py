@@ -20,7 +20,7 @@ from services.slab.cell.forward import Blocks, render
 from services.slab.cell.rig import Rig
 from services.slab.read.images import Measurements
 from services.slab.solve.budget import Budget, Stage
-from services.slab.solve.checkpoint import Checkpoint, CheckpointFile, CombinedRenders
+from services.slab.solve.checkpoint import Checkpoint, Checkpoints, CombinedRenders
 from services.slab.solve.coordinates import Coordinates
 from services.slab.solve.measured_directions import broad_step, noise_ratio, step_matrix
 from services.slab.solve.normal import Each, NormalEquations, ResidualSums, normal_equations
@@ -117,7 +117,7 @@ class GaussNewton:
     """Renders of this stage that later ones are combined with, in a thick cell."""
     is_searching: bool = False
     """Whether the fit may still be far off: then steps use smooth derivatives and broad directions in any cell."""
-    checkpoint_file: CheckpointFile | None = None
+    checkpoints: Checkpoints | None = None
     """File that stores the state of the fit and from which the fit continues; None for neither."""
     each: Each = map
     """See ``normal_equations``."""
@@ -126,7 +126,7 @@ class GaussNewton:
         """The solution, from a guess, or from the state that an earlier attempt saved before a step of the last
         stages.
         """
-        checkpoint = None if self.checkpoint_file is None else self.checkpoint_file.read()
+        checkpoint = None if self.checkpoints is None else self.checkpoints.read()
         if checkpoint is None:
             return self.finish(self.search(guess()))
         self.renders, self.paths, self.path_noise = checkpoint.renders, checkpoint.paths, checkpoint.path_noise
@@ -190,8 +190,8 @@ class GaussNewton:
     def finish(self, checkpoint: Checkpoint) -> Solution:
         """Take the steps of the last stages, each stage until its steps promise no more than noise does."""
         while checkpoint.stage < len(self.budget.last):
-            if self.checkpoint_file is not None:
-                self.checkpoint_file.write(checkpoint)
+            if self.checkpoints is not None:
+                self.checkpoints.write(checkpoint)
             material, stage = checkpoint.material, self.budget.last[checkpoint.stage]
             is_thick, is_last = self.is_thick(material), checkpoint.stage + 1 == len(self.budget.last)
             # Weights of a thin cell contain the noise of all renders that the last stage may combine.
