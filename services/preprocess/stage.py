@@ -42,7 +42,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     from services.preprocess.masking.masks import HandMasks
     from services.preprocess.masking.valid import require_plausible_scale
     from services.preprocess.opening import open_source
-    from services.preprocess.tasks.attempt_files import STAGE, AttemptFiles
+    from services.preprocess.tasks.attempt_files import KINDS, STAGE, AttemptFiles
     from services.preprocess.tasks.blocks import Block, blocks_of, calls_of, images_of
     from services.preprocess.tasks.plan import create_arrays, digest_of_inputs, held_out_images
     from services.preprocess.tasks.progress import Progress
@@ -71,6 +71,8 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     if not files.begin(digest, spec.store):
         create_arrays(files.arrays, source, with_shadows=spec.shadows)
         files.mark_resumable(digest)
+    for note in files.records.set_damaged_aside(KINDS):
+        context.report(StageEvent(stage="prepare", kind="log", message=note))
 
     lights = [source.lights_of(k) for k in range(len(cameras))]
     progress = Progress(context, sum(len(own) for own in lights), len(cameras))

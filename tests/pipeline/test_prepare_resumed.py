@@ -31,6 +31,7 @@ from services.preprocess.quality.images import write_picture
 from services.preprocess.stage import run
 from services.preprocess.tasks import attempt_files, blocks
 from services.preprocess.views.scratch import write_array
+from services.tasks import record_files
 from tests.support.folder_captures import write_folder, write_tree
 
 KILLS = 50
@@ -80,7 +81,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, at: int) -> Iterator[None]:
         return wrapped
 
     with monkeypatch.context() as patch:
-        patch.setattr(attempt_files, "write_atomic", counted(write_atomic, after=False))
+        patch.setattr(record_files, "write_atomic", counted(write_atomic, after=False))
         patch.setattr(attempt_files, "write_array", counted(write_array, after=True))
         patch.setattr(attempt_files.AttemptFiles, "array", counted(attempt_files.AttemptFiles.array, after=False))
         patch.setattr(blocks, "write_picture", counted(write_picture, after=True))
@@ -145,6 +146,27 @@ def test_what_was_made_of_other_images_is_made_anew(undisturbed: tuple[Path, dic
     assert not [event for event in told if "already" in event.message]
     run(JobSpec(capture=tmp_path / "capture"), LocalContext(tmp_path / "other", 1))
     assert contents(tmp_path / "job") == contents(tmp_path / "other")
+
+
+def test_a_damaged_record_is_set_aside_with_a_word_and_its_image_made_again(
+    undisturbed: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    capture, expected = undisturbed
+
+    def cut_off(event: StageEvent) -> None:
+        if event.kind == "progress":
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        run(JobSpec(capture=capture), LocalContext(tmp_path, 1, cut_off))
+    (record,) = (tmp_path / attempt_files.WORK).glob("*/image-*.json")
+    record.write_bytes(record.read_bytes()[:-9])
+    told: list[str] = []
+    run(JobSpec(capture=capture), LocalContext(tmp_path, 2, lambda event: told.append(event.message)))
+    (note,) = [message for message in told if "damaged" in message]
+    assert note.startswith(f"The record {record.parent.name}/{record.name} is damaged: it is kept as ")
+    assert not [message for message in told if "already" in message]
+    assert contents(tmp_path) == expected
 
 
 def test_an_attempt_that_was_overtaken_records_nothing(

@@ -10,40 +10,36 @@
                                 flow.json, motion-<frame>.json, image-<light>.json
 
 A record is written after the files that it describes are on the disk, so a kill at any moment loses only the results
-that were being made.
+that were being made. The records are ``RecordFiles``, because every worker writes some.
 """
 
 from __future__ import annotations
 
 import hashlib
-import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import zarr
 
 from services.core.files.object_store import RemoteFolder, StoredObject, discard, new_remote_folder, remote_folder
 from services.core.geometry import Camera, Record
-from services.core.store import StageWriter, writable_array, write_atomic, write_record
+from services.core.store import StageWriter, writable_array, write_record
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone, StoredFile, ViewDone
 from services.preprocess.views.projection import Footprint
 from services.preprocess.views.scratch import write_array
 from services.preprocess.views.source import Motions, View
+from services.tasks.record_files import RecordFiles
 
-R = TypeVar("R", bound=Record)
 STAGE = "prepared"
 ARRAYS = "prepared.zarr"
 IMAGE_ARRAYS = ("radiance", "variance", "valid", "motion", "shadow")
 """Names of the arrays in which each image has a shard of its own."""
 WORK = ".prepared.work"
-PLAN = "plan.json"
 FOOTPRINT = ("mesh", "depth_mm", "normal", "covered")
-
-
-class _Plan(Record):
-    digest: str
+KINDS: dict[str, type[Record]] = {"view": ViewDone, "motion": FrameMotion, "flow": FlowDone, "image": ImageDone}
+"""First word of a record's name -> its kind."""
 
 
 class AttemptFiles:
@@ -55,6 +51,7 @@ class AttemptFiles:
 
     def __init__(self, writer: StageWriter) -> None:
         self.writer = writer
+        self.records = RecordFiles(writer.root / WORK, writer.require_lease)
 
     @property
     def folder(self) -> Path:
@@ -64,7 +61,7 @@ class AttemptFiles:
     @property
     def work(self) -> Path:
         """Folder of the work files, which are not published."""
-        return self.writer.root / WORK
+        return self.records.folder
 
     @property
     def arrays(self) -> Path:
@@ -87,12 +84,9 @@ class AttemptFiles:
         """
         earlier = sorted(self._attempts(), key=lambda path: int(path.name.rpartition(".")[2]))
         resumable = [path for path in earlier if (path / ARRAYS).exists()]
-        plan = _read(self.work / PLAN, _Plan)
-        resumed = resumable[-1] if plan is not None and plan.digest == digest and resumable else None
+        resumed = resumable[-1] if self.records.are_of(digest) and resumable else None
         if resumed is None:
-            # Remove the plan first, because it declares the other files as resumable
-            (self.work / PLAN).unlink(missing_ok=True)
-            shutil.rmtree(self.work, ignore_errors=True)
+            self.records.remove()
         for path in earlier:
             if path != resumed:
                 discard(path)
@@ -109,11 +103,11 @@ class AttemptFiles:
 
     def mark_resumable(self, digest: str) -> None:
         """Record that the empty store exists, from which moment a later attempt can resume it."""
-        write_record(self.work / PLAN, _Plan(digest=digest))
+        self.records.mark(digest)
 
     def end(self) -> None:
         """Remove the work files."""
-        shutil.rmtree(self.work, ignore_errors=True)
+        self.records.remove()
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Open an array of the store being written."""
@@ -129,12 +123,12 @@ class AttemptFiles:
         for name in FOOTPRINT:
             write_array(folder / f"{name}.npy", getattr(view.footprint, name))
         window = view.window
-        self._put(folder / "view.json", ViewDone(window=(window.top, window.bottom, window.left, window.right)))
+        self.records.put(f"{view.number}/view", ViewDone(window=(window.top, window.bottom, window.left, window.right)))
 
     def view(self, camera: int, whole: Camera) -> View | None:
         """A camera's view with memory-mapped arrays; None if it has not been written yet."""
         folder = self.scratch(camera)
-        done = _read(folder / "view.json", ViewDone)
+        done = self.records.get(f"{camera}/view", ViewDone)
         if done is None:
             return None
         arrays = {name: np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")) for name in FOOTPRINT}
@@ -143,24 +137,24 @@ class AttemptFiles:
 
     def put_motion(self, camera: int, frame: int, motion: FrameMotion) -> None:
         """Write the motion of one frame."""
-        self._put(self.scratch(camera) / f"motion-{frame}.json", motion)
+        self.records.put(f"{camera}/motion-{frame}", motion)
 
     def motions(self, camera: int, frames: tuple[int, ...]) -> Motions:
         """Motions of those of the given frames for which they have been written."""
-        found = {frame: _read(self.scratch(camera) / f"motion-{frame}.json", FrameMotion) for frame in frames}
+        found = {frame: self.records.get(f"{camera}/motion-{frame}", FrameMotion) for frame in frames}
         return {frame: one.matched() for frame, one in found.items() if one is not None}
 
     def put_flow(self, camera: int, done: FlowDone) -> None:
         """Record that a camera's optical flow was computed and its pictures are written."""
-        self._put(self.scratch(camera) / "flow.json", done)
+        self.records.put(f"{camera}/flow", done)
 
     def flow(self, camera: int) -> FlowDone | None:
         """Record of a camera's optical flow; None if it has not been computed yet."""
-        return _read(self.scratch(camera) / "flow.json", FlowDone)
+        return self.records.get(f"{camera}/flow", FlowDone)
 
     def put_image(self, camera: int, light: int, done: ImageDone) -> None:
         """Record that an image is stored."""
-        self._put(self.scratch(camera) / f"image-{light}.json", done)
+        self.records.put(f"{camera}/image-{light}", done)
 
     def image(self, camera: int, light: int) -> ImageDone | None:
         """Record of an image; None if one of its files is missing or has another size.
@@ -179,7 +173,7 @@ class AttemptFiles:
 
     def record(self, camera: int, light: int) -> ImageDone | None:
         """Last record of an image, whether or not its files still match it; None if there is none."""
-        return _read(self.scratch(camera) / f"image-{light}.json", ImageDone)
+        return self.records.get(f"{camera}/image-{light}", ImageDone)
 
     def is_shaded(self, camera: int, light: int) -> bool:
         """Whether an image is stored and its shadows have been flagged."""
@@ -224,22 +218,12 @@ class AttemptFiles:
         remote = remote_folder(self.arrays)
         listed = {} if remote is None else remote.listed()
         for path in self.work.glob("*/image-*.json"):
-            done = _read(path, ImageDone)
+            done = self.records.get(f"{path.parent.name}/{path.stem}", ImageDone)
             if done is not None and any(listed.get(name) != one for name, one in done.objects.items()):
                 path.unlink()
-
-    def _put(self, path: Path, record: Record) -> None:
-        # Refuse to write a record if a later attempt holds the lease
-        self.writer.require_lease()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, record.model_dump_json().encode())
 
     def _attempts(self) -> Iterator[Path]:
         prefix = f".{STAGE}."
         for path in self.writer.root.glob(f"{prefix}*"):
             if path.is_dir() and path.name.removeprefix(prefix).isdigit():
                 yield path
-
-
-def _read(path: Path, kind: type[R]) -> R | None:
-    return kind.model_validate_json(path.read_bytes()) if path.is_file() else None
