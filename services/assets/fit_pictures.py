@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.assets.report import ReportPictures
+from services.assets.report_page import ReportPictures
 from services.assets.stains import stain_image
 from services.core.geometry import Camera, Tooth
 from services.core.pages.pictures import PICTURES, read_pictures

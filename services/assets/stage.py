@@ -49,7 +49,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
 
     from services.assets.asset import errors_json, parameters_json, write_asset
     from services.assets.fit_pictures import report_pictures
-    from services.assets.report import write_report
+    from services.assets.report_page import write_report
     from services.core.files.meshes import read_mesh
     from services.transport.scene.rigid_moves import moved_camera, moved_light
     from services.transport.scene.stain_uv import read_stains

@@ -63,7 +63,7 @@ def calibrate(spec: JobSpec, context: StageContext) -> AssetManifest:
         CaptureInputError: names the frame, board, sphere or camera that cannot be used, and the remedy.
         JobCancelledError: the job was cancelled.
     """
-    from services.calibrate.session.report import write_report
+    from services.calibrate.session.report_page import write_report
     from services.calibrate.session.run import CALIBRATION, RESIDUALS, write_session
     from services.calibrate.session.run import calibrate as calibrate_folder
     from services.core.results import AssetManifest

@@ -45,8 +45,8 @@ def lab_demo(
 ) -> None:
     """Make a virtual laboratory's raw frames once, measure a tooth from them alone, and compare it with the truth."""
     from services.bench.lab.chain import remove_results
-    from services.bench.lab.report import PAGE, lines, write_summary
     from services.bench.lab.run import measured
+    from services.bench.lab.summary_page import PAGE, lines, write_summary
     from services.core.files.folders import require_folder
     from services.phantom.lab.make import COARSE_SIZE, DEMO_SIZE, make_lab
 

@@ -43,7 +43,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     from services.preprocess.masking.valid import require_plausible_scale
     from services.preprocess.opening import open_source
     from services.preprocess.tasks.attempt_files import KINDS, STAGE, AttemptFiles
-    from services.preprocess.tasks.blocks import Block, blocks_of, calls_of, images_of
+    from services.preprocess.tasks.blocks import PreparationBlock, blocks_of, calls_of, images_of
     from services.preprocess.tasks.plan import create_arrays, digest_of_inputs, held_out_images
     from services.preprocess.tasks.progress import Progress
     from services.preprocess.tasks.summary import summarise
@@ -80,7 +80,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     with executor(flag, prefix=prefix, weight=WEIGHTS[spec.priority]) as run_on:
         threads = run_on.threads()
         unlocated = [k for k, camera in enumerate(cameras) if files.view(k, camera) is None]
-        for _ in run_on.as_completed(calls_of(Block(spec, files, "locate", k) for k in unlocated)):
+        for _ in run_on.as_completed(calls_of(PreparationBlock(spec, files, "locate", k) for k in unlocated)):
             context.raise_if_cancelled()
         frames = [
             [one for one in source.matched_frames(k) if one not in files.motions(k, source.matched_frames(k))]
@@ -91,7 +91,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         # Run comparing and developing together, as neither needs the other. Comparisons come first, because a camera's
         # whole comparison is one block
         uncompared = [k for k in range(len(cameras)) if source.measures_motion and files.flow(k) is None]
-        compare = [Block(spec, files, "compare", k) for k in uncompared]
+        compare = [PreparationBlock(spec, files, "compare", k) for k in uncompared]
         missing = [[j for j in own if files.image(k, j) is None] for k, own in enumerate(lights)]
         progress.begin(sum(len(own) for own in missing), threads)
         develop = blocks_of(spec, files, "develop", missing, threads)
@@ -102,7 +102,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         if spec.shadows:
             unshaded = [k for k, own in enumerate(lights) if not all(files.is_shaded(k, j) for j in own)]
             progress.begin_shading(len(unshaded))
-            for _ in run_on.as_completed(calls_of(Block(spec, files, "shade", k) for k in unshaded)):
+            for _ in run_on.as_completed(calls_of(PreparationBlock(spec, files, "shade", k) for k in unshaded)):
                 context.raise_if_cancelled()
 
     manifest, known = summarise(files, source, subject, held_out, masks.digest, context)

@@ -16,7 +16,7 @@ from typing import Any
 from services.core.slab.folder import SlabFolder, read_folder
 from services.core.stage import raise_if
 from services.slab.cell.dictionary import KNOTS
-from services.slab.cell.forward import Block, Blocks, BlockSums
+from services.slab.cell.forward import Blocks, BlockSums, PathBlock
 from services.slab.dictionaries.chosen import dictionary_of
 from services.slab.fit import fit_images
 from services.slab.options import SlabOptions
@@ -94,7 +94,7 @@ def run_wavelengths(
 def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
     """Fit a whole wavelength, one block after the other."""
 
-    def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> Iterator[BlockSums]:
+    def blocks(trace: Callable[[PathBlock], BlockSums], some: Sequence[PathBlock]) -> Iterator[BlockSums]:
         for block in some:
             raise_if(task.flag.exists)
             yield trace(block)
@@ -103,7 +103,7 @@ def wavelength_task(_host: Any, task: WavelengthTask) -> Path:
 
 
 def blocks_task(
-    _host: Any, trace: Callable[[Block], BlockSums], blocks: Sequence[Block], flag: Path
+    _host: Any, trace: Callable[[PathBlock], BlockSums], blocks: Sequence[PathBlock], flag: Path
 ) -> list[BlockSums]:
     """Trace some blocks of paths, one after the other."""
     sums = []
@@ -137,7 +137,7 @@ def _spread(run_on: Executor, task: WavelengthTask, block_bytes: int) -> Blocks:
     """A function that runs blocks on all workers and gives their sums in the order of the blocks."""
     numbers = itertools.count()
 
-    def blocks(trace: Callable[[Block], BlockSums], some: Sequence[Block]) -> list[BlockSums]:
+    def blocks(trace: Callable[[PathBlock], BlockSums], some: Sequence[PathBlock]) -> list[BlockSums]:
         raise_if(task.flag.exists)
         name = f"{task.wavelength_nm:g}-{next(numbers)}"
         size = max(1, min(len(some) // (TASKS_PER_THREAD * run_on.threads()), MAX_TRAVELLING_BYTES // block_bytes))

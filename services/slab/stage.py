@@ -106,7 +106,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     """
     from services.slab.fit import write_results
     from services.slab.results.chart import phase_picture
-    from services.slab.results.report import write_report
+    from services.slab.results.report_page import write_report
     from services.slab.results.result import SlabReport
     from services.slab.results.stored import read_result_images
     from services.slab.results.tabphase import scene_xml, values_text

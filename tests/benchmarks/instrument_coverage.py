@@ -33,10 +33,10 @@ from numpy.typing import NDArray
 
 from services.fit.coordinates.domain import Domain
 from services.fit.coordinates.instrument_errors import DEFAULT_SE, kind_of_error
-from services.fit.measurements.blocks import Block, BlockTask, read_block
+from services.fit.measurements.blocks import BlockTask, PixelBlock, read_block
 from services.fit.passes import final_uncertainty as closing
 from services.fit.solve import covariance
-from services.fit.solve.closing import ClosingSums, positive_part
+from services.fit.solve.final_uncertainty import FinalSums, positive_part
 from services.fit.solve.recombination import Recombination
 from services.fit.solve.sandwich import CombinedSolution, Sandwich, combine_with_prior
 from services.fit.stages import channel_fit
@@ -71,7 +71,7 @@ class Changes:
         """Names of the twelve moves."""
         return [name.removeprefix("c0_") for name in self.stored if name.startswith("c0_") and name != "c0_none"]
 
-    def of_block(self, block: Block, errors: Sequence[str]) -> NDArray[np.float32]:
+    def of_block(self, block: PixelBlock, errors: Sequence[str]) -> NDArray[np.float32]:
         """Changes (K, 2, L, N) of a block's images, twice the same: by the errors named, then by the moves."""
         names = block.instrument
         assert names is not None
@@ -86,7 +86,7 @@ class Changes:
         moved = [self._squares(block, name).mean(axis=(0, 1)) for name in self.moves]
         return np.repeat(np.array([*changes, *moved])[:, None], 2, axis=1).astype(np.float32)
 
-    def information(self, block: Block) -> Array:
+    def information(self, block: PixelBlock) -> Array:
         """What a block's photographs tell of the moves, (12, 12): products of the changes of the pixels on one diagonal
         of each square with those on the other.
         """
@@ -98,7 +98,7 @@ class Changes:
         product = (one * block.fit_weight.reshape(-1)) @ other.T
         return np.asarray(0.5 * (product + product.T))
 
-    def _squares(self, block: Block, name: str) -> Array:
+    def _squares(self, block: PixelBlock, name: str) -> Array:
         # Stored images at the pixels of each of the block's pixels, (rows, columns, L, N).
         camera, pixels = block.fitted_view.camera, block.fitted_view.pixels
         width, height = camera.size
@@ -126,7 +126,7 @@ class Recorder:
 
     def measure(
         self, problem: Any, x: Array, whiten: Array, held: Any, samples: int, moves: Any, *more: Any
-    ) -> ClosingSums:
+    ) -> FinalSums:
         """The final uncertainty estimate with the fit's own changes, which is returned, and with stock's, which is
         kept."""
         errors = problem.domain.errors.names
@@ -141,10 +141,10 @@ class Recorder:
             return found
 
         with patch.object(closing, closing._changes_by_scene.__name__, by_stock):
-            stock: ClosingSums = closing.measure_closing(problem, x, whiten, held, samples, moves, *more)
+            stock: FinalSums = closing.measure_final_uncertainty(problem, x, whiten, held, samples, moves, *more)
         self.shifts = stock.shifts[len(held) :]
         self.slopes = relative_slopes(problem.domain, problem.base, x)
-        return closing.measure_closing(problem, x, whiten, held, samples, moves, *more)
+        return closing.measure_final_uncertainty(problem, x, whiten, held, samples, moves, *more)
 
     def combine(
         self, domain: Domain, x: Array, sandwich: Sandwich, meats: Any, unfinished: Array, parts: int = 1

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, expect
 
 from services.api.app import create_app
 from services.api.jobs.admission import Machine
-from services.assets.report import _spread
+from services.assets.report_page import _spread
 from services.core.results import Estimate, FitReport
 from services.core.settings import ServerSettings
 from services.core.verdict import percent, verdict_of

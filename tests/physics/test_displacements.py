@@ -9,7 +9,7 @@ import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Mesh
-from services.fit.measurements.blocks import Block, BlockTask, write_block
+from services.fit.measurements.blocks import BlockTask, PixelBlock, write_block
 from services.fit.passes.final_uncertainty import DisplacedScene, displacements_task
 from services.tasks.engine_host import InProcessHost
 from services.transport.engine import Engine
@@ -34,7 +34,7 @@ def test_changes_are_half_the_difference_of_images_of_both_displaced_surfaces(tm
     displaced = write_recipe(tmp_path, replace(scene, teeth=(ToothSurfaces(scene.teeth[0].outer, longer),)))
     lights = len(scene.light_positions_mm)
     ones = np.ones((lights, len(view)))
-    block = write_block(tmp_path, Block(view, ones, ones, ones, ones > 2))
+    block = write_block(tmp_path, PixelBlock(view, ones, ones, ones, ones > 2))
     task = BlockTask(block, 0, write_recipe(tmp_path, scene), "closing", TISSUE, SAMPLES)
 
     found = displacements_task(InProcessHost(), task, TISSUE, DisplacedScene(displaced, len(errors)), SEEDS)

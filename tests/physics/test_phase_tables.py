@@ -98,7 +98,7 @@ def test_a_dictionary_of_tents_adds_up() -> None:
 def test_values_in_a_kernel(name: str) -> None:
     import mitsuba as mi
 
-    from services.transport.scene.tables import PhaseTables
+    from services.transport.scene.phase_tables import PhaseTables
 
     table = TABLES[name]
     rng = np.random.default_rng(5)
@@ -121,7 +121,7 @@ def test_values_in_a_kernel(name: str) -> None:
 def test_nodes_closer_than_single_precision_stay_finite() -> None:
     import mitsuba as mi
 
-    from services.transport.scene.tables import PhaseTables
+    from services.transport.scene.phase_tables import PhaseTables
 
     kernel = PhaseTables([PhaseTable((0.0, math.pi / 2 - 1e-9, math.pi / 2 + 1e-9, math.pi), (1.0, 2.0, 2.0, 1.0))])
     sideways = kernel.density(mi.UInt32(1), mi.Vector3f(0, 0, 1), mi.Vector3f(1, 0, 0))
@@ -133,7 +133,7 @@ def test_sampled_angles_have_the_distribution_of_the_table(name: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from services.transport.scene.tables import PhaseTables
+    from services.transport.scene.phase_tables import PhaseTables
 
     table = TABLES[name]
     rng = mi.PCG32(SAMPLES, initstate=3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.anatomy.dentin_shape import DentinShape
-from services.fit.measurements.blocks import Block, BlockInstrument
+from services.fit.measurements.blocks import BlockInstrument, PixelBlock
 from services.fit.measurements.instrument.photographs import error_derivatives, photographed, placed, slope_noise
 from services.fit.measurements.slopes import image_slopes, motions_of
 from services.fit.measurements.view_stack import ViewStack
@@ -41,7 +41,7 @@ def test_a_column_is_the_difference_of_renders() -> None:
     (motion,) = motions_of(recipe, (stack,))
     acting = BlockInstrument("gain.green", ("light_gain.a", "light_gain.b"), "flare.c0.green", 1.0)
     view = View(one, stack.pixels)
-    block = Block(view, image, variance, np.ones(image.shape), ~whole, instrument=acting, motion=motion)
+    block = PixelBlock(view, image, variance, np.ones(image.shape), ~whole, instrument=acting, motion=motion)
     for name in ("teeth.tx", "teeth.ty"):
         seen = []
         for sign in (1, -1):

@@ -13,7 +13,7 @@ import pytest
 
 from services.core.slab.folder import Light
 from services.slab.cell.dictionary import KNOTS, Material, henyey_greenstein
-from services.slab.cell.forward import Block, render, run_block
+from services.slab.cell.forward import PathBlock, render, run_block
 from services.slab.cell.interface import Interface, fresnel
 from services.slab.cell.single import single_scattering
 from services.slab.solve.normal import derivative_rows
@@ -40,7 +40,7 @@ def totals(
     }
     rig = small_rig(lights=NORMAL_LIGHT, cell=cell)
     sums = np.stack(
-        [run_block(Block(rig, 0, material, 7, (0, number), paths, False)).totals for number in range(blocks)]
+        [run_block(PathBlock(rig, 0, material, 7, (0, number), paths, False)).totals for number in range(blocks)]
     )
     assert (sums[:, 2] == 0).all()
     # Unscattered light is reflected to and fro between the faces.

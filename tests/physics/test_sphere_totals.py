@@ -9,9 +9,9 @@ import pytest
 
 from services.core.slab.folder import Cell, Glass
 from services.slab.cell.interface import Interface
-from services.slab.sphere.instrument import expected
 from services.slab.sphere.invert import interface_of
 from services.slab.sphere.records import Sphere, SphereFile, TotalsReading
+from services.slab.sphere.spectrometer import expected
 from services.slab.sphere.totals import Optics, Totals, slab_totals
 from tests.support.slab_tables import total_cases
 

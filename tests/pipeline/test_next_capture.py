@@ -20,7 +20,7 @@ from services.fit.checks.next_capture import (
     rotated_camera,
     sentence,
 )
-from services.fit.measurements.blocks import Block, BlockInstrument, read_block, write_block
+from services.fit.measurements.blocks import BlockInstrument, PixelBlock, read_block, write_block
 from services.fit.passes.passes import Passes, StackProblem
 from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.estimates import estimates
@@ -51,7 +51,7 @@ def scene(*positions_mm: tuple[float, float, float]) -> SceneRecipe:
 def problem_of(folder: Path, recipe: SceneRecipe) -> StackProblem[Tissue]:
     view = View(camera("c0"), PIXELS)
     reference = FakeEngine(recipe)._formula(TRUTH, view)
-    block = Block(
+    block = PixelBlock(
         view,
         reference,
         SENSOR.variance(reference),

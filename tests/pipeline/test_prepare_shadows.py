@@ -18,7 +18,7 @@ from services.preprocess.masking.valid import valid_bits
 from services.preprocess.quality.images import QualityReport
 from services.preprocess.tasks import blocks
 from services.preprocess.tasks.attempt_files import AttemptFiles
-from services.preprocess.tasks.blocks import Block
+from services.preprocess.tasks.blocks import PreparationBlock
 from services.preprocess.views.direct_light import expected_irradiance
 from services.preprocess.views.projection import project
 from services.preprocess.views.source import Bits
@@ -95,9 +95,9 @@ def test_shading_that_was_cut_off_is_done_again_on_another_worker(
 ) -> None:
     """Dask runs a block again if its worker died between writing an image's flags and writing their record."""
     root, _ = asked
-    kept = Block.__call__
+    kept = PreparationBlock.__call__
 
-    def twice(block: Block) -> None:
+    def twice(block: PreparationBlock) -> None:
         if block.step == "shade":
             with monkeypatch.context() as patch:
                 patch.setattr(AttemptFiles, "files_of", Mock(side_effect=KeyboardInterrupt))
@@ -106,7 +106,7 @@ def test_shading_that_was_cut_off_is_done_again_on_another_worker(
             assert [k for k in range(8) if block.files.image(0, k) is None]
         kept(block)
 
-    monkeypatch.setattr(Block, "__call__", twice)
+    monkeypatch.setattr(PreparationBlock, "__call__", twice)
     prepare(root / "capture", tmp_path / "cut_off", shadows=True)
     assert shadows(root / "asked").any()
     for path in (root / "asked" / "prepared").rglob("*"):

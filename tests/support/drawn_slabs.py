@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.slab.solve.uncertainty import LARGEST_COEFFICIENT_SHARE
-from services.slab.sphere.instrument import expected
 from services.slab.sphere.invert import ASSUMED_SE, ASSUMED_UNSCATTERED_SHARE, fit_readings, interface_of
 from services.slab.sphere.records import SphereFile
 from services.slab.sphere.results import SphereFit
+from services.slab.sphere.spectrometer import expected
 from services.slab.sphere.totals import NODES, Optics, slab_totals
 
 WIDTH_MM = 2.0

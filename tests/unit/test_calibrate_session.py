@@ -18,7 +18,7 @@ from services.calibrate.session.flats import measure_vignetting, relative_square
 from services.calibrate.session.judge import judge
 from services.calibrate.session.photos import Channels, Photos, black_of
 from services.calibrate.session.record import uncertainty_of
-from services.calibrate.session.report import write_report
+from services.calibrate.session.report_page import write_report
 from services.calibrate.session.run import Session, calibrate, write_session
 from services.calibrate.session.spheres import LightsStep, find_lights
 from services.calibrate.stage import calibrate as calibrate_job

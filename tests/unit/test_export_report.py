@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.assets.curves import Series, log_chart
-from services.assets.report import THIN_CAVEAT, ReportPictures, write_report
+from services.assets.report_page import THIN_CAVEAT, ReportPictures, write_report
 from services.core.pages.pictures import Picture
 from services.core.results import Correlation, Estimate, FitReport
 from services.transport.thickness import ThicknessMap

@@ -11,7 +11,7 @@ import pytest
 
 from services.core.files.content_files import StoredFile
 from services.core.records import Device
-from services.fit.measurements.blocks import Block, BlockTask, read_block, write_block
+from services.fit.measurements.blocks import BlockTask, PixelBlock, read_block, write_block
 from services.fit.passes.derivatives import Differentiation
 from services.fit.passes.evaluate import evaluate_task
 from services.fit.passes.passes import compare_task, image_task, jacobian_task, orders_task
@@ -21,12 +21,14 @@ from services.transport.scene.recipe_files import read_recipe, write_recipe
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, sphere
 
 
-def block_with(weights: list[list[float]]) -> Block:
+def block_with(weights: list[list[float]]) -> PixelBlock:
     weight = np.array(weights)
     pixels = np.stack([np.arange(weight.shape[1]), np.zeros(weight.shape[1], dtype=int)], axis=1).astype(np.int32)
     held_out = np.zeros(weight.shape, dtype=bool)
     held_out[0, 1] = True
-    return Block(View(camera_at((0, 1, 0)), pixels), np.ones(weight.shape), np.ones(weight.shape), weight, held_out)
+    return PixelBlock(
+        View(camera_at((0, 1, 0)), pixels), np.ones(weight.shape), np.ones(weight.shape), weight, held_out
+    )
 
 
 @pytest.mark.parametrize(

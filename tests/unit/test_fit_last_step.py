@@ -10,7 +10,7 @@ import pytest
 
 from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.normal_equations import LossChange
-from services.fit.stages.channel_fit import CLOSING_MIN_SHARE, CLOSING_TRIALS, last_step
+from services.fit.stages.channel_fit import FINAL_MIN_SHARE, FINAL_TRIALS, last_step
 
 WHOLE = 0.5
 
@@ -65,7 +65,7 @@ def test_a_step_that_is_contradicted_is_tried_at_the_parabolas_least() -> None:
     # lowest at 2000 / 4600, with -435 ± 156 where -681 ± 91 was promised.
     problem = FakeProblem(300.0)
     assert taken(problem, part_count=14) == pytest.approx(2000 / 4600)
-    assert len(problem.asked) == CLOSING_TRIALS
+    assert len(problem.asked) == FINAL_TRIALS
 
 
 def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
@@ -73,14 +73,14 @@ def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
     # errors.
     problem = FakeProblem(1100.0, slope=2400.0)
     assert taken(problem, part_count=14) == 0
-    assert len(problem.asked) == CLOSING_TRIALS
+    assert len(problem.asked) == FINAL_TRIALS
 
 
 @pytest.mark.parametrize("change", [50_000.0, 1e12])
 def test_a_step_is_shortened_to_a_tenth_at_most(change: float) -> None:
     problem = FakeProblem(change)
     taken(problem, part_count=1)
-    assert problem.asked == pytest.approx([1, CLOSING_MIN_SHARE])
+    assert problem.asked == pytest.approx([1, FINAL_MIN_SHARE])
 
 
 def test_a_step_that_promises_nothing_is_not_compared() -> None:

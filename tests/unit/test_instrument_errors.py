@@ -28,7 +28,7 @@ from services.fit.coordinates.instrument_errors import (
     errors_of,
     have_common_cause,
 )
-from services.fit.measurements.blocks import Block, BlockInstrument, read_block, write_block
+from services.fit.measurements.blocks import BlockInstrument, PixelBlock, read_block, write_block
 from services.fit.measurements.instrument.moves import move_covariance, write_moves
 from services.fit.measurements.instrument.photographs import error_derivatives, photographed
 from services.fit.passes.moves import by_scene
@@ -50,12 +50,12 @@ DOMAIN = Domain((Coordinate(("enamel.sigma",)), Coordinate(("enamel.alpha",), 3.
 TISSUE = Tissue(Medium(4.0, 0.999, g1=0.8), Medium(4.0, 0.999, g1=0.8))
 
 
-def block(random: np.random.Generator) -> Block:
+def block(random: np.random.Generator) -> PixelBlock:
     shape = (2, 5)
     image = random.uniform(0.2, 1.0, shape)
     view = View(camera("c0"), np.stack([np.arange(5), np.arange(5)], axis=-1).astype(np.int32))
     acting = BlockInstrument("gain.green", ("light_gain.a", "light_gain.b"), "flare.c0.green", 1.3)
-    return Block(view, image, np.full(shape, 1e-4), np.ones(shape), np.zeros(shape, dtype=bool), instrument=acting)
+    return PixelBlock(view, image, np.full(shape, 1e-4), np.ones(shape), np.zeros(shape, dtype=bool), instrument=acting)
 
 
 def test_columns_are_the_derivatives_of_what_the_instrument_takes() -> None:

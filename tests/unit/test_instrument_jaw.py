@@ -13,7 +13,7 @@ from services.core.results import PreparedManifest
 from services.fit.checks.instrument.sentences import instrument_sentences
 from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.coordinates.instrument_errors import errors_of
-from services.fit.measurements.blocks import Block, BlockInstrument
+from services.fit.measurements.blocks import BlockInstrument, PixelBlock
 from services.fit.measurements.instrument.capture import MAX_JAW_LIGHTS, instrument_of
 from services.fit.measurements.instrument.photographs import error_derivatives, photographed
 from services.fit.solve.covariance import Uncertainty, uncertainty
@@ -35,13 +35,13 @@ def domain_of(teeth: tuple[int, ...]) -> Domain:
     return Domain(tuple(Coordinate((f"{k}.enamel.{kind}",)) for k in teeth for kind in ("sigma", "alpha")), ERRORS)
 
 
-def tooth_block(image: Array) -> Block:
+def tooth_block(image: Array) -> PixelBlock:
     pixels = np.stack([np.arange(PIXELS)] * 2, axis=-1).astype(np.int32)
     acting = BlockInstrument("gain.green", ("light_gain.a", "light_gain.b"), "flare.c0.green", 1.2)
     shape = image.shape
     view = View(camera("c0"), pixels)
     ones = np.ones(shape)
-    return Block(view, image, NOISE**2 * ones, NOISE**-2 * ones, np.zeros(shape, dtype=bool), instrument=acting)
+    return PixelBlock(view, image, NOISE**2 * ones, NOISE**-2 * ones, np.zeros(shape, dtype=bool), instrument=acting)
 
 
 def equations_of(teeth: tuple[int, ...], domain: Domain, random: np.random.Generator) -> tuple[NormalEquations, Array]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from services.bench.lab import run
 from services.bench.lab.comparison import QUANTITIES, Measured, Outcome, outcome, step_errors, verdict
 from services.bench.lab.known import VARIANTS, session_from_scan, true_calibration, write_variant
-from services.bench.lab.report import lines, write_summary
+from services.bench.lab.summary_page import lines, write_summary
 from services.core.calibration.record import Calibration
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.files.meshes import read_teeth, write_mesh

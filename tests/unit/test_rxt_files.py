@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from services.core.errors import CaptureInputError
-from services.slab.sphere.instrument import expected
 from services.slab.sphere.invert import fit_readings
 from services.slab.sphere.readings import read_readings
 from services.slab.sphere.records import SphereFile, TotalsReading
+from services.slab.sphere.spectrometer import expected
 from services.slab.sphere.totals import Totals
 from tests.support.shared_data import shared_path
 

@@ -16,7 +16,7 @@ from services.core.results import Estimate
 from services.core.stage import LocalContext
 from services.fit.checks.instrument.moved import pose_sentences, shift_sentences
 from services.fit.coordinates.instrument_errors import errors_of
-from services.fit.measurements.blocks import Block, BlockInstrument, read_block, write_block
+from services.fit.measurements.blocks import BlockInstrument, PixelBlock, read_block, write_block
 from services.fit.measurements.instrument.motion import MAX_SHIFTED, shift_errors_px
 from services.fit.measurements.instrument.photographs import error_derivatives, photographed, placed
 from services.fit.measurements.instrument.pose import brightenings, displacements
@@ -80,7 +80,7 @@ def test_a_ball_that_turns_under_its_lights_brightens_as_its_irradiance() -> Non
     np.testing.assert_allclose(towards, 2 / 63.2, rtol=0.1)
 
 
-def seen_block(twist: Array) -> tuple[Block, FakeEngine, Array]:
+def seen_block(twist: Array) -> tuple[PixelBlock, FakeEngine, Array]:
     """Block of a ball's pixels, the engine that shows them, and photographs of the ball moved by a twist."""
     recipe = single_tooth(sphere(4.0), None, np.array([one.position_mm for one in lights()]), np.full(6, 1e6))
     engine, one = FakeEngine(recipe), camera("c0")
@@ -105,7 +105,7 @@ def seen_block(twist: Array) -> tuple[Block, FakeEngine, Array]:
     acting = BlockInstrument("gain.green", names, "flare.c0.green", 1.0, tuple(f"shift.c0.l{k}" for k in range(6)))
     none = np.zeros(shape, dtype=bool)
     return (
-        Block(
+        PixelBlock(
             View(one, view.pixels), image[:, inside], np.ones(shape), np.ones(shape), none, None, None, acting, motion
         ),
         engine,

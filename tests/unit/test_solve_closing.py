@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.coordinates.instrument_errors import InstrumentErrors
-from services.fit.solve.closing import ClosingSums, closing_sums, response
-from services.fit.solve.covariance import ClosingModel, Uncertainty, Whitening, closing_model, uncertainty, whitening
+from services.fit.solve.covariance import FinalModel, Uncertainty, Whitening, final_model, uncertainty, whitening
+from services.fit.solve.final_uncertainty import FinalSums, final_sums, response
 from services.fit.solve.normal_equations import NormalEquations, normal_equations
 from tests.support.z_scores import rms_bounds
 
@@ -58,10 +58,10 @@ class Linear:
         r1, r2 = self.pair(x @ self.exact - photo, IMAGE)
         return normal_equations(j1, j2, r1, r2, np.full(len(photo), SENSOR**2), self.weight, LIGHTS)
 
-    def closing(self, x: np.ndarray, photo: np.ndarray, transform: np.ndarray) -> ClosingSums:
+    def closing(self, x: np.ndarray, photo: np.ndarray, transform: np.ndarray) -> FinalSums:
         residuals = self.pair(x @ self.exact - photo, IMAGE)
         moved = np.array([self.pair(self.direction, IMAGE)])
-        return closing_sums(
+        return final_sums(
             transform,
             self.pair(self.similar, SLOPE),
             self.pair(self.exact, SLOPE),
@@ -84,7 +84,7 @@ def fitted(problem: Linear, *, measured: bool, offset: float) -> tuple[np.ndarra
     if not measured:
         return x, uncertainty(DOMAIN, x, equations)
     sums = problem.closing(x, photo, whitening(DOMAIN, equations).transform)
-    last = closing_model(DOMAIN, x, equations, sums).step()
+    last = final_model(DOMAIN, x, equations, sums).step()
     return x + last, uncertainty(DOMAIN, x + last, equations, sums, last)
 
 
@@ -107,14 +107,14 @@ def test_stated_errors_are_those_seen_over_noise(held: bool) -> None:
     assert (found < high).all(), found
 
 
-def model_and_loss(seed: int) -> tuple[ClosingModel, np.ndarray, Callable[[np.ndarray], float]]:
+def model_and_loss(seed: int) -> tuple[FinalModel, np.ndarray, Callable[[np.ndarray], float]]:
     # Images are linear and ``similar`` is their own derivative, so the model's statements about x can be compared with
     # the loss itself.
     problem = Linear(seed)
     problem.similar = problem.exact
     photo, x = problem.photograph(0.0), problem.truth + 0.05
     equations = problem.equations(x, photo)
-    model = closing_model(DOMAIN, x, equations, problem.closing(x, photo, whitening(DOMAIN, equations).transform))
+    model = final_model(DOMAIN, x, equations, problem.closing(x, photo, whitening(DOMAIN, equations).transform))
     return model, x, lambda at: 0.5 * float(problem.weight @ (at @ problem.exact - photo) ** 2)
 
 
@@ -158,7 +158,7 @@ def test_a_response_is_without_bias_and_its_stated_noise_is_what_is_seen() -> No
         nothing = np.zeros((0, 2, LIGHTS * PIXELS))
         similar, exact = problem.pair(problem.similar, SLOPE), problem.pair(problem.exact, SLOPE)
         draws.append(
-            closing_sums(
+            final_sums(
                 transform, similar, exact, copied, (np.zeros(400), np.zeros(400)), nothing, problem.weight, LIGHTS
             )
         )
@@ -173,7 +173,7 @@ def test_a_response_is_without_bias_and_its_stated_noise_is_what_is_seen() -> No
 def test_a_response_that_noise_explains_is_not_believed() -> None:
     rng = np.random.default_rng(3)
     noise = np.full((3, 3), 0.09)
-    sums = ClosingSums(
+    sums = FinalSums(
         np.zeros(3),
         np.eye(3),
         np.eye(3) + 0.1 * rng.standard_normal((3, 3)),
@@ -188,7 +188,7 @@ def test_a_response_that_noise_explains_is_not_believed() -> None:
 
 def test_a_response_beyond_noise_is_taken_as_it_is() -> None:
     truth = np.array([[1.5, 0.4, 0.0], [0.0, 0.8, 0.2], [0.0, 0.3, 0.7]])
-    sums = ClosingSums(np.zeros(3), np.eye(3), truth, np.full((3, 3), 1e-8), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    sums = FinalSums(np.zeros(3), np.eye(3), truth, np.full((3, 3), 1e-8), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     np.testing.assert_allclose(
         response(sums, np.zeros((3, 3)), DOMAIN.relation).inverse, np.linalg.inv(truth), atol=1e-5
     )
@@ -205,7 +205,7 @@ def test_a_gain_moves_itself_and_not_the_tissue_although_derivatives_have_change
     transform = whitening(domain, equations).transform
     brighter = np.broadcast_to(0.01 * image, (1, 2, 100))
     nothing, flat = (0 * image, 0 * image), np.zeros(3, dtype=bool)
-    sums = closing_sums(transform, (exact, exact), (exact, exact), flat, nothing, brighter, weight, 1, 1)
+    sums = final_sums(transform, (exact, exact), (exact, exact), flat, nothing, brighter, weight, 1, 1)
     inverse = response(sums, transform.T @ domain.precision @ transform, domain.relation, 1).inverse
     # The prior of 100 % is not quite nothing: 1 / (1e4 * 58) of the information on the gain alone.
     np.testing.assert_allclose(transform @ inverse @ sums.shifts[0], [0.0, 0.0, 0.01], atol=1e-6)
@@ -220,7 +220,7 @@ def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
     noise = np.where(own, 0.1, 0.03)
     excess = np.where(own, 0.3 * rng.standard_normal(own.shape), 0.0)
     measured = np.eye(24) + excess + noise * rng.standard_normal(own.shape)
-    sums = ClosingSums(np.zeros(24), np.eye(24), measured, noise**2, np.zeros((0, 24)), np.zeros((0, 24, 24)))
+    sums = FinalSums(np.zeros(24), np.eye(24), measured, noise**2, np.zeros((0, 24)), np.zeros((0, 24, 24)))
     told, alike = (
         response(sums, np.zeros((24, 24)), relation).excess
         for relation in (domain.relation, np.zeros_like(domain.relation))
@@ -232,10 +232,10 @@ def test_how_a_tooth_responds_is_not_hidden_by_teeth_that_do_not() -> None:
     assert np.abs(told[~own]).max() < 0.03
 
 
-def shifted(shift: NDArray[np.float64], noise: NDArray[np.float64]) -> ClosingSums:
+def shifted(shift: NDArray[np.float64], noise: NDArray[np.float64]) -> FinalSums:
     """Sums with one shift (F,) and its noise (F, F)."""
     none = np.zeros_like(noise)
-    return ClosingSums(np.zeros(len(shift)), none, none, none, shift[None], noise[None])
+    return FinalSums(np.zeros(len(shift)), none, none, none, shift[None], noise[None])
 
 
 def test_a_shift_without_noise_is_taken_as_it_is_and_one_within_its_noise_is_not() -> None:
@@ -286,7 +286,7 @@ def test_noise_of_a_shift_does_not_pass_for_a_direction_that_can_be_avoided() ->
 def test_the_measurement_survives_the_journal() -> None:
     problem = Linear(1)
     sums = problem.closing(problem.truth, problem.photograph(0.0), np.eye(3))
-    assert ClosingSums.of(sums.record()).record() == sums.record()
+    assert FinalSums.of(sums.record()).record() == sums.record()
     assert (sums + sums).response == pytest.approx(2 * sums.response)
 
 
@@ -299,7 +299,7 @@ def test_errors_follow_the_step_that_the_tissue_takes_and_not_the_one_it_asked_f
     transform[:3, :3] = np.diag([0.5, 0.7, 0.9])
     known = Whitening(transform, np.zeros((4, 0)))
     gradient = np.array([9.0, -7.0, 5.0, 3.0])
-    model = ClosingModel(
+    model = FinalModel(
         domain, np.array([1.0, 2.0, 2.0, 0.0]), known, np.eye(4) + 0.1 * root, gradient, np.zeros((4, 4))
     )
     step = model.step()

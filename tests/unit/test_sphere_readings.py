@@ -12,11 +12,11 @@ import pytest
 
 from services.cli.sphere import sphere_command
 from services.core.errors import CaptureInputError, SettingsError
-from services.slab.sphere.instrument import expected
 from services.slab.sphere.invert import Fitted, fit_readings, interface_of
 from services.slab.sphere.readings import read_readings
 from services.slab.sphere.records import SphereFile
 from services.slab.sphere.results import SphereQuantity
+from services.slab.sphere.spectrometer import expected
 from services.slab.sphere.totals import Optics, slab_totals
 from services.slab.sphere.translucency import lab_of, over_backing, translucency_of
 from tests.support.shared_data import shared_path

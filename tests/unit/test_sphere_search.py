@@ -14,9 +14,9 @@ import typer
 
 from services.cli.sphere import PROGRESS_S, notes_once, progress, sphere_command
 from services.core.verdict import NOT_CONVERGED_STATUS
-from services.slab.sphere.instrument import expected
 from services.slab.sphere.invert import fit_readings, interface_of
 from services.slab.sphere.records import SphereFile
+from services.slab.sphere.spectrometer import expected
 from services.slab.sphere.totals import Optics, slab_totals
 from tests.support.drawn_slabs import Drawn, drawn, is_at_truth, is_determined, outcome, random_slab
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 from services.calibrate.registration.register import MAX_MISFIT_MM, register_folder
-from services.calibrate.session.report import write_report
+from services.calibrate.session.report_page import write_report
 from services.calibrate.session.run import CALIBRATION as CALIBRATION_FILE
 from services.calibrate.session.run import calibrate, write_session
 from services.core.raw.registration import REGISTRATION, Registration

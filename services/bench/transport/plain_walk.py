@@ -39,18 +39,18 @@ class PlainWalk(Walk):
     def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
         # Fly to the next scattering or to the surface.
         geometry = self.geometry
-        medium = walker.place & 1
+        medium = walker.enclosure & 1
         sigma = dr.select(medium == 0, 0, self.media.sigma[0])
         distance = dr.select(sigma > 0, minus_log1m(walker.rng.next_float32()) / sigma, dr.inf)
         traced = walker.active & (distance >= geometry.clearance(walker.origin, walker.active & (medium != 0)))
-        hit = geometry.intersect(walker.origin, walker.omega, walker.place, traced)
+        hit = geometry.intersect(walker.origin, walker.omega, walker.enclosure, traced)
         scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
         crosses = walker.active & ~scatters & hit.valid
         beyond = geometry.advance(walker.origin, walker.omega, hit, crosses)
         walker.origin = dr.select(
             scatters, dr.fma(walker.omega, distance, walker.origin), dr.select(crosses, beyond, walker.origin)
         )
-        walker.place = dr.select(crosses, geometry.beyond(walker.place, walker.omega, hit), walker.place)
+        walker.enclosure = dr.select(crosses, geometry.beyond(walker.enclosure, walker.omega, hit), walker.enclosure)
         (count,) = walker.scatterings.counts
         walker.scatterings.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
 
@@ -76,7 +76,12 @@ class PlainWalk(Walk):
         def renew(walker: Walker, ended: mi.Bool) -> Walker:
             walker.sample = walker.sample + 1
             fresh = self.start.begin(walker.lane, walker.sample, ended)
-            walker.rng, walker.origin, walker.omega, walker.place = fresh.rng, fresh.origin, fresh.omega, fresh.place
+            walker.rng, walker.origin, walker.omega, walker.enclosure = (
+                fresh.rng,
+                fresh.origin,
+                fresh.omega,
+                fresh.enclosure,
+            )
             walker.weight, walker.reference, walker.scatterings.counts = (
                 fresh.weight,
                 mi.Float(fresh.weight),

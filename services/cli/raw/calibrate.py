@@ -27,7 +27,7 @@ def calibrate_command(
     """Calibrate cameras, lights and colours, each with its error; a calibration beyond its limits ends with status
     9.
     """
-    from services.calibrate.session.report import write_report
+    from services.calibrate.session.report_page import write_report
     from services.calibrate.session.run import calibrate, write_session
     from services.core.calibration.record import Calibration
     from services.core.store import read_record

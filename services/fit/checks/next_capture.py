@@ -17,7 +17,7 @@ from services.core.geometry import Camera
 from services.core.results import Estimate
 from services.fit.checks.identifiability import QUANTITIES, quantity_in_words
 from services.fit.coordinates.instrument_errors import DEFAULT_SE
-from services.fit.measurements.blocks import Block, BlockInstrument, BlockTask, write_block
+from services.fit.measurements.blocks import BlockInstrument, BlockTask, PixelBlock, write_block
 from services.fit.measurements.instrument.photographs import block_of, error_derivatives
 from services.fit.passes.derivatives import Differentiation
 from services.fit.passes.passes import StackProblem, TraceRow, trace_row
@@ -246,7 +246,7 @@ def _probe(
     chosen = pixels[np.unique(np.linspace(0, len(pixels) - 1, min(PIXELS, len(pixels))).astype(int))]
     shape = (len(words), len(chosen))
     counted = np.array([word != "" for word in words])
-    block = Block(
+    block = PixelBlock(
         View(camera, chosen),
         np.zeros(shape),
         np.ones(shape),

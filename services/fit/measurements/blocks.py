@@ -91,7 +91,7 @@ class BlockMotion:
 
 
 @dataclass(frozen=True)
-class Block:
+class PixelBlock:
     """Measurements of some pixels of one view; arrays over (light, pixel) are (L, N)."""
 
     view: View
@@ -154,7 +154,7 @@ def split_pixels(pixels: NDArray[np.int64], lights: int, views: int) -> list[NDA
     return np.array_split(pixels, max(preferred, -(-len(pixels) // pixels_per_block(lights))))
 
 
-def write_block(folder: Path, block: Block) -> StoredFile:
+def write_block(folder: Path, block: PixelBlock) -> StoredFile:
     """Store a block in ``folder``."""
     parts = {} if block.parts is None else {"shown": block.parts.shown, "tooth": block.parts.tooth}
     instrument: dict[str, NDArray[Any]] = {}
@@ -189,7 +189,7 @@ def write_block(folder: Path, block: Block) -> StoredFile:
     )
 
 
-def read_block(stored: StoredFile) -> Block:
+def read_block(stored: StoredFile) -> PixelBlock:
     """Read a block."""
     a = stored.load()
     camera = Camera.model_validate_json(a["camera"].tobytes())
@@ -205,7 +205,7 @@ def read_block(stored: StoredFile) -> Block:
     if "slopes" in a:
         names = "slopes", "slope_noise", "displacement", "brightening", "centre_mm"
         motion = BlockMotion(*(a[name].astype(float) for name in names))
-    return Block(
+    return PixelBlock(
         view,
         a["reference"].astype(float),
         a["variance"].astype(float),

@@ -18,7 +18,7 @@ from services.core.records import JobSpec, Loss, MaskBit
 from services.core.results import PreparedManifest
 from services.core.store import open_stage
 from services.fit.coordinates.instrument_errors import NO_ERRORS, InstrumentErrors
-from services.fit.measurements.blocks import Block, split_pixels, write_block
+from services.fit.measurements.blocks import PixelBlock, split_pixels, write_block
 from services.fit.measurements.held_out import held_out_images, left_out_lights
 from services.fit.measurements.instrument.capture import Instrument
 from services.fit.measurements.instrument.moves import Move
@@ -310,7 +310,7 @@ def write_channel(
         )
         motion = None if (of_view := moved[view.camera.name]) is None else of_view.of(lights, pixels)
         cell = cells[view.camera.name][pixels]
-        block = Block(*measured, weight[cut], held_out, parts, cell, instrument_of_block, motion)
+        block = PixelBlock(*measured, weight[cut], held_out, parts, cell, instrument_of_block, motion)
         return write_block(folder, block)
 
     def level(max_pixels: int | None) -> Level:

@@ -20,7 +20,7 @@ from services.fit.measurements.instrument.photographs import block_of, error_der
 from services.fit.passes.derivatives import Differentiation
 from services.fit.passes.moves import by_scene, moves_task
 from services.fit.passes.passes import StackProblem, TraceRow, trace_row
-from services.fit.solve.closing import ClosingSums, closing_sums
+from services.fit.solve.final_uncertainty import FinalSums, final_sums
 from services.tasks.engine_host import EngineHost
 from services.transport.optics.parameters import MEDIUM_FIELDS, Mouth, Optics, Tissue
 
@@ -49,7 +49,7 @@ class DisplacedScene:
     """Number of the displacements, without their opposites."""
 
 
-def measure_closing(
+def measure_final_uncertainty(
     problem: StackProblem[Optics],
     x: Array,
     whiten: Array,
@@ -58,7 +58,7 @@ def measure_closing(
     moves: Sequence[Move] = (),
     shapes: HeldShapes = (),
     displaced: DisplacedScene | None = None,
-) -> ClosingSums:
+) -> FinalSums:
     """Closing sums of all blocks at x (F,), added in block order.
 
     Args:
@@ -85,10 +85,10 @@ def measure_closing(
     changes = _changes_by_scene(problem, few, displaced, moves, label)
     common = (similar, differentiation, first, whiten, slopes, copied, second, images, ends)
     pending = [
-        run.submit(f"{label}-{task.index}", closing_task, task, *common, *own)
+        run.submit(f"{label}-{task.index}", final_task, task, *common, *own)
         for task, own in zip(tasks, changes, strict=True)
     ]
-    parts: list[tuple[ClosingSums, TraceRow]] = run.gather(pending)
+    parts: list[tuple[FinalSums, TraceRow]] = run.gather(pending)
     problem.passes.record([row for _, row in parts])
     total = parts[0][0]
     for sums, _ in parts[1:]:
@@ -139,7 +139,7 @@ def displacements_task(
     return np.array(changes).astype(np.float32)
 
 
-def closing_task(
+def final_task(
     host: EngineHost,
     task: BlockTask,
     similar: Tissue | Mouth,
@@ -152,7 +152,7 @@ def closing_task(
     image_seeds: tuple[int, int],
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
     *changes: NDArray[np.float32],
-) -> tuple[ClosingSums, TraceRow]:
+) -> tuple[FinalSums, TraceRow]:
     """One block's closing sums and trace, with the changes (K, 2, L, N) by the displacements or moves of each scene.
 
     Rows of ``slopes`` that are ``copied`` are taken from the similar media's Jacobian.
@@ -181,7 +181,7 @@ def closing_task(
 
     similar_rows = derivatives(differentiation, replace(task, tissue=similar), similar_seeds)
     exact = similar_rows if copied.all() else derivatives(slopes, task, seeds)
-    sums = closing_sums(
+    sums = final_sums(
         whiten,
         (similar_rows[0], similar_rows[1]),
         (exact[0], exact[1]),

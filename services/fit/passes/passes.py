@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from services.core.files.content_files import StoredFile
 from services.fit.coordinates.domain import Domain, similar_tissue
 from services.fit.coordinates.instrument_errors import kind_of_error
-from services.fit.measurements.blocks import Block, BlockTask, read_block
+from services.fit.measurements.blocks import BlockTask, PixelBlock, read_block
 from services.fit.measurements.instrument.photographs import (
     block_of,
     error_derivatives,
@@ -131,7 +131,7 @@ def jacobian_task(
     return Products(equations, (residual.trace, rendered, trace_row("products", task, start)))
 
 
-def _regions(block: Block, near: Near) -> list[Region]:
+def _regions(block: PixelBlock, near: Near) -> list[Region]:
     assert block.parts is not None
     lights = len(block.reference)
     return [(near[tooth], np.tile(block.parts.tooth == tooth, lights)) for tooth in np.unique(block.parts.tooth)]
@@ -212,7 +212,7 @@ class Passes:
             [self.executor.submit(f"{label}-{t.index}", task, t, *args) for t in self.tasks(label, tissue, samples)]
         )
 
-    def read_blocks(self) -> list[Block]:
+    def read_blocks(self) -> list[PixelBlock]:
         """The blocks themselves, in order."""
         return [read_block(stored) for stored in self.blocks]
 

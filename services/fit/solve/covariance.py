@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from services.fit.coordinates.domain import Domain
 from services.fit.coordinates.instrument_errors import kind_of_error
-from services.fit.solve.closing import ClosingSums, Response, positive_part, response
 from services.fit.solve.elimination import eliminate
+from services.fit.solve.final_uncertainty import FinalSums, Response, positive_part, response
 from services.fit.solve.normal_equations import NormalEquations
 from services.fit.solve.recombination import Fault
 from services.fit.solve.sandwich import Sandwich, combine_with_prior
@@ -150,7 +150,7 @@ class Pooled:
     carried: Array
 
 
-def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Response) -> Pooled:
+def _pooled(t: Array, equations: NormalEquations, sums: FinalSums, solved: Response) -> Pooled:
     # Weight two gradients by their noise: the solver's pooled one, carried by the measured response instead of its own
     # curvature, and that of the final uncertainty estimate. The difference of the two ways of carrying counts as error
     # of its own size, because images are linear over short distances only.
@@ -170,7 +170,7 @@ def _pooled(t: Array, equations: NormalEquations, sums: ClosingSums, solved: Res
 
 
 @dataclass(frozen=True)
-class ClosingModel:
+class FinalModel:
     """Quadratic model at a solution after its response was measured: M^-1, and the gradient (F,) with its noise (F, F),
     in whitened coordinates.
     """
@@ -245,13 +245,13 @@ class ClosingModel:
         return np.asarray(np.linalg.solve(self.inverse, np.linalg.solve(self.whitened.transform, step)))
 
 
-def closing_model(domain: Domain, x: Array, equations: NormalEquations, sums: ClosingSums) -> ClosingModel:
+def final_model(domain: Domain, x: Array, equations: NormalEquations, sums: FinalSums) -> FinalModel:
     """Quadratic model at x, where the final uncertainty estimate was made."""
     whitened = whitening(domain, equations)
     t = whitened.transform
     solved = response(sums, t.T @ domain.precision @ t, domain.relation, len(domain.errors.names))
     pooled = _pooled(t, equations, sums, solved)
-    return ClosingModel(
+    return FinalModel(
         domain, x, whitened, solved.inverse, pooled.gradient + t.T @ domain.prior_slope(x), positive_part(pooled.noise)
     )
 
@@ -260,7 +260,7 @@ def uncertainty(
     domain: Domain,
     x: Array,
     equations: NormalEquations,
-    sums: ClosingSums | None = None,
+    sums: FinalSums | None = None,
     step: Array | None = None,
     moved: Sequence[str] = (),
     part_count: int = 1,
@@ -312,7 +312,7 @@ def uncertainty(
         )
 
     # Count the remaining step along the determined directions as error.
-    remaining = ClosingModel(domain, x, whitened, inverse, remaining_gradient, parts["rendering"]).remaining_step()
+    remaining = FinalModel(domain, x, whitened, inverse, remaining_gradient, parts["rendering"]).remaining_step()
     combined = combine_with_prior(
         domain, x, Sandwich(t, inverse, meat, misfit, weighing), parts, np.outer(remaining, remaining), part_count
     )

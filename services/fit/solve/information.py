@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.solve.closing import positive_part
 from services.fit.solve.covariance import Uncertainty
+from services.fit.solve.final_uncertainty import positive_part
 from services.fit.solve.sandwich import Sandwich
 
 Array = NDArray[np.float64]

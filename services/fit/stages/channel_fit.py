@@ -18,11 +18,11 @@ from services.core.records import JobSpec
 from services.fit.coordinates.domain import Domain, similar_tissue
 from services.fit.measurements.observations import ChannelFiles, Level
 from services.fit.passes.evaluate import Evaluation, Shown, evaluate
-from services.fit.passes.final_uncertainty import DisplacedScene, HeldCosines, HeldShapes, measure_closing
+from services.fit.passes.final_uncertainty import DisplacedScene, HeldCosines, HeldShapes, measure_final_uncertainty
 from services.fit.passes.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton
-from services.fit.solve.closing import ClosingSums
-from services.fit.solve.covariance import ClosingModel, Uncertainty, closing_model, uncertainty, whitening
+from services.fit.solve.covariance import FinalModel, Uncertainty, final_model, uncertainty, whitening
+from services.fit.solve.final_uncertainty import FinalSums
 from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State
 from services.fit.solve.normal_equations import NormalEquations
 from services.fit.solve.step_test import StepTest
@@ -39,11 +39,11 @@ takes this place."""
 SLOPE_ERROR = 0.5
 """Relative error of the change that Jacobians of similar media predict for one tooth's exact images, however short the
 step; the errors of several teeth are independent."""
-CLOSING_DIVISOR = 2
+FINAL_DIVISOR = 2
 """Divisor of the paths for the final uncertainty estimate, which is combined with all equations of the exact steps."""
-CLOSING_TRIALS = 2
+FINAL_TRIALS = 2
 """Number of lengths that are tried for the step after the final uncertainty estimate."""
-CLOSING_MIN_SHARE = 0.1
+FINAL_MIN_SHARE = 0.1
 """Shortest length that is tried, as a share of the one before."""
 REPEAT_STAGE = "again"
 """Name of the stage that continues a fit from its first solution, where the prior of the instrument's errors moved that
@@ -52,7 +52,7 @@ MIN_SAMPLES = 4
 """Least number of paths per pixel, however many pixels there are."""
 
 
-def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_count: int, samples: int) -> Array:
+def last_step(problem: StackProblem[Any], x: Array, model: FinalModel, part_count: int, samples: int) -> Array:
     """The step (F,) from x by the final uncertainty estimate, possibly shortened; zeros where its predicted gain is
     within noise or no length is better.
 
@@ -61,7 +61,7 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
         samples: paths per pixel of a comparison.
     """
     step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
-    for trial in range(CLOSING_TRIALS):
+    for trial in range(FINAL_TRIALS):
         predicted, predicted_se = model.predicted_change(step)
         if predicted >= 0:
             break
@@ -74,7 +74,7 @@ def last_step(problem: StackProblem[Any], x: Array, model: ClosingModel, part_co
             break
         # Go to the minimum of the parabola through slope and comparison (Nocedal and Wright 2006, section 3.5).
         slope = model.slope(step)
-        step = max(0.5 * slope / (slope - max(change, 0.0)), CLOSING_MIN_SHARE) * step
+        step = max(0.5 * slope / (slope - max(change, 0.0)), FINAL_MIN_SHARE) * step
     return np.zeros(len(x))
 
 
@@ -302,12 +302,12 @@ class Stages(ABC, Generic[Optics]):
             displaced = self._displaced_scene(domain.tissue_at(x, problem.base))
             prefix = message_prefix(self.files.channel, self.tooth)
             self.log(f"{prefix}: the final uncertainty estimate begins, which may take as long as all steps.")
-            held, fewer = self._held_cosines(domain), max(samples // CLOSING_DIVISOR, 1)
-            sums = measure_closing(problem, x, whitened.transform, held, fewer, moves, shapes, displaced)
+            held, fewer = self._held_cosines(domain), max(samples // FINAL_DIVISOR, 1)
+            sums = measure_final_uncertainty(problem, x, whitened.transform, held, fewer, moves, shapes, displaced)
             return {
                 "sums": sums.record(),
                 "step": last_step(
-                    problem, x, closing_model(domain, x, equations, sums), self.part_count, samples
+                    problem, x, final_model(domain, x, equations, sums), self.part_count, samples
                 ).tolist(),
                 "displacements": 0 if displaced is None else displaced.count,
             }
@@ -315,7 +315,7 @@ class Stages(ABC, Generic[Optics]):
         self.raise_if_cancelled()
         entry, _ = self.journal.get_or_compute(key, compute)
         step = np.array(entry["step"])
-        sums = ClosingSums.of(entry["sums"])
+        sums = FinalSums.of(entry["sums"])
         sources = ["shape"] * (len(shapes) + entry["displacements"]) + [move.body for move in moves]
         return uncertainty(domain, x + step, equations, sums, step, sources, self.part_count)
 

@@ -46,7 +46,7 @@ LARGEST_BLOCK = 4
 
 
 @dataclass(frozen=True)
-class Block:
+class PreparationBlock:
     """One step for some frames or lights of one camera.
 
     Attributes:
@@ -107,7 +107,7 @@ class Block:
 
 def blocks_of(
     spec: JobSpec, files: AttemptFiles, step: Step, items: Sequence[Sequence[int]], threads: int
-) -> tuple[Block, ...]:
+) -> tuple[PreparationBlock, ...]:
     """Split one step for the given frames or lights of each camera into enough blocks to keep all threads busy.
 
     Args:
@@ -117,24 +117,24 @@ def blocks_of(
     size = -(-sum(len(own) for own in items) // (BLOCKS_PER_THREAD * threads))
     size = min(max(size, 1), LARGEST_BLOCK)
     return tuple(
-        Block(spec, files, step, camera, tuple(own[k : k + size]))
+        PreparationBlock(spec, files, step, camera, tuple(own[k : k + size]))
         for camera, own in enumerate(items)
         for k in range(0, len(own), size)
     )
 
 
-def block_task(_host: Any, block: Block) -> Block:
+def block_task(_host: Any, block: PreparationBlock) -> PreparationBlock:
     """Run a block as a task, which needs no engine; returns the block."""
     block()
     return block
 
 
-def calls_of(blocks: Iterable[Block]) -> list[Call]:
+def calls_of(blocks: Iterable[PreparationBlock]) -> list[Call]:
     """Arguments with which an executor runs blocks."""
     return [(f"{block.step}-{block.camera}", block_task, (block,)) for block in blocks]
 
 
-def images_of(block: Block, files: AttemptFiles) -> Iterator[ImageDone]:
+def images_of(block: PreparationBlock, files: AttemptFiles) -> Iterator[ImageDone]:
     """Records of the images that a block has made."""
     files.writer.require_lease()
     for light in block.items:

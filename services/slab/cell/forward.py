@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from services.core.errors import NonFiniteError
 from services.slab.cell.dictionary import KNOTS, Material
 from services.slab.cell.interface import Interface
+from services.slab.cell.kernel_tables import tables_of
 from services.slab.cell.rig import Rig, Views
 from services.slab.cell.single import single_scattering
-from services.slab.cell.tables import tables_of
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -30,7 +30,7 @@ there, slower below."""
 
 
 @dataclass(frozen=True)
-class Block:
+class PathBlock:
     """Paths of one light; ``seed`` and ``place`` (step, batch) determine its random numbers."""
 
     rig: Rig
@@ -58,7 +58,7 @@ class BlockSums:
 class Blocks(Protocol):
     """A function that runs blocks: ``map`` itself, or the workers of a cluster."""
 
-    def __call__(self, task: Callable[[Block], BlockSums], blocks: Sequence[Block], /) -> Iterable[BlockSums]:
+    def __call__(self, task: Callable[[PathBlock], BlockSums], blocks: Sequence[PathBlock], /) -> Iterable[BlockSums]:
         """Results in the order of the blocks."""
 
 
@@ -82,7 +82,7 @@ class Batches:
         return np.asarray(self.images.mean(axis=0))
 
 
-def run_block(block: Block) -> BlockSums:
+def run_block(block: PathBlock) -> BlockSums:
     """Trace one block.
 
     Raises:
@@ -112,7 +112,9 @@ def render(
     """Render independent batches of ``paths`` paths per light."""
     lights = range(len(rig.lights))
     tasks = [
-        Block(rig, light, material, seed, (step, batch), paths, scores) for batch in range(batches) for light in lights
+        PathBlock(rig, light, material, seed, (step, batch), paths, scores)
+        for batch in range(batches)
+        for light in lights
     ]
     first_images, first_rows = single_scattering(rig, material, scores=scores)
     images = np.empty((batches, *first_images.shape))
@@ -125,7 +127,7 @@ def render(
     return Batches(images, rows, first_images, first_rows)
 
 
-def _late_share(block: Block) -> float:
+def _late_share(block: PathBlock) -> float:
     """Share of late vertices that are connected to cameras."""
     return THICK_SHARE if block.material.extinction_per_mm * block.rig.width_mm > THICK else 1.0
 

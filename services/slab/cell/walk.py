@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 
 from services.slab.cell.dictionary import KNOTS, SPACING_RAD
+from services.slab.cell.kernel_tables import GUIDE
 from services.slab.cell.perspective import perspective_view
 from services.slab.cell.streams import path_state, uniform
-from services.slab.cell.tables import GUIDE
 
 MAX_SCATTERS = 8192
 """Number of scatterings at which a path ends; the weight that it still carries is reported."""

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from services.core.slab.folder import Cell
 from services.slab.cell.interface import Interface
-from services.slab.sphere.instrument import Readings, expected
 from services.slab.sphere.records import SphereFile, TotalsReading
 from services.slab.sphere.results import (
     OtherSlab,
@@ -40,6 +39,7 @@ from services.slab.sphere.search import (
     slabs_that_read,
     thick_reflectance,
 )
+from services.slab.sphere.spectrometer import Readings, expected
 from services.slab.sphere.totals import NODES, Optics, Totals
 
 Array = NDArray[np.float64]

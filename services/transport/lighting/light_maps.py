@@ -84,7 +84,7 @@ class MapRay:
     direction: mi.Vector3f
     travelled: mi.Float
     """Distance in mm from the plane across the scene's centre, negative before it."""
-    place: mi.UInt32
+    enclosure: mi.UInt32
     entry: mi.Float
     """Distance travelled to the entry into the outer surface, mm."""
     dentin_entry: mi.Float
@@ -190,19 +190,19 @@ class LightMaps:
         start = mi.Point3f(self._centre + offset - direction * before)
 
         def step(ray: MapRay) -> tuple[MapRay]:
-            hit = geometry.intersect(ray.point, ray.direction, ray.place, ray.alive)
-            behind = geometry.beyond(ray.place, ray.direction, hit)
+            hit = geometry.intersect(ray.point, ray.direction, ray.enclosure, ray.alive)
+            behind = geometry.beyond(ray.enclosure, ray.direction, hit)
             ray.travelled += dr.select(hit.valid, hit.distance, 0)
             through = mi.Float(1)
             if ior is not None:
                 through = 1 - fresnel.reflectance(
-                    dr.abs(dr.dot(ray.direction, hit.normal)), geometry.contrast(ior, ray.place, behind)
+                    dr.abs(dr.dot(ray.direction, hit.normal)), geometry.contrast(ior, ray.enclosure, behind)
                 )
             if geometry.stained:
-                through *= geometry.stain(hit, ray.alive & geometry.on_stain(hit, ray.place, behind))
+                through *= geometry.stain(hit, ray.alive & geometry.on_stain(hit, ray.enclosure, behind))
             self._record_hit(ray, geometry, hit, through)
             ray.point = dr.select(hit.valid, geometry.advance(ray.point, ray.direction, hit, hit.valid), ray.point)
-            ray.place = dr.select(hit.valid, behind, ray.place)
+            ray.enclosure = dr.select(hit.valid, behind, ray.enclosure)
             return (ray,)
 
         ray = MapRay(
@@ -294,7 +294,7 @@ class LightMaps:
         forward, right = mi.Vector3f(first.x, first.y, first.z), mi.Vector3f(second.x, second.y, second.z)
         return LightMaps._Frame(first.w, right, dr.cross(forward, right), forward, second.w)
 
-    def look_up(self, light: mi.UInt32, point: mi.Point3f, place: mi.UInt32, active: mi.Bool) -> LightView:
+    def look_up(self, light: mi.UInt32, point: mi.Point3f, enclosure: mi.UInt32, active: mi.Bool) -> LightView:
         """Media between ``point`` and a light, with the direction to that light."""
         frame, from_centre = self._frame(light), mi.Vector3f(point - self._centre)
         from_light = frame.forward * frame.distance + from_centre
@@ -327,9 +327,9 @@ class LightMaps:
             y - row,
             active & inside,
         )
-        return self._view(found, place)
+        return self._view(found, enclosure)
 
-    def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:  # noqa: ARG002 - scenes of several surfaces need the place
+    def _view(self, cell: MapCell, enclosure: mi.UInt32) -> LightView:  # noqa: ARG002 - scenes of several surfaces need the enclosure
         """Media and light according to a cell of the map."""
         entry, dentin_entry, dentin_exit = (
             dr.fma(cell.interpolated(*half), self._depth_step, -self._half_depth_mm)

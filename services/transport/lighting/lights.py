@@ -87,7 +87,7 @@ class ShadowRay:
     """A straight line on its way to a light."""
 
     point: mi.Point3f
-    place: mi.UInt32
+    enclosure: mi.UInt32
     depth: mi.Float
     """Optical depth so far."""
     surface: list[mi.Float]
@@ -110,7 +110,7 @@ def shadow(
     media: Media,
     point: mi.Point3f,
     direction: mi.Vector3f,
-    place: mi.UInt32,
+    enclosure: mi.UInt32,
     active: mi.Bool,
     *,
     measured: tuple[int, ...] = (),
@@ -128,15 +128,15 @@ def shadow(
     """
 
     def step(ray: ShadowRay, direction: mi.Vector3f) -> tuple[ShadowRay, mi.Vector3f]:
-        medium = geometry.medium(ray.place)
+        medium = geometry.medium(ray.enclosure)
         sigma = media.extinction(medium)
-        hit = geometry.intersect(ray.point, direction, ray.place, ray.alive)
+        hit = geometry.intersect(ray.point, direction, ray.enclosure, ray.alive)
         length = dr.select(hit.valid, hit.distance, 0)
         ray.depth = dr.fma(sigma, length, ray.depth)
         ray.lengths = [
             total + dr.select(medium == k, length, 0) for k, total in zip(measured, ray.lengths, strict=True)
         ]
-        behind = geometry.beyond(ray.place, direction, hit)
+        behind = geometry.beyond(ray.enclosure, direction, hit)
         cosine = dr.dot(direction, hit.normal)
         if shape is not None:
             jump = (media.extinction(geometry.medium(behind)) - sigma) * inverse_cosine(cosine)
@@ -145,23 +145,23 @@ def shadow(
                 for total, speed in zip(ray.border, geometry.velocity(hit, shape, ray.alive), strict=True)
             ]
         if thin_ior is not None:
-            contrast = geometry.contrast(thin_ior, ray.place, behind)
+            contrast = geometry.contrast(thin_ior, ray.enclosure, behind)
             ray.surface[0] *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), contrast), 1)
         if geometry.stained:
-            crosses = ray.alive & geometry.on_stain(hit, ray.place, behind)
+            crosses = ray.alive & geometry.on_stain(hit, ray.enclosure, behind)
             ray.surface[0] *= geometry.stain(hit, crosses)
             ray.stains = [reservoir.offer(hit, crosses) for reservoir in ray.stains]
         if geometry.opaque:
             ray.surface[0] = dr.select(hit.opaque, 0, ray.surface[0])
         ray.point = dr.select(hit.valid, geometry.advance(ray.point, direction, hit, hit.valid), ray.point)
-        ray.place = dr.select(hit.valid, behind, ray.place)
+        ray.enclosure = dr.select(hit.valid, behind, ray.enclosure)
         ray.alive &= hit.valid & ~hit.opaque & (ray.depth < DARK_DEPTH)
         return ray, direction
 
     modes = 0 if shape is None else geometry.modes_of[shape]
     lengths, border = [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)]
     surface = [mi.Float(1)] * (thin_ior is not None or geometry.stained or geometry.opaque)
-    ray = ShadowRay(point, place, mi.Float(0), surface, lengths, border, stains or [], mi.Bool(active))
+    ray = ShadowRay(point, enclosure, mi.Float(0), surface, lengths, border, stains or [], mi.Bool(active))
     ended: ShadowRay
     ended, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")
     return ended

@@ -66,12 +66,12 @@ class MouthMaps(LightMaps):
         limit = mi.UInt32(self._depth_code(ray.limit)) | (first << 16)
         self._pack([entry, ray.dentin_entry, ray.dentin_exit], ray.surface, ray.events, kinds, (limit,))
 
-    def _view(self, cell: MapCell, place: mi.UInt32) -> LightView:
+    def _view(self, cell: MapCell, enclosure: mi.UInt32) -> LightView:
         halves = ((0, 0), (0, 16), (1, 0), (2, 0))
         entry, dentin_entry, dentin_exit, limit = (
             dr.fma(cell.interpolated(*half), self._depth_step, -self._half_depth_mm) for half in halves
         )
-        solid = self._geometry.inside(place)
+        solid = self._geometry.inside(enclosure)
         outside = solid > self._geometry.teeth
         followed = (
             ((cell.corners[0][1] & 0x10000) != 0) & ((cell.corners[0][2] >> 16) == solid + 1) & (cell.depth < limit)

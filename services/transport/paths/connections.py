@@ -39,7 +39,7 @@ class Vertex:
     point: mi.Point3f
     omega: mi.Vector3f
     """Propagation direction of the path before the vertex scatters it."""
-    place: mi.UInt32
+    enclosure: mi.UInt32
     throughput: mi.Float
     """Throughput of the path, albedos included."""
     max_transmittance: mi.Float
@@ -165,7 +165,7 @@ class Connections:
                 self.media,
                 vertex.point,
                 check.direction,
-                vertex.place,
+                vertex.enclosure,
                 casts,
                 thin_ior=self.ior,
                 stains=stains,
@@ -177,7 +177,7 @@ class Connections:
 
         def correct(vertex: Vertex, lane: mi.UInt32, check: LookupCheck, weight: mi.Float, casts: mi.Bool) -> mi.Float:
             ray = shadow(
-                self.geometry, self.media, vertex.point, check.direction, vertex.place, casts,
+                self.geometry, self.media, vertex.point, check.direction, vertex.enclosure, casts,
                 measured=self.scores.sigma_media, shape=self.plan.shape, thin_ior=self.ior,
             )  # fmt: skip
             self._count(
@@ -216,7 +216,7 @@ class Connections:
             light, brightness = groups.choose(
                 group, vertex.point, lambda direction: self._density(vertex, direction), u
             )
-            lookup = maps.look_up(light, vertex.point, vertex.place, active)
+            lookup = maps.look_up(light, vertex.point, vertex.enclosure, active)
             # The kept vertex represents all that were offered with it, and the chosen light its whole group.
             weight = vertex.total / dr.maximum(vertex.max_transmittance, 1e-30) * brightness
             expected, lengths = lookup.transmittance(self.media), lookup.lengths(self.scores.sigma_media)
@@ -282,7 +282,7 @@ class Connections:
 
     def _medium(self, vertex: Vertex) -> mi.UInt32:
         """Medium in which a vertex scatters, or the wall (number ``media.count``) where it lies on the wall."""
-        medium = self.geometry.medium(vertex.place)
+        medium = self.geometry.medium(vertex.enclosure)
         return dr.select(vertex.wall[0], mi.UInt32(self.media.count), medium) if vertex.wall else medium
 
     def _density(self, vertex: Vertex, direction: mi.Vector3f) -> mi.Float:

@@ -61,7 +61,7 @@ class Exits:
         """
         if not self.plan.exit_cosines:
             return
-        phase = PhaseFunction(self.media, self.geometry.medium(walker.place))
+        phase = PhaseFunction(self.media, self.geometry.medium(walker.enclosure))
         azimuth = dr.sincos(2 * dr.pi * walker.rng.next_float32())
         begin = mi.Vector2f(*self.geometry.depths(walker.origin.z, self.media.sigma))
         landing = dr.select(hit.valid, dr.fma(walker.omega.z, hit.distance, walker.origin.z), walker.origin.z)

@@ -42,7 +42,7 @@ class PathStart:
     origin: mi.Point3f
     omega: mi.Vector3f
     """Unit propagation direction."""
-    place: mi.UInt32
+    enclosure: mi.UInt32
     """Solids or slab layer that the origin lies in; see ``geometry``."""
     weight: mi.Float
     """Throughput at the start."""

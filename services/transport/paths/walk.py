@@ -77,7 +77,7 @@ class Walk:
             rng=path.rng,
             origin=path.origin,
             omega=path.omega,
-            place=path.place,
+            enclosure=path.enclosure,
             weight=path.weight,
             reference=mi.Float(path.weight),
             scatterings=self.scores.unscattered(),
@@ -121,14 +121,14 @@ class Walk:
         return walker.weight * self.scores.albedo(walker.scatterings)
 
     def _fly(self, walker: Walker) -> Flight:
-        medium = self.geometry.medium(walker.place)
+        medium = self.geometry.medium(walker.enclosure)
         sigma = self.media.extinction(medium)
         distance = dr.select(sigma > 0, minus_log1m(walker.rng.next_float32()) / sigma, dr.inf)
         # A flight that ends within the known clearance meets no surface: no ray is traced.
         inside = walker.active & (medium != 0)
         traced = walker.active & (distance >= self.geometry.clearance(walker.origin, inside))
-        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, traced)
-        # A lane with no surface ahead has left the tooth, whatever its place is: it meets nothing and ends.
+        hit = self.geometry.intersect(walker.origin, walker.omega, walker.enclosure, traced)
+        # A lane with no surface ahead has left the tooth, whatever its enclosure is: it meets nothing and ends.
         scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
         meets = walker.active & ~scatters & hit.valid
         reflects = mi.Bool(False)
@@ -136,7 +136,7 @@ class Walk:
             # A thin face lets a camera ray in, weighted, where its mirror image would be of empty space, and reflects
             # other rays by chance.
             contrast = self.geometry.contrast(
-                self.ior, walker.place, self.geometry.beyond(walker.place, walker.omega, hit)
+                self.ior, walker.enclosure, self.geometry.beyond(walker.enclosure, walker.omega, hit)
             )
             mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), contrast)
             reflects = meets & hit.outer & ~hit.opaque
@@ -152,9 +152,9 @@ class Walk:
         return (self.scores.order(walker.scatterings) == 0) & (medium == 0) & walker.primary
 
     def _fly_past_faces(self, walker: Walker, throughput: mi.Float, tally: Tally) -> Flight:
-        medium = self.geometry.medium(walker.place)
+        medium = self.geometry.medium(walker.enclosure)
         sigma = self.media.extinction(medium)
-        hit = self.geometry.intersect(walker.origin, walker.omega, walker.place, walker.active)
+        hit = self.geometry.intersect(walker.origin, walker.omega, walker.enclosure, walker.active)
         leaving = hit.valid & hit.outer
         through = mi.Float(1)
         if self.ior is not None:
@@ -203,7 +203,7 @@ class Walk:
         length = dr.select(flight.scatters, flight.distance, dr.select(flight.meets, hit.distance, 0))
         walker.sums = self.scores.flight(walker.sums, flight.medium, length, flight.scatters)
         crosses = flight.meets & ~flight.reflects & ~flight.bounces
-        behind = self.geometry.beyond(walker.place, omega, hit)
+        behind = self.geometry.beyond(walker.enclosure, omega, hit)
         cosine = dr.dot(omega, hit.normal)
         if self.plan.shape is not None:
             # Score the border's transmittance change, and offer the crossing for the scattering change.
@@ -216,11 +216,11 @@ class Walk:
             u = walker.rng.next_float32()
             crossing_point = dr.fma(omega, hit.distance, walker.origin)
             walker.border_crossing = [
-                offer(kept, crossing_point, omega, hit, walker.place, behind, throughput, shifts, u, at_border)
+                offer(kept, crossing_point, omega, hit, walker.enclosure, behind, throughput, shifts, u, at_border)
                 for kept in walker.border_crossing
             ]
         if self.geometry.stained:
-            stained = crosses & self.geometry.on_stain(hit, walker.place, behind)
+            stained = crosses & self.geometry.on_stain(hit, walker.enclosure, behind)
             walker.weight *= self.geometry.stain(hit, stained)
             walker.stains = [reservoir.offer(hit, stained) for reservoir in walker.stains]
         reached = self.geometry.advance(walker.origin, omega, hit, crosses)
@@ -230,7 +230,7 @@ class Walk:
             dr.select(flight.meets, reached, walker.origin),
         )
         walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
-        walker.place = dr.select(crosses, behind, walker.place)
+        walker.enclosure = dr.select(crosses, behind, walker.enclosure)
         scattered_in = flight.medium
         if self.geometry.opaque:
             scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium)
@@ -244,7 +244,7 @@ class Walk:
         if self.geometry.opaque:
             omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
         found = Vertex(
-            walker.origin, omega, walker.place, self._throughput(walker), bound, walker.scatterings, walker.sums,
+            walker.origin, omega, walker.enclosure, self._throughput(walker), bound, walker.scatterings, walker.sums,
             walker.border_sums, walker.secondary, walker.shape_factor, wall, walker.stains, mi.Float(0),
         )  # fmt: skip
         walker.vertex = self.connections.offer(
@@ -307,8 +307,8 @@ class Walk:
             # Add the light that the border point scatters directly.
             if self.lights is not None:
                 chosen = self.lights.choose(crossing.point, scattering, rng, begins)
-                point, place = scattering.point(chosen.direction), scattering.place(chosen.direction)
-                ray = shadow(self.geometry, self.media, point, chosen.direction, place, begins, thin_ior=self.ior)
+                point, enclosure = scattering.point(chosen.direction), scattering.enclosure(chosen.direction)
+                ray = shadow(self.geometry, self.media, point, chosen.direction, enclosure, begins, thin_ior=self.ior)
                 value = strength * chosen.total * scattering.balance(chosen.direction) * ray.transmittance()
                 for mode, ratio in enumerate(ratios):
                     tally.add_derivative(len(self.plan.scores) + mode, walker.lane, chosen.index, value * ratio, begins)
@@ -317,7 +317,7 @@ class Walk:
             u_lobe = rng.next_float32() if self.media.two_lobes else None
             omega = scattering.sample(rng.next_float32(), u_lobe, rng.next_float32(), rng.next_float32())
             balance = scattering.balance(omega)
-            walker.origin, walker.place, walker.omega = scattering.point(omega), scattering.place(omega), omega
+            walker.origin, walker.enclosure, walker.omega = scattering.point(omega), scattering.enclosure(omega), omega
             walker.weight = strength * (scattering.sigma_a + scattering.sigma_b) * dr.abs(balance)
             walker.reference = mi.Float(walker.weight)
             walker.shape_factor = [dr.mulsign(ratio, balance) for ratio in ratios]
@@ -332,7 +332,7 @@ class Walk:
             "rng",
             "origin",
             "omega",
-            "place",
+            "enclosure",
             "weight",
             "reference",
             "scatterings",
@@ -349,7 +349,12 @@ class Walk:
         def renew(walker: Walker, ended: mi.Bool) -> Walker:
             walker.sample = walker.sample + 1
             path = self.start.begin(walker.lane, walker.sample, ended)
-            walker.rng, walker.origin, walker.omega, walker.place = path.rng, path.origin, path.omega, path.place
+            walker.rng, walker.origin, walker.omega, walker.enclosure = (
+                path.rng,
+                path.origin,
+                path.omega,
+                path.enclosure,
+            )
             walker.weight, walker.reference = path.weight, mi.Float(path.weight)
             walker.scatterings = self.scores.unscattered()
             walker.steps = [mi.UInt32(0) for _ in walker.steps]

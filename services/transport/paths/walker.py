@@ -21,7 +21,7 @@ class Walker:
     origin: mi.Point3f
     omega: mi.Vector3f
     """Unit propagation direction."""
-    place: mi.UInt32
+    enclosure: mi.UInt32
     """Solids or slab layer that the origin lies in; see ``geometry``."""
     weight: mi.Float
     """Throughput without the albedos, which follow from ``scatterings``."""

@@ -37,7 +37,7 @@ class Path:
 
     sampler: Any
     ray: mi.Ray3f
-    place: mi.UInt32
+    enclosure: mi.UInt32
     throughput: mi.Spectrum
     radiance: mi.Spectrum
     last: mi.Interaction3f
@@ -105,7 +105,7 @@ class Shadow:
     """A straight line on its way to an emitter."""
 
     ray: mi.Ray3f
-    place: mi.UInt32
+    enclosure: mi.UInt32
     depth: mi.Spectrum
     """Optical depth so far."""
     surface: mi.Float
@@ -144,7 +144,7 @@ class ScenePaths:
         path = Path(
             sampler=sampler,
             ray=mi.Ray3f(ray),
-            place=mi.UInt32(0),
+            enclosure=mi.UInt32(0),
             throughput=mi.Spectrum(1),
             leader=self.media.pick_leader(sampler.next_1d(active)),
             leader_densities=mi.Spectrum(1),
@@ -183,7 +183,7 @@ class ScenePaths:
 
     def _fly(self, path: Path) -> Flight:
         # A flight that ends within the known clearance meets no surface and traces no ray.
-        part = self.teeth.medium(path.place)
+        part = self.teeth.medium(path.enclosure)
         sigmas = self.media.extinction(part)
         sigma = self.media.of_leader(path.leader, sigmas)
         inside = path.active & (part != 0)
@@ -246,7 +246,7 @@ class ScenePaths:
 
     def _vertex(self, path: Path, flight: Flight) -> mi.Interaction3f:
         # Here 1 - alpha below single precision is lost, unlike in the walk, because a picture does not show 1e-7.
-        path.throughput *= dr.select(flight.scatters, self.media.albedo(self.teeth.medium(path.place)), 1)
+        path.throughput *= dr.select(flight.scatters, self.media.albedo(self.teeth.medium(path.enclosure)), 1)
         vertex = dr.zeros(mi.Interaction3f)
         vertex.p = dr.select(flight.scatters, path.ray(flight.distance), flight.si.p)
         vertex.n = dr.select(flight.scatters, 0, flight.si.n)
@@ -261,7 +261,7 @@ class ScenePaths:
         light, brought = self.scene.sample_emitter_direction(vertex, sampler.next_2d(connects), False, connects)
 
         # Evaluate and sample a scattering in a tooth.
-        part = self.teeth.medium(path.place)
+        part = self.teeth.medium(path.enclosure)
         u_lobe = sampler.next_1d(scatters) if self.media.two_lobes else None
         onward = self.media.sample_direction(part, path.leader, path.ray.d, u_lobe, sampler.next_2d(scatters))
         to_light, to_onward = self.media.phase(part, path.ray.d, light.d), self.media.phase(part, path.ray.d, onward)
@@ -317,12 +317,14 @@ class ScenePaths:
         line.o = dr.select(flight.scatters, vertex.p, line.o)
         line.maxt = light.dist * (1 - mi.math.ShadowEpsilon)
         share = dr.select(light.delta, 1, power(light.pdf, density)) / chance
-        path.radiance += dr.select(connects, value * share * self._transmittance(line, path.place, connects), 0)
+        path.radiance += dr.select(connects, value * share * self._transmittance(line, path.enclosure, connects), 0)
 
     def _continue_path(self, path: Path, flight: Flight, vertex: mi.Interaction3f, choice: OnwardChoice) -> None:
         samples_direction, mirrors = flight.samples_direction, flight.mirrors
         crosses = flight.meets & ~samples_direction & ~mirrors
-        path.place = dr.select(crosses, self.teeth.beyond(path.place, flight.part, flight.cosine), path.place)
+        path.enclosure = dr.select(
+            crosses, self.teeth.beyond(path.enclosure, flight.part, flight.cosine), path.enclosure
+        )
         mirrored = path.ray.d - mi.Vector3f(flight.si.n) * (2 * flight.cosine)
         direction = dr.select(samples_direction, choice.direction, dr.select(mirrors, mirrored, path.ray.d))
         onward = flight.si.spawn_ray(direction)
@@ -335,7 +337,7 @@ class ScenePaths:
         path.from_tooth = dr.select(samples_direction, flight.scatters, path.from_tooth)
         path.depth += dr.select(samples_direction, mi.UInt32(1), 0)
 
-    def _transmittance(self, ray: mi.Ray3f, place: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+    def _transmittance(self, ray: mi.Ray3f, enclosure: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """Transmittance of the straight line along ``ray``, through teeth as far as its maxt."""
 
         def step(shadow: Shadow) -> Shadow:
@@ -343,8 +345,8 @@ class ScenePaths:
             meets = shadow.alive & found.is_valid()
             si = found.compute_surface_interaction(shadow.ray, +mi.RayFlags.Minimal, meets)
             part = self.teeth.part(found, meets)
-            length = dr.select(meets, found.t, dr.select((shadow.place != 0) & shadow.alive, shadow.ray.maxt, 0))
-            shadow.depth += self.media.extinction(self.teeth.medium(shadow.place)) * length
+            length = dr.select(meets, found.t, dr.select((shadow.enclosure != 0) & shadow.alive, shadow.ray.maxt, 0))
+            shadow.depth += self.media.extinction(self.teeth.medium(shadow.enclosure)) * length
             cosine = dr.dot(shadow.ray.d, si.n)
             if self.ior is not None:
                 shadow.surface *= dr.select(
@@ -354,11 +356,13 @@ class ScenePaths:
             shadow.alive = meets & (part != 0) & (dr.min(shadow.depth) < DARK_DEPTH)
             onward = si.spawn_ray(shadow.ray.d)
             onward.maxt = shadow.ray.maxt - found.t
-            shadow.place = dr.select(shadow.alive, self.teeth.beyond(shadow.place, part, cosine), shadow.place)
+            shadow.enclosure = dr.select(
+                shadow.alive, self.teeth.beyond(shadow.enclosure, part, cosine), shadow.enclosure
+            )
             shadow.ray = dr.select(shadow.alive, onward, shadow.ray)
             return shadow
 
-        shadow = Shadow(ray, mi.UInt32(place), mi.Spectrum(0), mi.Float(1), mi.Bool(active))
+        shadow = Shadow(ray, mi.UInt32(enclosure), mi.Spectrum(0), mi.Float(1), mi.Bool(active))
         (shadow,) = dr.while_loop(
             (shadow,), lambda shadow: shadow.alive, lambda shadow: (step(shadow),), label="light through teeth"
         )

@@ -31,8 +31,8 @@ class ToothShapes:
 class SceneTeeth:
     """The teeth of one scene, with their surfaces where they are when this is built.
 
-    A lane's *place* holds bit ENAMEL inside an enamel surface and bit DENTIN inside a dentin surface, so teeth may not
-    overlap.
+    A lane's *enclosure* holds bit ENAMEL inside an enamel surface and bit DENTIN inside a dentin surface, so teeth may
+    not overlap.
     """
 
     def __init__(self, scene: Any, shapes: ToothShapes) -> None:
@@ -72,15 +72,15 @@ class SceneTeeth:
         # A hit in an instance has no shape; its number is then 0, which is no tooth's.
         return dr.gather(mi.UInt32, self._parts, dr.reinterpret_array(mi.UInt32, found.shape), active)
 
-    def medium(self, place: mi.UInt32) -> mi.UInt32:
-        """Medium at a place: dentin over enamel over the outside (0)."""
-        return dr.select((place & DENTIN) != 0, DENTIN, place & ENAMEL)
+    def medium(self, enclosure: mi.UInt32) -> mi.UInt32:
+        """Medium of an enclosure: dentin over enamel over the outside (0)."""
+        return dr.select((enclosure & DENTIN) != 0, DENTIN, enclosure & ENAMEL)
 
-    def beyond(self, place: mi.UInt32, part: mi.UInt32, cosine: mi.Float) -> mi.UInt32:
+    def beyond(self, enclosure: mi.UInt32, part: mi.UInt32, cosine: mi.Float) -> mi.UInt32:
         """Place after crossing a surface at ``cosine`` between direction and outward normal; the next hit corrects a
         missed one.
         """
-        return dr.select(cosine < 0, place | part, place & ~part)
+        return dr.select(cosine < 0, enclosure | part, enclosure & ~part)
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Distance within which no surface lies; not positive where that is not known."""

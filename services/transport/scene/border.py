@@ -126,7 +126,7 @@ class BorderScattering:
             omega, direction
         )
 
-    def place(self, direction: mi.Vector3f) -> mi.UInt32:
+    def enclosure(self, direction: mi.Vector3f) -> mi.UInt32:
         """The side on which a walk in ``direction`` starts, by the sign of n . direction."""
         onward = dr.dot(direction, self.crossing.normal) * dr.dot(self.crossing.omega, self.crossing.normal) > 0
         return dr.select(onward, self.crossing.after, self.crossing.before)

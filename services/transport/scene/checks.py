@@ -17,7 +17,7 @@ range of single precision."""
 INTENSITIES = (1e-30, 1e30)
 """Smallest and largest intensity of a light, for the same reason."""
 MAX_TEETH = 15
-"""Largest number of teeth: a place in the scene is 32 bits, two for each tooth and one for gums."""
+"""Largest number of teeth: an enclosure is 32 bits, two for each tooth and one for gums."""
 
 
 def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], reach_mm: float) -> None:

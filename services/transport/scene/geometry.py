@@ -1,8 +1,8 @@
 """Geometries: the regions that media fill. The walk asks a geometry for the next surface along a ray and for the medium
 behind it.
 
-A geometry's *place* is a small integer per lane that encodes its position: for meshes (``mesh_geometry.py``) the set of
-surfaces it is inside of, for slabs the number of the layer.
+A geometry's *enclosure* is a small integer per lane that encodes its position: for meshes (``mesh_geometry.py``) the
+set of surfaces it is inside of, for slabs the number of the layer.
 """
 
 from __future__ import annotations
@@ -61,16 +61,16 @@ class Geometry(Protocol):
     def stained(self) -> bool:
         """Whether stains attenuate light that crosses outer faces."""
 
-    def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:
+    def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, enclosure: mi.UInt32, active: mi.Bool) -> Hit:
         """Next surface along a ray."""
 
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Distance in mm within which no surface lies; 0 where that is not known."""
 
-    def medium(self, place: mi.UInt32) -> mi.UInt32:
+    def medium(self, enclosure: mi.UInt32) -> mi.UInt32:
         """Index of the medium, 0 for empty space."""
 
-    def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
+    def beyond(self, enclosure: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
         """Place after crossing the surface."""
 
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:
@@ -109,15 +109,17 @@ class SlabGeometry:
         ]
         self.modes_of: tuple[int, ...] = (int(moving_border),)
 
-    def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:
+    def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, enclosure: mi.UInt32, active: mi.Bool) -> Hit:
         """Next plane, exactly: the layer is known, so no tolerance is needed."""
         down = direction.z > 0
         target = dr.select(down, self._planes[1], self._planes[0])
         for layer in range(2, self.layers + 1):
-            target = dr.select(place == layer, dr.select(down, self._planes[layer], self._planes[layer - 1]), target)
+            target = dr.select(
+                enclosure == layer, dr.select(down, self._planes[layer], self._planes[layer - 1]), target
+            )
         distance = dr.maximum((target - origin.z) / direction.z, 0)
         distance = dr.select(active & (direction.z != 0), distance, dr.inf)
-        outer = dr.select(down, place == self.layers, place == 1)
+        outer = dr.select(down, enclosure == self.layers, enclosure == 1)
         return Hit(
             distance,
             active & dr.isfinite(distance),
@@ -125,7 +127,7 @@ class SlabGeometry:
             outer,
             mi.Bool(False),
             mi.UInt32(0),
-            place,
+            enclosure,
             mi.Point2f(0),
         )
 
@@ -133,13 +135,13 @@ class SlabGeometry:
         """Always 0: intersecting a plane costs as little as this look-up."""
         return mi.Float(0)
 
-    def medium(self, place: mi.UInt32) -> mi.UInt32:
+    def medium(self, enclosure: mi.UInt32) -> mi.UInt32:
         """Layer number; both outsides are empty."""
-        return dr.select(place > self.layers, 0, place)
+        return dr.select(enclosure > self.layers, 0, enclosure)
 
-    def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:  # noqa: ARG002 - meshes need the hit
+    def beyond(self, enclosure: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:  # noqa: ARG002 - meshes need the hit
         """The neighbouring layer, by the sign of the direction's z."""
-        return dr.select(direction.z > 0, place + 1, place - 1)
+        return dr.select(direction.z > 0, enclosure + 1, enclosure - 1)
 
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:  # noqa: ARG002 - meshes need it
         """The point on the plane itself, because the layer number tells the side."""

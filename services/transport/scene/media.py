@@ -13,7 +13,7 @@ import numpy as np
 from services.core.errors import InputError
 from services.transport.optics import phase
 from services.transport.optics.parameters import Medium
-from services.transport.scene.tables import PhaseTables
+from services.transport.scene.phase_tables import PhaseTables
 
 MAX_SELECTED = 3
 """Largest number of media among which kernels select by comparison; values of more media are gathered from a table."""

@@ -1,8 +1,8 @@
 """Teeth, gums and the wall of the mouth as triangles, and the media between them.
 
 All surfaces are one mesh. A surface's number is k for the outer surface of tooth k of T, neighbours included, T + k for
-its dentin, 2T for gums and 2T + 1 for the wall. A lane's *place* holds bit n while it is inside the solid that surface
-n bounds, so solids may overlap. Code for features that a scene lacks is absent from its kernels.
+its dentin, 2T for gums and 2T + 1 for the wall. A lane's *enclosure* holds bit n while it is inside the solid that
+surface n bounds, so solids may overlap. Code for features that a scene lacks is absent from its kernels.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class MeshGeometry:
             tables.append(mi.Float(np.ascontiguousarray(np.concatenate(parts).reshape(-1), dtype=np.float32)))
         return tables
 
-    def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, place: mi.UInt32, active: mi.Bool) -> Hit:  # noqa: ARG002 - slabs need the place
+    def intersect(self, origin: mi.Point3f, direction: mi.Vector3f, enclosure: mi.UInt32, active: mi.Bool) -> Hit:  # noqa: ARG002 - slabs need the enclosure
         """Next surface along a ray, by ray tracing."""
         ray = mi.Ray3f(origin, direction)
         found = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
@@ -170,28 +170,28 @@ class MeshGeometry:
         """Distance in mm within which no surface lies; not positive where that is not known."""
         return self._clearance(point, active)
 
-    def inside(self, place: mi.UInt32) -> mi.UInt32:
-        """Number of the tooth whose tissue fills a place; the number of teeth for gums, and one more outside of all
-        solids.
+    def inside(self, enclosure: mi.UInt32) -> mi.UInt32:
+        """Number of the tooth whose tissue fills an enclosure; the number of teeth for gums, and one more outside of
+        all solids.
         """
-        within = place & (2**self.teeth - 1)
+        within = enclosure & (2**self.teeth - 1)
         if self._dentins:
-            dentin = (place >> self.teeth) & (2**self.teeth - 1)
+            dentin = (enclosure >> self.teeth) & (2**self.teeth - 1)
             within = dr.select(dentin != 0, dentin, within)
         return dr.select(
             within != 0,
             dr.tzcnt(within),
-            dr.select((place >> (2 * self.teeth)) != 0, mi.UInt32(self.teeth), mi.UInt32(self.teeth + 1)),
+            dr.select((enclosure >> (2 * self.teeth)) != 0, mi.UInt32(self.teeth), mi.UInt32(self.teeth + 1)),
         )
 
-    def medium(self, place: mi.UInt32) -> mi.UInt32:
-        """Medium at a place: dentin over enamel over gums over air, whatever surfaces overlap."""
+    def medium(self, enclosure: mi.UInt32) -> mi.UInt32:
+        """Medium of an enclosure: dentin over enamel over gums over air, whatever surfaces overlap."""
         if self.single:
-            inside_outer = place & 1
-            return dr.select((place & 2) != 0, mi.UInt32(2), inside_outer) if self._dentins else inside_outer
-        tooth, numbers = self.inside(place), self.numbers
+            inside_outer = enclosure & 1
+            return dr.select((enclosure & 2) != 0, mi.UInt32(2), inside_outer) if self._dentins else inside_outer
+        tooth, numbers = self.inside(enclosure), self.numbers
         enamel = self.outer_medium(tooth)
-        in_dentin = ((place >> self.teeth) & (2**self.teeth - 1)) != 0
+        in_dentin = ((enclosure >> self.teeth) & (2**self.teeth - 1)) != 0
         of_tooth = dr.select(in_dentin, enamel + 1, enamel) if self._dentins else enamel
         return dr.select(
             tooth < self.teeth, of_tooth, dr.select(tooth == self.teeth, mi.UInt32(numbers.of_gums), mi.UInt32(0))
@@ -205,20 +205,20 @@ class MeshGeometry:
             return dr.select(solid < self.teeth, mi.UInt32(1), mi.UInt32(self.numbers.of_gums))
         return solid * (1 + self.numbers.dentin) + 1
 
-    def beyond(self, place: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
+    def beyond(self, enclosure: mi.UInt32, direction: mi.Vector3f, hit: Hit) -> mi.UInt32:
         """Place after a hit. Entering sets the surface's bit and leaving clears it, so the next hit corrects a missed
         one.
         """
         bit = dr.select(hit.outer, mi.UInt32(1), mi.UInt32(2)) if self.single else mi.UInt32(1) << hit.surface
-        return dr.select(dr.dot(direction, hit.normal) < 0, place | bit, place & ~bit)
+        return dr.select(dr.dot(direction, hit.normal) < 0, enclosure | bit, enclosure & ~bit)
 
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:
         """Ratio, at least 1, of the indices of refraction of the media at two places."""
         if self.single:
             return ior
 
-        def index(place: mi.UInt32) -> mi.Float:
-            tooth = self.inside(place)
+        def index(enclosure: mi.UInt32) -> mi.Float:
+            tooth = self.inside(enclosure)
             return dr.select(tooth < self.teeth, ior, dr.select(tooth == self.teeth, self.recipe.gums_ior, 1.0))
 
         first, second = index(before), index(after)

@@ -93,7 +93,7 @@ def media_of(mouth: Mouth, recipe: SceneRecipe) -> list[Medium]:
         require_medium(f"{prefix}enamel", tissue.enamel)
         media.append(tissue.enamel)
         if numbers.dentin:
-            # No place of a tooth without dentin refers to its second number, so enamel fills it.
+            # No enclosure of a tooth without dentin refers to its second number, so enamel fills it.
             media.append(tissue.enamel if tooth.dentin is None else tissue.dentin)
             require_medium(f"{prefix}dentin", media[-1])
         modes = 0 if tooth.dentin is None else len(tooth.dentin.modes_mm)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.fit.measurements.blocks import Block, BlockTask, read_block
+from services.fit.measurements.blocks import BlockTask, PixelBlock, read_block
 from services.transport.scene.rigid_moves import SCAN, moved_camera, rigid, twist_of
 
 Array = NDArray[np.float64]
@@ -17,12 +17,12 @@ MAX_BRIGHTENING = 0.5
 """Largest relative change of an image by the scan's turn under the lights; the formula is one for small turns."""
 
 
-def block_of(task: BlockTask) -> Block:
+def block_of(task: BlockTask) -> PixelBlock:
     """The block of a task, as its camera sees the scan where the task's errors put it."""
     return placed(read_block(task.block), dict(task.errors))
 
 
-def placed(block: Block, errors: Mapping[str, float]) -> Block:
+def placed(block: PixelBlock, errors: Mapping[str, float]) -> PixelBlock:
     """The block with its camera where it sees an unmoved scan as it sees the scan that these errors move."""
     twist = twist_of(errors)
     if block.motion is None or not twist.any():
@@ -31,7 +31,7 @@ def placed(block: Block, errors: Mapping[str, float]) -> Block:
     return replace(block, view=replace(block.view, camera=camera))
 
 
-def photographed(image: Array, block: Block, errors: Mapping[str, float]) -> Array:
+def photographed(image: Array, block: PixelBlock, errors: Mapping[str, float]) -> Array:
     """Photographs (L, N) that an instrument with these errors would take of an image (L, N), which shows the scan where
     they put it (``placed``) under lights that do not move with it.
     """
@@ -53,7 +53,7 @@ def photographed(image: Array, block: Block, errors: Mapping[str, float]) -> Arr
     return np.asarray(taken + errors.get(instrument.flare, 0.0) * instrument.brightest)
 
 
-def error_derivatives(image: Array, block: Block, names: Sequence[str]) -> Array:
+def error_derivatives(image: Array, block: PixelBlock, names: Sequence[str]) -> Array:
     """Derivatives (K, L N) of the photographs with respect to each named error: the image for the gain, one light's
     image for a light's gain, the brightest pixel's value everywhere for a flare, and for the scan's pose and for the
     shift of a photograph what ``pose`` says.
@@ -82,7 +82,7 @@ def error_derivatives(image: Array, block: Block, names: Sequence[str]) -> Array
     return found.reshape(len(names), image.size)
 
 
-def slope_noise(block: Block, names: Sequence[str]) -> tuple[Array, Array]:
+def slope_noise(block: PixelBlock, names: Sequence[str]) -> tuple[Array, Array]:
     """What the photographs' noise in the slopes adds to the products of these derivatives: to J'WJ and to J'W Sigma WJ,
     (K, K) each.
     """

@@ -30,9 +30,9 @@ from services.fit.measurements.observations import (
 )
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.stages.attempt import Attempt
-from services.fit.stages.jaw.report import JawFit, report
 from services.fit.stages.jaw.schedule import JawSchedule
 from services.fit.stages.jaw.starts import MIN_TOOTH_PIXELS, TOOTH_ERRORS, start_mouth, start_tooth
+from services.fit.stages.jaw.tooth_reports import JawFit, report
 from services.fit.stages.jaw.views import fitted_pixels, label_views, views_of_parts, views_without_teeth
 from services.fit.stages.previews import shown_images
 from services.fit.stages.tooth.schedule import ChannelSchedule

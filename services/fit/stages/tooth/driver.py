@@ -21,7 +21,7 @@ from services.core.results import FitReport
 from services.fit.checks.alignment import offset_sentences
 from services.fit.checks.frames import photograph_sentences
 from services.fit.checks.identifiability import NOT_EXPLAINED, PARTLY_EXPLAINED, correlation, determined_sentences
-from services.fit.checks.instrument.report import instrument_report
+from services.fit.checks.instrument.estimates import instrument_report
 from services.fit.checks.next_calibration import calibration_advice
 from services.fit.coordinates.priors import GUMS_START
 from services.fit.measurements.instrument.capture import instrument_of

@@ -14,7 +14,7 @@ from services.core.verdict import MAX_ERROR
 from services.fit.checks.alignment import offset_sentences
 from services.fit.checks.frames import photograph_sentences
 from services.fit.checks.identifiability import determined_sentences
-from services.fit.checks.instrument.report import instrument_report
+from services.fit.checks.instrument.estimates import instrument_report
 from services.fit.measurements.observations import Observations
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.passes.evaluate import ErrorSums, Evaluation

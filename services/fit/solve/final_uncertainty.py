@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ClosingSums:
+class FinalSums:
     """Sums over measurements in whitened coordinates y (F,); the sums of blocks add."""
 
     gradient: Array
@@ -43,17 +43,17 @@ class ClosingSums:
     shift_noise: Array
     """Monte Carlo covariance (K, F, F) of each shift."""
 
-    def __add__(self, other: ClosingSums) -> ClosingSums:
-        return ClosingSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+    def __add__(self, other: FinalSums) -> FinalSums:
+        return FinalSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     def record(self) -> dict[str, Any]:
         """The sums as JSON values."""
         return {f.name: getattr(self, f.name).tolist() for f in fields(self)}
 
     @staticmethod
-    def of(record: dict[str, Any]) -> ClosingSums:
+    def of(record: dict[str, Any]) -> FinalSums:
         """Sums from the JSON values of ``record``."""
-        sums = ClosingSums(**{name: np.array(value, dtype=np.float64) for name, value in record.items()})
+        sums = FinalSums(**{name: np.array(value, dtype=np.float64) for name, value in record.items()})
         count = len(sums.gradient)
         return replace(
             sums, shifts=sums.shifts.reshape(-1, count), shift_noise=sums.shift_noise.reshape(-1, count, count)
@@ -102,7 +102,7 @@ def positive_part(matrix: Array) -> Array:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def closing_sums(
+def final_sums(
     whiten: Array,
     similar: tuple[Array, Array],
     exact: tuple[Array, Array],
@@ -112,7 +112,7 @@ def closing_sums(
     weight: Array,
     lights: int,
     errors: int = 0,
-) -> ClosingSums:
+) -> FinalSums:
     """Closing sums of one block of measurements, M = lights x pixels.
 
     Args:
@@ -158,7 +158,7 @@ def closing_sums(
     for a in range(len(m)):
         for terms, sign in ((m[a] * rendered, 1.0), (d[a] * e + m[a] * o, 1.0), (d[a] * rendered, -1.0)):
             variance[a] += sign * (per_pixel(weight * terms, lights) ** 2).sum(axis=1)
-    return ClosingSums(
+    return FinalSums(
         gradient=gradient,
         gradient_noise=gradient_noise,
         response=response,
@@ -180,7 +180,7 @@ class Response:
     """E (F, F) after shrinkage."""
 
 
-def response(sums: ClosingSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
+def response(sums: FinalSums, prior: Array, relation: NDArray[np.int_], errors: int = 0) -> Response:
     """Shrink the measured response towards the identity, which is the response that the usable curvature implies.
 
     Images are linear in the instrument's errors, and derivatives by these are exact, so M = [1 + E, F; G, 1]. The
