@@ -34,10 +34,11 @@ from services.slab.cell.forward import Batches, render
 from services.slab.cell.rig import Rig, rig_of
 from services.slab.read.images import shot_noise
 from services.slab.solve.coordinates import Knots
-from services.slab.solve.gauss_newton import DAMPING, Solution, quadratic_at
+from services.slab.solve.gauss_newton import DAMPING, quadratic_at
 from services.slab.solve.measured_directions import step_matrix
 from services.slab.solve.normal import NormalEquations, derivative_rows, normal_equations
 from services.slab.solve.prior import precision
+from services.slab.solve.solution import Solution
 from services.slab.solve.uncertainty import phase_chain, slopes, uncertainty_of
 from services.slab.solve.weights import Weights, smoothed_covariance, weights_of
 

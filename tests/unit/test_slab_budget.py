@@ -40,12 +40,21 @@ def test_effort_multiplies_the_paths_and_leaves_the_steps() -> None:
     assert min(stage.paths for stage in whole.scaled(1e-9).last) == 1
 
 
-@pytest.mark.parametrize(("gain", "path_variance", "is_over"), [(1.9, 0.4, True), (2.1, 0.4, False), (1.9, 0.6, False)])
-def test_a_stage_ends_where_steps_promise_no_more_than_noise_and_paths_add_little(
-    gain: float, path_variance: float, is_over: bool
+@pytest.mark.parametrize(
+    ("gain", "path_variance", "is_settled", "is_over"),
+    [
+        (1.9, 0.4, False, True),
+        (2.1, 0.4, False, False),
+        (1.9, 0.6, False, False),
+        (9.0, 0.4, True, True),
+        (9.0, 0.6, True, False),
+    ],
+)
+def test_a_stage_ends_where_steps_promise_or_change_little_and_paths_add_little(
+    gain: float, path_variance: float, is_settled: bool, is_over: bool
 ) -> None:
     fit, stage = solver(), Budget().last[0]
-    following = fit.next_checkpoint(checkpoint(0, 0), stage, THIN, gain, path_variance)
+    following = fit.next_checkpoint(checkpoint(0, 0), stage, THIN, gain, path_variance, is_settled=is_settled)
     assert (following.stage, following.step) == ((1, 0) if is_over else (0, 1))
 
 
@@ -54,8 +63,8 @@ def test_a_stage_ends_where_steps_promise_no_more_than_noise_and_paths_add_littl
 )
 def test_a_stage_ends_with_its_steps(moved: Material, allowed: int) -> None:
     fit, stage = solver(), Budget().last[1]
-    assert fit.next_checkpoint(checkpoint(1, allowed - 2), stage, moved, 9.0, 9.0).stage == 1
-    assert fit.next_checkpoint(checkpoint(1, allowed - 1), stage, moved, 9.0, 9.0).stage == 2
+    assert fit.next_checkpoint(checkpoint(1, allowed - 2), stage, moved, 9.0, 9.0, is_settled=False).stage == 1
+    assert fit.next_checkpoint(checkpoint(1, allowed - 1), stage, moved, 9.0, 9.0, is_settled=False).stage == 2
 
 
 def test_a_search_that_has_gone_astray_takes_no_further_step() -> None:

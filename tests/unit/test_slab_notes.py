@@ -11,9 +11,9 @@ from services.slab.read.images import Measurements
 from services.slab.results.notes import notes_of
 from services.slab.results.result import Errors
 from services.slab.solve.coordinates import Knots
-from services.slab.solve.gauss_newton import Solution
 from services.slab.solve.normal import UNKNOWNS
 from services.slab.solve.prior import Quadratic
+from services.slab.solve.solution import Solution
 from tests.support.small_slab import made_up_fit, small_rig
 
 GOOD = Errors(fit_error=0.01, held_out_error=None)

@@ -13,10 +13,10 @@ from services.slab.cell.dictionary import ANGLES_RAD, KNOTS, henyey_greenstein
 from services.slab.dictionaries.through_beam import Index
 from services.slab.results.result import Errors, parameters_of, phase_of, with_believable_flags
 from services.slab.solve.coordinates import Knots
-from services.slab.solve.gauss_newton import Solution
 from services.slab.solve.normal import UNKNOWNS
 from services.slab.solve.prior import Quadratic
-from services.slab.solve.uncertainty import Uncertainty, resolution_deg, uncertainty_of
+from services.slab.solve.solution import Solution
+from services.slab.solve.uncertainty import Uncertainty, largest_move, resolution_deg, uncertainty_of
 from tests.support.small_slab import made_up_fit
 
 MATERIAL = henyey_greenstein(2.0, 0.5, 0.1)
@@ -58,6 +58,22 @@ def test_kernels_pass_what_is_wide_and_average_what_is_narrow() -> None:
     np.testing.assert_allclose(averaging @ np.ones(KNOTS), 1, rtol=1e-6)
     np.testing.assert_allclose((averaging @ wide)[inner], wide[inner], atol=0.05)
     assert np.abs(averaging @ narrow)[inner].max() < 0.05
+
+
+def test_a_move_is_told_in_standard_errors_of_what_is_reported() -> None:
+    one = np.full(UNKNOWNS, 1e-4)  # variances: 1 % of each value of ln f, 0.01 per mm of absorption
+    uncertainty = Uncertainty(np.diag(one), np.diag(one), (np.diag(one), np.diag(one)))
+    assert largest_move(MATERIAL, MATERIAL, uncertainty) == 0
+    # Absorption alone moves by two and a half of its own, and by more of no other value.
+    darker = replace(MATERIAL, absorption_per_mm=MATERIAL.absorption_per_mm + 0.025)
+    assert largest_move(MATERIAL, darker, uncertainty) == pytest.approx(2.5)
+    # A ripple of the phase function that no coefficient shows counts by its rms: 2 % of values known to 1 %.
+    signs = np.where(np.arange(KNOTS) % 2 == 0, 1.0, -1.0)
+    rippled = replace(MATERIAL, scattering=MATERIAL.scattering * np.exp(0.02 * signs))
+    assert largest_move(MATERIAL, rippled, uncertainty) == pytest.approx(2, rel=0.02)
+    # A value that is not determined is not waited for.
+    vague = np.diag(np.append(np.ones(KNOTS), 1e-4))
+    assert largest_move(MATERIAL, rippled, Uncertainty(vague, vague, (vague, vague))) < 0.1
 
 
 def kernels(curvature: float) -> np.ndarray:

@@ -9,7 +9,7 @@ from services.slab.cell.rig import Rig
 from services.slab.read.diagnosis import misfit_faults, sample_faults, similarity_faults, standing_out
 from services.slab.read.images import Measurements
 from services.slab.results.result import Errors, Parameters, PhaseFunction, image_error, is_unlike
-from services.slab.solve.gauss_newton import Solution
+from services.slab.solve.solution import Solution
 
 Array = NDArray[np.float64]
 

@@ -26,7 +26,9 @@ from services.slab.solve.measured_directions import broad_step, noise_ratio, ste
 from services.slab.solve.normal import Each, NormalEquations, ResidualSums, normal_equations
 from services.slab.solve.prior import Quadratic, is_thick
 from services.slab.solve.smooth import Smoother, smoother_of
+from services.slab.solve.solution import Solution
 from services.slab.solve.step_length import MAX_HALVINGS, noise_fall, predicted_fall, shortened
+from services.slab.solve.uncertainty import largest_move, uncertainty_of
 from services.slab.solve.weights import smoothed_covariance, weights_of
 
 Array = NDArray[np.float64]
@@ -45,6 +47,10 @@ value holds in a thick cell, because the error left in sigma_s at a constant sig
 of all directions, and is still a tenth of sigma_s."""
 UNCONVERGED_RATIO = 5.0
 """The same ratio, above which the last step shows that the fit has not converged."""
+SETTLED_MOVE = 1 / 3
+"""Largest change of a reported value by the last step, in its standard errors, at which a fit has converged whatever
+the step promises. Promises are compared with the noise of the paths alone, and where many renders are combined that is
+far below the noise of the images: steps then promise several times as much and change nothing that is reported."""
 MAX_COMBINED_CHANGE = 0.05
 """Largest distance in ln sigma_s at which residuals of several media are combined: the nonlinear part is then below a
 thousandth."""
@@ -66,35 +72,6 @@ class State:
     equations: NormalEquations
     paths: int
     damping: float
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Result of the solver; ``converged`` is a value, not an error."""
-
-    material: Material
-    quadratic: Quadratic
-    """Model of half the misfit, at the last linearisation."""
-    gradient_noise: Array
-    scale: float | Array
-    used: int
-    steps: int
-    """Number of all steps, in the search and in the last stages."""
-    converged: bool
-    paths: int
-    """Number of all paths, over lights and batches."""
-    coordinates: Coordinates
-    """Coordinates whose unknowns the quadratic is in."""
-    misfit: float
-    """Half of the weighted squares before the last step, without the Monte Carlo noise of the images."""
-    misfit_se: float
-    data_noise: Array
-    """Covariance of the last gradient's noise by the measurements (U, U)."""
-    matrix_error_gradient: Array
-    """Error of the last step by the noise of the matrix, as a gradient: ``matrix_error`` times the step (U,)."""
-    path_variance: float
-    """Variance of the last step by the paths, in units of that by the measurements; 0 where renders are not
-    combined."""
 
 
 @dataclass
@@ -212,18 +189,27 @@ class GaussNewton:
             if is_last and self.combines(material):
                 data = noise_fall(quadratic, prior, equations.data_noise)
                 path_variance = noise_fall(quadratic, prior, equations.gradient_noise) / data
-            checkpoint = self.next_checkpoint(checkpoint, stage, moved, gain, path_variance)
+            solution = Solution(
+                moved, quadratic, equations.gradient_noise, scale, equations.used, checkpoint.steps + 1,
+                False, self.paths, self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
+                equations.matrix_error @ (self.coordinates.unknowns(moved) - x), path_variance,
+            )  # fmt: skip
+            is_settled = is_last and largest_move(material, moved, uncertainty_of(solution)) < SETTLED_MOVE
+            checkpoint = self.next_checkpoint(checkpoint, stage, moved, gain, path_variance, is_settled=is_settled)
             if self.is_astray(moved):
                 break
-        return Solution(
-            moved, quadratic, equations.gradient_noise, scale, equations.used, checkpoint.steps,
-            checkpoint.is_converged and gain < UNCONVERGED_RATIO and not self.is_astray(moved), self.paths,
-            self.coordinates, equations.misfit, equations.misfit_se, equations.data_noise,
-            equations.matrix_error @ (self.coordinates.unknowns(moved) - x), path_variance,
-        )  # fmt: skip
+        has_converged = (is_settled or gain < UNCONVERGED_RATIO) and not self.is_astray(moved)
+        return replace(solution, converged=has_converged)
 
     def next_checkpoint(
-        self, checkpoint: Checkpoint, stage: Stage, moved: Material, gain: float, path_variance: float
+        self,
+        checkpoint: Checkpoint,
+        stage: Stage,
+        moved: Material,
+        gain: float,
+        path_variance: float,
+        *,
+        is_settled: bool,
     ) -> Checkpoint:
         """The state before the next step of the stage, or before the first of the next stage where this one has ended.
 
@@ -231,12 +217,13 @@ class GaussNewton:
             gain: fall that the last step promised, in units of the fall that noise alone promises.
             path_variance: variance by the paths in units of that by the measurements, where residuals of the last
                 stage's renders are combined; else 0.
+            is_settled: whether the last step moved no reported value by much of its standard error.
         """
         thick = self.is_thick(moved)
         min_gain, max_steps = PROMISE_RATIO_THICK if thick else PROMISE_RATIO, stage.max_steps(thick=thick)
         is_near = abs(math.log(moved.scattering_per_mm / checkpoint.material.scattering_per_mm)) < MAX_COMBINED_CHANGE
         is_over = (
-            gain < min_gain and path_variance < MAX_PATH_VARIANCE and (is_near or not thick)
+            (gain < min_gain or is_settled) and path_variance < MAX_PATH_VARIANCE and (is_near or not thick)
         ) or checkpoint.step + 1 >= max_steps
         assert self.path_noise is not None
         assert self.multiple is not None

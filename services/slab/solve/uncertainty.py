@@ -18,9 +18,9 @@ from services.slab.cell.dictionary import (
     cosine_moments,
     tent_solid_angles,
 )
-from services.slab.solve.gauss_newton import Solution
 from services.slab.solve.measured_directions import measured_directions
 from services.slab.solve.prior import Quadratic
+from services.slab.solve.solution import Solution
 
 Array = NDArray[np.float64]
 
@@ -137,6 +137,17 @@ def slopes(material: Material) -> dict[str, Array]:
         "sigma_s_reduced": np.append(parts - moments, 0.0),
         "g": np.append((moments - g * parts) / sigma_s, 0.0),
     }
+
+
+def largest_move(before: Material, after: Material, uncertainty: Uncertainty) -> float:
+    """Change from one medium to another in standard errors: the largest of the coefficients' and g's changes, and the
+    rms of those of the determined values of the phase function.
+    """
+    change = np.append(np.log(after.scattering / before.scattering), after.absorption_per_mm - before.absorption_per_mm)
+    numbers = [abs(float(slope @ change)) / uncertainty.larger_error(slope) for slope in slopes(after).values()]
+    errors, determined = phase_errors(after, uncertainty)
+    values = (phase_chain(after) @ change * after.phase_per_sr / errors)[determined]
+    return max(*numbers, float(np.sqrt(np.mean(values**2))) if values.size else 0.0)
 
 
 def phase_chain(material: Material) -> Array:
