@@ -5,6 +5,7 @@ soon as it is there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -15,9 +16,9 @@ from services.fit.passes.evaluate import ErrorSums
 from services.transport.optics.parameters import Medium, Tissue
 
 
-def row(peer: str, seconds: float, error: float, rate: float | None = None) -> ToothRow:
+def row(peer: str, seconds: float, error: float, rate: float | None = None, error_se: float = 0.001) -> ToothRow:
     return ToothRow(
-        benchmark="tooth", peer=peer, seconds=seconds, error=error, error_se=0.001, fitted_error=error, stage="",
+        benchmark="tooth", peer=peer, seconds=seconds, error=error, error_se=error_se, fitted_error=error, stage="",
         parameters={}, rate=rate
     )  # fmt: skip
 
@@ -53,6 +54,21 @@ def test_our_time_ends_when_no_later_start_is_worse() -> None:
     assert summary(ours, [row(PEER, 90.0, 0.02)], target=0.022).efficiency_ratio == 90.0 / 9.0
 
 
+def test_a_level_that_a_peer_touches_and_leaves_is_not_reached() -> None:
+    peer = [row(PEER, 10.0, 0.02), row(PEER, 50.0, 0.2), row(PEER, 90.0, 0.1)]
+    found = summary(OURS, peer, target=0.03)
+    assert (found.efficiency_ratio, found.lower_bound) == (90.0 / 5.0, True)
+
+
+def test_a_race_between_errors_known_too_roughly_decides_nothing() -> None:
+    peer = [row(PEER, 10.0, 0.3), row(PEER, 90.0, 0.049, error_se=0.037)]
+    found = summary(OURS, peer, target=0.05)
+    assert found.efficiency_ratio is None
+    assert found.undecided.startswith("This race decides nothing: its errors are known to 3.7 %, and a level of 5.0 %")
+    label = picture([one.model_dump() for one in (*OURS, *peer, found)]).axes[0].get_lines()[1].get_label()
+    assert label == f"{PEER}, undecided"
+
+
 def test_picture_shows_every_rate_and_the_bound() -> None:
     peers = [
         row(PEER, 10.0, 0.3, 0.02),
@@ -70,6 +86,8 @@ def test_picture_shows_every_rate_and_the_bound() -> None:
 class FixedErrors:
     """Replaces a prepared tooth: the same errors for every solver."""
 
+    truth = MappingProxyType({"enamel.sigma_s_reduced": 1.8, "dentin.sigma_s_reduced": 7.84})
+
     def errors(self, tissue: Tissue, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:  # noqa: ARG002
         return ErrorSums(0.04, 1.0, 0.0, 1e-12), ErrorSums(0.09, 1.0, 0.0, 1e-12)
 
@@ -84,6 +102,7 @@ def test_rows_are_kept_as_they_come() -> None:
     assert kept[1][1]["error"] == pytest.approx(0.3)
     assert kept[1][1]["fitted_error"] == pytest.approx(0.2)
     assert kept[1][1]["parameters"]["enamel.sigma_s_reduced"] == pytest.approx(0.5 * 0.99 * 4)
+    assert kept[1][1]["parameter_error"] == pytest.approx(0.1)
 
 
 def test_tissue_of_reported_parameters() -> None:

@@ -10,8 +10,13 @@ noise.
 Each has one thread, and seconds are its processor time, which other jobs on the machine change little. The peer tries
 three learning rates for five minutes each and takes that of the smallest error on the fitted images; this fit goes on
 until 40 minutes, of which those five count. The peer's ratio is its time to the target divided by ours. The target is
-our last error times ``MARGIN``, or the error that the photographs' noise resolves if that is larger. A peer that does
-not reach the target gets a lower bound of the ratio, and another row with the ratio at the error that it ended with.
+our last error times ``MARGIN``, or the error that the photographs' noise resolves if that is larger. A fit has reached
+it where no later error is above it by more than its standard error. A peer that does not reach the target gets a lower
+bound of the ratio, and another row with the ratio at the error that it ended with.
+
+An error must be known to a third of the target, or the race decides nothing and its row says so in place of a ratio:
+an error known to 4 % touches any target below that by chance. Each row also has the largest relative error of the
+reduced scattering coefficients, as images may be right where parameters are not.
 """
 
 from __future__ import annotations
@@ -43,6 +48,8 @@ QUICK_CHOICE_S, QUICK_LIMIT_S = 20.0, 60.0
 MARK_GROWTH = 1.12
 """Ratio of the times of two successive measurements of a peer's error."""
 MARGIN = 1.1
+MAX_ERROR_SE = 1 / 3
+"""Largest standard error of an error that decides a race, as a share of the target."""
 ERROR_SAMPLES = 1024
 
 Case = Literal["race", "scale"]
@@ -59,12 +66,16 @@ class ToothRow(Row):
     """Standard error of ``error`` by the Monte Carlo noise of its measurement."""
     fitted_error: float
     """Relative error on the fitted images."""
+    parameter_error: float | None = None
+    """Largest relative error of the reduced scattering coefficients; None where the truth is not known."""
     stage: str
     parameters: dict[str, float]
     rate: float | None = None
     """Learning rate of Adam; None for the product."""
     lower_bound: bool = False
     """Whether ``efficiency_ratio``, here the ratio of times to one held-out error, is only a bound."""
+    undecided: str = ""
+    """In a summary without a ratio, the sentence that says why the race decides nothing."""
 
 
 @dataclass
@@ -84,10 +95,11 @@ class ErrorRecorder:
             for part in ("enamel", "dentin")
             for leaf in ("sigma", "alpha", "sigma_s_reduced")
         }
+        off = [abs(values[name] / true - 1) for name, true in self.case.truth.items()]
         row = ToothRow(
             benchmark="tooth", peer=peer, seconds=seconds, error=held_out.resolved_error or 0.0,
             error_se=held_out.error_se or 0.0, fitted_error=fitted.resolved_error or 0.0, stage=stage,
-            parameters=values, **more,
+            parameter_error=max(off, default=None), parameters=values, **more,
         )  # fmt: skip
         self.rows.append(row)
         self.keep([one.model_dump() for one in self.rows])
@@ -122,7 +134,9 @@ def run(*, quick: bool, case: Case = "race", keep: Keep = lambda _: None) -> lis
         target = max(MARGIN * ours[-1].error, tooth.resolution())
         for rows in peers.values():
             recorder.rows.append(summary(ours, rows, target))
-            if recorder.rows[-1].lower_bound:
+            if recorder.rows[-1].undecided:
+                print(recorder.rows[-1].undecided)
+            elif recorder.rows[-1].lower_bound:
                 recorder.rows.append(summary(ours, rows, rows[-1].error, "tooth-at-its-end"))
     return [row.model_dump() for row in recorder.rows]
 
@@ -183,17 +197,29 @@ def _descend(recorder: ErrorRecorder, fit: StockFit, rows: list[ToothRow], until
 
 def summary(ours: list[ToothRow], peer: list[ToothRow], target: float, name: str = "tooth-summary") -> ToothRow:
     """Return a row with the ratio of the peer's time to the target to ours; where the peer does not reach the target,
-    its last time counts and the ratio is a lower bound.
-
-    The peer reaches the target at its first error that is not above it. We reach it only when no later error, for
-    instance of another start, is above it by more than one standard error.
+    its last time counts and the ratio is a lower bound. Where errors are known too roughly, the row has no ratio.
     """
-    above = [k for k, row in enumerate(ours) if row.error - row.error_se > target]
-    settled = ours[min(above[-1] + 1, len(ours) - 1) if above else 0]
-    reached = next((row for row in peer if row.error <= target), None)
-    last = reached or peer[-1]
-    changes = {"benchmark": name, "efficiency_ratio": last.seconds / settled.seconds, "lower_bound": reached is None}
+    own, others = reached(ours, target) or ours[-1], reached(peer, target)
+    last = others or peer[-1]
+    vaguest = max(row.error_se for row in (own, last))
+    changes: dict[str, Any] = {"benchmark": name, "lower_bound": others is None}
+    if vaguest > MAX_ERROR_SE * target:
+        changes["undecided"] = (
+            f"This race decides nothing: its errors are known to {100 * vaguest:.1f} %, and a level of"
+            f" {100 * target:.1f} % needs a third of that; leave out --quick."
+        )
+    else:
+        changes["efficiency_ratio"] = last.seconds / own.seconds
     return last.model_copy(update=changes)
+
+
+def reached(rows: list[ToothRow], target: float) -> ToothRow | None:
+    """The first row from which on no error is above the target by more than its standard error; None where there is
+    none.
+    """
+    above = [k for k, row in enumerate(rows) if row.error - row.error_se > target]
+    first = above[-1] + 1 if above else 0
+    return rows[first] if first < len(rows) else None
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
@@ -212,7 +238,12 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
         mine = [row for row in rows if (row["benchmark"], row["peer"], row["rate"]) == ("tooth", peer, rate)]
         label = peer if rate is None else f"{peer}, rate {rate:g}"
         if (end := ratios.get(peer)) is not None and end["rate"] == rate:
-            label += f", {'over ' if end['lower_bound'] else ''}{end['efficiency_ratio']:.3g} times our time"
+            ratio = end["efficiency_ratio"]
+            label += (
+                ", undecided"
+                if ratio is None
+                else f", {'over ' if end['lower_bound'] else ''}{ratio:.3g} times our time"
+            )
         axes.plot(
             [row["seconds"] for row in mine],
             [100 * row["error"] for row in mine],

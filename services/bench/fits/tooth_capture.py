@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +96,9 @@ class PreparedTooth:
     observations: Observations
     views: tuple[ViewStack, ...]
     engine: Engine
+    truth: Mapping[str, float] = field(default_factory=dict)
+    """True reduced scattering coefficients, per mm, by ``enamel.sigma_s_reduced`` and ``dentin.sigma_s_reduced``; empty
+    where they are not known."""
 
     def errors(self, tissue: Tissue | Mouth, *, samples: int, seed: int) -> tuple[ErrorSums, ErrorSums]:
         """Return the error sums on fitted and on held-out images, from two renders of so many paths per pixel."""
@@ -170,7 +173,10 @@ def smallest_case(folder: Path, *, pixel_step: int = 1, seed: int = 1) -> Prepar
         "pixel_step": pixel_step,
         "seed": seed,
     }
-    return prepared_tooth(folder / "job", JobSpec.model_validate(options))
+    known = json.loads((source / "truth.json").read_text())
+    media = known["channels"][CHANNEL] if "channels" in known else known
+    truth = {f"{part}.sigma_s_reduced": float(media[part]["sigma_s_reduced"]) for part in ("enamel", "dentin")}
+    return replace(prepared_tooth(folder / "job", JobSpec.model_validate(options)), truth=truth)
 
 
 def tissue_of(values: Mapping[str, float]) -> Tissue:
