@@ -67,6 +67,22 @@ def test_a_stage_ends_with_its_steps(moved: Material, allowed: int) -> None:
     assert fit.next_checkpoint(checkpoint(1, allowed - 1), stage, moved, 9.0, 9.0, is_settled=False).stage == 2
 
 
+@pytest.mark.parametrize(
+    ("material", "gain", "steps", "is_far"),
+    [
+        (THIN, 60.0, 3, True),
+        (THIN, -60.0, 3, True),
+        (THIN, 40.0, 3, False),
+        (THICK, 60.0, 3, False),
+        (THIN, 60.0, 99, False),
+    ],
+)
+def test_a_thin_fit_far_from_its_minimum_returns_to_the_search(
+    material: Material, gain: float, steps: int, is_far: bool
+) -> None:
+    assert solver().is_far(material, gain, steps) is is_far
+
+
 def test_a_search_that_has_gone_astray_takes_no_further_step() -> None:
     fit = solver()
     fit.budget, fit.path_noise, fit.multiple = Budget(batches=2, first_paths=5), None, None

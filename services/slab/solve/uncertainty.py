@@ -63,13 +63,17 @@ class Uncertainty:
         return max(self.standard_error(slope), self.error_by_images(slope))
 
 
-def uncertainty_of(solution: Solution) -> Uncertainty:
+def uncertainty_of(solution: Solution, *, with_remaining: bool = True) -> Uncertainty:
     """Covariances at a solution.
 
     The unbiased matrix is indefinite where it is noise, and the matrix with the noise included would promise too much:
     so only directions whose curvature stands out count. The gradient's noise is that of the measurements, and that of
     the paths as measured between batches; the displacement left to the minimum counts as error, and so does the prior's
     pull.
+
+    Args:
+        solution: the solution.
+        with_remaining: whether the displacement left to the minimum counts as error.
     """
     coordinates, material, quadratic = solution.coordinates, solution.material, solution.quadratic
     x = coordinates.unknowns(material)
@@ -89,7 +93,8 @@ def uncertainty_of(solution: Solution) -> Uncertainty:
     chosen = chosen @ (directions.noise(noise) + pull + bounds) @ chosen
     remaining = _remaining_square(solution, x, priors[0], chosen)
     # Flags ask what the prior adds, so the covariance under the weak prior has only the noise that the weights contain.
-    chosen, alone = chosen + remaining, alone + remaining
+    if with_remaining:
+        chosen, alone = chosen + remaining, alone + remaining
     if (chain := coordinates.chain(material)) is None:
         averaging = np.linalg.inv(directions.total) @ directions.curvature
         return Uncertainty(chosen, alone, (chosen, alone), averaging[:KNOTS, :KNOTS])
