@@ -205,13 +205,15 @@ class GaussNewton:
                 again = self.search(moved)
                 checkpoint = replace(again, steps=checkpoint.steps + 1 + again.steps)
                 continue
-            errors = uncertainty_of(solution, with_remaining=False)
-            is_settled = is_last and largest_move(material, moved, errors) < SETTLED_MOVE
+            is_settled = False
+            if is_last and gain >= PROMISE_RATIO and path_variance < MAX_PATH_VARIANCE:
+                errors = uncertainty_of(solution, with_remaining=False)
+                is_settled = largest_move(material, moved, errors) < SETTLED_MOVE
             checkpoint = self.next_checkpoint(checkpoint, stage, moved, gain, path_variance, is_settled=is_settled)
             if self.is_astray(moved):
                 break
         # A negative promise comes of a matrix that is mostly noise, and tells as little as a large one.
-        is_near = abs(gain) < UNCONVERGED_RATIO or (is_settled and path_variance < MAX_PATH_VARIANCE)
+        is_near = abs(gain) < UNCONVERGED_RATIO or is_settled
         return replace(solution, converged=is_near and not self.is_astray(moved))
 
     def next_checkpoint(

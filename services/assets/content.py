@@ -1,0 +1,119 @@
+"""What an exporter is given: the measured parts of a published asset, by name, with surfaces and estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from services.assets.people_mesh import PeopleMesh, people_mesh
+from services.core.errors import CorruptStoreError, MissingStageError
+from services.core.files.meshes import fdi_numbers, read_mesh, read_teeth
+from services.core.geometry import Mesh
+from services.core.results import AssetManifest, Estimate
+from services.core.store import open_stage
+from services.transport.optics.half_space import half_space_reflectance
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium
+
+RGB = ("red", "green", "blue")
+Tables = dict[str, dict[str, Estimate]]
+
+
+@dataclass(frozen=True)
+class AssetPart:
+    """One surface of an asset and the estimates of what it bounds."""
+
+    name: str
+    """``tooth_11_enamel``, ``tooth_11_dentin``, ``gums`` or ``cavity``."""
+    tissue: str
+    """``enamel``, ``dentin``, ``gums`` or ``cavity``."""
+    surface: Mesh
+    """The closed surface as it was fitted, mm; a wall of the mouth may be open."""
+    mesh: PeopleMesh
+    """The same surface with normals and texture coordinates."""
+    estimates: Mapping[str, Mapping[str, Estimate]]
+    """Channel -> ``sigma``, ``alpha``, ``sigma_s_reduced`` ... -> estimate."""
+
+    def media(self) -> dict[str, Medium]:
+        """The scattering medium behind the surface in each channel; empty for a surface that only reflects."""
+        values: dict[str, dict[str, Any]] = {
+            channel: {field: table[field].value for field in MEDIUM_FIELDS if field in table}
+            for channel, table in self.estimates.items()
+        }
+        return {channel: Medium(**own) for channel, own in values.items() if {"sigma", "alpha"} <= own.keys()}
+
+    def absorption_per_mm(self) -> NDArray[np.float64]:
+        """Absorption coefficient, 1/mm, of red, green and blue."""
+        return _as_rgb({channel: (1 - medium.alpha) * medium.sigma for channel, medium in self.media().items()})
+
+    def base_colour(self) -> NDArray[np.float64]:
+        """Linear red, green and blue of the surface under diffuse light: the reflectance of a half space of the medium
+        (van de Hulst 1980, section 11.3), or of the wall itself.
+        """
+        found = {channel: half_space_reflectance(medium) for channel, medium in self.media().items()}
+        if not found:
+            found = {channel: t["reflectance"].value for channel, t in self.estimates.items() if "reflectance" in t}
+        return np.clip(_as_rgb(found), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class AssetContent:
+    """All parts of one asset."""
+
+    parts: tuple[AssetPart, ...]
+    channels: tuple[str, ...]
+    converged: bool
+    """Whether the fit behind the numbers converged."""
+
+
+def read_content(job: Path) -> AssetContent:
+    """The content of the asset that a job has published; results of earlier versions are read too.
+
+    Raises:
+        MissingStageError: no asset of a tooth or mouth is published. CorruptStoreError: a file is not as it was
+            published. MeshError: a surface is open or inside out.
+    """
+    folder, manifest = open_stage(job, "asset", AssetManifest)
+    if not fdi_numbers(folder):
+        raise MissingStageError(f"The asset in {job} holds no tooth; export a job of kind tooth or jaw.")
+    path = folder / "parameters.json"
+    try:
+        tables = TypeAdapter(Tables).validate_json(path.read_bytes())
+    except (OSError, ValidationError) as problem:
+        raise CorruptStoreError(f"{path} cannot be read; write it again with dentine export.") from problem
+    parts: list[AssetPart] = []
+
+    def add(name: str, tissue: str, surface: Mesh, prefixes: tuple[str, ...]) -> None:
+        own = {
+            channel: {
+                full.removeprefix(prefix): estimate
+                for prefix in prefixes
+                for full, estimate in table.items()
+                if full.startswith(prefix)
+            }
+            for channel, table in tables.items()
+        }
+        parts.append(AssetPart(name, tissue, surface, people_mesh(surface), own))
+
+    for tooth in read_teeth(folder):
+        for tissue, surface in (("enamel", tooth.outer), ("dentin", tooth.dentin)):
+            if surface is not None:
+                add(f"tooth_{tooth.fdi}_{tissue}", tissue, surface, (f"{tissue}.", f"{tooth.fdi}.{tissue}."))
+    for tissue in ("gums", "cavity"):
+        if (folder / f"{tissue}.ply").is_file():
+            surface = read_mesh(folder / f"{tissue}.ply")
+            surface.require_surface(f"{tissue}.ply")
+            add(tissue, tissue, surface, (f"{tissue}.",))
+    return AssetContent(tuple(parts), tuple(tables), manifest.converged)
+
+
+def _as_rgb(values: Mapping[str, float]) -> NDArray[np.float64]:
+    # Channels of other names than red, green and blue give a grey, their mean.
+    if set(RGB) <= values.keys():
+        return np.array([values[channel] for channel in RGB])
+    return np.full(3, float(np.mean(list(values.values()))) if values else 0.5)

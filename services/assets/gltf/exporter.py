@@ -1,0 +1,123 @@
+"""Writes ``asset.gltf`` and ``asset.bin`` (glTF 2.0, Khronos 2017), with ratified extensions alone.
+
+glTF has no scattering media, so enamel and gums are shown by their reflectance, as dentin is. The absorption is stated
+as a volume's attenuation over a short distance, and all coefficients stand with their standard errors in the materials'
+``extras``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.assets.content import AssetContent, AssetPart
+from services.core.store import write_atomic
+
+METRES_PER_MM = 1e-3
+SHORT = 0.02
+"""Optical depth of the attenuation distance. Blender reads the attenuation by (1 - c) / d, which is right for short
+distances alone: it is 0.97 to 0.99 of the absorption at this one, and 0.27 to 0.63 at a depth of 1."""
+LOST = (
+    "Scattering is not shown, as glTF has no media: each surface has the reflectance of a half space of its tissue."
+    " Layers, phase functions and light from behind are lost; the coefficients are in extras."
+)
+FLOAT, UINT = 5126, 5125
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
+
+
+class GltfExporter:
+    """Exporter of glTF 2.0."""
+
+    def check(self) -> None:
+        """Nothing is needed but what every export needs."""
+
+    def write(self, content: AssetContent, folder: Path) -> None:
+        """Write one node, mesh and material for each part, in metres."""
+        binary = bytearray()
+        views: list[dict[str, Any]] = []
+        accessors: list[dict[str, Any]] = []
+
+        def accessor(values: NDArray[Any], kind: str, *, bounds: bool = False) -> int:
+            is_index = kind == "SCALAR"
+            target = ELEMENT_ARRAY_BUFFER if is_index else ARRAY_BUFFER
+            stored = np.ascontiguousarray(values, dtype="<u4" if is_index else "<f4")
+            views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": stored.nbytes, "target": target})
+            binary.extend(stored.tobytes())
+            told: dict[str, Any] = {
+                "bufferView": len(views) - 1,
+                "componentType": UINT if is_index else FLOAT,
+                "count": len(stored),
+                "type": kind,
+            }
+            if bounds:
+                told |= {"min": stored.min(axis=0).tolist(), "max": stored.max(axis=0).tolist()}
+            accessors.append(told)
+            return len(accessors) - 1
+
+        meshes = []
+        for k, part in enumerate(content.parts):
+            mesh = part.mesh
+            attributes = {
+                "POSITION": accessor(mesh.vertices_mm * METRES_PER_MM, "VEC3", bounds=True),
+                "NORMAL": accessor(mesh.normals, "VEC3"),
+                "TEXCOORD_0": accessor(mesh.uv, "VEC2"),
+            }
+            primitive = {"attributes": attributes, "indices": accessor(mesh.faces.reshape(-1), "SCALAR"), "material": k}
+            meshes.append({"name": part.name, "primitives": [primitive]})
+        materials = [_material(part) for part in content.parts]
+        used = sorted({name for material in materials for name in material.get("extensions", {})})
+        document: dict[str, Any] = {
+            "asset": {
+                "version": "2.0",
+                "generator": "dentine",
+                "extras": {"lost": LOST, "converged": content.converged},
+            },
+            "scene": 0,
+            "scenes": [{"nodes": list(range(len(meshes)))}],
+            "nodes": [{"name": part.name, "mesh": k} for k, part in enumerate(content.parts)],
+            "meshes": meshes,
+            "materials": materials,
+            "accessors": accessors,
+            "bufferViews": views,
+            "buffers": [{"uri": "asset.bin", "byteLength": len(binary)}],
+        } | ({"extensionsUsed": used} if used else {})
+        write_atomic(folder / "asset.bin", bytes(binary))
+        write_atomic(folder / "asset.gltf", (json.dumps(document, indent=1) + "\n").encode())
+
+
+def _material(part: AssetPart) -> dict[str, Any]:
+    material: dict[str, Any] = {
+        "name": part.name,
+        "pbrMetallicRoughness": {
+            "baseColorFactor": [*part.base_colour().tolist(), 1.0],
+            "metallicFactor": 0.0,
+            "roughnessFactor": 0.5,
+        },
+        "extras": {
+            "coefficients": {
+                channel: {
+                    name: {"value": one.value, "se": one.se, "unit": one.unit, "determined": one.determined}
+                    for name, one in table.items()
+                }
+                for channel, table in part.estimates.items()
+            }
+        },
+    }
+    absorption = part.absorption_per_mm()
+    if part.media() and absorption.max() > 0:
+        distance_mm = SHORT / absorption.max()
+        volume = {
+            # A thickness of 0 would mean a surface without a volume, and the attenuation would be ignored.
+            "thicknessFactor": distance_mm * METRES_PER_MM,
+            "attenuationDistance": distance_mm * METRES_PER_MM,
+            "attenuationColor": np.exp(-absorption * distance_mm).tolist(),
+        }
+        material["extensions"] = {
+            "KHR_materials_transmission": {"transmissionFactor": 0.0},
+            "KHR_materials_volume": volume,
+        }
+    return material

@@ -1,0 +1,113 @@
+"""A published asset is written for other programs: with normals, texture coordinates, names, scale and coefficients."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.assets.exporters import export_to
+from services.core.errors import CorruptStoreError, InputError, MeshError, SettingsError
+from services.core.files.meshes import write_mesh
+from services.core.geometry import Mesh
+from services.core.results import AssetManifest
+from services.core.store import StageWriter
+from tests.support.command_line import dentine
+from tests.support.prepared import sphere
+
+COEFFICIENTS = {
+    "red": {"sigma": 4.0, "alpha": 0.99, "g1": 0.7},
+    "green": {"sigma": 5.0, "alpha": 0.98, "g1": 0.7},
+    "blue": {"sigma": 6.0, "alpha": 0.96, "g1": 0.7},
+}
+
+
+def published(root: Path, outer: Mesh | None = None) -> Path:
+    """A job's folder with the asset of a tooth of two spheres."""
+    writer = StageWriter(root, "asset", 1)
+    write_mesh(writer.folder / "teeth/11/outer.ply", outer or sphere(4.0))
+    write_mesh(writer.folder / "teeth/11/dentin.ply", sphere(3.0))
+    tables = {
+        channel: {
+            f"{part}.{name}": {"value": value, "se": value / 8, "unit": "1", "determined": True}
+            for part in ("enamel", "dentin")
+            for name, value in own.items()
+        }
+        for channel, own in COEFFICIENTS.items()
+    }
+    (writer.folder / "parameters.json").write_text(json.dumps(tables))
+    writer.publish(AssetManifest(files=()))
+    return root
+
+
+def array(folder: Path, document: dict[str, object], index: int, kind: str, columns: int) -> np.ndarray:
+    view = document["bufferViews"][document["accessors"][index]["bufferView"]]  # type: ignore[index]
+    stored = (folder / "asset.bin").read_bytes()[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    return np.frombuffer(stored, kind).reshape(-1, columns)
+
+
+def test_gltf_keeps_names_scale_normals_and_coefficients(tmp_path: Path) -> None:
+    (folder,) = export_to(published(tmp_path), ("gltf",))
+    document = json.loads((folder / "asset.gltf").read_text())
+    assert [node["name"] for node in document["nodes"]] == ["tooth_11_enamel", "tooth_11_dentin"]
+    primitive = document["meshes"][0]["primitives"][0]
+    points = array(folder, document, primitive["attributes"]["POSITION"], "<f4", 3)
+    np.testing.assert_allclose(
+        np.ptp(points, axis=0).max(), np.ptp(sphere(4.0).vertices_mm, axis=0).max() / 1000, rtol=1e-6
+    )
+    normals = array(folder, document, primitive["attributes"]["NORMAL"], "<f4", 3)
+    centre = points - sphere(4.0).vertices_mm.mean(axis=0) / 1000
+    cosines = np.einsum("ij,ij->i", normals, centre / np.linalg.norm(centre, axis=1, keepdims=True))
+    assert cosines.min() > 0.99  # of a sphere, the normals are radial
+    told = document["materials"][1]["extras"]["coefficients"]
+    assert {c: {n: told[c][n]["value"] for n in own} for c, own in COEFFICIENTS.items()} == COEFFICIENTS
+    assert told["red"]["sigma"]["se"] == 0.5
+    volume = document["materials"][1]["extensions"]["KHR_materials_volume"]
+    absorption = -np.log(volume["attenuationColor"]) / (1000 * volume["attenuationDistance"])
+    np.testing.assert_allclose(absorption, [(1 - t["alpha"]) * t["sigma"] for t in COEFFICIENTS.values()], rtol=1e-9)
+
+
+def test_texture_coordinates_do_not_overlap(tmp_path: Path) -> None:
+    (folder,) = export_to(published(tmp_path), ("gltf",))
+    document = json.loads((folder / "asset.gltf").read_text())
+    primitive = document["meshes"][0]["primitives"][0]
+    uv = array(folder, document, primitive["attributes"]["TEXCOORD_0"], "<f4", 2).astype(float)
+    faces = array(folder, document, primitive["indices"], "<u4", 3)
+    corners = uv[faces]
+    x, y = np.random.default_rng(0).uniform(size=(2, 400, 1))
+    sides = []
+    for k in range(3):
+        a, b = corners[:, k], corners[:, (k + 1) % 3]
+        sides.append((b[:, 0] - a[:, 0]) * (y - a[:, 1]) - (b[:, 1] - a[:, 1]) * (x - a[:, 0]))
+    signs = np.stack(sides)
+    covering = ((signs > 1e-9).all(axis=0) | (signs < -1e-9).all(axis=0)).sum(axis=1)
+    assert covering.max() == 1
+    assert covering.mean() > 0.3  # most of the texture is used
+
+
+def test_bad_input_is_one_sentence_each(tmp_path: Path) -> None:
+    root = published(tmp_path / "job")
+    with pytest.raises(SettingsError, match="Exporter 'obj' is not known; known are"):
+        export_to(root, ("obj",))
+    whole = sphere(4.0)
+    with pytest.raises(MeshError, match="not watertight"):
+        export_to(published(tmp_path / "open", Mesh(whole.vertices_mm, whole.faces[1:])), ("gltf",))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file"):
+        export_to(tmp_path / "file", ("gltf",))
+    (root / "asset/parameters.json").write_text("{}")
+    with pytest.raises(CorruptStoreError, match=r"parameters\.json of published stage asset"):
+        export_to(root, ("gltf",))
+    assert not (root / "asset-gltf").exists()
+
+
+def test_the_command_writes_again_in_place_of_an_earlier_export(tmp_path: Path) -> None:
+    root = published(tmp_path)
+    (root / "asset-gltf").mkdir()
+    (root / "asset-gltf/old").write_text("")
+    done = dentine("export", str(root), "--to", "gltf")
+    assert done.returncode == 0, done.stderr
+    assert sorted(p.name for p in (root / "asset-gltf").iterdir()) == ["asset.bin", "asset.gltf"]
+    assert not [p for p in root.iterdir() if p.name.startswith(".asset-gltf")]
