@@ -1,5 +1,5 @@
 # Each target does all its own set-up on a fresh Debian 12+ or Ubuntu 24.04+ machine; see deploy/setup.sh.
-.PHONY: demo lab-demo bom deploy-test deploy-check manifests gallery figures quick test test-all faults contracts attacks roles bare-test lint bench dashboard setup
+.PHONY: demo lab-demo bom deploy-test deploy-check manifests gallery figures quick test test-all faults contracts attacks roles clients bare-test lint bench dashboard setup
 
 BIN := .venv/bin
 # Files stay whole, because their tests share what they compute; tests/conftest.py puts the dearest files first. Compiled
@@ -45,6 +45,10 @@ attacks: ## every attack that is tried on the service, and their table in servic
 roles: ## every part of the service in a virtual environment of its own, and a small job through them, some minutes; installs from the package index
 	@deploy/setup.sh
 	@$(BIN)/python -m pytest tests/architecture/test_role_packages.py tests/pipeline/test_roles.py tests/pipeline/test_api_install.py
+
+clients: setup ## assets opened by programs of others, Blender among them, some minutes; installs them from the package index into .clients, see deploy/clients.txt
+	@deploy/clients.sh
+	@$(BIN)/python -m pytest -rs tests/clients
 
 SUITE ?= bookworm
 bare-test: ## demo and test on a machine with apt, make and python3 alone, in a folder; SUITE names it; needs root and mmdebstrap, see docs/start/install.md

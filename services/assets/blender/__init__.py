@@ -1,0 +1,1 @@
+"""Exporter to Blender: a script that builds the scene."""

@@ -1,0 +1,1 @@
+"""Assets opened by programs of others; ``make clients`` sets them up."""

@@ -1,0 +1,172 @@
+"""One tooth rendered by Cycles from its asset, and by stock Mitsuba from the same surfaces and numbers."""
+
+from __future__ import annotations
+
+import runpy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.assets.asset import write_asset
+from services.assets.blender.scripts import write_scripts
+from services.assets.mitsuba.scene import load_scene, nested_scene
+from services.core.geometry import Camera, Light, Mesh, Tooth
+from services.core.records import Boundary
+from services.core.results import Estimate, FitReport
+from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
+from services.transport.scene.stain_uv import ToothStains
+from tests.support.clients import run_client
+
+Array = NDArray[np.float64]
+IOR = 1.631
+LAMP = Light(name="l0", position_mm=(150.0, 600.0, 250.0), intensity=(1e6, 1e6, 1e6))
+CHANNELS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A tooth, its numbers by channel, a camera, and what lights it."""
+
+    outer: Mesh
+    dentin: Mesh | None
+    tissues: tuple[Tissue, ...]
+    camera: Camera
+    lit_by: Literal["sky", "lamp"] = "sky"
+    boundary: Boundary = "matched"
+    glass: dict[str, Any] | None = None
+    """Mitsuba's surface that replaces the asset's, where the script is asked for glass."""
+    words: tuple[str, ...] = field(default=())
+    """Further options of the script."""
+    lamp: Light = LAMP
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels, one for each tissue."""
+        return CHANNELS[: len(self.tissues)]
+
+    def covered(self) -> NDArray[np.bool_]:
+        """Pixels (H, W) whose centre shows the tooth."""
+        from services.transport.rays import RayScene
+
+        width, height = self.camera.size
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        hits = RayScene(self.outer).first_hits(*self.camera.rays(x.ravel(), y.ravel()))
+        return hits.hit.reshape(height, width)
+
+
+def report_of(tissues: dict[str, Tissue]) -> FitReport:
+    """A fit's report with these numbers."""
+    parameters = {
+        channel: {
+            f"{part}.{name}": Estimate(value=getattr(tissue.medium(part), name), se=0.01, unit="1", determined=True)
+            for part in ("enamel", "dentin")
+            for name in MEDIUM_FIELDS
+        }
+        for channel, tissue in tissues.items()
+    }
+    errors = dict.fromkeys(tissues, 0.03)
+    return FitReport(
+        converged=True, advice="", parameters=parameters, fit_error=errors, held_out_error=errors, steps=3, seconds=1.0
+    )
+
+
+def write_case(folder: Path, case: Case, stains: ToothStains | None = None) -> None:
+    """Write the case's asset, with the scripts for Blender."""
+    light = case.lamp.model_copy(update={"intensity": case.lamp.intensity[: len(case.tissues)]})
+    write_asset(
+        folder,
+        report_of(dict(zip(case.channels, case.tissues, strict=True))),
+        (Tooth(11, case.outer, case.dentin),),
+        (case.camera,),
+        (light,),
+        channels=case.channels,
+        boundary=case.boundary,
+        ior=IOR,
+        stains=stains,
+    )
+    write_scripts(folder)
+
+
+def cycles_image(folder: Path, case: Case, samples: int, seed: int, *words: str) -> Array:
+    """Radiance (H, W, C) by the asset's script, C being the case's channels."""
+    import mitsuba as mi
+
+    picture = folder / f"cycles-{seed}.exr"
+    lit = ("--light", "none", "--sky", "1") if case.lit_by == "sky" else ("--light", case.lamp.name)
+    done = run_client(
+        "bpy",
+        folder / "blender" / "blender_scene.py",
+        "--render",
+        picture,
+        "--scale",
+        "1",
+        "--flat",
+        "--samples",
+        str(samples),
+        "--seed",
+        str(seed),
+        *lit,
+        *case.words,
+        *words,
+    )
+    assert done.returncode == 0, done.stderr
+    return np.array(mi.Bitmap(str(picture)), dtype=np.float64)[..., : len(case.tissues)]
+
+
+def mitsuba_image(folder: Path, case: Case, samples: int, seed: int) -> Array:
+    """Radiance (H, W, C) by stock Mitsuba's ``prbvolpath``; channels with the same numbers are rendered once."""
+    import mitsuba as mi
+
+    if case.boundary == "thin":
+        runpy.run_path(str(folder / "thin_boundary.py"))["register"]()
+    teeth = folder / "teeth" / "11"
+    files = {"11": (teeth / "outer.ply", teeth / "dentin.ply" if case.dentin is not None else None)}
+    found: dict[Tissue, Array] = {}
+    for k, tissue in enumerate(case.tissues):
+        if tissue not in found:
+            scene = nested_scene(
+                files,
+                tissue,
+                (case.camera,),
+                case.lamp.position_mm,
+                case.lamp.intensity[k],
+                boundary=case.boundary,
+                ior=IOR,
+            )
+            if case.lit_by == "sky":
+                scene["light"] = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}
+            if case.glass is not None:
+                scene["outer_11"]["bsdf"] = case.glass
+            found[tissue] = np.array(mi.render(load_scene(scene), spp=samples, seed=17 * seed + k))[..., 0]
+    return np.stack([found[tissue] for tissue in case.tissues], axis=-1).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Cycles ÷ Mitsuba of the mean over the tooth, by channel (C,), with its standard error from the seeds."""
+
+    value: Array
+    se: Array
+
+
+def ratio_of(cycles: Array, mitsuba: Array, covered: NDArray[np.bool_]) -> Ratio:
+    """Ratio of the means of images (S, H, W, C) of S seeds, over the pixels that show the tooth."""
+    ours, theirs = (images[:, covered].mean(axis=1) for images in (cycles, mitsuba))
+    value = ours.mean(axis=0) / theirs.mean(axis=0)
+    spread = [each.std(axis=0, ddof=1) / np.sqrt(len(each)) / each.mean(axis=0) for each in (ours, theirs)]
+    return Ratio(value, np.asarray(value * np.hypot(*spread)))
+
+
+def ball(radius_mm: float, subdivisions: int = 4) -> Mesh:
+    """A ball about the origin."""
+    from tests.support.small_tooth import sphere
+
+    return sphere(radius_mm, subdivisions)
+
+
+def empty() -> Medium:
+    """No medium."""
+    return Medium(0.0, 0.0)
