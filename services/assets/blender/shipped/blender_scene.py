@@ -50,7 +50,7 @@ precision resolves 1e-6 mm of a tooth."""
 BOUNCES = 1024
 """Largest number of scattering events of a path. Enamel scatters light hundreds of times: 12 bounces, Blender's usual
 number, give 71 % of the light."""
-LEAST_PIXELS = 512
+MIN_PIXELS = 512
 """Least number of pixels of a picture's longer side, unless ``--scale`` is given."""
 UNITS = {"mm": 1.0, "m": 0.001}
 """Blender units per mm, by the name of the length that one Blender unit stands for."""
@@ -213,7 +213,7 @@ def choose(scene: Any, asset: Any, options: argparse.Namespace) -> None:
     for name in lights:
         scene.objects[name].hide_render = scene.objects[name].hide_viewport = name != light
     size = scene.camera["size"]
-    scale = options.scale or max(1, math.ceil(LEAST_PIXELS / max(size)))
+    scale = options.scale or max(1, math.ceil(MIN_PIXELS / max(size)))
     scene.render.resolution_x, scene.render.resolution_y = (round(scale * length) for length in size)
 
 
