@@ -69,6 +69,8 @@ class AssetContent:
     channels: tuple[str, ...]
     converged: bool
     """Whether the fit behind the numbers converged."""
+    folder: Path
+    """Folder of the published asset, whose files are as they were published."""
 
 
 def read_content(job: Path) -> AssetContent:
@@ -109,7 +111,7 @@ def read_content(job: Path) -> AssetContent:
             surface = read_mesh(folder / f"{tissue}.ply")
             surface.require_surface(f"{tissue}.ply")
             add(tissue, tissue, surface, (f"{tissue}.",))
-    return AssetContent(tuple(parts), tuple(tables), manifest.converged)
+    return AssetContent(tuple(parts), tuple(tables), manifest.converged, folder)
 
 
 def _as_rgb(values: Mapping[str, float]) -> NDArray[np.float64]:

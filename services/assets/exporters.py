@@ -18,7 +18,12 @@ from services.core.choices import chosen
 from services.core.files.folders import require_folder
 from services.core.store import translate_disk_errors
 
-EXPORTERS: Mapping[str, str] = MappingProxyType({"gltf": "services.assets.gltf.exporter:GltfExporter"})
+EXPORTERS: Mapping[str, str] = MappingProxyType(
+    {
+        "blender": "services.assets.blender.exporter:BlenderExporter",
+        "gltf": "services.assets.gltf.exporter:GltfExporter",
+    }
+)
 """Name of an exporter -> ``module:class``, imported when it is used."""
 
 

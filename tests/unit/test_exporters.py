@@ -24,7 +24,7 @@ COEFFICIENTS = {
 }
 
 
-def published(root: Path, outer: Mesh | None = None) -> Path:
+def published(root: Path, outer: Mesh | None = None, rig: dict[str, object] | None = None) -> Path:
     """A job's folder with the asset of a tooth of two spheres."""
     writer = StageWriter(root, "asset", 1)
     write_mesh(writer.folder / "teeth/11/outer.ply", outer or sphere(4.0))
@@ -38,6 +38,8 @@ def published(root: Path, outer: Mesh | None = None) -> Path:
         for channel, own in COEFFICIENTS.items()
     }
     (writer.folder / "parameters.json").write_text(json.dumps(tables))
+    if rig is not None:
+        (writer.folder / "rig.json").write_text(json.dumps(rig))
     writer.publish(AssetManifest(files=()))
     return root
 
@@ -111,3 +113,18 @@ def test_the_command_writes_again_in_place_of_an_earlier_export(tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     assert sorted(p.name for p in (root / "asset-gltf").iterdir()) == ["asset.bin", "asset.gltf"]
     assert not [p for p in root.iterdir() if p.name.startswith(".asset-gltf")]
+
+
+def test_blender_gets_surfaces_numbers_and_scripts(tmp_path: Path) -> None:
+    (folder,) = export_to(published(tmp_path, rig={"views": {}}), ("blender",))
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert files == {
+        "parameters.json", "rig.json", "teeth/11/outer.ply", "teeth/11/dentin.ply", "blender/blender_scene.py",
+        "blender/bodies.py", "blender/materials.py",
+    }  # fmt: skip
+
+
+def test_an_asset_without_cameras_is_to_be_written_again_for_blender(tmp_path: Path) -> None:
+    with pytest.raises(CorruptStoreError, match="describes no cameras; write the asset again with dentine export"):
+        export_to(published(tmp_path, rig={"cameras": ["c0"]}), ("blender",))
+    assert not (tmp_path / "asset-blender").exists()

@@ -1,0 +1,42 @@
+"""Writes a folder from which Blender 5 builds the measured scene, with its media: surfaces, numbers and scripts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+from services.assets.blender.scripts import write_scripts
+from services.assets.content import AssetContent
+from services.core.errors import CorruptStoreError
+
+KEPT = ("*.json", "*.ply", "teeth/**/*", "surfaces/*")
+"""Files of an asset that the scripts read; manifests and scenes of other programs stay behind."""
+LEFT_OUT = ("asset.json", "manifest.json")
+
+
+class BlenderExporter:
+    """Exporter to Blender: its script runs in Blender, or as ``python blender/blender_scene.py --save tooth.blend``."""
+
+    def check(self) -> None:
+        """Nothing is needed: the scripts run where Blender is."""
+
+    def write(self, content: AssetContent, folder: Path) -> None:
+        """Copy surfaces and numbers of the asset, and write the scripts beside them.
+
+        Raises:
+            CorruptStoreError: the asset is of an earlier version, whose rig.json says nothing of cameras.
+        """
+        rig = content.folder / "rig.json"
+        if not rig.is_file() or "views" not in json.loads(rig.read_text(encoding="utf-8")):
+            raise CorruptStoreError(
+                f"{rig} is of an earlier version and describes no cameras; write the asset again with dentine export,"
+                " without --to."
+            )
+        for pattern in KEPT:
+            for source in sorted(content.folder.glob(pattern)):
+                target = folder / source.relative_to(content.folder)
+                if source.is_file() and source.name not in LEFT_OUT:
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(source, target)
+        write_scripts(folder)
