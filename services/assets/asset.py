@@ -134,7 +134,6 @@ def write_asset(
         "ior": ior,
         "channels": list(channels),
         "cameras": [camera.name for camera in cameras],
-        "camera_pixels": [camera.size for camera in cameras],
         "scene.xml": colour,
         "views": {camera.name: camera.model_dump(exclude={"name"}) for camera in shown},
         "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},

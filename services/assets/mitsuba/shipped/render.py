@@ -30,7 +30,7 @@ def render(
     if rig["boundary"] == "thin":
         runpy.run_path(str(folder / "thin_boundary.py"))["register"]()
     sensor = rig["cameras"].index(camera)
-    width, height = rig["camera_pixels"][sensor]
+    width, height = rig["views"][camera]["size"]
     film = {} if large else {f"width_{sensor}": width, f"height_{sensor}": height}
     x, y, z = rig["lights"][light]["position_mm"]
     planes = []
