@@ -35,8 +35,8 @@ def check() -> None:
         PlatformError: a package is missing.
     """
     require_packages(PACKAGES, "fit")
-    for module in ("asset", "fit_pictures", "report"):
-        importlib.import_module(f"services.assets.{module}")
+    for module in ("services.assets.asset", "services.assets.fit_pictures", "services.assets.report_page"):
+        importlib.import_module(module)
 
 
 def export(spec: JobSpec, context: StageContext) -> AssetManifest:

@@ -102,6 +102,7 @@ def test_the_curves_ask_for_metrics_that_the_server_has() -> None:
         for target in panel["targets"]
         for name in re.findall(r"dentine_\w+", target["expr"])
     }
-    source = (DEPLOY.parent / "services" / "api" / "health" / "metrics.py").read_text()
+    api = DEPLOY.parent / "services" / "api"
+    source = "".join((api / name).read_text() for name in ("health/metrics.py", "http/request_metrics.py"))
     for name in asked:
         assert f'"{re.sub("_(total|bucket)$", "", name)}"' in source, name
