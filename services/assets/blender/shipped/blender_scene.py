@@ -329,7 +329,7 @@ def main() -> None:
                 bpy.context.window.scene = scene
         if options.save:
             bpy.ops.wm.save_as_mainfile(filepath=str(options.save.resolve()))
-    except bodies.SceneError as problem:
+    except RuntimeError as problem:
         if started_in_blender():
             raise
         sys.exit(str(problem))
