@@ -28,8 +28,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from services.assets.content import RGB
 from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
-from services.assets.mitsuba.rgb import RGB, colour_scene
+from services.assets.mitsuba.rgb import colour_scene
 from services.assets.mitsuba.scene import (
     SceneDict,
     large_film,

@@ -21,6 +21,7 @@ from services.transport.optics.half_space import half_space_reflectance
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium
 
 RGB = ("red", "green", "blue")
+"""Names of the channels that are taken for the three colours, in their order."""
 Tables = dict[str, dict[str, Estimate]]
 
 

@@ -77,7 +77,7 @@ class ReportPictures:
     camera: str = ""
     """Name of the camera of the thickness map and of the stains."""
     stains: NDArray[np.floating] | None = None
-    """Transmittance of the stains (H, W, C), NaN off the tooth; see ``export.stains.stain_image``."""
+    """Transmittance of the stains (H, W, C), NaN off the tooth; see ``stains.stain_image``."""
     stained: tuple[str, ...] = ()
     """The C channels that have stains."""
 

@@ -69,6 +69,11 @@ def test_a_race_between_errors_known_too_roughly_decides_nothing() -> None:
     assert label == f"{PEER}, undecided"
 
 
+def test_a_peer_that_is_clearly_above_the_level_has_a_bound_however_roughly_it_is_known() -> None:
+    found = summary(OURS, [row(PEER, 90.0, 0.6, error_se=0.03)], target=0.03)
+    assert (found.efficiency_ratio, found.lower_bound, found.undecided) == (90.0 / 5.0, True, "")
+
+
 def test_picture_shows_every_rate_and_the_bound() -> None:
     peers = [
         row(PEER, 10.0, 0.3, 0.02),

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from services.assets.asset import write_asset
-from services.assets.mitsuba.rgb import RGB, Colour, colour_scene
+from services.assets.content import RGB
+from services.assets.mitsuba.rgb import Colour, colour_scene
 from services.assets.mitsuba.scene import MIN_FILM_PIXELS, nested_scene
 from services.core.errors import InputError
 from services.core.geometry import Light, Mesh, Tooth

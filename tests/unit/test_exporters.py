@@ -66,6 +66,9 @@ def test_gltf_keeps_names_scale_normals_and_coefficients(tmp_path: Path) -> None
     told = document["materials"][1]["extras"]["coefficients"]
     assert {c: {n: told[c][n]["value"] for n in own} for c, own in COEFFICIENTS.items()} == COEFFICIENTS
     assert told["red"]["sigma"]["se"] == 0.5
+    said = document["asset"]["extras"]
+    assert "stains" in said["lost"]
+    assert said["colours"].startswith("The camera's red, green and blue are taken for linear RGB")
     volume = document["materials"][1]["extensions"]["KHR_materials_volume"]
     absorption = -np.log(volume["attenuationColor"]) / (1000 * volume["attenuationDistance"])
     np.testing.assert_allclose(absorption, [(1 - t["alpha"]) * t["sigma"] for t in COEFFICIENTS.values()], rtol=1e-9)

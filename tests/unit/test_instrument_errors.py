@@ -210,8 +210,8 @@ def test_says_what_was_assumed_and_which_calibration_is_at_fault() -> None:
     assert "1 % for the gain, 1 % for each light, 0.3 % for flare, 0.05 mm and 0.1° for where the scan lies" in assumed
     _, fault = instrument_sentences(spec, errors, {"green": (Fault(2, -0.05, -4.2),)}, kinds)
     assert fault.startswith(
-        "In green the images put light_gain.b off by -5.0 %, 4.2 times what their own error and its standard error of"
-        " 1 %"
+        "In green the images put light_gain.b off by -5.0 %, 4.2 times what their own error and its standard error of 1"
+        " %"
     )
     assert "check that light, its cable and its name" in fault
     assert set(REMEDY) == set(COMMON_KINDS[0])
@@ -340,9 +340,8 @@ def test_an_uncertainty_that_no_fit_uses_is_told() -> None:
     told = instrument_sentences(JobSpec(capture=Path("/mouth")), {"green": ERRORS}, {}, (), stated)
     assert told == (
         (
-            "The calibration states how wrong camera.c0.rx and 1 more may be. No fit moves single cameras and lights: "
-            "of these errors the standard errors know at most the lights' distances, which count in their gains, and"
-            " what moves all "
-            "lights as one."
+            "The calibration states how wrong camera.c0.rx and 1 more may be. No fit moves single cameras and lights:"
+            " of these errors the standard errors know at most the lights' distances, which count in their gains, and"
+            " what moves all lights as one."
         ),
     )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.content import AssetContent, AssetPart
+from services.assets.content import RGB, AssetContent, AssetPart
 from services.core.store import write_atomic
 
 METRES_PER_MM = 1e-3
@@ -23,7 +23,7 @@ SHORT = 0.02
 distances alone: it is 0.97 to 0.99 of the absorption at this one, and 0.27 to 0.63 at a depth of 1."""
 LOST = (
     "Scattering is not shown, as glTF has no media: each surface has the reflectance of a half space of its tissue."
-    " Layers, phase functions and light from behind are lost; the coefficients are in extras."
+    " Layers, phase functions, stains and light from behind are lost; the coefficients are in extras."
 )
 FLOAT, UINT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -74,7 +74,7 @@ class GltfExporter:
             "asset": {
                 "version": "2.0",
                 "generator": "dentine",
-                "extras": {"lost": LOST, "converged": content.converged},
+                "extras": {"lost": LOST, "colours": _colours(content.channels), "converged": content.converged},
             },
             "scene": 0,
             "scenes": [{"nodes": list(range(len(meshes)))}],
@@ -87,6 +87,12 @@ class GltfExporter:
         } | ({"extensionsUsed": used} if used else {})
         write_atomic(folder / "asset.bin", bytes(binary))
         write_atomic(folder / "asset.gltf", (json.dumps(document, indent=1) + "\n").encode())
+
+
+def _colours(channels: tuple[str, ...]) -> str:
+    if set(RGB) <= set(channels):
+        return "The camera's red, green and blue are taken for linear RGB; no colour matrix is applied."
+    return f"All grey: the mean over the channels {', '.join(channels)}, which are not red, green and blue."
 
 
 def _material(part: AssetPart) -> dict[str, Any]:

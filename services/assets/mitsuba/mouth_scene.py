@@ -59,7 +59,7 @@ def mouth_scene(
     gums_ior: float = 1.33,
     samples: Any = 64,
 ) -> SceneDict:
-    """Scene of a mouth under one point light; for the other arguments see ``mitsuba_scene.nested_scene``.
+    """Scene of a mouth under one point light; for the other arguments see ``scene.nested_scene``.
 
     Args:
         files: surfaces that ``write_mouth_surfaces`` wrote.

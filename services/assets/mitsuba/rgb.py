@@ -17,9 +17,6 @@ import numpy as np
 from services.assets.mitsuba.scene import MAX_DEPTH, ROULETTE_DEPTH, SceneDict
 from services.core.errors import InputError
 
-RGB = ("red", "green", "blue")
-"""Names of the channels of a colour scene, in its order."""
-
 COLOUR_INTEGRATOR: SceneDict = {"type": "volpathmis", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH}
 """Integrator that samples free paths of all channels together. ``volpath`` samples one channel's and weighs it for the
 others, and where extinctions differ twofold the weights have no finite variance: red came out 4 % dark after 16,384

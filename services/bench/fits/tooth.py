@@ -48,6 +48,8 @@ QUICK_CHOICE_S, QUICK_LIMIT_S = 20.0, 60.0
 MARK_GROWTH = 1.12
 """Ratio of the times of two successive measurements of a peer's error."""
 MARGIN = 1.1
+CLEAR_Z = 3.0
+"""Standard errors by which an error lies above the target where it has clearly not reached it."""
 MAX_ERROR_SE = 1 / 3
 """Largest standard error of an error that decides a race, as a share of the target."""
 ERROR_SAMPLES = 1024
@@ -201,7 +203,9 @@ def summary(ours: list[ToothRow], peer: list[ToothRow], target: float, name: str
     """
     own, others = reached(ours, target) or ours[-1], reached(peer, target)
     last = others or peer[-1]
-    vaguest = max(row.error_se for row in (own, last))
+    # A peer that is clearly above the target has not reached it, however roughly its error is known.
+    is_clear = others is None and last.error - CLEAR_Z * last.error_se > target
+    vaguest = max(row.error_se for row in ((own,) if is_clear else (own, last)))
     changes: dict[str, Any] = {"benchmark": name, "lower_bound": others is None}
     if vaguest > MAX_ERROR_SE * target:
         changes["undecided"] = (

@@ -12,9 +12,8 @@ from services.fit.solve.covariance import Uncertainty
 
 NOT_EXPLAINED = "The fit does not explain these images yet, so what this capture tells of the tooth is not known."
 PARTLY_EXPLAINED = (
-    "The model leaves out part of these images, so the coefficients may be farther off than their standard errors"
-    " and what this"
-    " capture tells of the tooth is not known."
+    "The model leaves out part of these images, so the coefficients may be farther off than their standard errors and"
+    " what this capture tells of the tooth is not known."
 )
 QUANTITIES = {"sigma_s_reduced": "scattering", "sigma_a": "absorption"}
 COORDINATES = {"sigma": ("scattering", 1), "alpha": ("absorption", -1)}

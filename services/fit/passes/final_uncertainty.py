@@ -1,5 +1,5 @@
-"""The final uncertainty estimate of a fit whose Jacobians came from similar media (see ``solve.closing``): one task
-per block, on any worker.
+"""The final uncertainty estimate of a fit whose Jacobians came from similar media (see ``solve.final_uncertainty``):
+one task per block, on any worker.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ In whitened coordinates y, x = T y, in which the usable curvature J~'WJ~ + Lambd
 D        J~'W Sigma W J~, the noise of the measurements; s >= 1 is the factor by which residuals exceed it
 C        Monte Carlo covariance of the final gradient, by pixels (``normal_equations``)
 Lambda   precision of the weak prior, which alone determines directions without data
-M        response of the solution, 1 where Jacobians are the images' own (``solve.closing``)
-S        covariance of the gradient by the errors of held mean cosines and moved bodies (``solve.closing``)
+M        response of the solution, 1 where Jacobians are the images' own (``solve.final_uncertainty``)
+S        covariance of the gradient by the errors of held mean cosines and moved bodies (``solve.final_uncertainty``)
 N        variance of steps p that used M by the noise in M, diag(sum_b var(M_ab) p_b^2)
 r        remaining step to the minimum, where the fit ended before it: M^-1 (gradient + Lambda (x - mean))
 =======  ===============================================================================================================

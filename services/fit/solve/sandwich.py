@@ -28,7 +28,7 @@ class Sandwich:
     """Factor s by which residuals exceed the measurements' noise."""
     weighing: Array
     """Difference (F, F) between the meat by which the combination with the prior is chosen and the meat that is stated
-    (``ClosingSums.expected_shift_covariance``)."""
+    (``FinalSums.expected_shift_covariance``)."""
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Covariance V (K, K) of the prior of the instrument's errors."""
     rejected: tuple[int, ...] = ()

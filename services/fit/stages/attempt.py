@@ -207,9 +207,8 @@ def assess_convergence(fits: Mapping[str, ChannelFit[Any]]) -> Assessment:
     ]
     doubts = [
         f"{c}: unseen images are {100 * error:.1f} % off beside their noise, so the model leaves out more than the"
-        " standard errors contain. In virtual mouths with such errors, whose enamel scatters little, coefficients"
-        " were up to 11"
-        " standard errors off."
+        " standard errors contain. In virtual mouths with such errors, whose enamel scatters little, coefficients were"
+        " up to 11 standard errors off."
         for c, fit in fits.items()
         if c not in unexplained and (error := _doubtful_error(fit)) is not None
     ]

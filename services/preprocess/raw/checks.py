@@ -137,9 +137,8 @@ def _is_empty(root: Path, frames: tuple[RawFrame, RawFrame], exposures: tuple[Ex
         if own.max() < least and predicted.max() >= SURELY_COUNTED * least:
             raise CaptureInputError(
                 f"Frame {root / frame.file} ({frame.label}) is empty: it counts nothing above its black, where"
-                f" {other.file} lets expect {predicted.max():.3g} counts; take it again with the light on, or"
-                " correct its"
-                " kind, exposure_s, gain or level."
+                f" {other.file} lets expect {predicted.max():.3g} counts; take it again with the light on, or correct"
+                " its kind, exposure_s, gain or level."
             )
     return bool(blocks[0].max() < least)
 

@@ -203,9 +203,8 @@ def misfit_faults(dictionary: str, misfit: float, misfit_se: float, values: int,
     if is_default:
         remedy = "check" if converged else "let the fit converge first, and then check"
         sentence = (
-            f"The images differ from the fit {times}, so its standard errors say too little: {remedy} their"
-            " variances, and the cell,"
-            " the beam and the angles that the folder describes."
+            f"The images differ from the fit {times}, so its standard errors say too little: {remedy} their variances,"
+            " and the cell, the beam and the angles that the folder describes."
         )
     else:
         sentence = (

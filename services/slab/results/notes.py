@@ -14,8 +14,8 @@ from services.slab.solve.solution import Solution
 Array = NDArray[np.float64]
 
 LARGE_PATH_VARIANCE = 1.0
-"""Variance by the paths, in units of that by the images, above which paths are the larger part of the standard"
-" errors."""
+"""Variance by the paths, in units of that by the images, above which paths are the larger part of the standard
+errors."""
 
 
 def notes_of(
@@ -74,8 +74,7 @@ def _on_phase(phase: PhaseFunction) -> list[str]:
         notes.append(
             f"The images resolve structure of the phase function that is {finest:.0f} to {coarsest:.0f} degrees wide,"
             " depending on the angle. Narrower structure, such as rings of spheres, is averaged, and each standard"
-            " error is that of"
-            " the average."
+            " error is that of the average."
         )
     return notes
 

@@ -1,6 +1,4 @@
-"""Medium parameters in physical units, and their names; ``domain`` holds the unbounded domain in which they are
-fitted.
-"""
+"""Media of teeth in physical units, and the names of their parameters."""
 
 from __future__ import annotations
 

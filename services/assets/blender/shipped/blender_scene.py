@@ -10,7 +10,7 @@ Three ways to run it in the folder of an asset::
 Cycles scatters light in the media themselves, so its pictures are those of the measured parameters. It adds the
 coefficients of volumes that overlap. Therefore the enamel is a shell, of the outer surface and the dentin's surface
 turned round, and the dentin's own object lies ``GAP_MM`` inside that: of two faces at the same place one is passed
-over, which costs 12 % of the light.
+over, which changed the light of balls and of an incisor by 4 to 52 %.
 """
 
 from __future__ import annotations

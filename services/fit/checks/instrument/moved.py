@@ -85,9 +85,8 @@ def shift_sentences(channel: str, faults: Sequence[Fault], errors: InstrumentErr
         named.add(photograph)
         yield (
             f"In {channel} {photograph} is shifted by {abs(fault.size):.2f} px, {abs(fault.z):.1f} times what its own"
-            f" error and the standard error of its motion, {errors.se[fault.index]:.2g} px, allow together: the"
-            " subject moved in it;"
-            " take it again, or leave that light out (left_out_lights)."
+            f" error and the standard error of its motion, {errors.se[fault.index]:.2g} px, allow together: the subject"
+            " moved in it; take it again, or leave that light out (left_out_lights)."
         )
 
 

@@ -70,16 +70,14 @@ def instrument_sentences(
         return (
             (
                 "The standard errors take the instrument for perfect, as instrument = 'off' says: gain, lights and"
-                " flare"
-                " may be wrong."
+                " flare may be wrong."
             ),
         )
     if not any(own.names for own in errors.values()):
         return (
             (
-                f"The standard errors take the instrument for perfect: a fit of the solver {spec.solver} does not"
-                " know its gain,"
-                " lights and flare."
+                f"The standard errors take the instrument for perfect: a fit of the solver {spec.solver} does not know"
+                " its gain, lights and flare."
             ),
         )
     unmoved = (
@@ -107,10 +105,8 @@ def _assumed(names: tuple[str, ...], errors: Mapping[str, InstrumentErrors]) -> 
             else ""
         )
         yield (
-            f"Assumed, as the calibration does not state how wrong it may be: {listed}. "
-            "The standard errors depend on these; state them as uncertainty in capture.json, or in a raw folder's"
-            " calibration.json."
-            f"{gain}"
+            f"Assumed, as the calibration does not state how wrong it may be: {listed}. The standard errors depend on"
+            f" these; state them as uncertainty in capture.json, or in a raw folder's calibration.json.{gain}"
         )
 
 
@@ -132,10 +128,9 @@ def _unused(stated: CalibrationUncertainty | None) -> Iterator[str]:
     if unused:
         rest = f" and {len(unused) - 1} more" if unused[1:] else ""
         yield (
-            f"The calibration states how wrong {unused[0]}{rest} may be. No fit moves single cameras and lights: "
-            "of these errors the standard errors know at most the lights' distances, which count in their gains, and"
-            " what moves all "
-            "lights as one."
+            f"The calibration states how wrong {unused[0]}{rest} may be. No fit moves single cameras and lights: of"
+            " these errors the standard errors know at most the lights' distances, which count in their gains, and what"
+            " moves all lights as one."
         )
 
 
@@ -143,8 +138,7 @@ def _exact_lights(errors: Mapping[str, InstrumentErrors]) -> Iterator[str]:
     if not any(kind_of_error(name) == "light_gain" for own in errors.values() for name in own.names):
         yield (
             "The standard errors take single lights for as bright as the calibration says: under so many a jaw's fit"
-            " knows their"
-            " common gain alone."
+            " knows their common gain alone."
         )
 
 
