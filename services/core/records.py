@@ -36,6 +36,23 @@ Number = Annotated[float, Strict()]
 somebody wrote "level": true."""
 Whole = Annotated[int, BeforeValidator(_no_stand_in)]
 """A whole number under the same rule; 2.0 counts as whole."""
+
+
+def _auto_or_whole(value: Any) -> Any:
+    if value == AUTO:
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float) or int(value) != value or not 1 <= value <= 64:
+        raise PydanticCustomError("pixel_step_type", 'give "auto" or a whole number from 1 to 64')
+    return int(value)
+
+
+AUTO: Literal["auto"] = "auto"
+PixelStep = Annotated[
+    int | Literal["auto"],
+    BeforeValidator(_auto_or_whole),
+    WithJsonSchema({"anyOf": [{"type": "string", "const": AUTO}, {"type": "integer", "minimum": 1, "maximum": 64}]}),
+]
+"""Edge of the fitted squares in pixels, or ``auto``."""
 JobName = Annotated[
     str, StringConstraints(strip_whitespace=True, min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")
 ]
@@ -292,7 +309,13 @@ class JobSpec(Record):
         "endpoint, region and credentials are those of the workers' environment (AWS_ENDPOINT_URL, AWS_REGION, "
         "AWS_ACCESS_KEY_ID, …)",
     )
-    pixel_step: Whole = Field(default=1, ge=1, le=64, description="fit means over squares of n x n pixels")
+    pixel_step: PixelStep = Field(
+        default=AUTO,
+        description=(
+            "fit means over squares of n x n pixels; auto: the largest whose edge at the teeth is at most 0.5 mm, and"
+            " single pixels where stains are fitted"
+        ),
+    )
     samples_per_pixel: Whole = Field(
         default=64, ge=2, le=65536, description="paths per pixel and pass at the start; raised as the fit needs"
     )

@@ -126,7 +126,15 @@ class FitReport(Record):
             " none was looked for"
         ),
     )
+    pixel_step: int = Field(default=1, description="edge of the fitted squares, in pixels of the photographs")
+    pixel_edge_mm: float | None = Field(
+        default=None, description="edge of the fitted squares at the teeth, median over the cameras"
+    )
     seconds: float = Field(description="from the first attempt's start to the end, pauses between attempts included")
+    seconds_by_purpose: dict[str, float] = Field(
+        default={},
+        description="time of the last attempt's tasks by what they were for, summed over workers, the longest first",
+    )
 
 
 class Figure(Record):

@@ -6,7 +6,6 @@ import importlib
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 from services.core.choices import chosen
 from services.core.installed import require_packages
@@ -15,9 +14,6 @@ from services.core.results import FitReport, PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import StageWriter, open_stage
 from services.core.verdict import VERDICT, verdict_of
-
-if TYPE_CHECKING:
-    pass
 
 ENGINE = "services.transport.engine:Engine"
 
@@ -68,7 +64,8 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     kinds: dict[str, Callable[[Attempt], FitDriver | JawDriver]] = {"tooth": FitDriver, "jaw": JawDriver}
     driver = chosen("Kind of fit", spec.kind, kinds)(attempt)
     notes = open_stage(context.root, "prepared", PreparedManifest, verify=False)[1].notes
-    report = driver.run(time.time()).model_copy(update={"notes": notes})
+    report = driver.run(time.time())
+    report = report.model_copy(update={"notes": notes, "seconds_by_purpose": attempt.seconds_by_purpose})
     writer.publish(report)
     verdict = verdict_of(report)
     context.report(

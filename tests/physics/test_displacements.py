@@ -37,7 +37,7 @@ def test_changes_are_half_the_difference_of_images_of_both_displaced_surfaces(tm
     block = write_block(tmp_path, PixelBlock(view, ones, ones, ones, ones > 2))
     task = BlockTask(block, 0, write_recipe(tmp_path, scene), "closing", TISSUE, SAMPLES)
 
-    found = displacements_task(InProcessHost(), task, TISSUE, DisplacedScene(displaced, len(errors)), SEEDS)
+    found = displacements_task(InProcessHost(), task, TISSUE, DisplacedScene(displaced, len(errors)), SEEDS).values
 
     assert found.shape == (len(errors), len(SEEDS), lights, len(view))
     known = replace(TISSUE, shape=())

@@ -13,7 +13,7 @@ from services.api.captures.descriptions import Describe, describe, description_f
 from services.core.errors import DentineError
 from services.core.geometry import Record
 from services.core.light.safety import FREE_FLASHES_PER_S
-from services.core.records import JobSpec
+from services.core.records import AUTO, JobSpec
 
 DEMO_VALUES = 16_896
 """Number of values that the demonstration fits: 8 lights in 3 images of about 21 by 33 pixels, one channel."""
@@ -51,7 +51,8 @@ def size_of(spec: JobSpec, describe: Describe = describe) -> JobSize | None:
 
 def _sized(spec: JobSpec, values: int) -> JobSize:
     steps = spec.adam_steps if spec.solver == "adam" else spec.max_steps
-    return JobSize(pixels=max(values // spec.pixel_step**2, 1), samples=spec.samples_per_pixel, steps=steps)
+    edge = 1 if spec.pixel_step == AUTO else int(spec.pixel_step)
+    return JobSize(pixels=max(values // edge**2, 1), samples=spec.samples_per_pixel, steps=steps)
 
 
 def method_of(spec: JobSpec) -> str:

@@ -23,6 +23,7 @@ from services.fit.measurements.held_out import held_out_images, left_out_lights
 from services.fit.measurements.instrument.capture import Instrument
 from services.fit.measurements.instrument.moves import Move
 from services.fit.measurements.levels import LevelReader, reduced_camera, whole_squares
+from services.fit.measurements.pixel_step import chosen_pixel_step
 from services.fit.measurements.slopes import image_slopes
 from services.fit.measurements.surroundings import read_neighbours
 from services.fit.measurements.view_stack import ViewStack, comparison_cells, on_coarse_grid
@@ -52,6 +53,14 @@ class Observations:
     cavity: Mesh | None = None
     neighbours: tuple[Tooth, ...] = ()
     """Teeth that are rendered around a single one, the nearest first."""
+    pixel_step: int = 1
+    """Edge of the fitted squares, in pixels of the photographs."""
+
+    @property
+    def pixel_edge_mm(self) -> float:
+        """Median over cameras of the edge of a fitted square at the teeth."""
+        centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in self.teeth]).mean(axis=0)
+        return self.pixel_step * float(np.median([camera.pixel_mm(centre_mm) for camera in self.manifest.cameras]))
 
     @property
     def light_positions_mm(self) -> Array:
@@ -140,14 +149,17 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
                 f" {', '.join(manifest.channels)}."
             )
     held_out = held_out_images(manifest, spec)
+    centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in teeth]).mean(axis=0)
+    step = chosen_pixel_step(folder, manifest, centre_mm, spec)
     if spec.kind == "tooth" and not manifest.surroundings:
-        return Observations(folder, manifest, teeth, held_out)
+        return Observations(folder, manifest, teeth, held_out, pixel_step=step)
     gums, cavity = (
         read_mesh(path) if path.is_file() else None for path in (folder / "gums.ply", folder / "cavity.ply")
     )
     if spec.kind == "tooth":
-        return Observations(folder, manifest, teeth, held_out, gums, neighbours=read_neighbours(folder, teeth[0]))
-    return Observations(folder, manifest, teeth, held_out, gums, cavity)
+        neighbours = read_neighbours(folder, teeth[0])
+        return Observations(folder, manifest, teeth, held_out, gums, neighbours=neighbours, pixel_step=step)
+    return Observations(folder, manifest, teeth, held_out, gums, cavity, pixel_step=step)
 
 
 def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tuple[ViewStack, ...]:
@@ -157,15 +169,16 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
         CaptureInputError: no valid pixel, or no light in them.
     """
     manifest, index = observations.manifest, observations.manifest.channels.index(channel)
-    level = LevelReader(observations.folder / "prepared.zarr", index, spec.pixel_step)
+    step = observations.pixel_step
+    level = LevelReader(observations.folder / "prepared.zarr", index, step)
     lights, views, used = range(len(manifest.lights)), [], ~left_out_lights(manifest, spec)[:, None, None]
     for c, camera in enumerate(manifest.cameras):
-        valid = np.stack([whole_squares(level.bits(c, light, camera) == 0, spec.pixel_step) for light in lights]) & used
+        valid = np.stack([whole_squares(level.bits(c, light, camera) == 0, step) for light in lights]) & used
         y, x = np.nonzero(valid.any(axis=0))
         if len(x) == 0:
             continue
         outside = np.uint16(MaskBit.OUTSIDE)
-        usable = (whole_squares(level.bits(c, light, camera) & ~outside == 0, spec.pixel_step) for light in lights)
+        usable = (whole_squares(level.bits(c, light, camera) & ~outside == 0, step) for light in lights)
         images = ((*level.image(c, light, camera), seen) for light, seen in zip(lights, usable, strict=True))
         reference, spread, slopes = (
             np.stack(one)
@@ -181,7 +194,7 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
         ) ** 2
         known = np.isfinite(spread) & (spread > 0)
         pixels = np.stack([x, y], axis=-1).astype(np.int32)
-        reduced = reduced_camera(camera, spec.pixel_step)
+        reduced = reduced_camera(camera, step)
         views.append(
             ViewStack(
                 reduced,

@@ -18,7 +18,7 @@ from services.fit.measurements.blocks import BlockTask
 from services.fit.measurements.instrument.moves import Move
 from services.fit.measurements.instrument.photographs import block_of, error_derivatives, photographed
 from services.fit.passes.derivatives import Differentiation
-from services.fit.passes.moves import by_scene, moves_task
+from services.fit.passes.moves import Changes, by_scene, moves_task
 from services.fit.passes.passes import StackProblem, TraceRow, trace_row
 from services.fit.solve.final_uncertainty import FinalSums, final_sums
 from services.tasks.engine_host import EngineHost
@@ -88,8 +88,8 @@ def measure_final_uncertainty(
         run.submit(f"{label}-{task.index}", final_task, task, *common, *own)
         for task, own in zip(tasks, changes, strict=True)
     ]
-    parts: list[tuple[FinalSums, TraceRow]] = run.gather(pending)
-    problem.passes.record([row for _, row in parts])
+    parts: list[tuple[FinalSums, tuple[TraceRow, ...]]] = run.gather(pending)
+    problem.passes.record([row for _, rows in parts for row in rows])
     total = parts[0][0]
     for sums, _ in parts[1:]:
         total = total + sums
@@ -124,9 +124,9 @@ def _changes_by_scene(
 
 def displacements_task(
     host: EngineHost, task: BlockTask, tissue: Tissue, scene: DisplacedScene, seeds: tuple[int, int]
-) -> NDArray[np.float32]:
+) -> Changes:
     """Changes of a block's images by the displacements of a scene's dentin: (K, 2, L, N) by displacement and seed."""
-    view = block_of(task).fitted_view
+    start, view = time.time(), block_of(task).fitted_view
 
     def images(mode: int) -> Array:
         weights = np.zeros(2 * scene.count)
@@ -136,7 +136,7 @@ def displacements_task(
         return np.stack([np.asarray(stack.mean, dtype=np.float64) for stack in stacks])
 
     changes = [0.5 * (images(k) - images(scene.count + k)) for k in range(scene.count)]
-    return np.array(changes).astype(np.float32)
+    return Changes(np.array(changes).astype(np.float32), trace_row("displacements", task, start))
 
 
 def final_task(
@@ -151,9 +151,9 @@ def final_task(
     seeds: tuple[int, int],
     image_seeds: tuple[int, int],
     ends: tuple[tuple[Tissue | Mouth, Tissue | Mouth], ...],
-    *changes: NDArray[np.float32],
-) -> tuple[FinalSums, TraceRow]:
-    """One block's closing sums and trace, with the changes (K, 2, L, N) by the displacements or moves of each scene.
+    *changes: Changes,
+) -> tuple[FinalSums, tuple[TraceRow, ...]]:
+    """One block's closing sums and trace, with the changes by the displacements or moves of each scene.
 
     Rows of ``slopes`` that are ``copied`` are taken from the similar media's Jacobian.
     """
@@ -187,12 +187,12 @@ def final_task(
         (exact[0], exact[1]),
         copied,
         (residual(renders[0]), residual(renders[1])),
-        np.concatenate([np.array(moved).reshape(len(ends), 2, size), *(one.reshape(-1, 2, size) for one in changes)]),
+        np.concatenate([np.array(moved).reshape(len(ends), 2, size), *(one.values.reshape(-1, 2, size) for one in changes)]),
         block.fit_weight.reshape(-1),
         len(block.reference),
         len(slopes.errors),
     )
-    return sums, trace_row("closing", task, start)
+    return sums, (*(one.trace for one in changes), trace_row("closing", task, start))
 
 
 def _copied_rows(domain: Domain) -> NDArray[np.bool_]:

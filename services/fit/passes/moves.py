@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +14,20 @@ from services.core.geometry import Camera
 from services.fit.measurements.blocks import BlockTask
 from services.fit.measurements.instrument.moves import DIFFERENCE_WIDTH, Move
 from services.fit.measurements.instrument.photographs import block_of
+from services.fit.passes.passes import TraceRow, trace_row
 from services.tasks.engine_host import EngineHost
 from services.transport.optics.parameters import Mouth, Tissue
 from services.transport.scene.recipe import View
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Changes (K, 2, L, N) of a block's images, by change and seed, and the trace of the task that rendered them."""
+
+    values: NDArray[np.float32]
+    trace: TraceRow
 
 
 def by_scene(moves: Sequence[Move]) -> tuple[tuple[Move, ...], ...]:
@@ -27,11 +38,11 @@ def by_scene(moves: Sequence[Move]) -> tuple[tuple[Move, ...], ...]:
 
 def moves_task(
     host: EngineHost, task: BlockTask, tissue: Tissue | Mouth, moves: tuple[Move, ...], seeds: tuple[int, int]
-) -> NDArray[np.float32]:
+) -> Changes:
     """Changes of a block's images by the moves of one scene, of one standard deviation each: (K, 2, L, N) by move and
     seed.
     """
-    block = block_of(task)
+    start, block = time.time(), block_of(task)
     view, count = block.fitted_view, len(block.reference)
     lit = view.lights if view.lights is not None else tuple(range(count))
 
@@ -48,4 +59,4 @@ def moves_task(
         ]
         for move in moves
     ]
-    return (np.array(changes) / DIFFERENCE_WIDTH).astype(np.float32)
+    return Changes((np.array(changes) / DIFFERENCE_WIDTH).astype(np.float32), trace_row("moves", task, start))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from services.core.job_kinds import SLAB_OPTIONS
@@ -80,6 +81,25 @@ NOISE_Z = 2.0
 photographs."""
 STEPS_PER_PREVIEW = 3
 """Number of steps between two previews; the first follows the first step."""
+
+PURPOSES: Mapping[str, str] = MappingProxyType(
+    {
+        "orders": "table search",
+        "image": "images",
+        "jacobian": "derivatives",
+        "gradient": "derivatives",
+        "products": "derivatives",
+        "compare": "comparison of steps",
+        "stain": "stains",
+        "weights": "weights of the loss",
+        "evaluate": "evaluation",
+        "closing": "final uncertainty",
+        "moves": "moves of scan and dome",
+        "displacements": "displacements of the dentin",
+        "advice": "advice on the next capture",
+    }
+)
+"""Purpose of a task, as the report names it, by the kind of its trace row."""
 
 Views = Mapping[str, tuple[ViewStack, ...]]
 """Observed views by channel."""
@@ -154,6 +174,14 @@ class Attempt:
                     self.context.report(StageEvent(stage="fit", kind="preview", data=preview))
 
         return report
+
+    @property
+    def seconds_by_purpose(self) -> dict[str, float]:
+        """Time of this attempt's tasks by purpose, the longest first."""
+        seconds = dict.fromkeys(PURPOSES.values(), 0.0)
+        for row in self.trace:
+            seconds[PURPOSES[row.kind]] += row.end_s - row.start_s
+        return {name: seconds[name] for name in sorted(seconds, key=lambda name: -seconds[name]) if seconds[name] > 0}
 
     def write_records(
         self, journal: Journal, observations: Observations, evaluations: Mapping[str, Evaluation], views: Views

@@ -29,6 +29,8 @@ export class OptionField {
   private readonly input: Input;
   private readonly refusal: HTMLElement;
   private readonly schema: OptionSchema;
+  /** The number that may stand in place of a word such as auto. */
+  private readonly number: OptionSchema | undefined;
 
   constructor(
     readonly name: string,
@@ -36,6 +38,7 @@ export class OptionField {
     isRequired = false,
   ) {
     this.schema = { ...schema, ...(schema.anyOf?.find((one) => one.type !== "null") ?? {}) };
+    if (this.schema.const !== undefined) this.number = schema.anyOf?.find((one) => one.type === "integer");
     const id = `option-${name.replace(".", "-")}`;
     this.input = build(this.schema, id);
     if (isRequired) this.input.required = true;
@@ -126,12 +129,14 @@ export class OptionField {
         .split(",")
         .map((part) => part.trim())
         .filter((part) => part);
+    if (this.number && text !== this.schema.const) return Number.isNaN(Number(text)) ? text : Number(text);
     if (this.schema.enum?.some((one) => typeof one === "number")) return Number(text);
     return this.schema.type === "number" || this.schema.type === "integer" ? Number(text) : text;
   }
 
   private help(): string {
-    const { minimum, maximum, exclusiveMinimum, type } = this.schema;
+    const { type } = this.schema;
+    const { minimum, maximum, exclusiveMinimum } = this.number ?? this.schema;
     const limits =
       minimum !== undefined && maximum !== undefined
         ? `${minimum} to ${maximum}`

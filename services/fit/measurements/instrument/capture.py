@@ -98,7 +98,11 @@ class Instrument:
 
 
 def instrument_of(
-    manifest: PreparedManifest, spec: JobSpec, teeth_mm: NDArray[np.float64], prepared: Path | None = None
+    manifest: PreparedManifest,
+    spec: JobSpec,
+    teeth_mm: NDArray[np.float64],
+    prepared: Path | None = None,
+    pixel_step: int = 1,
 ) -> Instrument | None:
     """The instrument of a capture; None where the job takes it for exact, and for the solver adam, which does not fit
     its errors.
@@ -109,6 +113,7 @@ def instrument_of(
         teeth_mm: centre of the teeth (3,).
         prepared: folder of the prepared capture, whose photographs' motion a tooth's fit estimates; None to take it for
             exact.
+        pixel_step: edge of the fitted squares, in pixels of the photographs.
     """
     if spec.instrument == "off" or spec.solver == "adam":
         return None
@@ -120,5 +125,5 @@ def instrument_of(
         stated is not manifest.uncertainty,
         max_gains,
         has_pose=spec.kind == "tooth",
-        shifts_px=shift_errors_px(prepared, spec.pixel_step) if prepared is not None and spec.kind == "tooth" else {},
+        shifts_px=shift_errors_px(prepared, pixel_step) if prepared is not None and spec.kind == "tooth" else {},
     )

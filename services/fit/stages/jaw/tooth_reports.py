@@ -89,6 +89,8 @@ def report(
         fit_error_se=standard_errors({c: one.fitted for c, one in _evaluations(fits).items()}),
         held_out_error_se=standard_errors({c: one.held_out for c, one in _evaluations(fits).items()}),
         steps=sum(jaw.fit.steps for jaw in fits.values()),
+        pixel_step=observations.pixel_step,
+        pixel_edge_mm=observations.pixel_edge_mm,
         seconds=seconds,
         teeth=teeth,
         **instrument_report(spec, {c: jaw.fit.uncertainty for c, jaw in fits.items()}, observations.manifest),

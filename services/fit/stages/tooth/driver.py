@@ -15,8 +15,6 @@ from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.frame import ToothFrame
 from services.anatomy.job_dentin import dentin_shape
 from services.core.files.content_files import StoredFile
-from services.core.geometry import Camera, Tooth
-from services.core.records import JobSpec
 from services.core.results import FitReport
 from services.fit.checks.alignment import offset_sentences
 from services.fit.checks.frames import photograph_sentences
@@ -65,11 +63,7 @@ class FitDriver:
         neighbours = neighbour_surfaces(tooth, observations.neighbours, observations.manifest.cameras, spec)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
-        layout = (
-            stain_layout(tooth.outer, texel_edge_mm(pixel_edge_mm(tooth, observations.manifest.cameras, spec)))
-            if spec.stains
-            else None
-        )
+        layout = stain_layout(tooth.outer, texel_edge_mm(observations.pixel_edge_mm)) if spec.stains else None
         scenes = {
             channel: channel_scene(
                 observations, channel, (dentin,), spec, None if layout is None else layout.corners_uv, neighbours
@@ -77,7 +71,7 @@ class FitDriver:
             for channel in channels
         }
         centre_mm = tooth.outer.vertices_mm.mean(axis=0)
-        instrument = instrument_of(observations.manifest, spec, centre_mm, observations.folder)
+        instrument = instrument_of(observations.manifest, spec, centre_mm, observations.folder, observations.pixel_step)
         files = {
             channel: write_channel(attempt.inputs, scenes[channel], channel, views[channel], spec.loss, instrument)
             for channel in channels
@@ -197,6 +191,8 @@ class FitDriver:
             else PARTLY_EXPLAINED
             if assessment.doubtful
             else determined_sentences(tables, correlations),
+            pixel_step=observations.pixel_step,
+            pixel_edge_mm=observations.pixel_edge_mm,
             seconds=seconds,
             **instrument_report(self.attempt.spec, uncertainties, observations.manifest),
         )
@@ -230,9 +226,3 @@ def shape_covariance(uncertainty: Uncertainty, tooth: int | None = None) -> tupl
         if coordinate.kind == "shape" and coordinate.tooth == tooth
     ]
     return tuple(tuple(row) for row in uncertainty.covariance[np.ix_(own, own)].tolist())
-
-
-def pixel_edge_mm(tooth: Tooth, cameras: tuple[Camera, ...], spec: JobSpec) -> float:
-    """Median over cameras of the spacing of fitted pixels at the tooth."""
-    centre_mm = tooth.outer.vertices_mm.mean(axis=0)
-    return float(np.median([camera.pixel_mm(centre_mm) for camera in cameras])) * spec.pixel_step
