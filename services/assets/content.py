@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from services.transport.optics.parameters import MEDIUM_FIELDS, Medium
 
 RGB = ("red", "green", "blue")
 """Names of the channels that are taken for the three colours, in their order."""
+TOOTH_IOR = 1.631
+"""Refractive index of enamel (teeth 2018), where the asset names none."""
 Tables = dict[str, dict[str, Estimate]]
 
 
@@ -40,6 +43,13 @@ class AssetPart:
     estimates: Mapping[str, Mapping[str, Estimate]]
     """Channel -> ``sigma``, ``alpha``, ``sigma_s_reduced`` ... -> estimate."""
 
+    def told_estimates(self) -> dict[str, dict[str, Any]]:
+        """The estimates as JSON values: channel -> name -> value, se, unit, determined."""
+        return {
+            channel: {name: estimate.model_dump(exclude={"se_parts"}) for name, estimate in table.items()}
+            for channel, table in self.estimates.items()
+        }
+
     def media(self) -> dict[str, Medium]:
         """The scattering medium behind the surface in each channel; empty for a surface that only reflects."""
         values: dict[str, dict[str, Any]] = {
@@ -50,7 +60,12 @@ class AssetPart:
 
     def absorption_per_mm(self) -> NDArray[np.float64]:
         """Absorption coefficient, 1/mm, of red, green and blue."""
-        return _as_rgb({channel: (1 - medium.alpha) * medium.sigma for channel, medium in self.media().items()})
+        found = {channel: (1 - medium.alpha) * medium.sigma for channel, medium in self.media().items()}
+        return _as_rgb(found, unknown=0.0)
+
+    def scattering_reduced_per_mm(self) -> NDArray[np.float64]:
+        """Reduced scattering coefficient, 1/mm, of red, green and blue."""
+        return _as_rgb({channel: medium.sigma_s_reduced for channel, medium in self.media().items()}, unknown=0.0)
 
     def base_colour(self) -> NDArray[np.float64]:
         """Linear red, green and blue of the surface under diffuse light: the reflectance of a half space of the medium
@@ -72,6 +87,21 @@ class AssetContent:
     """Whether the fit behind the numbers converged."""
     folder: Path
     """Folder of the published asset, whose files are as they were published."""
+    ior: float = TOOTH_IOR
+    """Refractive index of the teeth."""
+
+    @property
+    def shown_channels(self) -> tuple[str, str, str]:
+        """The channels that stand for red, green and blue; the last stands for those that are missing."""
+        named = RGB if set(RGB) <= set(self.channels) else (*self.channels, *self.channels[-1:] * 2)
+        return named[0], named[1], named[2]
+
+    @property
+    def told_colours(self) -> str:
+        """A sentence on what the colours are."""
+        if set(RGB) <= set(self.channels):
+            return "The camera's red, green and blue are taken for linear RGB; no colour matrix is applied."
+        return f"All grey: the mean over the channels {', '.join(self.channels)}, which are not red, green and blue."
 
 
 def read_content(job: Path) -> AssetContent:
@@ -112,11 +142,17 @@ def read_content(job: Path) -> AssetContent:
             surface = read_mesh(folder / f"{tissue}.ply")
             surface.require_surface(f"{tissue}.ply")
             add(tissue, tissue, surface, (f"{tissue}.",))
-    return AssetContent(tuple(parts), tuple(tables), manifest.converged, folder)
+    return AssetContent(tuple(parts), tuple(tables), manifest.converged, folder, _ior(folder / "rig.json"))
 
 
-def _as_rgb(values: Mapping[str, float]) -> NDArray[np.float64]:
+def _ior(rig: Path) -> float:
+    # Assets of earlier versions may lack the file or the index.
+    told = json.loads(rig.read_bytes()).get("ior") if rig.is_file() else None
+    return TOOTH_IOR if told is None else float(told)
+
+
+def _as_rgb(values: Mapping[str, float], unknown: float = 0.5) -> NDArray[np.float64]:
     # Channels of other names than red, green and blue give a grey, their mean.
     if set(RGB) <= values.keys():
         return np.array([values[channel] for channel in RGB])
-    return np.full(3, float(np.mean(list(values.values()))) if values else 0.5)
+    return np.full(3, float(np.mean(list(values.values()))) if values else unknown)

@@ -22,6 +22,7 @@ EXPORTERS: Mapping[str, str] = MappingProxyType(
     {
         "blender": "services.assets.blender.exporter:BlenderExporter",
         "gltf": "services.assets.gltf.exporter:GltfExporter",
+        "usd": "services.assets.usd.exporter:UsdExporter",
     }
 )
 """Name of an exporter -> ``module:class``, imported when it is used."""

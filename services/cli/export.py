@@ -13,7 +13,7 @@ def export(
     names: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Further exporters, after --to.")
     ] = None,
-    to: Annotated[list[str] | None, typer.Option(help="Exporter of the published asset: blender, gltf.")] = None,
+    to: Annotated[list[str] | None, typer.Option(help="Exporter of the published asset: blender, gltf, usd.")] = None,
 ) -> None:
     """Write the asset and report of a finished fit again, or with --to its asset for other programs."""
     if names and not to:

@@ -57,8 +57,8 @@ def test_a_saved_file_holds_the_teeth_at_their_size(saved: Facts) -> None:
     assert list(saved["scenes"]) == ["teeth"]
     assert saved["others"] == []
     scene = saved["scenes"]["teeth"]
-    assert set(scene["meshes"]) == {"11_enamel", "11_dentin"}
-    enamel, dentin = scene["meshes"]["11_enamel"], scene["meshes"]["11_dentin"]
+    assert set(scene["meshes"]) == {"tooth_11_enamel", "tooth_11_dentin"}
+    enamel, dentin = scene["meshes"]["tooth_11_enamel"], scene["meshes"]["tooth_11_dentin"]
     np.testing.assert_allclose(enamel["dimensions"], np.ptp(CASE.outer.vertices_mm, axis=0), rtol=1e-3)
     # The gap of 1e-4 mm is 4e-5 of the dentin's size.
     np.testing.assert_allclose(dentin["dimensions"], np.ptp(ball(2.4, 3).vertices_mm, axis=0) - 2e-4, rtol=1e-6)
@@ -73,17 +73,17 @@ def test_a_saved_file_holds_the_teeth_at_their_size(saved: Facts) -> None:
 def test_a_saved_file_holds_the_coefficients(saved: Facts) -> None:
     meshes = saved["scenes"]["teeth"]["meshes"]
     sigma = np.array([tissue.enamel.sigma for tissue in TISSUES])
-    first, second = meshes["11_enamel"]["material"]["volumes"]
-    np.testing.assert_allclose(meshes["11_enamel"]["sigma_per_mm"], sigma, rtol=1e-12)
+    first, second = meshes["tooth_11_enamel"]["material"]["volumes"]
+    np.testing.assert_allclose(meshes["tooth_11_enamel"]["sigma_per_mm"], sigma, rtol=1e-12)
     np.testing.assert_allclose(first["absorption"], 0.02 * sigma, rtol=1e-6)
     np.testing.assert_allclose(first["scattering"], 0.8 * 0.98 * sigma, rtol=1e-6)
     np.testing.assert_allclose(second["scattering"], 0.2 * 0.98 * sigma, rtol=1e-6)
     assert second["absorption"] == [0.0, 0.0, 0.0]
     np.testing.assert_allclose([first["g"], second["g"]], [0.6, -0.2], rtol=1e-6)
-    (core,) = meshes["11_dentin"]["material"]["volumes"]
+    (core,) = meshes["tooth_11_dentin"]["material"]["volumes"]
     np.testing.assert_allclose(core["absorption"], 0.1 * 2 * sigma, rtol=1e-6)
     # Where indices match, nothing but the medium is there.
-    kinds = meshes["11_enamel"]["material"]["kinds"]
+    kinds = meshes["tooth_11_enamel"]["material"]["kinds"]
     assert set(kinds) == {"ShaderNodeVolumeCoefficients", "ShaderNodeAddShader", "ShaderNodeOutputMaterial"}
 
 
@@ -109,7 +109,7 @@ def test_the_text_editor_adds_a_scene_once_and_leaves_those_of_the_user(asset: P
     found = facts_of("--text", asset / "blender" / "blender_scene.py", "--", "--sky", "0.5", "--light", "none")
     assert list(found["scenes"]) == ["teeth"]
     scene = found["scenes"]["teeth"]
-    assert set(scene["meshes"]) == {"11_enamel", "11_dentin"}
+    assert set(scene["meshes"]) == {"tooth_11_enamel", "tooth_11_dentin"}
     assert scene["world"] == 0.5
     assert [lamp["hidden"] for lamp in scene["lamps"].values()] == [True]
     assert found["others"] == ["Scene"]
@@ -136,7 +136,7 @@ def test_another_cosine_in_each_channel_is_rendered_channel_by_channel(tmp_path:
         np.testing.assert_allclose(whole[..., k], alone[..., 0], rtol=1e-5, atol=1e-7)
     assert whole[..., 2].mean() > 1.02 * whole[..., 0].mean()
     found = save(tmp_path)
-    assert len(found["scenes"]["teeth"]["meshes"]["11_enamel"]["material"]["volumes"]) == 4
+    assert len(found["scenes"]["teeth"]["meshes"]["tooth_11_enamel"]["material"]["volumes"]) == 4
     assert "channels one after another" in "".join(found["texts"].values())
 
 
@@ -158,10 +158,10 @@ def test_glass_and_subsurface_are_told(asset: Path, tmp_path: Path) -> None:
     rig = json.loads((tmp_path / "asset/rig.json").read_text())
     (tmp_path / "asset/rig.json").write_text(json.dumps(rig | {"boundary": "thin"}))
     glass = save(tmp_path / "asset", "--surface", "glass")
-    assert "ShaderNodeBsdfGlass" in glass["scenes"]["teeth"]["meshes"]["11_enamel"]["material"]["kinds"]
+    assert "ShaderNodeBsdfGlass" in glass["scenes"]["teeth"]["meshes"]["tooth_11_enamel"]["material"]["kinds"]
     assert "refracts" in "".join(glass["texts"].values())
     simple = save(tmp_path / "asset", "--subsurface")
-    assert list(simple["scenes"]["teeth"]["meshes"]) == ["11"]
+    assert list(simple["scenes"]["teeth"]["meshes"]) == ["tooth_11"]
     assert "Front light, distant shots" in "".join(simple["texts"].values())
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from collections.abc import Mapping
 from functools import cache
@@ -54,3 +55,16 @@ def run_client(
         check=False,
         env={**os.environ, **(environment or {})},
     )
+
+
+@cache
+def node_command() -> tuple[tuple[str, ...], dict[str, str]]:
+    """Node and an environment in which it finds ``gltf-validator``; skips the test where there is none."""
+    home = found_python().parent
+    node = shutil.which("node", path=os.pathsep.join([str(home), os.environ.get("PATH", "")]))
+    modules = os.pathsep.join([str(home.parent / "node_modules"), os.environ.get("NODE_PATH", "")])
+    environment = {**os.environ, "NODE_PATH": modules}
+    command = [node or "node", "-e", "require('gltf-validator')"]
+    if node is None or subprocess.run(command, check=False, capture_output=True, env=environment).returncode:
+        pytest.skip(f"no Node with gltf-validator in {home} or on NODE_PATH; run make clients")
+    return (node,), environment

@@ -24,14 +24,21 @@ COEFFICIENTS = {
 }
 
 
-def published(root: Path, outer: Mesh | None = None, rig: dict[str, object] | None = None) -> Path:
-    """A job's folder with the asset of a tooth of two spheres."""
+def published(
+    root: Path, outer: Mesh | None = None, rig: dict[str, object] | None = None, dentin: Mesh | None = None
+) -> Path:
+    """A job's folder with the asset of a tooth; of two spheres unless its surfaces are given."""
     writer = StageWriter(root, "asset", 1)
     write_mesh(writer.folder / "teeth/11/outer.ply", outer or sphere(4.0))
-    write_mesh(writer.folder / "teeth/11/dentin.ply", sphere(3.0))
+    write_mesh(writer.folder / "teeth/11/dentin.ply", dentin or sphere(3.0))
     tables = {
         channel: {
-            f"{part}.{name}": {"value": value, "se": value / 8, "unit": "1", "determined": True}
+            f"{part}.{name}": {
+                "value": value,
+                "se": value / 8,
+                "unit": "1/mm" if name == "sigma" else "1",
+                "determined": True,
+            }
             for part in ("enamel", "dentin")
             for name, value in own.items()
         }
@@ -67,7 +74,8 @@ def test_gltf_keeps_names_scale_normals_and_coefficients(tmp_path: Path) -> None
     assert {c: {n: told[c][n]["value"] for n in own} for c, own in COEFFICIENTS.items()} == COEFFICIENTS
     assert told["red"]["sigma"]["se"] == 0.5
     said = document["asset"]["extras"]
-    assert "stains" in said["lost"]
+    assert "light from behind are lost" in said["lost"]
+    assert document["scenes"][0]["extras"] == said
     assert said["colours"].startswith("The camera's red, green and blue are taken for linear RGB")
     volume = document["materials"][1]["extensions"]["KHR_materials_volume"]
     absorption = -np.log(volume["attenuationColor"]) / (1000 * volume["attenuationDistance"])

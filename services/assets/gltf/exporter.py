@@ -1,8 +1,8 @@
 """Writes ``asset.gltf`` and ``asset.bin`` (glTF 2.0, Khronos 2017), with ratified extensions alone.
 
-glTF has no scattering media, so enamel and gums are shown by their reflectance, as dentin is. The absorption is stated
-as a volume's attenuation over a short distance, and all coefficients stand with their standard errors in the materials'
-``extras``.
+Lengths are metres and y points up, as glTF wants it, where the asset's z does. glTF has no scattering media, so enamel
+and gums are shown by their reflectance, as dentin is. The absorption is stated as a volume's attenuation over a short
+distance, and all coefficients stand with their standard errors in the materials' ``extras``.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.content import RGB, AssetContent, AssetPart
+from services.assets.appearance import LOST, Appearance, appearance
+from services.assets.content import AssetContent, AssetPart
 from services.core.store import write_atomic
 
 METRES_PER_MM = 1e-3
+Y_UP = ([0, 2, 1], [1, 1, -1])
+"""Order and signs of an asset's coordinates in glTF: (x, y, z) becomes (x, z, -y)."""
 SHORT = 0.02
 """Optical depth of the attenuation distance. Blender reads the attenuation by (1 - c) / d, which is right for short
 distances alone: it is 0.97 to 0.99 of the absorption at this one, and 0.27 to 0.63 at a depth of 1."""
-LOST = (
-    "Scattering is not shown, as glTF has no media: each surface has the reflectance of a half space of its tissue."
-    " Layers, phase functions, stains and light from behind are lost; the coefficients are in extras."
-)
 FLOAT, UINT = 5126, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
@@ -62,22 +61,20 @@ class GltfExporter:
         for k, part in enumerate(content.parts):
             mesh = part.mesh
             attributes = {
-                "POSITION": accessor(mesh.vertices_mm * METRES_PER_MM, "VEC3", bounds=True),
-                "NORMAL": accessor(mesh.normals, "VEC3"),
+                "POSITION": accessor(_turned(mesh.vertices_mm) * METRES_PER_MM, "VEC3", bounds=True),
+                "NORMAL": accessor(_turned(mesh.normals), "VEC3"),
                 "TEXCOORD_0": accessor(mesh.uv, "VEC2"),
             }
             primitive = {"attributes": attributes, "indices": accessor(mesh.faces.reshape(-1), "SCALAR"), "material": k}
             meshes.append({"name": part.name, "primitives": [primitive]})
-        materials = [_material(part) for part in content.parts]
+        materials = [_material(part, appearance(content, part)) for part in content.parts]
         used = sorted({name for material in materials for name in material.get("extensions", {})})
+        said = {"lost": LOST, "colours": content.told_colours, "converged": content.converged}
         document: dict[str, Any] = {
-            "asset": {
-                "version": "2.0",
-                "generator": "dentine",
-                "extras": {"lost": LOST, "colours": _colours(content.channels), "converged": content.converged},
-            },
+            "asset": {"version": "2.0", "generator": "dentine", "extras": said},
             "scene": 0,
-            "scenes": [{"nodes": list(range(len(meshes)))}],
+            # Programs show what a scene says, and pass over what the asset does.
+            "scenes": [{"nodes": list(range(len(meshes))), "extras": said}],
             "nodes": [{"name": part.name, "mesh": k} for k, part in enumerate(content.parts)],
             "meshes": meshes,
             "materials": materials,
@@ -89,41 +86,29 @@ class GltfExporter:
         write_atomic(folder / "asset.gltf", (json.dumps(document, indent=1) + "\n").encode())
 
 
-def _colours(channels: tuple[str, ...]) -> str:
-    if set(RGB) <= set(channels):
-        return "The camera's red, green and blue are taken for linear RGB; no colour matrix is applied."
-    return f"All grey: the mean over the channels {', '.join(channels)}, which are not red, green and blue."
+def _turned(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    order, signs = Y_UP
+    return vectors[:, order] * signs
 
 
-def _material(part: AssetPart) -> dict[str, Any]:
-    material: dict[str, Any] = {
-        "name": part.name,
-        "pbrMetallicRoughness": {
-            "baseColorFactor": [*part.base_colour().tolist(), 1.0],
-            "metallicFactor": 0.0,
-            "roughnessFactor": 0.5,
-        },
-        "extras": {
-            "coefficients": {
-                channel: {
-                    name: {"value": one.value, "se": one.se, "unit": one.unit, "determined": one.determined}
-                    for name, one in table.items()
-                }
-                for channel, table in part.estimates.items()
-            }
-        },
-    }
+def _material(part: AssetPart, look: Appearance) -> dict[str, Any]:
+    extensions: dict[str, Any] = {}
+    if look.ior is not None:
+        extensions["KHR_materials_ior"] = {"ior": look.ior}
     absorption = part.absorption_per_mm()
     if part.media() and absorption.max() > 0:
         distance_mm = SHORT / absorption.max()
-        volume = {
+        extensions["KHR_materials_transmission"] = {"transmissionFactor": 0.0}
+        extensions["KHR_materials_volume"] = {
             # A thickness of 0 would mean a surface without a volume, and the attenuation would be ignored.
             "thicknessFactor": distance_mm * METRES_PER_MM,
             "attenuationDistance": distance_mm * METRES_PER_MM,
             "attenuationColor": np.exp(-absorption * distance_mm).tolist(),
         }
-        material["extensions"] = {
-            "KHR_materials_transmission": {"transmissionFactor": 0.0},
-            "KHR_materials_volume": volume,
-        }
-    return material
+    surface = {
+        "baseColorFactor": [*look.base_colour, 1.0],
+        "metallicFactor": 0.0,
+        "roughnessFactor": look.roughness,
+    }
+    material = {"name": part.name, "pbrMetallicRoughness": surface, "extras": {"coefficients": part.told_estimates()}}
+    return material | ({"extensions": extensions} if extensions else {})

@@ -193,10 +193,12 @@ class Asset:
             if path.with_name("dentin.ply").is_file():
                 core = read_ply(path.with_name("dentin.ply"))
                 shell.append(Side(core.turned()))
-                found.append(Body(f"{number}_dentin", self.medium(f"{prefix}dentin"), [Side(core)], moved=not cut))
+                found.append(
+                    Body(f"tooth_{number}_dentin", self.medium(f"{prefix}dentin"), [Side(core)], moved=not cut)
+                )
             files = [path.with_name(f"stain_{channel}.png") for channel in self.channels]
             stains = [file if file.is_file() else None for file in files]
-            found.append(Body(f"{number}_enamel", self.medium(f"{prefix}enamel"), shell, bool(cut), stains))
+            found.append(Body(f"tooth_{number}_enamel", self.medium(f"{prefix}enamel"), shell, bool(cut), stains))
         return found + ([Body("gums", self.medium("gums"), flesh, moved=False)] if flesh else [])
 
     def solids(self) -> list[Body]:
@@ -205,8 +207,9 @@ class Asset:
         dentins = {body.name.removesuffix("_dentin"): body.medium for body in found if body.name.endswith("_dentin")}
         solids = [body for body in found if body.name == "gums"]
         for body in found:
-            number = body.name.removesuffix("_enamel")
-            if number != body.name:
+            name = body.name.removesuffix("_enamel")
+            if name != body.name:
+                number = name.removeprefix("tooth_")
                 outer = Side(read_ply(self.folder / "teeth" / number / "outer.ply"), outside=True)
-                solids.append(Body(number, dentins.get(number, body.medium), [outer], moved=False))
+                solids.append(Body(name, dentins.get(name, body.medium), [outer], moved=False))
         return solids

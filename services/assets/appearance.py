@@ -1,0 +1,87 @@
+"""How programs without measured media show a part of an asset: colour, highlight and subsurface scattering.
+
+The names and meanings of the subsurface inputs are those of OpenPBR 1.1 (Academy Software Foundation 2024): the radius
+times the scale is the mean free path of light that forgets its direction at each scattering, 1 / (sigma_s' + sigma_a).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.assets.content import AssetContent, AssetPart
+
+Colour = tuple[float, float, float]
+
+ROUGHNESS = 0.35
+"""Roughness of the highlight, whose square is the width alpha of a GGX lobe: 0.12, a wet and polished tooth. No fit
+measures it."""
+GUMS_IOR = 1.33
+"""Refractive index of gums, which are wet."""
+LOST = (
+    "The surfaces have the colour of their tissue under even light, and the highlight of a wet tooth, which no fit"
+    " measured. Light within the media, layers under each other, phase functions and light from behind are lost;"
+    " the coefficients stand beside the surfaces."
+)
+"""What a surface material cannot say, for the file."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """What a surface shader is told."""
+
+    base_colour: Colour
+    """Linear reflectance under diffuse light."""
+    roughness: float
+    """Roughness of the highlight, 0 to 1; its square is GGX's alpha."""
+    ior: float | None
+    """Refractive index of the highlight; None for a wall without one."""
+    radius_mm: float | None
+    """Longest mean free path of the three colours, mm; None for a surface that only reflects."""
+    radius_scale: Colour
+    """Mean free paths in units of ``radius_mm``, at most 1."""
+
+
+def appearance(content: AssetContent, part: AssetPart) -> Appearance:
+    """The appearance of a part. A tooth's mean free paths are those of its dentin, through which most light passes."""
+    dentin = next((one for one in content.parts if one.name == part.name.replace("_enamel", "_dentin")), part)
+    # Light that meets nothing has no mean free path.
+    total = dentin.scattering_reduced_per_mm() + dentin.absorption_per_mm()
+    paths_mm = np.full(3, np.inf) if not total.all() else 1 / total
+    scatters = bool(np.isfinite(paths_mm).all())
+    ior = None if part.tissue == "cavity" else GUMS_IOR if part.tissue == "gums" else content.ior
+    return Appearance(
+        base_colour=_colour(part.base_colour()),
+        roughness=1.0 if ior is None else ROUGHNESS,
+        ior=ior,
+        radius_mm=float(paths_mm.max()) if scatters else None,
+        radius_scale=_colour(paths_mm / paths_mm.max()) if scatters else (1.0, 1.0, 1.0),
+    )
+
+
+def _colour(values: np.ndarray) -> Colour:
+    red, green, blue = (float(value) for value in values)
+    return red, green, blue
+
+
+def open_pbr_inputs(look: Appearance) -> dict[str, tuple[str, float | Colour]]:
+    """Inputs of OpenPBR that differ from their defaults, name -> (MaterialX type, value)."""
+    inputs: dict[str, tuple[str, float | Colour]] = {
+        "base_color": ("color3", look.base_colour),
+        "specular_roughness": ("float", look.roughness),
+    }
+    if look.ior is None:
+        inputs["specular_weight"] = ("float", 0.0)
+    else:
+        inputs["specular_ior"] = ("float", look.ior)
+    if look.radius_mm is not None:
+        inputs |= {
+            "subsurface_weight": ("float", 1.0),
+            "subsurface_color": ("color3", look.base_colour),
+            "subsurface_radius": ("float", look.radius_mm),
+            "subsurface_radius_scale": ("color3", look.radius_scale),
+            # The mean free path is that of isotropic scattering.
+            "subsurface_scatter_anisotropy": ("float", 0.0),
+        }
+    return inputs

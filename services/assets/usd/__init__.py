@@ -1,0 +1,1 @@
+"""USD: surfaces with preview and OpenPBR materials, and the coefficients as attributes."""

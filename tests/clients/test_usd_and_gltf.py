@@ -1,0 +1,122 @@
+"""Blender imports the USD and glTF files of an asset, and the formats' own validators find nothing wrong in them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.assets.exporters import export_to
+from services.core.geometry import Mesh
+from tests.support.clients import client_python, run_client
+from tests.support.prepared import sphere
+from tests.unit.test_exporters import COEFFICIENTS, published
+
+HERE = Path(__file__).parent
+FILES = {"usd": "asset.usda", "gltf": "asset.gltf"}
+UNKNOWN_SHADER = "MissingShaderIdInRegistry"
+"""The one finding that is expected: ``usd-core`` brings no definitions of MaterialX's shaders, ``ND_...``."""
+Facts = dict[str, Any]
+SEMI_AXES_MM = np.array([3.0, 2.5, 4.5])
+CENTRE_MM = np.array([0.5, -1.0, 7.0])
+"""Three unequal lengths and a place, so that a turned or mirrored axis is seen."""
+
+
+def ellipsoid(share: float) -> Mesh:
+    ball = sphere(1.0)
+    return Mesh(share * SEMI_AXES_MM * ball.vertices_mm + CENTRE_MM, ball.faces)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = published(tmp_path_factory.mktemp("job"), ellipsoid(1.0), dentin=ellipsoid(0.75))
+    export_to(root, tuple(FILES))
+    return root
+
+
+def imported(path: Path) -> Facts:
+    done = run_client("bpy", HERE / "import_facts.py", path)
+    assert done.returncode == 0, done.stderr
+    found: Facts = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
+
+
+def findings(module: str, path: Path) -> list[list[str]]:
+    done = run_client(module, HERE / "usd_findings.py", path)
+    assert done.returncode == 0, done.stderr
+    found: list[list[str]] = json.loads(done.stdout.strip().splitlines()[-1])
+    return [one for one in found if not (one[1] == UNKNOWN_SHADER and "shaderId 'ND_" in one[2])]
+
+
+@pytest.fixture(scope="module", params=FILES)
+def facts(request: pytest.FixtureRequest, job: Path) -> tuple[str, Facts]:
+    client_python("bpy")
+    return request.param, imported(job / f"asset-{request.param}" / FILES[request.param])
+
+
+def require_like(found: Facts, expected: Mesh) -> None:
+    """The surface at its size and place, with z upwards, smooth normals, and texture coordinates within 0 to 1."""
+    points = 1000 * np.array(found["metres"])
+    np.testing.assert_allclose(np.ptp(points, axis=0), np.ptp(expected.vertices_mm, axis=0), rtol=1e-3)
+    np.testing.assert_allclose(points.min(axis=0), expected.vertices_mm.min(axis=0), atol=1e-3)
+    outwards = (points[np.array(found["corner_vertex"])] - CENTRE_MM) / SEMI_AXES_MM**2
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    # Faces of some 0.3 rad turn a vertex's normal by a small part of that; flat shading would give 0.96 and less.
+    assert np.einsum("ij,ij->i", np.array(found["corner_normals"]), outwards).min() > 0.99
+    uv = np.array(found["corner_uv"])
+    assert uv.min() >= 0
+    assert uv.max() <= 1
+    assert np.ptp(uv, axis=0).min() > 0.3
+    assert found["smooth"]
+
+
+def test_blender_gets_names_sizes_normals_and_texture_coordinates(facts: tuple[str, Facts]) -> None:
+    meshes = facts[1]["meshes"]
+    assert set(meshes) == {"tooth_11_enamel", "tooth_11_dentin"}
+    for name, share in (("tooth_11_enamel", 1.0), ("tooth_11_dentin", 0.75)):
+        require_like(meshes[name], ellipsoid(share))
+        assert meshes[name]["material"] == name
+        assert meshes[name]["inputs"]["Roughness"] == pytest.approx(0.35, rel=1e-6)
+        assert meshes[name]["inputs"]["IOR"] == pytest.approx(1.631, rel=1e-6)
+
+
+def test_blender_gets_the_coefficients(facts: tuple[str, Facts]) -> None:
+    name, found = facts
+    mesh = found["meshes"]["tooth_11_dentin"]
+    for leaf in ("sigma", "alpha", "g1"):
+        expected = np.array([own[leaf] for own in COEFFICIENTS.values()])
+        if name == "usd":
+            spelled = "sigma_per_mm" if leaf == "sigma" else leaf
+            told = [mesh["properties"][spelled + ending] for ending in ("", "_se")]
+        else:
+            tables = mesh["material_properties"]["coefficients"]
+            told = [[tables[channel][leaf][key] for channel in COEFFICIENTS] for key in ("value", "se")]
+        np.testing.assert_allclose(told, [expected, expected / 8], rtol=1e-6)
+
+
+def test_the_validators_find_nothing_in_usd_and_materialx(job: Path) -> None:
+    assert findings("pxr", job / "asset-usd/asset.usda") == []
+    assert findings("MaterialX", job / "asset-usd/asset.mtlx") == []
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "old", "new", "finding"),
+    [
+        ("pxr", "asset.usda", "metersPerUnit = 0.001", "", "MissingMetersPerUnitMetadata"),
+        ("pxr", "asset.usda", 'prepend apiSchemas = ["MaterialBindingAPI"]', "", "MissingMaterialBindingAPI"),
+        ("pxr", "asset.usda", '"UsdPreviewSurface"', '"UsdPreviewSurfaces"', UNKNOWN_SHADER),
+        ("MaterialX", "asset.mtlx", '"subsurface_radius"', '"subsurface_length"', "subsurface_length"),
+        ("MaterialX", "asset.mtlx", 'type="float" value="0.35"', 'type="color3" value="1, 1, 1"', "type"),
+    ],
+)
+def test_the_validators_notice_a_broken_file(
+    module: str, name: str, old: str, new: str, finding: str, job: Path, tmp_path: Path
+) -> None:
+    client_python(module)
+    text = (job / "asset-usd" / name).read_text()
+    assert old in text
+    (tmp_path / name).write_text(text.replace(old, new))
+    assert finding in json.dumps(findings(module, tmp_path / name))
