@@ -242,6 +242,7 @@ def accumulate(
     prepare_device()
     ior = _checked(layers, ior, boundary, source)
     _check_directions(source, mu_incident, exit_cosines, ring_edges_mm)
+    from services.transport.boundary.models import slab_boundary
     from services.transport.paths.scores import Plan
     from services.transport.paths.starts import SlabStart
     from services.transport.paths.walk import Walk
@@ -249,12 +250,13 @@ def accumulate(
     from services.transport.scene.media import Media, Score
 
     names, scores = _derivatives(layers) if gradient else ((), ())
+    faces = slab_boundary(boundary, ior)
     border = gradient and len(layers) == 2
     geometry = SlabGeometry(tuple(layer.thickness_mm for layer in layers), moving_border=border)
     media = Media([_medium(layer) for layer in layers])
     plan = Plan(
         scores=tuple(Score(*score) for score in scores), shape=0 if border else None, faces=True,
-        bend=boundary == "smooth", exit_cosines=exit_cosines, ring_edges_mm=ring_edges_mm,
+        exit_cosines=exit_cosines, ring_edges_mm=ring_edges_mm,
     )  # fmt: skip
     sums = Sums(
         1 + len(scores) + border + len(exit_cosines) + plan.rings, float(specular_share(ior, source, mu_incident))
@@ -268,11 +270,10 @@ def accumulate(
             LANES,
             _pass_seed(seed, sums.passes),
             diffuse=source == "diffuse",
-            ior=ior,
-            bend=plan.bend,
+            boundary=faces,
             cosine=mu_incident,
         )
-        slots, slopes = Walk(geometry, media, None, start, plan, ior if ior != 1 else None).run(samples).arrays()
+        slots, slopes = Walk(geometry, media, None, start, plan, faces).run(samples).arrays()
         table = np.stack([faces[:, :2] for faces in (slots, *slopes)], axis=1)
         if from_scores is not False:
             equivalent = np.tensordot(table[:, 1:-1], spread, axes=(1, 0))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.choices import chosen
 from services.core.errors import InputError
 from services.transport.optics.parameters import Mouth, Tissue
 from services.transport.paths.until import MAX_SAMPLES, Effort, Sums, trace_until
@@ -61,6 +60,7 @@ class Engine:
             if not math.isfinite(ior) or ior < 1:
                 raise InputError(f"{name} = {ior:g} must be at least 1; give the index of refraction of {usual}.")
         prepare_device(threads, recipe.device)
+        from services.transport.boundary.models import mesh_boundary
         from services.transport.lighting.light_maps import LightMaps
         from services.transport.lighting.lights import PointLights
         from services.transport.lighting.mouth_maps import MouthMaps
@@ -75,8 +75,8 @@ class Engine:
         self._shape_gradients: dict[int, ShapeGradients] = {}
         self._radius_mm = reach_mm
         refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
-        self._ior = chosen("Boundary", recipe.boundary, {"matched": None, "thin": recipe.ior if refracts else None})
-        self._lights.maps.trace(self._geometry, self._ior)
+        self._boundary = mesh_boundary(recipe.boundary, recipe.ior, refracts=refracts)
+        self._lights.maps.trace(self._geometry, self._boundary)
 
     def images(
         self,
@@ -226,7 +226,7 @@ class Engine:
                 " Jacobian's."
             )
         if tooth not in self._shape_gradients:
-            self._shape_gradients[tooth] = ShapeGradients(self._geometry, tooth, self._ior, self._radius_mm)
+            self._shape_gradients[tooth] = ShapeGradients(self._geometry, tooth, self._boundary, self._radius_mm)
         lights = len(view.lights or self.recipe.light_positions_mm)
         photons = photons or -(-samples * len(view) // lights)
         found = self._shape_gradients[tooth](
@@ -313,7 +313,7 @@ class Engine:
         others = len(self.recipe.neighbours)
         reshaped = self._geometry.reshape((*(tuple(tooth.shape) for tooth in mouth.teeth), *[()] * others))
         if self._geometry.restain((*(tooth.stain for tooth in mouth.teeth), *[None] * others)) or reshaped:
-            self._lights.maps.trace(self._geometry, self._ior)
+            self._lights.maps.trace(self._geometry, self._boundary)
             self._lights_by_selection.clear()
         return Media(media), self._lights_of(view)
 
@@ -352,7 +352,7 @@ class Engine:
     def _walk(self, media: Media, lights: PointLights, start: CameraStart, plan: Plan) -> Walk:
         from services.transport.paths.walk import Walk
 
-        return Walk(self._geometry, media, lights, start, plan, self._ior)
+        return Walk(self._geometry, media, lights, start, plan, self._boundary)
 
     def _lights_of(self, view: View) -> PointLights:
         """Lights that a view lists, or all; its kernel contains no others."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -95,6 +94,7 @@ def test_the_walk_holds_in_every_corner(corners: Corners) -> None:
 
 @pytest.mark.parametrize("boundary", [MATCHED, THIN, SMOOTH])
 def test_a_lane_is_the_walk_that_a_slab_of_its_own_takes(corners: Corners, boundary: int) -> None:
+    from services.transport.boundary.models import slab_boundary
     from services.transport.paths.starts import SlabStart
     from services.transport.paths.walk import Walk
     from services.transport.scene.geometry import SlabGeometry
@@ -110,11 +110,11 @@ def test_a_lane_is_the_walk_that_a_slab_of_its_own_takes(corners: Corners, bound
     number = int(brightest.argmax())
     assert brightest[number] > 0.01
     ior = float(corners.ior[number])
-    start = SlabStart(SETS, 5, diffuse=True, ior=ior, bend=boundary == SMOOTH)
+    faces = slab_boundary({MATCHED: "matched", THIN: "thin", SMOOTH: "smooth"}[boundary], ior)
+    start = SlabStart(SETS, 5, diffuse=True, boundary=faces)
     geometry = SlabGeometry(corners.width_mm[:, number].tolist(), moving_border=True)
-    plan = replace(stress_plan(STEPS), bend=boundary == SMOOTH)
     media = Media([column[number] for column in corners.media()])
-    totals, derivatives = Walk(geometry, media, None, start, plan, None if boundary == MATCHED else ior).run(4).arrays()
+    totals, derivatives = Walk(geometry, media, None, start, stress_plan(STEPS), faces).run(4).arrays()
     # The same random numbers take the same path; the two kernels round some sums differently.
     np.testing.assert_allclose(lanes.totals[number], totals[number] / 4, rtol=1e-5)
     np.testing.assert_allclose(

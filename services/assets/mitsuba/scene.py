@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.choices import chosen
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
 from services.core.records import Boundary
@@ -117,7 +118,7 @@ def shell_integrator() -> SceneDict:
 
 
 def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> SceneDict:
-    """BSDF of the enamel's surface: no boundary, or the thin-boundary plug-in that ships with the asset.
+    """BSDF of the enamel's surface, as its boundary model names it.
 
     Args:
         boundary: the boundary model.
@@ -125,26 +126,10 @@ def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> 
         stain: picture of the absorbed share of transmitted light, 1 - a_t; without a boundary it becomes a mask before
             black.
     """
-    texture = (
-        None
-        if stain is None
-        else {
-            "type": "bitmap",
-            "filename": stain.as_posix(),
-            "raw": True,
-            "filter_type": "bilinear",
-            "wrap_mode": "clamp",
-        }
-    )
-    if boundary == "thin":
-        return {"type": "thin_boundary", "ior": ior} | ({} if texture is None else {"stain": texture})
-    if texture is None:
-        return {"type": "null"}
-    return {
-        "type": "mask",
-        "opacity": texture,
-        "nested": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
-    }
+    from services.transport.boundary.models import MESH_MODELS
+
+    found: SceneDict = chosen("Boundary", boundary, MESH_MODELS).mitsuba(ior, stain)
+    return found
 
 
 TeethFiles = Mapping[str, tuple[Path, Path | None]]

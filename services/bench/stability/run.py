@@ -22,6 +22,7 @@ from services.bench.stability.corners import REGIONS, SMOOTH, Corners, draw
 from services.bench.stability.difficult_scenes import check_scene, scenes
 from services.bench.stability.formula_errors import FORMULAS, worst_by_region
 from services.slab.simulate import specular_share
+from services.transport.boundary.smooth import Smooth
 from services.transport.optics import fresnel
 from services.transport.optics.parameters import MEDIUM_FIELDS
 from services.transport.paths.scores import Plan
@@ -65,22 +66,38 @@ class StabilityRow(Row):
     """Difference of a scene from one that must have equal images, in standard errors."""
 
 
+class LaneFaces(Smooth):
+    """Flat faces of all three models in one kernel; an index of 1 makes a lane's faces matched."""
+
+    def __init__(self, corners: Corners) -> None:
+        self.ior = mi.Float(corners.ior.astype(np.float32))
+        self.bends = mi.Bool(corners.boundary == SMOOTH)
+
+    def reflectance_inside(self, cosine: mi.Float) -> mi.Float:
+        """Reflectance of a smooth or of a thin face: the first is, seen from inside, a face of index 1 / n."""
+        return fresnel.reflectance(cosine, dr.select(self.bends, dr.rcp(self.ior), self.ior))
+
+    def enter(self, cosine: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Weight and inner cosine of light that enters a smooth or a thin face."""
+        weight, inside = super().enter(cosine)
+        return weight, dr.select(self.bends, inside, cosine)
+
+
 class LaneStart(SlabStart):
     """Starts of random walks in slabs whose source and faces differ from lane to lane."""
 
     def __init__(self, corners: Corners, seed: int) -> None:
         self.lanes, self.seed = len(corners), dr.opaque(mi.UInt32, seed)
-        self.ior = mi.Float(corners.ior.astype(np.float32))
+        self.boundary = LaneFaces(corners)
         self.normal = mi.Bool(~corners.diffuse)
-        self.bends = mi.Bool(corners.boundary == SMOOTH)
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
         """Begin a walk, as ``SlabStart`` does."""
         rng = stream(self.seed, lane, sample)
         cosine = dr.select(self.normal, 1, dr.sqrt(1 - rng.next_float32()))
-        inside = dr.select(self.bends, dr.sqrt(1 - (1 - dr.square(cosine)) / dr.square(self.ior)), cosine)
+        weight, inside = self.boundary.enter(cosine)
         omega = mi.Vector3f(dr.sqrt(dr.maximum(1 - dr.square(inside), 0)), 0, inside)
-        return PathStart(rng, mi.Point3f(0), omega, mi.UInt32(1), 1 - fresnel.reflectance(cosine, self.ior))
+        return PathStart(rng, mi.Point3f(0), omega, mi.UInt32(1), weight)
 
 
 @dataclass(frozen=True)
@@ -109,17 +126,8 @@ def stress_plan(most_steps: int, *, gradient: bool = True) -> Plan:
 def trace(corners: Corners, *, paths: int, most_steps: int, seed: int, gradient: bool = True) -> LaneTotals:
     """Trace all sets at once, one lane each, with at most ``most_steps`` flights per path."""
     geometry = SlabGeometry(tuple(corners.width_mm), moving_border=True)
-    walk = Walk(
-        geometry,
-        Media(corners.media()),
-        None,
-        LaneStart(corners, seed),
-        stress_plan(most_steps, gradient=gradient),
-        1.0,
-    )
-    # A smooth face seen from inside is a face of index 1 / n, so one kernel serves all three boundary models.
-    ior = mi.Float(corners.ior.astype(np.float32))
-    walk.ior = dr.select(mi.Bool(corners.boundary == SMOOTH), dr.rcp(ior), ior)
+    start, plan = LaneStart(corners, seed), stress_plan(most_steps, gradient=gradient)
+    walk = Walk(geometry, Media(corners.media()), None, start, plan, start.boundary)
     totals, derivatives = walk.run(paths).arrays()
     return LaneTotals(totals / paths, np.array(derivatives).reshape(-1, *totals.shape)[:, :, :2] / paths)
 

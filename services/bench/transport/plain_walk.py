@@ -26,9 +26,9 @@ class PlainEngine(Engine):
     def _walk(self, media: Media, lights: PointLights, start: CameraStart, plan: Plan) -> Walk:
         assert media.count == 1
         assert not media.two_lobes
-        assert self._ior is None
+        assert self._boundary.unaltered
         assert plan == Plan()
-        return PlainWalk(self._geometry, media, lights, start, plan, None)
+        return PlainWalk(self._geometry, media, lights, start, plan, self._boundary)
 
 
 class PlainWalk(Walk):

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from services.transport.boundary.model import Boundary
 from services.transport.paths.scores import Plan
 from services.transport.paths.starts import CameraStart, LightStart
 from services.transport.paths.tally import Tally
@@ -68,9 +69,9 @@ class BorderWalk(Walk, ABC):
         start: CameraStart | LightStart,
         texels: Texels,
         order: int,
-        ior: float | None,
+        boundary: Boundary,
     ) -> None:
-        super().__init__(geometry, media, None, start, Plan(), ior)
+        super().__init__(geometry, media, None, start, Plan(), boundary)
         self.mesh, self.texels, self.order = geometry, texels, order
         self.columns = (order + 1) ** 2 + 1
         """Columns of a light table: one per harmonic of the light that has collided, and one for light that has not."""
@@ -115,9 +116,9 @@ class LightWalk(BorderWalk):
     """Photons from the lights; gathers the light on each texel by direction."""
 
     def __init__(
-        self, geometry: MeshGeometry, media: Media, start: LightStart, texels: Texels, order: int, ior: float | None
+        self, geometry: MeshGeometry, media: Media, start: LightStart, texels: Texels, order: int, boundary: Boundary
     ) -> None:
-        super().__init__(geometry, media, start, texels, order, ior)
+        super().__init__(geometry, media, start, texels, order, boundary)
         self.photons = start
         # Sum whole numbers, so that sums do not depend on the order of threads.
         self.table = dr.zeros(mi.Int64, start.groups * texels.count * self.columns)
@@ -160,14 +161,14 @@ class CameraWalk(BorderWalk):
         media: Media,
         start: CameraStart,
         texels: Texels,
-        ior: float | None,
+        boundary: Boundary,
         coefficients: Array,
         light: NDArray[np.float32],
     ) -> None:
         """Take c_j (order + 1,), and light as (N, batches, texels, columns): coefficients of harmonics for crossings
         after a collision, and in the last column the light for crossings before any, which have a single direction.
         """
-        super().__init__(geometry, media, start, texels, len(coefficients) - 1, ior)
+        super().__init__(geometry, media, start, texels, len(coefficients) - 1, boundary)
         self.pixels, self.light_batches = light.shape[:2]
         self.shape_modes = geometry.modes_of[texels.tooth]
         # Light that reaches the camera travels against the walk, which turns the sign of odd harmonics.

@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from services.transport.boundary.model import Boundary
 from services.transport.gradients.border_fields import CameraWalk, LightWalk, Texels, harmonics
 from services.transport.gradients.border_series import BorderSeries, patches
 from services.transport.optics.parameters import Tissue
@@ -29,14 +30,14 @@ MAX_LANES_PER_GROUP = 64
 class ShapeGradients:
     """Shape gradients of one tooth in one scene; texels are made once."""
 
-    def __init__(self, geometry: MeshGeometry, tooth: int, ior: float | None, radius_mm: float) -> None:
+    def __init__(self, geometry: MeshGeometry, tooth: int, boundary: Boundary, radius_mm: float) -> None:
         dentin = geometry.recipe.teeth[tooth].dentin
         assert dentin is not None
-        self.geometry, self.tooth, self.recipe, self.ior, self.radius_mm = (
+        self.geometry, self.tooth, self.recipe, self.boundary, self.radius_mm = (
             geometry,
             tooth,
             geometry.recipe,
-            ior,
+            boundary,
             radius_mm,
         )
         self._patches = patches(dentin.base, TEXELS)
@@ -76,7 +77,7 @@ class ShapeGradients:
             )
             start = CameraStart(piece, CAMERA_BATCHES, camera_seed, self.radius_mm)
             sums = CameraWalk(
-                self.geometry, media, start, texels, self.ior, series.coefficients(order), light
+                self.geometry, media, start, texels, self.boundary, series.coefficients(order), light
             ).shape_sums(per_batch)
             crossed += sums.reshape(CAMERA_BATCHES, len(piece), LIGHT_BATCHES, -1).sum(axis=1) / per_batch
         return ShapeGradient(*crossed_mean(crossed), samples=per_batch * CAMERA_BATCHES)
@@ -88,7 +89,7 @@ class ShapeGradients:
         lanes = min(MAX_LANES_PER_GROUP, per_group)
         positions, intensities = self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen]
         start = LightStart(positions, intensities, self.recipe.vertices_mm(), LIGHT_BATCHES, lanes, seed)
-        return LightWalk(self.geometry, media, start, texels, order, self.ior).gather(-(-per_group // lanes))
+        return LightWalk(self.geometry, media, start, texels, order, self.boundary).gather(-(-per_group // lanes))
 
     def _light_of_pixels(
         self,

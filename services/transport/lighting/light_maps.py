@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.transport.optics import fresnel
+from services.transport.boundary.model import Boundary
 from services.transport.scene.geometry import DENTIN, ENAMEL, Hit
 from services.transport.scene.media import Media
 
@@ -173,7 +173,7 @@ class LightMaps:
         self.count = len(chosen)
         dr.eval(self._table)
 
-    def trace(self, geometry: MeshGeometry, ior: mi.Float | None) -> None:
+    def trace(self, geometry: MeshGeometry, boundary: Boundary) -> None:
         """Compute the maps for the present surfaces."""
         lanes = self.count * self.size**2
         index = dr.arange(mi.UInt32, lanes)
@@ -194,10 +194,8 @@ class LightMaps:
             behind = geometry.beyond(ray.enclosure, ray.direction, hit)
             ray.travelled += dr.select(hit.valid, hit.distance, 0)
             through = mi.Float(1)
-            if ior is not None:
-                through = 1 - fresnel.reflectance(
-                    dr.abs(dr.dot(ray.direction, hit.normal)), geometry.contrast(ior, ray.enclosure, behind)
-                )
+            if not boundary.unaltered:
+                through = boundary.straight(geometry, ray.direction, ray.enclosure, behind, hit)
             if geometry.stained:
                 through *= geometry.stain(hit, ray.alive & geometry.on_stain(hit, ray.enclosure, behind))
             self._record_hit(ray, geometry, hit, through)

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from services.transport.boundary.model import Boundary
 from services.transport.lighting.light_groups import LightGroups
 from services.transport.lighting.light_maps import DARK_DEPTH, LightMaps
-from services.transport.optics import fresnel
 from services.transport.scene.border import inverse_cosine
 from services.transport.scene.geometry import Geometry
 from services.transport.scene.media import Media
@@ -113,17 +113,17 @@ def shadow(
     enclosure: mi.UInt32,
     active: mi.Bool,
     *,
+    boundary: Boundary,
     measured: tuple[int, ...] = (),
     shape: int | None = None,
-    thin_ior: mi.Float | None = None,
     stains: list[FaceCrossing] | None = None,
 ) -> ShadowRay:
     """Follow straight lines to distant lights through all media.
 
     Args:
+        boundary: model of the outer faces.
         measured: media whose path lengths are summed.
         shape: index of the tooth to whose dentin shape derivatives are computed.
-        thin_ior: index of refraction of ``thin`` outer faces; None where they are index-matched.
         stains: an empty reservoir for one of the stained faces crossed; None where stain derivatives are not computed.
     """
 
@@ -144,9 +144,9 @@ def shadow(
                 dr.fma(speed, jump, total)
                 for total, speed in zip(ray.border, geometry.velocity(hit, shape, ray.alive), strict=True)
             ]
-        if thin_ior is not None:
-            contrast = geometry.contrast(thin_ior, ray.enclosure, behind)
-            ray.surface[0] *= dr.select(hit.valid & hit.outer, 1 - fresnel.reflectance(dr.abs(cosine), contrast), 1)
+        if not boundary.unaltered:
+            through = boundary.straight(geometry, direction, ray.enclosure, behind, hit)
+            ray.surface[0] *= dr.select(hit.valid & hit.outer, through, 1)
         if geometry.stained:
             crosses = ray.alive & geometry.on_stain(hit, ray.enclosure, behind)
             ray.surface[0] *= geometry.stain(hit, crosses)
@@ -160,7 +160,7 @@ def shadow(
 
     modes = 0 if shape is None else geometry.modes_of[shape]
     lengths, border = [mi.Float(0) for _ in measured], [mi.Float(0) for _ in range(modes)]
-    surface = [mi.Float(1)] * (thin_ior is not None or geometry.stained or geometry.opaque)
+    surface = [mi.Float(1)] * (not boundary.unaltered or geometry.stained or geometry.opaque)
     ray = ShadowRay(point, enclosure, mi.Float(0), surface, lengths, border, stains or [], mi.Bool(active))
     ended: ShadowRay
     ended, _ = dr.while_loop((ray, direction), lambda ray, _: ray.alive, step, label="shadow ray")

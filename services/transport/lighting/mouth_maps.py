@@ -10,6 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from services.transport.boundary.model import Boundary
 from services.transport.lighting.light_maps import LightMaps, LightView, MapCell, MapRay
 from services.transport.scene.geometry import Hit
 from services.transport.scene.mesh_geometry import MeshGeometry
@@ -29,10 +30,10 @@ class MouthMaps(LightMaps):
     WORDS = 3
     MAX_BYTES = 2**26
 
-    def trace(self, geometry: MeshGeometry, ior: mi.Float | None) -> None:
+    def trace(self, geometry: MeshGeometry, boundary: Boundary) -> None:
         """Compute the maps for the present surfaces."""
         self._geometry = geometry
-        super().trace(geometry, ior)
+        super().trace(geometry, boundary)
 
     def _record_hit(self, ray: MapRay, geometry: MeshGeometry, hit: Hit, through: mi.Float) -> None:
         is_hit, entering = hit.valid, dr.dot(ray.direction, hit.normal) < 0

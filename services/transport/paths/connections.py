@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from services.transport.boundary.model import Boundary
 from services.transport.lighting.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
 from services.transport.paths.scores import Plan, Scatterings, Scores
 from services.transport.paths.stain_tally import StainTally
@@ -89,15 +90,15 @@ class Connections:
     """Connections from the vertices of walks through one geometry under one plan."""
 
     def __init__(
-        self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, scores: Scores, ior: mi.Float | None
+        self, geometry: Geometry, media: Media, lights: PointLights, plan: Plan, scores: Scores, boundary: Boundary
     ) -> None:
-        self.geometry, self.media, self.lights, self.plan, self.scores, self.ior = (
+        self.geometry, self.media, self.lights, self.plan, self.scores, self.boundary = (
             geometry,
             media,
             lights,
             plan,
             scores,
-            ior,
+            boundary,
         )
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.period = lights.connection_period
@@ -167,7 +168,7 @@ class Connections:
                 check.direction,
                 vertex.enclosure,
                 casts,
-                thin_ior=self.ior,
+                boundary=self.boundary,
                 stains=stains,
             )
             value = weight * tally.weight(lane, check.light, casts)
@@ -178,7 +179,7 @@ class Connections:
         def correct(vertex: Vertex, lane: mi.UInt32, check: LookupCheck, weight: mi.Float, casts: mi.Bool) -> mi.Float:
             ray = shadow(
                 self.geometry, self.media, vertex.point, check.direction, vertex.enclosure, casts,
-                measured=self.scores.sigma_media, shape=self.plan.shape, thin_ior=self.ior,
+                measured=self.scores.sigma_media, shape=self.plan.shape, boundary=self.boundary,
             )  # fmt: skip
             self._count(
                 vertex,

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from services.transport.optics import fresnel
+from services.transport.boundary.model import Boundary
 from services.transport.optics.free_flight import one_minus_exp
 from services.transport.paths.scores import Plan
 from services.transport.paths.tally import Tally
@@ -29,8 +29,8 @@ two cancel, and the integrand is constant."""
 class Exits:
     """Exit slots of a tally, from ``first_slot`` on: lit and far face for every cosine, then for every ring."""
 
-    def __init__(self, geometry: SlabGeometry, media: Media, plan: Plan, ior: mi.Float | None, first_slot: int) -> None:
-        self.geometry, self.media, self.plan, self.ior = geometry, media, plan, ior
+    def __init__(self, geometry: SlabGeometry, media: Media, plan: Plan, boundary: Boundary, first_slot: int) -> None:
+        self.geometry, self.media, self.plan, self.boundary = geometry, media, plan, boundary
         self.cosines, self.edges_mm = (
             mi.Float(np.array(values, dtype=np.float32)) for values in (plan.exit_cosines, plan.ring_edges_mm)
         )
@@ -73,7 +73,7 @@ class Exits:
             optical_depth: mi.Float, scattered: mi.Float, lane: mi.UInt32, active: mi.Bool,
         ) -> tuple[mi.UInt32, mi.Vector3f, mi.Vector2f, mi.Vector2f, mi.Vector2f, mi.Float, mi.Float, mi.UInt32,
                    mi.Bool]:  # fmt: skip
-            inside, narrowing, mirrored = self._face(dr.gather(mi.Float, self.cosines, which, active))
+            inside, narrowing, mirrored = self.boundary.leave(dr.gather(mi.Float, self.cosines, which, active))
             sine = dr.sqrt(dr.maximum(1 - dr.square(inside), 0))
             contributions = []
             for side, sign in enumerate((-1, 1)):
@@ -112,12 +112,3 @@ class Exits:
             step,
             label="every exit cosine",
         )
-
-    def _face(self, cosine: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Cosine inside, ratio of solid angle times cosine outside to the same inside, and reflectance of the face."""
-        if self.ior is None:
-            return cosine, mi.Float(1), mi.Float(0)
-        mirrored = fresnel.reflectance(cosine, self.ior)
-        if not self.plan.bend:
-            return cosine, mi.Float(1), mirrored
-        return dr.sqrt(1 - (1 - dr.square(cosine)) / dr.square(self.ior)), dr.square(self.ior), mirrored

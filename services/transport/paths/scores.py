@@ -24,8 +24,6 @@ class Plan:
     tally."""
     faces: bool = False
     """Count the light that leaves the slab's faces instead of connecting to lights."""
-    bend: bool = False
-    """Use Fresnel's law at the true internal angle (flat ``smooth`` faces) instead of the unbent ``thin`` layer."""
     exit_cosines: tuple[float, ...] = ()
     """With ``faces``: also the radiance that leaves at these cosines."""
     ring_edges_mm: tuple[float, ...] = ()

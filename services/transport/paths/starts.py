@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from services.transport.boundary.model import Boundary
 from services.transport.lighting.light_maps import aligned
-from services.transport.optics import fresnel
 from services.transport.scene.recipe import View
 
 NEAR_MARGIN_MM = 1.0
@@ -159,18 +159,15 @@ class LightStart:
 class SlabStart:
     """Walks that enter a slab's lit face at its origin, z = 0: collimated at a cosine to the normal, or Lambertian."""
 
-    def __init__(self, lanes: int, seed: int, *, diffuse: bool, ior: float, bend: bool, cosine: float = 1.0) -> None:
-        self.lanes, self.diffuse, self.bend = lanes, diffuse, bend
+    def __init__(self, lanes: int, seed: int, *, diffuse: bool, boundary: Boundary, cosine: float = 1.0) -> None:
+        self.lanes, self.diffuse, self.boundary = lanes, diffuse, boundary
         self.cosine = mi.Float(1) if cosine == 1 else dr.opaque(mi.Float, cosine)
         self.seed = dr.opaque(mi.UInt32, seed)
-        self.ior = dr.opaque(mi.Float, ior)
-        self.refractive = ior != 1
 
     def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
         """A path just inside the lit face, weighted by the share of light that enters."""
         rng = stream(self.seed, lane, sample)
         cosine = dr.sqrt(1 - rng.next_float32()) if self.diffuse else self.cosine
-        weight = 1 - fresnel.reflectance(cosine, self.ior) if self.refractive else mi.Float(1)
-        inside = dr.sqrt(1 - (1 - dr.square(cosine)) / dr.square(self.ior)) if self.bend else cosine
+        weight, inside = self.boundary.enter(cosine)
         omega = mi.Vector3f(dr.sqrt(dr.maximum(1 - dr.square(inside), 0)), 0, inside)
         return PathStart(rng, mi.Point3f(0), omega, mi.UInt32(1), weight)

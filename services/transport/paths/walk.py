@@ -9,8 +9,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from services.transport.boundary.model import Boundary
 from services.transport.lighting.lights import PointLights, shadow
-from services.transport.optics import fresnel
 from services.transport.optics.free_flight import minus_log1m, one_minus_exp
 from services.transport.paths.connections import Connections, Vertex
 from services.transport.paths.exits import Exits
@@ -37,20 +37,20 @@ class Walk:
         lights: PointLights | None,
         start: CameraStart | LightStart | SlabStart,
         plan: Plan,
-        ior: float | None,
+        boundary: Boundary,
     ) -> None:
         self.geometry, self.media, self.lights, self.start, self.plan = geometry, media, lights, start, plan
-        self.ior = None if ior is None else dr.opaque(mi.Float, ior)
+        self.boundary = boundary
         media.two_lobes |= any(score.field == "beta" for score in plan.scores)
         self.scores = Scores(plan, media)
-        self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.scores, self.ior)
+        self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.scores, boundary)
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
         self.exits: Exits | None = None
         if plan.exit_cosines or plan.ring_edges_mm:
             assert isinstance(geometry, SlabGeometry)
-            self.exits = Exits(geometry, media, plan, self.ior, first_slot=self.slots)
+            self.exits = Exits(geometry, media, plan, boundary, first_slot=self.slots)
             self.slots += self.exits.slots
 
     def run(self, samples: int, tally: Tally | None = None) -> Tally:
@@ -131,19 +131,12 @@ class Walk:
         # A lane with no surface ahead has left the tooth, whatever its enclosure is: it meets nothing and ends.
         scatters = walker.active & (distance < hit.distance) & (hit.valid | ~traced)
         meets = walker.active & ~scatters & hit.valid
-        reflects = mi.Bool(False)
-        if self.ior is not None:
-            # A thin face lets a camera ray in, weighted, where its mirror image would be of empty space, and reflects
-            # other rays by chance.
-            contrast = self.geometry.contrast(
-                self.ior, walker.enclosure, self.geometry.beyond(walker.enclosure, walker.omega, hit)
-            )
-            mirrored = fresnel.reflectance(dr.abs(dr.dot(walker.omega, hit.normal)), contrast)
-            reflects = meets & hit.outer & ~hit.opaque
-            entry = self._omits_reflection(walker, medium)
-            walker.weight *= dr.select(reflects & entry, 1 - mirrored, 1)
-            reflects &= ~entry & (walker.rng.next_float32() < mirrored)
-        return Flight(medium, sigma, hit, distance, scatters, meets, reflects, meets & hit.opaque)
+        # A face lets a camera ray in, weighted, where its mirror image would be of empty space, and reflects other rays
+        # by chance.
+        omits = self._omits_reflection(walker, medium)
+        met = self.boundary.meet(self.geometry, walker.omega, walker.enclosure, hit, meets, omits, walker.rng)
+        walker.weight *= met.weight
+        return Flight(medium, sigma, hit, distance, scatters, meets, met.reflects, meets & hit.opaque)
 
     def _omits_reflection(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
         """Lanes whose reflection at an outer face is left out: camera rays that would mirror empty space."""
@@ -156,11 +149,7 @@ class Walk:
         sigma = self.media.extinction(medium)
         hit = self.geometry.intersect(walker.origin, walker.omega, walker.enclosure, walker.active)
         leaving = hit.valid & hit.outer
-        through = mi.Float(1)
-        if self.ior is not None:
-            through = 1 - fresnel.reflectance(
-                dr.abs(dr.dot(walker.omega, hit.normal)), dr.rcp(self.ior) if self.plan.bend else self.ior
-            )
+        through = 1 - self.boundary.reflectance_inside(dr.abs(dr.dot(walker.omega, hit.normal)))
 
         # Count the share that leaves through an outer face.
         collides = one_minus_exp(sigma * hit.distance)
@@ -308,7 +297,9 @@ class Walk:
             if self.lights is not None:
                 chosen = self.lights.choose(crossing.point, scattering, rng, begins)
                 point, enclosure = scattering.point(chosen.direction), scattering.enclosure(chosen.direction)
-                ray = shadow(self.geometry, self.media, point, chosen.direction, enclosure, begins, thin_ior=self.ior)
+                ray = shadow(
+                    self.geometry, self.media, point, chosen.direction, enclosure, begins, boundary=self.boundary
+                )
                 value = strength * chosen.total * scattering.balance(chosen.direction) * ray.transmittance()
                 for mode, ratio in enumerate(ratios):
                     tally.add_derivative(len(self.plan.scores) + mode, walker.lane, chosen.index, value * ratio, begins)

@@ -27,8 +27,10 @@ class ToothOptics:
     enamel: tuple[Medium, ...]
     dentin: tuple[Medium, ...]
     """Empty where no dentin surface is named."""
-    ior: float | None = None
-    """Index of refraction of ``thin`` outer faces; None where they are index-matched."""
+    boundary: str = "matched"
+    """Name of the boundary model of the outer faces."""
+    ior: float = 1.0
+    """Index of refraction of the teeth."""
     roughness: float | None = None
     """GGX roughness of the outer face's mirror image; None leaves that image out, as a fit does."""
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from services.transport.optics import fresnel
+from services.transport.boundary.model import Boundary
 
 
 class Gloss:
@@ -15,16 +15,16 @@ class Gloss:
     continues unbent.
     """
 
-    def __init__(self, roughness: float, ior: mi.Float) -> None:
+    def __init__(self, roughness: float, boundary: Boundary) -> None:
         self.facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, roughness)
-        self.ior = ior
+        self.boundary = boundary
 
     def evaluate(self, si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """Reflected radiance times cosine, and the density of ``sample``, 1/sr, towards a world direction."""
         wo = si.to_local(direction)
         half = dr.normalize(si.wi + wo)
         above = (si.wi.z > 0) & (wo.z > 0) & (dr.dot(direction, si.n) > 0)
-        share = fresnel.reflectance(dr.abs(dr.dot(si.wi, half)), self.ior)
+        share = self.boundary.reflectance(dr.abs(dr.dot(si.wi, half)))
         value = share * self.facets.eval(half) * self.facets.G(si.wi, wo, half) / (4 * si.wi.z)
         density = self.facets.pdf(si.wi, half) / (4 * dr.dot(wo, half))
         return dr.select(above, value, 0), dr.select(above, density, 0)

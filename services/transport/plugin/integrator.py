@@ -41,6 +41,8 @@ from services.transport.scene.media import require_medium
 
 PLUGIN = "dentine"
 PARTS = ("enamel", "dentin")
+PLUGIN_BOUNDARIES = ("thin", "matched")
+"""Boundary models that paths through any scene have."""
 MEDIUM_DEFAULTS = {"beta": 1.0, "g1": 0.0, "g2": 0.0}
 STOCK_PROPERTIES = {"samples_per_pass", "block_size", "timeout"}
 """Properties that Mitsuba's own base class reads."""
@@ -107,7 +109,7 @@ def read_properties(given: Mapping[str, Any], channels: int) -> ToothProperties:
     boundary, ior, roughness, max_depth = (
         given.get(*pair) for pair in (("boundary", "thin"), ("ior", 1.631), ("roughness", None), ("max_depth", 5000))
     )
-    if boundary not in {"thin", "matched"}:
+    if boundary not in PLUGIN_BOUNDARIES:
         raise InputError(f"boundary = {boundary} must be 'thin' or 'matched'; choose one of these.")
     if not (isinstance(ior, int | float) and math.isfinite(ior) and ior >= 1):
         raise InputError(f"ior = {ior} must be at least 1; give the index of refraction of enamel, 1.631.")
@@ -122,9 +124,7 @@ def read_properties(given: Mapping[str, Any], channels: int) -> ToothProperties:
         )
     if not isinstance(max_depth, int) or max_depth < 1:
         raise InputError(f"max_depth = {max_depth} must be a positive whole number; correct it.")
-    optics = ToothOptics(
-        media["enamel"], media["dentin"], float(ior) if boundary == "thin" and ior != 1 else None, roughness
-    )
+    optics = ToothOptics(media["enamel"], media["dentin"], boundary, float(ior), roughness)
     return ToothProperties(ToothShapes(ids["enamel"], ids["dentin"]), optics, max_depth)
 
 

@@ -14,8 +14,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from services.transport.boundary.models import mesh_boundary
 from services.transport.lighting.light_maps import DARK_DEPTH
-from services.transport.optics import fresnel
 from services.transport.optics.free_flight import minus_log1m
 from services.transport.paths.walk import ROULETTE_WEIGHT
 from services.transport.plugin.channel_media import ChannelMedia, ToothOptics
@@ -123,8 +123,10 @@ class ScenePaths:
 
     def __init__(self, scene: Any, teeth: SceneTeeth, optics: ToothOptics, max_depth: int) -> None:
         self.scene, self.teeth, self.media = scene, teeth, ChannelMedia(optics)
-        self.ior = None if optics.ior is None else dr.opaque(mi.Float, optics.ior)
-        self.gloss = None if self.ior is None or optics.roughness is None else Gloss(optics.roughness, self.ior)
+        self.boundary = mesh_boundary(optics.boundary, optics.ior, refracts=optics.ior != 1)
+        self.gloss = None
+        if not self.boundary.unaltered and optics.roughness is not None:
+            self.gloss = Gloss(optics.roughness, self.boundary)
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
         self.inverse_irradiance = self._inverse_irradiance()
 
@@ -167,8 +169,8 @@ class ScenePaths:
         self._collect(path, flight)
         path.valid |= flight.meets
         path.active &= flight.meets | flight.scatters
-        if self.ior is not None:
-            self._reflect(path, flight, self.ior)
+        if not self.boundary.unaltered:
+            self._reflect(path, flight)
 
         vertex = self._vertex(path, flight)
         ends = flight.samples_direction & (path.depth + 1 >= self.max_depth)
@@ -226,14 +228,14 @@ class ScenePaths:
         carried = path.throughput * self.media.channel_weights(path.leader_densities)
         path.radiance += dr.select(active, carried * emitter.eval(flight.si, active) * share, 0)
 
-    def _reflect(self, path: Path, flight: Flight, ior: mi.Float) -> None:
+    def _reflect(self, path: Path, flight: Flight) -> None:
         """Decide which paths a thin outer face reflects.
 
         Without gloss, a path that arrives from outside the teeth shows no mirror image: it is transmitted, and the loss
         is a weight.
         """
         face, enters = flight.meets & (flight.part == ENAMEL), flight.cosine < 0
-        flight.reflected = fresnel.reflectance(dr.abs(flight.cosine), ior)
+        flight.reflected = self.boundary.reflectance(dr.abs(flight.cosine))
         is_reflected = face & (path.sampler.next_1d(face) < flight.reflected)
         if self.gloss is None:
             hidden = enters & ~path.from_tooth
@@ -348,10 +350,8 @@ class ScenePaths:
             length = dr.select(meets, found.t, dr.select((shadow.enclosure != 0) & shadow.alive, shadow.ray.maxt, 0))
             shadow.depth += self.media.extinction(self.teeth.medium(shadow.enclosure)) * length
             cosine = dr.dot(shadow.ray.d, si.n)
-            if self.ior is not None:
-                shadow.surface *= dr.select(
-                    meets & (part == ENAMEL), 1 - fresnel.reflectance(dr.abs(cosine), self.ior), 1
-                )
+            if not self.boundary.unaltered:
+                shadow.surface *= dr.select(meets & (part == ENAMEL), 1 - self.boundary.reflectance(dr.abs(cosine)), 1)
             shadow.surface *= dr.select(meets & (part == 0), 0, 1)
             shadow.alive = meets & (part != 0) & (dr.min(shadow.depth) < DARK_DEPTH)
             onward = si.spawn_ray(shadow.ray.d)
