@@ -28,6 +28,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from services.assets.colour.develop import CapturedColours, rig_colours
 from services.assets.content import RGB
 from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.assets.mitsuba.rgb import colour_scene
@@ -43,7 +46,7 @@ from services.assets.mitsuba.scene_xml import SceneParameter, write_scene
 from services.assets.stains import write_textures
 from services.core.errors import InputError
 from services.core.files.meshes import write_mapped_mesh, write_mesh
-from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
+from services.core.geometry import Camera, Light, Mesh, Tooth, Vector3, teeth_folder
 from services.core.records import Boundary
 from services.core.results import Estimate, FitReport
 from services.core.store import write_atomic
@@ -69,6 +72,7 @@ def write_asset(
     gums: Mesh | None = None,
     cavity: Mesh | None = None,
     stains: ToothStains | None = None,
+    colours: CapturedColours | None = None,
 ) -> tuple[str, ...]:
     """Write meshes, one Mitsuba scene per channel, parameters.json and errors.json; return the files' paths relative to
     ``folder``.
@@ -78,6 +82,7 @@ def write_asset(
         lights: ``intensity`` in the order of ``channels``.
         gums, cavity: surfaces of a jaw; None for a single tooth.
         stains: stain textures of a single tooth.
+        colours: colours of the cameras; None where none is known.
 
     Raises:
         CaptureInputError: a camera that Mitsuba cannot render.
@@ -139,7 +144,9 @@ def write_asset(
         "views": {camera.name: camera.model_dump(exclude={"name"}) for camera in shown},
         "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},
     }
-    _write_json(folder / "rig.json", rig)
+    names = tuple(camera.name for camera in cameras)
+    told = rig_colours(colours or CapturedColours(), channels, names, middle_of(teeth))
+    _write_json(folder / "rig.json", rig if told is None else rig | {"colour": told})
     _write_json(folder / "parameters.json", parameters_json(report))
     _write_json(folder / "errors.json", errors_json(report))
     if not (verdict := verdict_of(report)).converged:
@@ -147,6 +154,13 @@ def write_asset(
     for name in ("render.py", "thin_boundary.py") if boundary == "thin" else ("render.py",):
         write_atomic(folder / name, (SHIPPED / name).read_bytes())
     return tuple(sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()))
+
+
+def middle_of(teeth: Sequence[Tooth]) -> Vector3:
+    """Middle of the box around the teeth, mm."""
+    vertices = np.concatenate([tooth.outer.vertices_mm for tooth in teeth])
+    x, y, z = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return float(x), float(y), float(z)
 
 
 def _large_cameras(cameras: Sequence[Camera], samples: SceneParameter) -> SceneDict:

@@ -45,9 +45,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     Raises:
         StoreError: the fit or the prepared stage is missing or damaged.
     """
-    import numpy as np
-
-    from services.assets.asset import errors_json, parameters_json, write_asset
+    from services.assets.asset import errors_json, middle_of, parameters_json, write_asset
+    from services.assets.colour.develop import CapturedColours
     from services.assets.fit_pictures import report_pictures
     from services.assets.report_page import write_report
     from services.core.files.meshes import read_mesh
@@ -86,6 +85,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         gums=gums,
         cavity=cavity,
         stains=stains,
+        colours=CapturedColours(prepared.channels, prepared.colour) if prepared.colour else None,
     )
 
     history = json.loads((fit_folder / "history.json").read_text())
@@ -107,13 +107,6 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     write_atomic(context.root / "parameters.json", _json(parameters_json(report)))
     write_atomic(context.root / "errors.json", _json(errors_json(report)))
 
-    corners = [
-        corner
-        for tooth in teeth
-        for corner in (tooth.outer.vertices_mm.min(axis=0), tooth.outer.vertices_mm.max(axis=0))
-    ]
-    centre = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
-    centre_mm = float(centre[0]), float(centre[1]), float(centre[2])
     verdict = verdict_of(report)
     manifest = AssetManifest(
         files=files,
@@ -121,7 +114,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         converged=verdict.converged,
         advice=report.advice,
         verdict=verdict,
-        centre_mm=centre_mm,
+        centre_mm=middle_of(teeth),
     )
     write_record(writer.folder / "asset.json", manifest)
     writer.publish(manifest)

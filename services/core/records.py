@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, StringConstraints, WithJsonSchema, model_validator
 from pydantic_core import PydanticCustomError
 
+from services.core.calibration.cameras_and_lights import CameraColour, is_absent
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.files.store_url import StoreUrl
 from services.core.geometry import Camera, Light, Name, Record
@@ -115,6 +116,9 @@ class FolderCapture(Record):
     images: tuple[ImageEntry, ...] = Field(default=(), fail_fast=True)
     uncertainty: CalibrationUncertainty | None = Field(
         default=None, description="how wrong the calibration may be; null where that was not measured"
+    )
+    colour: dict[str, CameraColour] | None = Field(
+        default=None, exclude_if=is_absent, description="colours of each camera by its name; they apply to the asset"
     )
 
 

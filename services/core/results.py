@@ -8,6 +8,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from services.core.calibration.cameras_and_lights import CameraColour, is_absent
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Camera, Light, Record, Vector3
 from services.core.light.safety import FlashAcknowledgement
@@ -245,6 +246,9 @@ class PreparedManifest(Record):
     median_motion_px: float | None = Field(description="median displacement removed by stabilisation")
     uncertainty: CalibrationUncertainty | None = Field(
         default=None, description="how wrong the calibration may be; null where the capture does not say"
+    )
+    colour: dict[str, CameraColour] | None = Field(
+        default=None, exclude_if=is_absent, description="colours of each camera by its name; null where none is known"
     )
     masks: str = Field(
         default="", description="digest of the masks by hand that it was prepared with; empty without any"

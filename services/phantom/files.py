@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.calibration.cameras_and_lights import CameraColour
 from services.core.errors import InputError
 from services.core.geometry import Camera, Light
 from services.core.records import Boundary, FolderCapture, ImageEntry
@@ -19,6 +20,10 @@ CHANNELS = {1: ("green",), 3: ("red", "green", "blue")}
 """Names of the channels by their number."""
 HELD_OUT_EVERY = 4
 """Period of the lights that are held out by default."""
+
+XYZ_FROM_CAMERA = ((0.62, 0.22, 0.12422), (0.28, 0.70, 0.02), (0.03, 0.12, 0.67521))
+"""Matrix from the virtual cameras' red, green and blue to XYZ, as a calibration states it. Its rows add up to the white
+of D50, so a perfect diffuser is white."""
 
 Renderer = Literal["engine", "mitsuba"]
 
@@ -110,9 +115,13 @@ def write_description(
 ) -> None:
     """Write ``truth.json`` and then ``capture.json``, whose presence makes the folder a capture."""
     write_atomic(out / "truth.json", (json.dumps(truth, indent=1) + "\n").encode())
+    in_colour = len(channels) == len(XYZ_FROM_CAMERA)
+    colour = {camera.name: CameraColour(xyz_from_rgb=XYZ_FROM_CAMERA) for camera in cameras} if in_colour else None
     write_record(
         out / "capture.json",
-        FolderCapture(units="mm", channels=channels, cameras=cameras, lights=lights, images=tuple(images)),
+        FolderCapture(
+            units="mm", channels=channels, cameras=cameras, lights=lights, images=tuple(images), colour=colour
+        ),
     )
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from services.calibrate.colour.cie import D65, delta_e_2000, lab_from_xyz
-from services.calibrate.colour.transform import fit_colour, least_squares_matrix, root_terms
+from services.calibrate.colour.transform import fit_colour, least_squares_matrix
+from services.core.calibration.colours import root_terms
 from services.core.errors import CaptureInputError
 from tests.support.shared_data import shared_path
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.calibrate.colour.cie import D50, delta_e_2000, lab_from_xyz
+from services.core.calibration.colours import root_terms
 from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]
@@ -43,14 +44,6 @@ class ColourFit:
         if self.root_polynomial is None:
             return np.asarray(rgb @ self.matrix.T)
         return np.asarray(root_terms(rgb) @ self.root_polynomial.T)
-
-
-def root_terms(rgb: Floats) -> Floats:
-    """Return the root-polynomial terms of degree 2 (N, 6) of channels (N, 3), which scale with the light as the
-    channels do (Finlayson, Mackiewicz & Hurlbert 2015, table I).
-    """
-    r, g, b = np.maximum(rgb, 0).T
-    return np.stack([r, g, b, np.sqrt(r * g), np.sqrt(g * b), np.sqrt(r * b)], axis=1)
 
 
 def least_squares_matrix(terms: Floats, xyz: Floats) -> Floats:

@@ -11,6 +11,7 @@ from typing import Literal
 from pydantic import Field
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight, CameraColour, is_absent
+from services.core.calibration.colours import colours_among, require_colours
 from services.core.calibration.uncertainty import CalibrationUncertainty, require_known_names
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera, Record, Vector3
@@ -84,7 +85,7 @@ class Calibration(Record):
     @classmethod
     def of_capture(cls, description: FolderCapture) -> Calibration:
         """The calibration that a capture states of its cameras and lights."""
-        parts = {"units", "channels", "cameras", "lights", "uncertainty"}
+        parts = {"units", "channels", "cameras", "lights", "uncertainty", "colour"}
         return cls.model_validate(description.model_dump(include=parts))
 
 
@@ -171,6 +172,7 @@ def require_consistent(description: FolderCapture | Calibration, origin: str) ->
         require_own_files(description, origin)
     elif description.made is not None:
         require_date(description.made, origin, time.time())
+    require_colours(description.colour, tuple(named["camera"]), len(description.channels), origin)
     require_known_names(description.uncertainty, description.channels, description.cameras, description.lights, origin)
 
 
@@ -300,6 +302,7 @@ def recalibrated(description: FolderCapture, calibration: Calibration, path: Pat
         "cameras": tuple(cameras[one.name] for one in description.cameras),
         "lights": tuple(lights[one.name] for one in description.lights),
         "uncertainty": calibration.uncertainty,
+        "colour": colours_among(calibration.colour, (one.name for one in description.cameras)),
     }
     return description.model_copy(update=changed)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from services.core.calibration.cameras_and_lights import CalibratedCamera
+from services.core.calibration.colours import colours_among
 from services.core.calibration.record import Calibration, read_description, require_consistent
 from services.core.errors import CaptureInputError
 from services.core.raw.folder import DESCRIPTION, is_raw_folder, read_raw_folder
@@ -96,4 +97,5 @@ def described(root: Path, folder: RawFolder, calibration: Calibration, teeth_roo
         cameras=tuple(by_name[camera.name] for camera in folder.camera),
         lights=tuple(known[light.name] for light in folder.light if light.name in lit),
         uncertainty=with_registration(teeth_root or root, calibration.uncertainty),
+        colour=colours_among(calibration.colour, (camera.name for camera in folder.camera)),
     )

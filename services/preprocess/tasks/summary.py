@@ -111,6 +111,7 @@ def summarise(
         tooth_pixels=tuple(tooth_pixels.tolist()),
         median_motion_px=float(np.median(motions)) if motions else None,
         uncertainty=source.description.uncertainty,
+        colour=source.description.colour,
         masks=masks,
         notes=tuple(notes),
         valid_fraction=valid_pixels / sum(report.tooth_pixels for report in reports),

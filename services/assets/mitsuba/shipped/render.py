@@ -2,6 +2,8 @@
 
 Each colour channel is its own scene, because scattering differs per channel and Mitsuba's phase functions hold one
 number. The image has the photographs' pixels; ``--large`` writes the film's, which are at least 512 on an edge.
+``--colour srgb`` or ``acescg`` develops the camera's red, green and blue by the calibration's matrix, with 1 for a
+white diffuser that faces the light. A file name that ends with .png gives a picture in sRGB.
 """
 
 import argparse
@@ -41,11 +43,38 @@ def render(
     return np.stack(planes, axis=-1)
 
 
+SPACES = {"srgb": "linear sRGB", "acescg": "ACEScg"}
+
+
+def develop(image: np.ndarray, folder: Path, camera: str, light: str, colour: str) -> np.ndarray:
+    """Linear colours (..., 3) of radiance (..., C) that ``render`` has returned, 1 for a white diffuser in that light.
+
+    Args:
+        colour: ``srgb`` or ``acescg``; ``rig.json`` says where a camera's matrix comes from.
+    """
+    rig = json.loads((folder / "rig.json").read_text())
+    told, lamp = rig["colour"], rig["lights"][light]
+    distance = np.linalg.norm(np.subtract(lamp["position_mm"], told["diffuser_mm"]))
+    relative = image * np.pi * distance**2 / np.array(lamp["intensity"])
+    rgb = relative[..., [rig["channels"].index(name) for name in told["channels"]]]
+    own = told["cameras"][camera]
+    if own["root_polynomial"] is None:
+        xyz = rgb @ np.array(own["xyz_d50_from_rgb"]).T
+    else:  # Finlayson, Mackiewicz & Hurlbert 2015
+        red, green, blue = np.moveaxis(np.maximum(rgb, 0), -1, 0)
+        terms = [red, green, blue, np.sqrt(red * green), np.sqrt(green * blue), np.sqrt(red * blue)]
+        xyz = np.stack(terms, axis=-1) @ np.array(own["root_polynomial"]).T
+    return np.asarray(xyz @ np.array(told["from_xyz"][SPACES[colour]]).T)
+
+
 def write_image(image: np.ndarray, path: Path) -> None:
-    """Write linear radiance, shape (height, width, channels), as EXR."""
+    """Write linear values, shape (height, width, channels), as EXR, or as a PNG in sRGB."""
     if dr.thread_count() < 2:
         dr.set_thread_count(2)  # Mitsuba's writer waits for another thread, for ever where there is none
-    mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)).write(str(path))
+    bitmap = mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32))
+    if path.suffix == ".png":
+        bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    bitmap.write(str(path))
 
 
 def main() -> None:
@@ -55,12 +84,20 @@ def main() -> None:
     parser.add_argument("--light", default=None, help="name in rig.json; default the first")
     parser.add_argument("--spp", type=int, default=256, help="paths per pixel")
     parser.add_argument("--large", action="store_true", help="write the film's pixels and not the photographs'")
-    parser.add_argument("--out", type=Path, default=Path("tooth.exr"), help="EXR file")
+    parser.add_argument("--colour", choices=["camera", *SPACES], help="default camera, in a PNG srgb")
+    parser.add_argument("--out", type=Path, default=Path("tooth.exr"), help="EXR file, or PNG")
     options = parser.parse_args()
     folder = Path(__file__).resolve().parent
     rig = json.loads((folder / "rig.json").read_text())
     camera, light = options.camera or rig["cameras"][0], options.light or next(iter(rig["lights"]))
+    colour = options.colour or ("srgb" if options.out.suffix == ".png" else "camera")
+    if colour != "camera" and "colour" not in rig:
+        parser.error(
+            "this asset has no red, green and blue; choose --colour camera and a file name that ends with .exr"
+        )
     image = render(folder, camera, light, options.spp, large=options.large)
+    if colour != "camera":
+        image = develop(image, folder, camera, light, colour)
     write_image(image, options.out)
 
 
