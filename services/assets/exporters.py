@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import importlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
 
 from services.assets.content import AssetContent, read_content
+from services.assets.provenance.departing import departing, seal
 from services.core.choices import chosen
 from services.core.files.folders import require_folder
 from services.core.store import translate_disk_errors
@@ -42,20 +44,35 @@ class Exporter(Protocol):
         """Write all files into an empty folder."""
 
 
-def export_to(job: Path, names: Sequence[str]) -> tuple[Path, ...]:
+def export_to(
+    job: Path, names: Sequence[str], *, use: str | None = None, with_photographs: bool = True
+) -> tuple[Path, ...]:
     """Write the published asset of a job by some exporters; return a folder ``asset-<name>`` for each, in place of an
-    earlier one.
+    earlier one. Each folder holds the asset's provenance and a list of hashes.
+
+    Args:
+        use: what the exports are for, as the person's consent names it.
+        with_photographs: whether pictures that show a photograph, and hashes of photographs, go along.
 
     Raises:
         SettingsError: an exporter is not known. InputError: the job's folder takes no files. StoreError: the asset is
-            absent or damaged. MeshError: a surface is open.
+            absent or damaged. MeshError: a surface is open. ConsentError: the person has not agreed.
     """
     exporters = {name: _exporter(name) for name in names}
     for exporter in exporters.values():
         exporter.check()
     require_folder(job, "Folder")
     content = read_content(job)
-    return tuple(_write(exporter, content, job / f"asset-{name}") for name, exporter in exporters.items())
+    provenance = departing(job, content.folder, use, datetime.now(UTC), with_photographs=with_photographs)
+
+    def write(name: str, exporter: Exporter) -> Path:
+        def fill(folder: Path) -> None:
+            exporter.write(content, folder)
+            seal(folder, provenance, name, with_photographs=with_photographs)
+
+        return write_anew(job / f"asset-{name}", fill)
+
+    return tuple(write(name, exporter) for name, exporter in exporters.items())
 
 
 def _exporter(name: str) -> Exporter:
@@ -64,14 +81,14 @@ def _exporter(name: str) -> Exporter:
     return exporter
 
 
-def _write(exporter: Exporter, content: AssetContent, final: Path) -> Path:
-    # Readers see the old folder or the new one, never a half of it.
+def write_anew(final: Path, fill: Callable[[Path], None]) -> Path:
+    """Fill a folder in place of an earlier one; readers see the old folder or the new one, never a half of it."""
     partial, retired = (final.with_name(f".{final.name}.{what}") for what in ("partial", "retired"))
     with translate_disk_errors(final.parent):
         for left in (partial, retired):
             shutil.rmtree(left, ignore_errors=True)
         partial.mkdir()
-        exporter.write(content, partial)
+        fill(partial)
         if final.exists():
             final.rename(retired)
         partial.rename(final)

@@ -6,11 +6,14 @@ import importlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from services.core.consent import require_allowed
 from services.core.geometry import Mesh
 from services.core.installed import require_packages
+from services.core.provenance.record import PROVENANCE
 from services.core.records import JobSpec
 from services.core.results import AssetManifest, FitReport, PreparedManifest, ToothReport
 from services.core.stage import StageContext, StageEvent
@@ -48,6 +51,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.assets.asset import errors_json, middle_of, parameters_json, write_asset
     from services.assets.colour.develop import CapturedColours
     from services.assets.fit_pictures import report_pictures
+    from services.assets.provenance.made import provenance_of
     from services.assets.report_page import write_report
     from services.core.files.meshes import read_mesh
     from services.transport.scene.rigid_moves import moved_camera, moved_light
@@ -58,6 +62,9 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     context.raise_if_cancelled()
     fit_folder, report = open_stage(context.root, "fit", FitReport)
     prepared_folder, prepared = open_stage(context.root, "prepared", PreparedManifest, verify=False)
+    now = datetime.now(UTC)
+    provenance = provenance_of(spec, context.root, prepared_folder, now)
+    require_allowed(provenance.consent, None, now)
     writer = StageWriter(context.root, "asset", context.attempt)
     channels = tuple(report.parameters)
     shaped = fitted_dentins(prepared_folder, prepared, spec, report)
@@ -87,6 +94,8 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         stains=stains,
         colours=CapturedColours(prepared.channels, prepared.colour) if prepared.colour else None,
     )
+    write_record(writer.folder / PROVENANCE, provenance)
+    files = tuple(sorted((*files, PROVENANCE)))
 
     history = json.loads((fit_folder / "history.json").read_text())
     title = f"Tooth {teeth[0].fdi}" if spec.kind == "tooth" else f"Jaw of {len(teeth)} teeth"

@@ -64,12 +64,14 @@ def build_app() -> typer.Typer:
     from services.cli.raw.import_folder import import_command
     from services.cli.raw.landmarks import landmarks
     from services.cli.raw.register import register
+    from services.cli.reproduce import reproduce
     from services.cli.run import run
     from services.cli.secrets import build_secrets_app
     from services.cli.serve import serve
     from services.cli.slab import simulate_slab_command
     from services.cli.sphere import sphere_command
     from services.cli.token import build_token_app
+    from services.cli.verify import verify
     from services.core.settings import read_settings
 
     app = typer.Typer(
@@ -80,7 +82,7 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_root)
-    local = serve, dome_sim, capture, run, options, export, landmarks, register, phantom, bench
+    local = serve, dome_sim, capture, run, options, export, verify, reproduce, landmarks, register, phantom, bench
     kept = keep_calibration, calibrations
     for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo, *kept):
         app.command()(command)

@@ -14,6 +14,9 @@ def export(
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Further exporters, after --to.")
     ] = None,
     to: Annotated[list[str] | None, typer.Option(help="Exporter of the published asset: blender, gltf, usd.")] = None,
+    use: Annotated[
+        str | None, typer.Option("--for", help="What the export is for, as the person's consent names it.")
+    ] = None,
 ) -> None:
     """Write the asset and report of a finished fit again, or with --to its asset for other programs."""
     if names and not to:
@@ -23,7 +26,7 @@ def export(
     if to:
         from services.assets.exporters import export_to
 
-        for folder in export_to(out, tuple(dict.fromkeys((*to, *(names or ()))))):
+        for folder in export_to(out, tuple(dict.fromkeys((*to, *(names or ())))), use=use):
             print(f"written: {folder}")
         return
     from services.cli.run import run_some

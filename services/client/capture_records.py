@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from services.core.consent import SUBJECT
 from services.core.geometry import Record
 from services.core.owners import DEFAULT_GROUP
 
-SUBJECT = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 

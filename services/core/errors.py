@@ -7,6 +7,7 @@
     │   ├── SettingsError     unknown option, wrong type, impossible combination
     │   ├── MeshError         open, inside-out or wrongly scaled geometry
     │   ├── CaptureInputError a frame or file is missing or malformed
+    │   ├── ConsentError      the person has not agreed to what is asked for
     │   └── DomeBusyError     a capture or a preflight has the dome
     ├── StoreError            what is on disk is not what was published
     │   ├── MissingStageError nothing published where something is expected
@@ -86,6 +87,12 @@ class CaptureInputError(InputError):
     """A capture lacks a frame or holds one that cannot be read."""
 
     code = "bad-capture"
+
+
+class ConsentError(InputError):
+    """The photographed person has not agreed to an export, or no longer does."""
+
+    code = "no-consent"
 
 
 class DomeBusyError(InputError):

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from services.core.calibration.cameras_and_lights import CameraColour, is_absent
 from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.consent import Consent, Subject
 from services.core.files.store_url import StoreUrl
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
@@ -119,6 +120,12 @@ class FolderCapture(Record):
     )
     colour: dict[str, CameraColour] | None = Field(
         default=None, exclude_if=is_absent, description="colours of each camera by its name; they apply to the asset"
+    )
+    subject: Subject | None = Field(
+        default=None, exclude_if=is_absent, description="pseudonymous label of the person; never a name"
+    )
+    consent: Consent | None = Field(
+        default=None, exclude_if=is_absent, description="for which uses and until when the person agreed"
     )
 
 

@@ -7,10 +7,11 @@ import importlib
 from services.core.errors import SettingsError
 from services.core.installed import require_packages
 from services.core.placement import WEIGHTS
+from services.core.provenance.record import INPUTS, Inputs
 from services.core.records import JobSpec
 from services.core.results import PreparedManifest
 from services.core.stage import CANCEL_FLAG, StageContext, StageEvent
-from services.core.store import StageWriter
+from services.core.store import StageWriter, write_record
 
 PACKAGES = ("cv2", "imagecodecs", "jinja2", "rtree", "tifffile")
 """Import names of the packages that the extra ``preprocess`` installs."""
@@ -39,6 +40,7 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
         SettingsError: an option names an unknown light or channel. StoreError: the capture store is damaged.
             JobCancelledError: the job was cancelled.
     """
+    from services.core.provenance.inputs import hashed_inputs
     from services.preprocess.masking.masks import HandMasks
     from services.preprocess.masking.valid import require_plausible_scale
     from services.preprocess.opening import open_source
@@ -106,6 +108,12 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
                 context.raise_if_cancelled()
 
     manifest, known = summarise(files, source, subject, held_out, masks.digest, context)
+    inputs = Inputs(
+        files=hashed_inputs(spec, context.root, context.raise_if_cancelled),
+        consent=source.description.consent,
+        subject=source.description.subject,
+    )
+    write_record(files.folder / INPUTS, inputs)
     files.writer.publish(manifest, known)
     files.end()
     progress.finish()

@@ -122,7 +122,7 @@ def test_the_command_writes_again_in_place_of_an_earlier_export(tmp_path: Path) 
     (root / "asset-gltf/old").write_text("")
     done = dentine("export", str(root), "--to", "gltf")
     assert done.returncode == 0, done.stderr
-    assert sorted(p.name for p in (root / "asset-gltf").iterdir()) == ["asset.bin", "asset.gltf"]
+    assert sorted(p.name for p in (root / "asset-gltf").iterdir()) == ["asset.bin", "asset.gltf", "manifest.json"]
     assert not [p for p in root.iterdir() if p.name.startswith(".asset-gltf")]
 
 
@@ -131,7 +131,7 @@ def test_blender_gets_surfaces_numbers_and_scripts(tmp_path: Path) -> None:
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert files == {
         "parameters.json", "rig.json", "teeth/11/outer.ply", "teeth/11/dentin.ply", "blender/blender_scene.py",
-        "blender/bodies.py", "blender/materials.py",
+        "blender/bodies.py", "blender/materials.py", "manifest.json",
     }  # fmt: skip
 
 

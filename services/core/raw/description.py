@@ -98,4 +98,6 @@ def described(root: Path, folder: RawFolder, calibration: Calibration, teeth_roo
         lights=tuple(known[light.name] for light in folder.light if light.name in lit),
         uncertainty=with_registration(teeth_root or root, calibration.uncertainty),
         colour=colours_among(calibration.colour, (camera.name for camera in folder.camera)),
+        subject=folder.subject,
+        consent=folder.consent,
     )

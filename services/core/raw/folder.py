@@ -10,6 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from services.core.consent import Consent
 from services.core.errors import CaptureInputError
 from services.core.files.validation import fault_text
 from services.core.geometry import Record
@@ -28,6 +29,7 @@ _KINDS: Mapping[str, type[Record]] = MappingProxyType(
         "board": Board,
         "sphere": Sphere,
         "chart": Chart,
+        "consent": Consent,
         "scan": ScanFile,
         "landmark": Landmark,
         "pixels": SeenPoint,

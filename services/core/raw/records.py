@@ -13,6 +13,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from services.core.calibration.cameras_and_lights import is_absent
+from services.core.consent import Consent, Subject
 from services.core.geometry import Record, Vector3
 from services.core.raw.targets import Board, CalibrationFile, Chart, Label, Landmark, Pixel, RawName, ScanFile, Sphere
 from services.core.records import FileName, Number, Positive, Unit, Whole
@@ -156,6 +158,8 @@ class RawFolder(Record):
     chart: tuple[Chart, ...] = ()
     scan: ScanFile | None = None
     landmark: tuple[Landmark, ...] = ()
+    subject: Subject | None = Field(default=None, exclude_if=is_absent)
+    consent: Consent | None = Field(default=None, exclude_if=is_absent)
 
     @property
     def channels(self) -> tuple[str, ...]:
