@@ -132,7 +132,7 @@ def unpack(source: Path, folder: Path) -> None:
             mean = stored[f"{camera.name}_mean"].astype(np.float64) * float(stored[f"{camera.name}_scale"])
             images = np.zeros((2, LIGHTS, height, width, 1))
             images[:, :, y, x, 0] = mean, (mean * stored[f"{camera.name}_error"] / STEPS_PER_ERROR) ** 2
-            entries += write_images(folder, camera, lights, *images, held_out_lights(LIGHTS, None))
+            entries += write_images(folder, camera, lights, images[0], images[1], held_out_lights(LIGHTS, None))
     incisor = build_incisor()
     tooth = Tooth(FDI, incisor.outer, incisor.dentin)
     for name, mesh in (("outer", tooth.outer), ("dentin", incisor.dentin)):

@@ -187,7 +187,9 @@ def final_task(
         (exact[0], exact[1]),
         copied,
         (residual(renders[0]), residual(renders[1])),
-        np.concatenate([np.array(moved).reshape(len(ends), 2, size), *(one.values.reshape(-1, 2, size) for one in changes)]),
+        np.concatenate(
+            [np.array(moved).reshape(len(ends), 2, size), *(one.values.reshape(-1, 2, size) for one in changes)]
+        ),
         block.fit_weight.reshape(-1),
         len(block.reference),
         len(slopes.errors),

@@ -166,6 +166,7 @@ class Stages(ABC, Generic[Optics]):
             max_steps=self.spec.max_steps,
             max_samples=samples,
             tolerance=0.5 * self.spec.image_tolerance**2 * level.signal,
+            ends_settled=True,
             part_count=self.part_count,
         )
 
@@ -180,7 +181,8 @@ class Stages(ABC, Generic[Optics]):
         images' bias is larger than the noise of a few samples.
         """
         most = min(2 * self.spec.samples_per_pixel, options.max_samples)
-        return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
+        tolerance = 0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal
+        return replace(options, max_samples=most, tolerance=tolerance, ends_settled=False)
 
     def switch_to_full_resolution(self) -> Options:
         """Continue with images of full resolution; returns the solver limits there."""
