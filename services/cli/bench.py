@@ -27,6 +27,7 @@ _BENCHMARKS = MappingProxyType(
         "stability": "services.bench.stability.run:run",
         "tooth": "services.bench.fits.tooth:run",
         "transport-gradient": "services.bench.transport.gradient:run",
+        "transport-lanes": "services.bench.transport.lanes:run",
         "transport-lights": "services.bench.transport.lights:run",
         "transport-skip": "services.bench.transport.skip:run",
         "transport-stack": "services.bench.transport.stack:run",

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.bench.transport.lanes import FixedLanes
 from services.core.records import Boundary
 from services.transport.engine import Engine
 from services.transport.scene.recipe import View
@@ -55,6 +56,12 @@ def test_a_scene_built_twice_gives_the_same_bits(boundary: Boundary) -> None:
     assert (one.image.sum(axis=1) > 0).all()
     assert (np.abs(one.jacobian).sum(axis=(1, 2)) > 0).all()
     assert (one.orders.sum(axis=(1, 2)) > 0).all()
+
+
+@pytest.mark.parametrize("boundary", BOUNDARIES)
+def test_no_bit_depends_on_which_lane_walked_a_row(boundary: Boundary) -> None:
+    scene = stained_recipe(boundary)
+    require_same_bits(picture(FixedLanes(scene)), picture(Engine(scene)))
 
 
 @pytest.mark.dear("Engines in two more processes compile their own kernels.")

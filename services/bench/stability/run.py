@@ -87,13 +87,13 @@ class LaneStart(SlabStart):
     """Starts of random walks in slabs whose source and faces differ from lane to lane."""
 
     def __init__(self, corners: Corners, seed: int) -> None:
-        self.lanes, self.seed = len(corners), dr.opaque(mi.UInt32, seed)
+        self.rows, self.seed = len(corners), dr.opaque(mi.UInt32, seed)
         self.boundary = LaneFaces(corners)
         self.normal = mi.Bool(~corners.diffuse)
 
-    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
+    def begin(self, row: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
         """Begin a walk, as ``SlabStart`` does."""
-        rng = stream(self.seed, lane, sample)
+        rng = stream(self.seed, row, sample)
         cosine = dr.select(self.normal, 1, dr.sqrt(1 - rng.next_float32()))
         weight, inside = self.boundary.enter(cosine)
         omega = mi.Vector3f(dr.sqrt(dr.maximum(1 - dr.square(inside), 0)), 0, inside)

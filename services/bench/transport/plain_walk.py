@@ -1,7 +1,8 @@
 """The random walk specialised by hand to the simplest tooth: one medium of one lobe, index-matched, images only.
 
-Starts, ray tracing, connections to lights and sums are the engine's own; the steps of a path are written here without
-any options. The engine's kernel for such a scene must be no larger than this one, and its images equal to the last bit.
+Starts, ray tracing, connections to lights, sums and the order of paths are the engine's own; the steps of a path are
+written here without any options. The engine's kernel for such a scene must be no larger than this one, and its images
+equal to the last bit.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import mitsuba as mi
 from services.transport.engine import Engine
 from services.transport.lighting.lights import PointLights
 from services.transport.optics.free_flight import minus_log1m
+from services.transport.paths.rows import Rows
 from services.transport.paths.scores import Plan
 from services.transport.paths.starts import CameraStart
 from services.transport.paths.tally import Tally
@@ -36,9 +38,9 @@ class PlainWalk(Walk):
     only the part of a walker's state that these need.
     """
 
-    def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
+    def _step(self, walker: Walker, tally: Tally, rows: Rows) -> Walker:
         # Fly to the next scattering or to the surface.
-        geometry = self.geometry
+        geometry, before = self.geometry, mi.UInt64(walker.rng.state)
         medium = walker.enclosure & 1
         sigma = dr.select(medium == 0, 0, self.media.sigma[0])
         distance = dr.select(sigma > 0, minus_log1m(walker.rng.next_float32()) / sigma, dr.inf)
@@ -55,9 +57,8 @@ class PlainWalk(Walk):
         walker.scatterings.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
 
         # Connect to the lights, then sample a new direction.
-        self._connect(
-            walker, Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False), mi.Bool(False)), tally
-        )
+        flight = Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False), mi.Bool(False))
+        self._connect(walker, flight, before, tally)
         onward = PhaseFunction(self.media, medium).sample(
             walker.omega, None, walker.rng.next_float32(), walker.rng.next_float32()
         )
@@ -72,23 +73,6 @@ class PlainWalk(Walk):
         faded = (share < 1) & (walker.rng.next_float32() >= share)
         walker.weight *= dr.select(share < 1, dr.rcp(dr.maximum(share, 1e-20)), 1)
         ended = walker.active & ((~scatters & ~crosses) | faded)
-
-        def renew(walker: Walker, ended: mi.Bool) -> Walker:
-            walker.sample = walker.sample + 1
-            fresh = self.start.begin(walker.lane, walker.sample, ended)
-            walker.rng, walker.origin, walker.omega, walker.enclosure = (
-                fresh.rng,
-                fresh.origin,
-                fresh.omega,
-                fresh.enclosure,
-            )
-            walker.weight, walker.reference, walker.scatterings.counts = (
-                fresh.weight,
-                mi.Float(fresh.weight),
-                [mi.UInt32(0)],
-            )
-            walker.active = walker.sample < limit
-            return walker
-
-        renewed: Walker = dr.if_stmt((walker, ended), ended, renew, lambda walker, _: walker, label="next sample")
-        return renewed
+        self._keep_stream(walker, before)
+        self._renew(walker, ended, rows)
+        return walker

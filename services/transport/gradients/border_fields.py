@@ -84,25 +84,25 @@ class BorderWalk(Walk, ABC):
         uncollided = self.scores.order(walker.scatterings) == 0
 
         def count(
-            lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
+            row: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
         ) -> mi.UInt32:
-            self._count(lane, hit, omega, strength, uncollided, crosses)
-            return lane
+            self._count(row, hit, omega, strength, uncollided, crosses)
+            return row
 
         dr.if_stmt(
-            (walker.lane, flight.hit, walker.omega, strength, uncollided, crosses),
+            (walker.row, flight.hit, walker.omega, strength, uncollided, crosses),
             crosses,
             count,
-            lambda lane, *_: lane,
+            lambda row, *_: row,
             label="border",
         )
         super()._move(walker, flight, throughput)
 
     @abstractmethod
     def _count(
-        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
+        self, row: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
     ) -> None:
-        """Score crossings of a lane's path with ``strength``, its weight over the cosine; ``uncollided`` paths have not
+        """Score crossings of a row's path with ``strength``, its weight over the cosine; ``uncollided`` paths have not
         collided.
         """
 
@@ -133,7 +133,7 @@ class LightWalk(BorderWalk):
         dr.sync_thread()
         lights = self.photons
         sums = np.array(self.table).reshape(lights.count, lights.batches, -1, self.columns)
-        scale = lights.power[:, None] / (FIXED_POINT * lights.lanes_per_group * samples * self.texels.areas_mm2)
+        scale = lights.power[:, None] / (FIXED_POINT * lights.rows_per_group * samples * self.texels.areas_mm2)
         return np.asarray(sums * scale[:, None, :, None], dtype=np.float32)
 
     def _omits_reflection(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:  # noqa: ARG002 - cameras need the medium
@@ -141,9 +141,9 @@ class LightWalk(BorderWalk):
         return self.scores.order(walker.scatterings) == 0
 
     def _count(
-        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
+        self, row: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
     ) -> None:
-        first = (self.photons.group(lane) * self.texels.count + self._texel(hit, crosses)) * self.columns
+        first = (self.photons.group(row) * self.texels.count + self._texel(hit, crosses)) * self.columns
         units = strength * FIXED_POINT
         for k, harmonic in enumerate(dr.sh_eval(omega, self.order)):
             dr.scatter_add(self.table, mi.Int64(units * harmonic), first + k, crosses & ~uncollided)
@@ -174,29 +174,29 @@ class CameraWalk(BorderWalk):
         # Light that reaches the camera travels against the walk, which turns the sign of odd harmonics.
         self.coefficients = [dr.opaque(mi.Float, -c if j % 2 else c) for j, c in enumerate(coefficients.tolist())]
         self.light = mi.Float(light.reshape(-1))
-        self.sums = dr.zeros(mi.Float64, start.lanes * self.light_batches * self.shape_modes)
+        self.sums = dr.zeros(mi.Float64, start.rows * self.light_batches * self.shape_modes)
         dr.make_opaque(self.light, self.sums)
 
     def shape_sums(self, samples: int) -> Array:
-        """Sums over every lane's samples for each of M shape modes, (lanes, batches of light, M)."""
+        """Sums over every row's samples for each of M shape modes, (rows, batches of light, M)."""
         self.trace(samples, Tally(1, 1, 0))
         dr.eval(self.sums)
         dr.sync_thread()
         return np.array(self.sums).reshape(-1, self.light_batches, self.shape_modes)
 
     def _count(
-        self, lane: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
+        self, row: mi.UInt32, hit: Hit, omega: mi.Vector3f, strength: mi.Float, uncollided: mi.Bool, crosses: mi.Bool
     ) -> None:
         texel, speeds = self._texel(hit, crosses), self.mesh.velocity(hit, self.texels.tooth, crosses)
         harmonics = dr.sh_eval(omega, self.order)
         weighted = [harmonics[k] * c for j, c in enumerate(self.coefficients) for k in range(j * j, (j + 1) ** 2)]
         for batch in range(self.light_batches):
-            first = ((lane % self.pixels * self.light_batches + batch) * self.texels.count + texel) * self.columns
+            first = ((row % self.pixels * self.light_batches + batch) * self.texels.count + texel) * self.columns
             change = dr.gather(mi.Float, self.light, first + self.columns - 1, crosses & uncollided)
             for k, harmonic in enumerate(weighted):
                 change = dr.fma(harmonic, dr.gather(mi.Float, self.light, first + k, crosses & ~uncollided), change)
             for mode, speed in enumerate(speeds):
-                slot = (lane * self.light_batches + batch) * self.shape_modes + mode
+                slot = (row * self.light_batches + batch) * self.shape_modes + mode
                 dr.scatter_add(
                     self.sums, mi.Float64(-strength * speed * change), slot, crosses, mode=dr.ReduceMode.NoConflicts
                 )

@@ -24,7 +24,7 @@ LIGHT_BATCHES = 4
 CAMERA_BATCHES = 16
 TABLE_BUDGET = 48_000_000
 """Largest number of entries in a table of light by pixel, about 200 MB; more pixels are processed in slices."""
-MAX_LANES_PER_GROUP = 64
+MAX_ROWS_PER_GROUP = 64
 
 
 class ShapeGradients:
@@ -86,10 +86,10 @@ class ShapeGradients:
         self, media: Media, texels: Texels, chosen: list[int], photons: int, order: int, seed: int
     ) -> NDArray[np.float32]:
         per_group = -(-photons // LIGHT_BATCHES)
-        lanes = min(MAX_LANES_PER_GROUP, per_group)
+        rows = min(MAX_ROWS_PER_GROUP, per_group)
         positions, intensities = self.recipe.light_positions_mm[chosen], self.recipe.light_intensities[chosen]
-        start = LightStart(positions, intensities, self.recipe.vertices_mm(), LIGHT_BATCHES, lanes, seed)
-        return LightWalk(self.geometry, media, start, texels, order, self.boundary).gather(-(-per_group // lanes))
+        start = LightStart(positions, intensities, self.recipe.vertices_mm(), LIGHT_BATCHES, rows, seed)
+        return LightWalk(self.geometry, media, start, texels, order, self.boundary).gather(-(-per_group // rows))
 
     def _light_of_pixels(
         self,

@@ -125,11 +125,11 @@ class Connections:
         chosen.total = total
         return chosen
 
-    def connect(self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally) -> mi.PCG32:
+    def connect(self, vertex: Vertex, row: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally) -> mi.PCG32:
         """Add the contributions of all lights at the kept vertex to the tally; returns the advanced generator."""
 
-        def to_lights(vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool) -> mi.PCG32:
-            check, rng = self._connect_by_maps(vertex, lane, rng, active, tally)
+        def to_lights(vertex: Vertex, row: mi.UInt32, rng: mi.PCG32, active: mi.Bool) -> mi.PCG32:
+            check, rng = self._connect_by_maps(vertex, row, rng, active, tally)
 
             # Correct the maps' transmittance to one light by a shadow ray, cast with a probability proportional to the
             # assumed error.
@@ -137,10 +137,10 @@ class Connections:
             casts = active & (check.total * self.lights.inverse_irradiance > FAINTEST) & (rng.next_float32() < chance)
             weight = check.weight * check.total / (check.importance * chance)
             if isinstance(tally, StainTally):
-                tally.credit(lane, vertex.stains[0], check.expected_sum[0], active)
+                tally.credit(row, vertex.stains[0], check.expected_sum[0], active)
                 ray_stains = [FaceCrossing.none(rng.next_float32())]
                 dr.if_stmt(
-                    (vertex, lane, check, weight, ray_stains, casts),
+                    (vertex, row, check, weight, ray_stains, casts),
                     casts,
                     correct_stains,
                     lambda *_: mi.Float(0),
@@ -148,13 +148,13 @@ class Connections:
                 )
             else:
                 dr.if_stmt(
-                    (vertex, lane, check, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction"
+                    (vertex, row, check, weight, casts), casts, correct, lambda *_: mi.Float(0), label="correction"
                 )
             return rng
 
         def correct_stains(
             vertex: Vertex,
-            lane: mi.UInt32,
+            row: mi.UInt32,
             check: LookupCheck,
             weight: mi.Float,
             stains: list[FaceCrossing],
@@ -171,19 +171,19 @@ class Connections:
                 boundary=self.boundary,
                 stains=stains,
             )
-            value = weight * tally.weight(lane, check.light, casts)
-            tally.credit(lane, vertex.stains[0], value * (ray.transmittance() - check.expected), casts)
-            tally.credit(lane, ray.stains[0], value * ray.transmittance(), casts)
+            value = weight * tally.weight(row, check.light, casts)
+            tally.credit(row, vertex.stains[0], value * (ray.transmittance() - check.expected), casts)
+            tally.credit(row, ray.stains[0], value * ray.transmittance(), casts)
             return weight
 
-        def correct(vertex: Vertex, lane: mi.UInt32, check: LookupCheck, weight: mi.Float, casts: mi.Bool) -> mi.Float:
+        def correct(vertex: Vertex, row: mi.UInt32, check: LookupCheck, weight: mi.Float, casts: mi.Bool) -> mi.Float:
             ray = shadow(
                 self.geometry, self.media, vertex.point, check.direction, vertex.enclosure, casts,
                 measured=self.scores.sigma_media, shape=self.plan.shape, boundary=self.boundary,
             )  # fmt: skip
             self._count(
                 vertex,
-                lane,
+                row,
                 check.light,
                 check.direction,
                 weight * ray.transmittance(),
@@ -193,16 +193,16 @@ class Connections:
                 tally,
             )
             self._count(
-                vertex, lane, check.light, check.direction, -weight * check.expected, check.lengths, None, casts, tally
+                vertex, row, check.light, check.direction, -weight * check.expected, check.lengths, None, casts, tally
             )
             return weight
 
         return dr.if_stmt(
-            (vertex, lane, rng, active), active, to_lights, lambda _v, _l, rng, _a: rng, label="connection"
+            (vertex, row, rng, active), active, to_lights, lambda _v, _l, rng, _a: rng, label="connection"
         )
 
     def _connect_by_maps(
-        self, vertex: Vertex, lane: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally
+        self, vertex: Vertex, row: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally
     ) -> tuple[LookupCheck, mi.PCG32]:
         """Add the contributions that the light maps predict for one light of every group, and keep one of these lights
         with a probability proportional to the assumed error of its look-up.
@@ -211,7 +211,7 @@ class Connections:
         relative_error = MAP_RELATIVE_ERROR if self.plan.shape is None and not self.plan.stains else 1.0
 
         def step(
-            group: mi.UInt32, rng: mi.PCG32, check: LookupCheck, vertex: Vertex, lane: mi.UInt32, active: mi.Bool
+            group: mi.UInt32, rng: mi.PCG32, check: LookupCheck, vertex: Vertex, row: mi.UInt32, active: mi.Bool
         ) -> tuple[mi.UInt32, mi.PCG32, LookupCheck, Vertex, mi.UInt32, mi.Bool]:
             u = rng.next_float32() if groups.size > 1 else mi.Float(0)
             light, brightness = groups.choose(
@@ -228,11 +228,11 @@ class Connections:
             )
             expected_sum = check.expected_sum
             if isinstance(tally, StainTally):
-                cotangent = tally.weight(lane, light, active)
+                cotangent = tally.weight(row, light, active)
                 importance *= dr.abs(cotangent)
                 expected_sum = [dr.fma(weight * expected, cotangent, check.expected_sum[0])]
             else:
-                self._count(vertex, lane, light, lookup.direction, weight * expected, lengths, None, active, tally)
+                self._count(vertex, row, light, lookup.direction, weight * expected, lengths, None, active, tally)
             total = check.total + importance
             take = rng.next_float32() * total < importance
             check = dr.select(
@@ -241,7 +241,7 @@ class Connections:
                 check,
             )
             check.total, check.expected_sum = total, expected_sum
-            return group + 1, rng, check, vertex, lane, active
+            return group + 1, rng, check, vertex, row, active
 
         zero = mi.Float(0)
         check = LookupCheck(
@@ -249,7 +249,7 @@ class Connections:
             mi.Float(0), [mi.Float(0)] * self.plan.stains,
         )  # fmt: skip
         state = dr.while_loop(
-            (mi.UInt32(0), rng, check, vertex, lane, active),
+            (mi.UInt32(0), rng, check, vertex, row, active),
             lambda group, _r, _k, _v, _l, active: active & (group < groups.count),
             step,
             label="every group of lights",
@@ -259,7 +259,7 @@ class Connections:
     def _count(
         self,
         vertex: Vertex,
-        lane: mi.UInt32,
+        row: mi.UInt32,
         light: mi.UInt32,
         direction: mi.Vector3f,
         value: mi.Float,
@@ -270,16 +270,16 @@ class Connections:
     ) -> None:
         """Add a connection's value to its image and, times the score of the whole path, to the derivatives."""
         slot, primary = self._slot(vertex, light), active & vertex.primary
-        tally.add(lane, slot, value, primary)
+        tally.add(row, slot, value, primary)
         medium = self._medium(vertex)
         terms = PhaseFunction(self.media, medium).scores(self.scores.phase_fields, vertex.omega, direction)
         lengths_of = dict(zip(self.scores.sigma_media, lengths, strict=True))
         for which, score in enumerate(self.scores.complete(vertex.sums, vertex.scatterings, medium, terms, lengths_of)):
-            tally.add_derivative(which, lane, slot, value * score, primary)
+            tally.add_derivative(which, row, slot, value * score, primary)
         for mode in range(self.modes):
             border_score = vertex.border_sums[mode] if border is None else vertex.border_sums[mode] + border[mode]
             factor = dr.select(vertex.primary, border_score, vertex.shape_factor[mode])
-            tally.add_derivative(len(self.plan.scores) + mode, lane, slot, value * factor, active)
+            tally.add_derivative(len(self.plan.scores) + mode, row, slot, value * factor, active)
 
     def _medium(self, vertex: Vertex) -> mi.UInt32:
         """Medium in which a vertex scatters, or the wall (number ``media.count``) where it lies on the wall."""

@@ -53,7 +53,7 @@ class Exits:
         for edge in range(len(self.plan.ring_edges_mm)):
             ring += dr.select(radius >= dr.gather(mi.Float, self.edges_mm, edge), mi.UInt32(1), mi.UInt32(0))
         scattered = walker.active & hit.valid & hit.outer & (order > 0) & walker.primary
-        tally.add(walker.lane, self._first_ring + 2 * ring + face, value, scattered)
+        tally.add(walker.row, self._first_ring + 2 * ring + face, value, scattered)
 
     def connect(self, walker: Walker, hit: Hit, sigma: mi.Float, scattered: mi.Float, tally: Tally) -> None:
         """Add to the radiance at every cosine the light that collisions on the flight ahead scatter there;
@@ -70,7 +70,7 @@ class Exits:
 
         def step(
             which: mi.UInt32, omega: mi.Vector3f, across: mi.Vector2f, begin: mi.Vector2f, end: mi.Vector2f,
-            optical_depth: mi.Float, scattered: mi.Float, lane: mi.UInt32, active: mi.Bool,
+            optical_depth: mi.Float, scattered: mi.Float, row: mi.UInt32, active: mi.Bool,
         ) -> tuple[mi.UInt32, mi.Vector3f, mi.Vector2f, mi.Vector2f, mi.Vector2f, mi.Float, mi.Float, mi.UInt32,
                    mi.Bool]:  # fmt: skip
             inside, narrowing, mirrored = self.boundary.leave(dr.gather(mi.Float, self.cosines, which, active))
@@ -91,9 +91,9 @@ class Exits:
             back = mirrored * dr.exp(-(begin.x + begin.y) / inside)
             strength = scattered * (1 - mirrored) / (narrowing * inside * (1 - dr.square(back)))
             slot = self._first_cosine + 2 * which
-            tally.add(lane, slot, strength * dr.fma(contributions[1], back, contributions[0]), active)
-            tally.add(lane, slot + 1, strength * dr.fma(contributions[0], back, contributions[1]), active)
-            return which + 1, omega, across, begin, end, optical_depth, scattered, lane, active
+            tally.add(row, slot, strength * dr.fma(contributions[1], back, contributions[0]), active)
+            tally.add(row, slot + 1, strength * dr.fma(contributions[0], back, contributions[1]), active)
+            return which + 1, omega, across, begin, end, optical_depth, scattered, row, active
 
         state = (
             mi.UInt32(0),
@@ -103,7 +103,7 @@ class Exits:
             end,
             optical_depth,
             scattered,
-            walker.lane,
+            walker.row,
             active,
         )
         dr.while_loop(

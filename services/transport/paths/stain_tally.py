@@ -24,12 +24,12 @@ class StainTally(Tally):
         self._cotangent = mi.Float(np.ascontiguousarray(cotangent.reshape(-1), dtype=np.float32))
         dr.eval(self._cotangent)
 
-    def weight(self, lane: mi.UInt32, light: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """Cotangent of a lane's pixel under a light."""
-        return dr.gather(mi.Float, self._cotangent, light * self._pixels + lane % self._pixels, active)
+    def weight(self, row: mi.UInt32, light: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """Cotangent of a row's pixel under a light."""
+        return dr.gather(mi.Float, self._cotangent, light * self._pixels + row % self._pixels, active)
 
-    def credit(self, lane: mi.UInt32, crossing: FaceCrossing, value: mi.Float, active: mi.Bool) -> None:
+    def credit(self, row: mi.UInt32, crossing: FaceCrossing, value: mi.Float, active: mi.Bool) -> None:
         """Add a contribution's derivative to the texels of its kept face."""
         active = active & (crossing.number > 0)
         for texel, score in self._textures.scores(crossing, active):
-            dr.scatter_add(self.sums, mi.Float64(value * score), lane // self._pixels * self.slots + texel, active)
+            dr.scatter_add(self.sums, mi.Float64(value * score), row // self._pixels * self.slots + texel, active)

@@ -34,6 +34,13 @@ def stream(seed: mi.UInt32, pixel: mi.UInt32, sample: mi.UInt32) -> mi.PCG32:
     return rng
 
 
+def no_stream() -> mi.PCG32:
+    """The generator of a lane that has no path yet."""
+    rng = mi.PCG32()
+    rng.state, rng.inc = mi.UInt64(0), mi.UInt64(1)
+    return rng
+
+
 @dataclass
 class PathStart:
     """State of a fresh path."""
@@ -55,11 +62,13 @@ class CameraStart:
     Every camera has streams of its own, because its name enters the seed.
     """
 
+    fixed_lanes = False
+
     def __init__(self, view: View, batches: int, seed: int, radius_mm: float, skipped: int = 0) -> None:
         camera = view.camera
         width, _ = camera.size
         x, y = view.pixels[:, 0].astype(np.uint32), view.pixels[:, 1].astype(np.uint32)
-        self.lanes = batches * len(view)
+        self.rows = batches * len(view)
         self._pixels = np.tile(y * width + x, batches)
         self._batch = np.repeat(np.arange(batches, dtype=np.uint32) + np.uint32(skipped * batches), len(view))
         self.pixel = aligned(mi.UInt32(self._pixels.astype(np.uint32)))
@@ -76,12 +85,12 @@ class CameraStart:
             mi.Float, max(float(np.linalg.norm(camera_centre)) - radius_mm - NEAR_MARGIN_MM, 0.0)
         )
 
-    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
-        """A path through a random point of the lane's pixel; ``sample`` counts within the batch, from the first that is
+    def begin(self, row: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
+        """A path through a random point of the row's pixel; ``sample`` counts within the batch, from the first that is
         not skipped.
         """
-        pixel = dr.gather(mi.UInt32, self.pixel, lane, active)
-        batch = dr.gather(mi.UInt32, self.batch, lane, active)
+        pixel = dr.gather(mi.UInt32, self.pixel, row, active)
+        batch = dr.gather(mi.UInt32, self.batch, row, active)
         rng = stream(self.seed, pixel, sample * self.batches + batch)
         x = (pixel % self.width) + rng.next_float32()
         y = (pixel // self.width) + rng.next_float32()
@@ -96,8 +105,10 @@ class LightStart:
     their own.
 
     Weights are near 1; ``power`` is the quantity that a weight of 1 represents. A group is one batch of one light;
-    lanes are ordered by light, then by batch.
+    rows are ordered by light, then by batch.
     """
+
+    fixed_lanes = False
 
     def __init__(
         self,
@@ -105,13 +116,13 @@ class LightStart:
         intensities: NDArray[np.float64],
         outer_mm: NDArray[np.float64],
         batches: int,
-        lanes_per_group: int,
+        rows_per_group: int,
         seed: int,
     ) -> None:
         """Take the lights' positions (L, 3) and intensities (L,), and all vertices of the tooth (V, 3)."""
-        self.count, self.batches, self.lanes_per_group = len(positions_mm), batches, lanes_per_group
+        self.count, self.batches, self.rows_per_group = len(positions_mm), batches, rows_per_group
         self.groups = self.count * batches
-        self.lanes = self.groups * lanes_per_group
+        self.rows = self.groups * rows_per_group
         distance = np.linalg.norm(positions_mm, axis=1)
         forward = -positions_mm / distance[:, None]
         helper = np.where(np.abs(forward[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
@@ -129,18 +140,18 @@ class LightStart:
         before = np.minimum(np.linalg.norm(outer_mm, axis=1).max() + NEAR_MARGIN_MM, distance)
         columns = [forward, right * size[0, :, None], up * size[1, :, None], corner, distance[:, None], before[:, None]]
         self._frames = mi.Float(np.concatenate(columns, axis=1).astype(np.float32).reshape(-1))
-        self._lanes_per_group = dr.opaque(mi.UInt32, lanes_per_group)
+        self._rows_per_group = dr.opaque(mi.UInt32, rows_per_group)
         self._batches = dr.opaque(mi.UInt32, batches)
         self.seed = dr.opaque(mi.UInt32, seed)
         dr.eval(self._frames)
 
-    def group(self, lane: mi.UInt32) -> mi.UInt32:
-        """Group of a lane: light x batches + batch."""
-        return lane // self._lanes_per_group
+    def group(self, row: mi.UInt32) -> mi.UInt32:
+        """Group of a row: light x batches + batch."""
+        return row // self._rows_per_group
 
-    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
+    def begin(self, row: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:
         """A photon on its way to a random point of its light's rectangle."""
-        rng, first = stream(self.seed, lane, sample), self.group(lane) // self._batches * 14
+        rng, first = stream(self.seed, row, sample), self.group(row) // self._batches * 14
         forward, right, up, corner = (
             mi.Vector3f(*(dr.gather(mi.Float, self._frames, first + 3 * k + axis, active) for axis in range(3)))
             for k in range(4)
@@ -159,14 +170,16 @@ class LightStart:
 class SlabStart:
     """Walks that enter a slab's lit face at its origin, z = 0: collimated at a cosine to the normal, or Lambertian."""
 
-    def __init__(self, lanes: int, seed: int, *, diffuse: bool, boundary: Boundary, cosine: float = 1.0) -> None:
-        self.lanes, self.diffuse, self.boundary = lanes, diffuse, boundary
+    fixed_lanes = True
+
+    def __init__(self, rows: int, seed: int, *, diffuse: bool, boundary: Boundary, cosine: float = 1.0) -> None:
+        self.rows, self.diffuse, self.boundary = rows, diffuse, boundary
         self.cosine = mi.Float(1) if cosine == 1 else dr.opaque(mi.Float, cosine)
         self.seed = dr.opaque(mi.UInt32, seed)
 
-    def begin(self, lane: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
+    def begin(self, row: mi.UInt32, sample: mi.UInt32, active: mi.Bool) -> PathStart:  # noqa: ARG002 - views need the mask
         """A path just inside the lit face, weighted by the share of light that enters."""
-        rng = stream(self.seed, lane, sample)
+        rng = stream(self.seed, row, sample)
         cosine = dr.sqrt(1 - rng.next_float32()) if self.diffuse else self.cosine
         weight, inside = self.boundary.enter(cosine)
         omega = mi.Vector3f(dr.sqrt(dr.maximum(1 - dr.square(inside), 0)), 0, inside)

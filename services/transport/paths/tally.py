@@ -1,6 +1,6 @@
-"""Sums of a walk's contributions, in private slots per lane, so that sums never depend on the order of threads.
+"""Sums of a walk's contributions by row. One lane walks a row at a time, so sums never depend on the order of threads.
 
-Sums are in double precision: in single precision, a lane that adds ten thousand nearly equal numbers is off by 1e-5,
+Sums are in double precision: in single precision, a row that adds ten thousand nearly equal numbers is off by 1e-5,
 with the same sign each time.
 """
 
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 
 
 class Tally:
-    """Sums of contributions and of contributions times scores, per (lane, slot). A slot is a light, or a bin of
+    """Sums of contributions and of contributions times scores, per (row, slot). A slot is a light, or a bin of
     scattering order under a light.
     """
 
-    def __init__(self, lanes: int, slots: int, derivatives: int) -> None:
-        self.lanes, self.slots = lanes, slots
-        self.sums = dr.zeros(mi.Float64, lanes * slots)
-        self.derivatives = [dr.zeros(mi.Float64, lanes * slots) for _ in range(derivatives)]
+    def __init__(self, rows: int, slots: int, derivatives: int) -> None:
+        self.rows, self.slots = rows, slots
+        self.sums = dr.zeros(mi.Float64, rows * slots)
+        self.derivatives = [dr.zeros(mi.Float64, rows * slots) for _ in range(derivatives)]
         dr.make_opaque(self.sums, self.derivatives)
 
-    def add(self, lane: mi.UInt32, slot: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
+    def add(self, row: mi.UInt32, slot: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
         """Add a contribution to a slot's sum."""
-        dr.scatter_add(self.sums, mi.Float64(value), lane * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter_add(self.sums, mi.Float64(value), row * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts)
 
-    def add_derivative(self, which: int, lane: mi.UInt32, slot: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
+    def add_derivative(self, which: int, row: mi.UInt32, slot: mi.UInt32, value: mi.Float, active: mi.Bool) -> None:
         """Add a contribution times score to a slot's sum of derivative ``which``."""
         dr.scatter_add(
-            self.derivatives[which], mi.Float64(value), lane * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts
+            self.derivatives[which], mi.Float64(value), row * self.slots + slot, active, mode=dr.ReduceMode.NoConflicts
         )
 
     def evaluate(self) -> None:
@@ -39,6 +39,6 @@ class Tally:
         dr.sync_thread()
 
     def arrays(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Sums and derivative sums as (lanes, slots) float64."""
-        shape = (self.lanes, self.slots)
+        """Sums and derivative sums as (rows, slots) float64."""
+        shape = (self.rows, self.slots)
         return np.array(self.sums).reshape(shape), [np.array(d).reshape(shape) for d in self.derivatives]

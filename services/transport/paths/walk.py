@@ -14,8 +14,9 @@ from services.transport.lighting.lights import PointLights, shadow
 from services.transport.optics.free_flight import minus_log1m, one_minus_exp
 from services.transport.paths.connections import Connections, Vertex
 from services.transport.paths.exits import Exits
+from services.transport.paths.rows import Rows
 from services.transport.paths.scores import Plan, Scores
-from services.transport.paths.starts import CameraStart, LightStart, SlabStart
+from services.transport.paths.starts import CameraStart, LightStart, SlabStart, no_stream
 from services.transport.paths.tally import Tally
 from services.transport.paths.walker import Flight, Walker
 from services.transport.scene.border import BorderScattering, inverse_cosine, no_crossing, offer
@@ -54,8 +55,8 @@ class Walk:
             self.slots += self.exits.slots
 
     def run(self, samples: int, tally: Tally | None = None) -> Tally:
-        """Tally of ``samples`` paths in every lane, evaluated; a plan for stains needs a tally of its own kind."""
-        tally = tally or Tally(self.start.lanes, self.slots, len(self.plan.scores) + self.modes)
+        """Tally of ``samples`` paths in every row, evaluated; a plan for stains needs a tally of its own kind."""
+        tally = tally or Tally(self.start.rows, self.slots, len(self.plan.scores) + self.modes)
         self.trace(samples, tally)
         tally.evaluate()
         return tally
@@ -66,55 +67,55 @@ class Walk:
         Dr.Jit would record a body again, four times in nested loops, to take constant state out of it. This is turned
         off, and such state left out by hand: recording is half the time of a small image.
         """
-        limit = dr.opaque(mi.UInt32, samples)
-        lane = dr.arange(mi.UInt32, self.start.lanes)
-        path = self.start.begin(lane, mi.UInt32(0), mi.Bool(True))
+        rows = Rows(self.start.rows, samples, fixed=self.start.fixed_lanes)
 
         def zeros(count: int) -> list[mi.Float]:
             return [mi.Float(0) for _ in range(count)]
 
+        # No lane has a row yet; all take their first one in the first step, in which all lanes would connect.
         walker = Walker(
-            rng=path.rng,
-            origin=path.origin,
-            omega=path.omega,
-            enclosure=path.enclosure,
-            weight=path.weight,
-            reference=mi.Float(path.weight),
+            rng=no_stream(),
+            origin=dr.zeros(mi.Point3f, self.start.rows),
+            omega=dr.zeros(mi.Vector3f, self.start.rows),
+            enclosure=mi.UInt32(0),
+            weight=mi.Float(0),
+            reference=mi.Float(0),
             scatterings=self.scores.unscattered(),
             steps=[mi.UInt32(0) for _ in range(self.limited)],
             sums=self.scores.zero(),
             border_sums=zeros(self.modes),
             border_crossing=[no_crossing(self.modes)] * (self.plan.shape is not None),
-            stains=[FaceCrossing.none(path.rng.next_float32()) for _ in range(self.plan.stains)],
+            stains=[FaceCrossing.none(mi.Float(0)) for _ in range(self.plan.stains)],
             vertex=None if self.connections is None else self.connections.no_vertex(),
-            connection_step=mi.UInt32(0),
+            connection_step=mi.UInt32(0 if self.connections is None else self.connections.period - 1),
             secondary=[mi.Bool(False)] * (self.plan.shape is not None),
             shape_factor=zeros(self.modes),
-            lane=lane,
+            row=rows.before_first(),
             sample=mi.UInt32(0),
-            active=lane < dr.opaque(mi.UInt32, self.start.lanes),
+            active=mi.Bool(False),
+            working=rows.lanes(),
         )
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-            walker = dr.while_loop(
-                (walker,), lambda walker: walker.active, lambda one: (self._step(one, tally, limit),), label="walk"
-            )[0]
-            if self.connections is not None:
-                self.connections.connect(walker.vertex, walker.lane, walker.rng, walker.vertex.total > 0, tally)
+            dr.while_loop(
+                (walker,), lambda walker: walker.working, lambda one: (self._step(one, tally, rows),), label="walk"
+            )
 
-    def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
+    def _step(self, walker: Walker, tally: Tally, rows: Rows) -> Walker:
+        before = mi.UInt64(walker.rng.state)
         throughput = self._throughput(walker)
         flight = self._fly_past_faces(walker, throughput, tally) if self.plan.faces else self._fly(walker)
         throughput = self._throughput(walker)
         self._move(walker, flight, throughput)
         if self.connections is not None:
-            self._connect(walker, flight, tally)
+            self._connect(walker, flight, before, tally)
         self._deflect(walker, flight)
         ended = self._end(walker, flight)
         if self.plan.most_steps is not None:
             ended = self._cut(walker, ended, self.plan.most_steps, tally)
         if self.plan.shape is not None:
             ended = self._start_secondary(walker, ended, tally)
-        self._renew(walker, ended, limit)
+        self._keep_stream(walker, before)
+        self._renew(walker, ended, rows)
         return walker
 
     def _throughput(self, walker: Walker) -> mi.Float:
@@ -157,18 +158,18 @@ class Walk:
         value = throughput * (1 - collides) * through
         lengths = {k: dr.select(medium == k, hit.distance, 0) for k in self.scores.sigma_media}
         primary = walker.active & leaving & walker.primary
-        tally.add(walker.lane, face, value, primary)
+        tally.add(walker.row, face, value, primary)
         if self.exits is not None:
             self.exits.count_ring(walker, self.scores.order(walker.scatterings), hit, face, value, tally)
             self.exits.connect(
                 walker, hit, sigma, throughput * dr.exp(self.media.pick(self.media.log_alpha, medium)), tally
             )
         for which, score in enumerate(self.scores.complete(walker.sums, walker.scatterings, mi.UInt32(0), {}, lengths)):
-            tally.add_derivative(which, walker.lane, face, value * score, primary)
+            tally.add_derivative(which, walker.row, face, value * score, primary)
         for mode in range(self.modes):
             factor = dr.select(walker.primary, walker.border_sums[mode], walker.shape_factor[mode])
             tally.add_derivative(
-                len(self.plan.scores) + mode, walker.lane, face, value * factor, walker.active & leaving
+                len(self.plan.scores) + mode, walker.row, face, value * factor, walker.active & leaving
             )
 
         # The rest collides before the face or is reflected by it.
@@ -225,7 +226,7 @@ class Walk:
             scattered_in = dr.select(flight.bounces, mi.UInt32(self.media.count), flight.medium)
         walker.scatterings = self.scores.scatter(walker.scatterings, scattered_in, flight.scatters | flight.bounces)
 
-    def _connect(self, walker: Walker, flight: Flight, tally: Tally) -> None:
+    def _connect(self, walker: Walker, flight: Flight, before: mi.UInt64, tally: Tally) -> None:
         assert self.connections is not None
         assert walker.vertex is not None
         bound = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
@@ -239,9 +240,10 @@ class Walk:
         walker.vertex = self.connections.offer(
             walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces
         )
+        self._keep_stream(walker, before)
         walker.connection_step += 1
-        due = walker.active & (walker.connection_step == self.connections.period) & (walker.vertex.total > 0)
-        walker.rng = self.connections.connect(walker.vertex, walker.lane, walker.rng, due, tally)
+        due = walker.working & (walker.connection_step == self.connections.period) & (walker.vertex.total > 0)
+        walker.rng = self.connections.connect(walker.vertex, walker.row, walker.rng, due, tally)
         walker.vertex.total = dr.select(due, 0, walker.vertex.total)
         walker.connection_step = dr.select(walker.connection_step == self.connections.period, 0, walker.connection_step)
 
@@ -279,7 +281,7 @@ class Walk:
         walker.steps = [count + 1 for count in walker.steps]
         cut = walker.active & ~ended & (walker.steps[0] >= most_steps)
         if self.plan.faces:
-            tally.add(walker.lane, mi.UInt32(2), self._throughput(walker), cut & walker.primary)
+            tally.add(walker.row, mi.UInt32(2), self._throughput(walker), cut & walker.primary)
         return ended | cut
 
     def _start_secondary(self, walker: Walker, ended: mi.Bool, tally: Tally) -> mi.Bool:
@@ -302,7 +304,7 @@ class Walk:
                 )
                 value = strength * chosen.total * scattering.balance(chosen.direction) * ray.transmittance()
                 for mode, ratio in enumerate(ratios):
-                    tally.add_derivative(len(self.plan.scores) + mode, walker.lane, chosen.index, value * ratio, begins)
+                    tally.add_derivative(len(self.plan.scores) + mode, walker.row, chosen.index, value * ratio, begins)
 
             # Start one walk for the lobes of both sides, which carries their signed difference.
             u_lobe = rng.next_float32() if self.media.two_lobes else None
@@ -334,12 +336,27 @@ class Walk:
             setattr(walker, field, getattr(walker_after, field))
         return (ended & ~begins) | (begins & (walker.weight == 0))
 
-    def _renew(self, walker: Walker, ended: mi.Bool, limit: mi.UInt32) -> None:
-        """Put the lane's next sample in place of finished paths."""
+    def _keep_stream(self, walker: Walker, before: mi.UInt64) -> None:
+        """Restore the random numbers of lanes without a path. Their row's last connection takes the first ones that
+        follow the row's paths, however long a lane waits for it.
+        """
+        walker.rng.state = dr.select(walker.active, walker.rng.state, before)
 
-        def renew(walker: Walker, ended: mi.Bool) -> Walker:
-            walker.sample = walker.sample + 1
-            path = self.start.begin(walker.lane, walker.sample, ended)
+    def _renew(self, walker: Walker, ended: mi.Bool, rows: Rows) -> None:
+        """Put the row's next sample in place of finished paths, and another row in place of finished rows.
+
+        A lane whose row is finished waits for the step at which all lanes connect, as its row's last vertex is to be
+        connected first. So every row begins at the same step of that cycle, and its sums are the same whichever lane
+        walks it, and whatever that lane walked before.
+        """
+        idle = walker.working & (~walker.active | (ended & (walker.sample + 1 == rows.samples)))
+        takes = idle & (walker.connection_step == 0)
+
+        def renew(walker: Walker, begins: mi.Bool, takes: mi.Bool) -> Walker:
+            walker.row = dr.select(takes, rows.take(walker.row, takes), walker.row)
+            walker.sample = dr.select(takes, 0, walker.sample + 1)
+            walker.working = ~takes | (walker.row < rows.count)
+            path = self.start.begin(walker.row, walker.sample, begins & walker.working)
             walker.rng, walker.origin, walker.omega, walker.enclosure = (
                 path.rng,
                 path.origin,
@@ -355,8 +372,9 @@ class Walk:
                 crossing.total = mi.Float(0)
             walker.stains = [FaceCrossing.none(walker.rng.next_float32()) for _ in walker.stains]
             walker.secondary = [mi.Bool(False) for _ in walker.secondary]
-            walker.active = walker.sample < limit
+            walker.active = walker.working & (walker.sample < rows.samples)
             return walker
 
-        renewed = dr.if_stmt((walker, ended), ended, renew, lambda walker, _: walker, label="next sample")
+        begins = ended | takes
+        renewed = dr.if_stmt((walker, begins, takes), begins, renew, lambda walker, _b, _t: walker, label="next sample")
         vars(walker).update(vars(renewed))

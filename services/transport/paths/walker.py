@@ -15,7 +15,7 @@ from services.transport.scene.stain_textures import FaceCrossing
 
 @dataclass
 class Walker:
-    """State of every lane: a path under way, its scores so far, and its sample number."""
+    """State of every lane: a path under way, its scores so far, its row and its sample number."""
 
     rng: mi.PCG32
     origin: mi.Point3f
@@ -48,9 +48,13 @@ class Walker:
     shape_factor: list[mi.Float]
     """For a secondary walk: dt_b of each mode over the sum of their magnitudes, with the sign of the scattering
     difference."""
-    lane: mi.UInt32
+    row: mi.UInt32
+    """Row of the tally to which the path belongs."""
     sample: mi.UInt32
     active: mi.Bool
+    """Lanes with a path under way."""
+    working: mi.Bool
+    """Lanes with a path under way, and those that wait for their next row."""
 
     @property
     def primary(self) -> mi.Bool:
