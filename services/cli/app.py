@@ -61,6 +61,7 @@ def build_app() -> typer.Typer:
     from services.cli.phantom import phantom
     from services.cli.raw.board import board_command
     from services.cli.raw.calibrate import calibrate_command
+    from services.cli.raw.colmap import colmap_command
     from services.cli.raw.import_folder import import_command
     from services.cli.raw.landmarks import landmarks
     from services.cli.raw.register import register
@@ -91,6 +92,7 @@ def build_app() -> typer.Typer:
     app.command("import")(import_command)
     app.command("board")(board_command)
     app.command("calibrate")(calibrate_command)
+    app.command("colmap")(colmap_command)
     app.command("lab-demo")(lab_demo)
     simulate = typer.Typer(no_args_is_help=True, help="Simulate without a capture.", rich_markup_mode=None)
     simulate.callback()(_group)
@@ -108,6 +110,7 @@ _EXTRAS = MappingProxyType(
         "capture": "capture",
         "dome-sim": "capture",
         "bench": "worker,bench",
+        "colmap": "colmap",
         "import": "preprocess",
         "landmarks": "calibrate,preprocess",
         "register": "calibrate,preprocess",

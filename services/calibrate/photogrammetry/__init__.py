@@ -1,0 +1,1 @@
+"""Cameras and lights from the model of a photogrammetry program."""
