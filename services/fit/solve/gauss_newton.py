@@ -31,12 +31,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.errors import NonFiniteError
 from services.fit.coordinates.domain import Domain
 from services.fit.solve.elimination import ReducedEquations, eliminate
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
 from services.fit.solve.precision import is_settled
-from services.fit.solve.step_test import StepTest
+from services.fit.solve.step_test import SIGNIFICANCE_Z, StepTest, judged
 from services.fit.solve.trust_region import solve_box
 
 Array = NDArray[np.float64]
@@ -105,8 +104,7 @@ class Options:
     max_samples: int = 1024
     max_trials: int = 3
     """Largest number of trust radii tried with one set of normal equations."""
-    significance_z: float = 3.0
-    """A change is significant beyond this many standard errors: a worse step passes with probability at most 1.3e-3."""
+    significance_z: float = SIGNIFICANCE_Z
     model_error: float = 0.5
     """Relative error of the predicted change per unit of step length; at length 1 the prediction counts little."""
     slope_error: float = 0.0
@@ -243,22 +241,15 @@ class GaussNewton:
             if predicted_gain <= noise_gain:
                 break
             new, length = best + equations.lift @ step, self._length(step)
-            compared = problem.compare(best, new, samples=state.samples, step=state.step - 1, trial=trial)
-            change = compared.change + self.domain.prior_change(best, new)
-            if not np.isfinite([change, compared.variance]).all():
-                raise NonFiniteError(
-                    f"The loss is not finite at step {state.step}; check the capture for invalid radiance."
-                )
-
             # Prediction and comparison, each with its standard error; the part of the prediction that the gradient's
             # own noise causes is subtracted.
             model_se = math.hypot(
                 equations.step_noise(step), (options.slope_error + options.model_error * length) * predicted_gain
             )
-            step_test = StepTest(change, compared.se, noise_gain - predicted_gain, model_se, options.significance_z)
+            step_test = self._judged(problem, (best, new), state, trial, (noise_gain - predicted_gain, model_se))
             if step_test.is_better(options.significance_z):
-                poor = change > 0.25 * step_test.model
-                grown = 2 * radius if length > 0.8 * radius and change < 0.5 * step_test.model else radius
+                poor = step_test.change > 0.25 * step_test.model
+                grown = 2 * radius if length > 0.8 * radius and step_test.change < 0.5 * step_test.model else radius
                 state = replace(
                     state,
                     x=new,
@@ -309,15 +300,12 @@ class GaussNewton:
         step = np.clip(x + step / max(length, 1.0), low, high) - x
 
         new, whole = state.x + equations.lift @ step, equations.lift @ step
-        compared = problem.compare(
-            state.x, new, samples=state.samples, step=state.step - 1, trial=self.options.max_trials
-        )
-        change = compared.change + self.domain.prior_change(state.x, new)
         options, model = self.options, float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
         model_se = math.hypot(
             equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model
         )
-        step_test = StepTest(change, compared.se, model + gain_by_noise(equations), model_se, options.significance_z)
+        given = (state.x, new), state, options.max_trials, (model + gain_by_noise(equations), model_se)
+        step_test = self._judged(problem, *given)
         refused = not step_test.is_better(LAST_STEP_Z) if options.slope_error else step_test.is_worse
         if refused:
             return state
@@ -327,6 +315,17 @@ class GaussNewton:
                 self._carry(replace(state, x=new, result=Result.RUNNING, verdict="settling"), whole, 1.0)
             )
         return replace(state, x=new, memory=state.memory.moved(whole), verdict=f"{state.verdict}, settled")
+
+    def _judged(
+        self, problem: Problem, ends: tuple[Array, Array], state: State, trial: int, model: tuple[float, float]
+    ) -> StepTest:
+        old, new = ends
+        step, prior_change = state.step - 1, self.domain.prior_change(old, new)
+
+        def compare(samples: int, number: int) -> LossChange:
+            return problem.compare(old, new, samples=samples, step=step, trial=number)
+
+        return judged(compare, state.samples, trial, prior_change, model, self.options.significance_z)
 
     def _needs_more_samples(self, equations: ReducedEquations, state: State) -> bool:
         # Whether more samples are needed because the step's noise along a direction exceeds one scale. Instrument

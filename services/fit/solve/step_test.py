@@ -3,7 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+
+from services.core.errors import NonFiniteError
+from services.fit.solve.normal_equations import LossChange
+
+SIGNIFICANCE_Z = 3.0
+"""A change is significant beyond this many standard errors: a worse step passes with probability at most 1.3e-3."""
+FIRST_SHARE = 4
+"""Divisor of the paths of the first look at a step. Most steps are decided by it, far from the solution by the
+comparison and near to it by the prediction."""
+SECOND_LOOK = 1_000
+"""Added to the number of a trial, which seeds its renders, for its second look."""
 
 
 @dataclass(frozen=True)
@@ -14,7 +26,12 @@ class StepTest:
     change_se: float
     model: float
     model_se: float
-    significance_z: float = 3.0
+    significance_z: float = SIGNIFICANCE_Z
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether more paths would not be needed to judge the step."""
+        return self.is_worse or self.is_contradicted or self.is_better(self.significance_z)
 
     @property
     def is_worse(self) -> bool:
@@ -32,6 +49,42 @@ class StepTest:
         """
         total, total_se = _combine(self.change, self.change_se, self.model, self.model_se)
         return total + z * total_se < 0 and not self.is_worse and not (self.is_contradicted and self.change > 0)
+
+
+def judged(
+    compare: Callable[[int, int], LossChange],
+    samples: int,
+    trial: int,
+    prior_change: float,
+    model: tuple[float, float],
+    significance_z: float = SIGNIFICANCE_Z,
+) -> StepTest:
+    """Judge a step by a comparison with a quarter of the paths, and with the rest of them where that does not decide.
+
+    Args:
+        compare: compares the data's loss at both ends with so many paths per pixel, as the trial of this number.
+        samples: paths per pixel in all.
+        trial: number of the trial.
+        prior_change: change of the prior's part of F, which is exact.
+        model: the predicted change of F and its standard error.
+        significance_z: standard errors that are significant.
+
+    Raises:
+        NonFiniteError: the comparison is NaN or infinite.
+    """
+    looks = (max(samples // FIRST_SHARE, 1), trial), (samples - samples // FIRST_SHARE, trial + SECOND_LOOK)
+    total, seen = LossChange(0.0, 0.0), 0
+    for paths, number in looks:
+        found, before = compare(paths, number), seen
+        if not math.isfinite(found.change) or not math.isfinite(found.variance):
+            raise NonFiniteError("The loss of a step is not finite; check the capture for invalid radiance.")
+        seen += paths
+        old, new = before / seen, paths / seen
+        total = LossChange(old * total.change + new * found.change, old**2 * total.variance + new**2 * found.variance)
+        test = StepTest(total.change + prior_change, total.se, *model, significance_z)
+        if test.is_decided:
+            break
+    return test
 
 
 def _combine(first: float, first_se: float, second: float, second_se: float) -> tuple[float, float]:

@@ -24,8 +24,8 @@ from services.fit.solve import adam, gauss_newton
 from services.fit.solve.covariance import FinalModel, Uncertainty, final_model, uncertainty, whitening
 from services.fit.solve.final_uncertainty import FinalSums
 from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State
-from services.fit.solve.normal_equations import NormalEquations
-from services.fit.solve.step_test import StepTest
+from services.fit.solve.normal_equations import LossChange, NormalEquations
+from services.fit.solve.step_test import judged
 from services.fit.stages.step_report import StepReport, history_key, message_prefix
 from services.tasks.journal import Journal
 from services.transport.optics.parameters import Mouth, Optics, Tissue
@@ -65,17 +65,21 @@ def last_step(problem: StackProblem[Any], x: Array, model: FinalModel, part_coun
         predicted, predicted_se = model.predicted_change(step)
         if predicted >= 0:
             break
-        compared = problem.compare(x, x + step, samples=samples, step=0, trial=trial)
-        change = compared.change + problem.domain.prior_change(x, x + step)
-        step_test = StepTest(change, compared.se, predicted, math.hypot(predicted_se, slope_error * predicted))
+        expected = predicted, math.hypot(predicted_se, slope_error * predicted)
+        compare = partial(_compare_last, problem, x, x + step)
+        step_test = judged(compare, samples, trial, problem.domain.prior_change(x, x + step), expected)
         if step_test.is_better(LAST_STEP_Z):
             return step
         if not (step_test.is_worse or step_test.is_contradicted):
             break
         # Go to the minimum of the parabola through slope and comparison (Nocedal and Wright 2006, section 3.5).
         slope = model.slope(step)
-        step = max(0.5 * slope / (slope - max(change, 0.0)), FINAL_MIN_SHARE) * step
+        step = max(0.5 * slope / (slope - max(step_test.change, 0.0)), FINAL_MIN_SHARE) * step
     return np.zeros(len(x))
+
+
+def _compare_last(problem: StackProblem[Any], x: Array, moved: Array, samples: int, trial: int) -> LossChange:
+    return problem.compare(x, moved, samples=samples, step=0, trial=trial)
 
 
 @dataclass(frozen=True)
