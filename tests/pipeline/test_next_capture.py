@@ -20,12 +20,12 @@ from services.fit.checks.next_capture import (
     rotated_camera,
     sentence,
 )
+from services.fit.coordinates.media import media_domain
 from services.fit.measurements.blocks import BlockInstrument, PixelBlock, read_block, write_block
 from services.fit.passes.passes import Passes, StackProblem
 from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.solve.estimates import estimates
 from services.fit.solve.information import AddedInformation, covariance_with
-from services.fit.stages.tooth.schedule import media_domain
 from services.tasks.engine_host import InProcessHost
 from services.tasks.executors import LocalExecutor
 from services.tasks.seeds import Seeds

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from services.fit.coordinates.domain import HELD_G, similar_medium
+from services.fit.coordinates.media import media_domain, shared_domain
 from services.fit.coordinates.priors import LITERATURE_TABLE, MIN_SD, WEAK, literature, priors_of, towards
-from services.fit.stages.tooth.schedule import media_domain, shared_domain
 from services.transport.optics.parameters import Medium
 from tests.support.shared_data import shared_path
 

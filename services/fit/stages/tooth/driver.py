@@ -39,6 +39,7 @@ from services.fit.solve.estimates import estimates
 from services.fit.stages.attempt import Attempt, assess_convergence, standard_errors, worst_error
 from services.fit.stages.channel_fit import ChannelFit
 from services.fit.stages.previews import shown_images
+from services.fit.stages.tooth.first_channel import FirstChannel, first_channel
 from services.fit.stages.tooth.schedule import ChannelSchedule
 from services.tasks.executors import Executor
 from services.tasks.journal import Journal
@@ -83,21 +84,25 @@ class FitDriver:
         modes = len(dentin.modes_mm) if dentin is not None else 0
         order = sorted(channels, key=lambda c: -files[c].quality)
         fits: dict[str, ChannelFit[Tissue]] = {}
+        first: FirstChannel | None = None
         shape, covariance, next_capture = tuple[float, ...](), tuple[tuple[float, ...], ...](), ""
         with attempt.workers() as run_on:
             for number, channel in enumerate(order):
-                attempt.log(f"{channel}: renderers start, then the table is searched.")
+                begins = f"the fit starts from {order[0]}'s" if first else "renderers start, then the table is searched"
+                attempt.log(f"{channel}: {begins}.")
                 schedule = self._schedule(
                     observations, files[channel], views[channel], journal, run_on, (number, len(order))
                 )
                 schedule.has_dentin, schedule.modes, schedule.shape = dentin is not None, 0 if shape else modes, shape
                 schedule.gums = None if observations.gums is None else GUMS_START
                 schedule.shape_covariance = covariance
+                schedule.first = first
                 if dentin is not None and dentin.frame is not None:
                     given = files[channel].recipe, dentin.frame, tooth.fdi
                     schedule.make_displaced_scene = partial(_displaced_scene, attempt.inputs, *given)
                 schedule.stain_layout = layout
                 fits[channel] = schedule.run()
+                first = first_channel(fits[channel]) if number == 0 else first
                 if not shape:
                     shape, covariance = fits[channel].tissue.shape, shape_covariance(fits[channel].uncertainty)
                 if spec.advise and number == 0 and fits[channel].solution.result.converged:

@@ -24,6 +24,7 @@ constant reduced scattering and absorption, from the first exact stage on, under
 turns back after few scatterings. With two lobes g1, beta and g2 are free under weak Gaussian priors. The instrument's
 errors become coordinates in the first exact stage: in similar media they would only compensate the bias of these. So
 does the albedo of the gums around the tooth, where the scene has them.
+The other channels start in the exact stage, from what the first one found (``first_channel``).
 Absorption of a thin enamel cap is nearly invisible, so its exponent has a prior that is two decades wide.
 """
 
@@ -39,6 +40,7 @@ from numpy.typing import NDArray
 from services.core.errors import SettingsError
 from services.fit.checks.next_capture import Sensor, capture_advice
 from services.fit.coordinates.domain import BOUNDS, HELD_G, Coordinate, Domain, similar_medium, to_dual
+from services.fit.coordinates.media import media_domain, shared_domain
 from services.fit.coordinates.priors import COSINE, GUMS_SD, SHAPE, WEAK, Priors, priors_of
 from services.fit.measurements.observations import COARSE_PIXELS
 from services.fit.passes.final_uncertainty import DisplacedScene, HeldCosines, HeldShapes
@@ -49,6 +51,7 @@ from services.fit.solve import adam, table_search
 from services.fit.solve.gauss_newton import Options, Solution
 from services.fit.solve.losses import is_reweighted
 from services.fit.stages.channel_fit import ChannelFit, Stages
+from services.fit.stages.tooth.first_channel import FirstChannel
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.scene.stain_uv import StainLayout
 
@@ -94,6 +97,8 @@ class ChannelSchedule(Stages[Tissue]):
     """Known blend weights."""
     shape_covariance: tuple[tuple[float, ...], ...] = ()
     """Covariance of the known blend weights, which another channel's fit found; empty where they are exact."""
+    first: FirstChannel | None = None
+    """What the first channel's fit tells; None for the first channel itself."""
     stain_layout: StainLayout | None = None
     """Texels to fit; None where the surface is taken as clean."""
     make_displaced_scene: Callable[[Tissue], DisplacedScene] | None = None
@@ -164,9 +169,14 @@ class ChannelSchedule(Stages[Tissue]):
         # Fit the media and the dentin's shape by Gauss-Newton.
         spec, samples, options = self.spec, self.spec.samples_per_pixel, self.options(self.files.coarse)
         domain = self._domain(("sigma", "alpha"))
-        tissue, samples_reached = (
-            self._fit_similar_media(domain, options) if domain.coordinates else (self._held_tissue(), 2 * samples)
-        )
+        if self.first is not None:
+            tissue, samples_reached = self.first.start(spec.lobes).with_values(spec.held), 2 * samples
+            known = tuple((name, self.first.errors.get(name, 0.0)) for name in self.files.errors.names)
+            self.passes = replace(self.passes, errors=known)
+        elif domain.coordinates:
+            tissue, samples_reached = self._fit_similar_media(domain, options)
+        else:
+            tissue, samples_reached = self._held_tissue(), 2 * samples
         domain = self._with_shape(self._with_gums(self._with_cosines(domain) if spec.lobes == 1 else domain))
         domain = replace(domain, errors=self.files.errors)
         previous: Solution | None = None
@@ -287,7 +297,9 @@ class ChannelSchedule(Stages[Tissue]):
         # Add the enamel's mean cosine unless some parameter of the enamel is held, which another cosine would change.
         # The dentin's is left out, because light that reaches it has scattered often.
         fitted = [part for part in self.media[:1] if not any(name.startswith(f"{part}.") for name in self.spec.held)]
-        return Domain(domain.coordinates + tuple(Coordinate((f"{part}.cosine",), *COSINE) for part in fitted))
+        priors = {} if self.first is None else self.first.cosines
+        own = tuple(Coordinate((f"{part}.cosine",), *priors.get(part, COSINE)) for part in fitted)
+        return Domain(domain.coordinates + own)
 
     def _with_gums(self, domain: Domain) -> Domain:
         # Add the gums' albedo, which decides how much light they return to the tooth, under the prior of a jaw's gums.
@@ -377,21 +389,3 @@ class ChannelSchedule(Stages[Tissue]):
         return tissue.with_values(
             {f"{part}.{leaf}": value for part in ("enamel", "dentin") for leaf, value in lobes} | self.spec.held
         )
-
-
-def shared_domain(priors: Priors = WEAK) -> Domain:
-    """Domain of sigma and alpha, each shared by both media."""
-    return Domain(tuple(_coordinate((f"enamel.{leaf}", f"dentin.{leaf}"), priors) for leaf in ("sigma", "alpha")))
-
-
-def media_domain(parts: tuple[str, ...], leaves: tuple[str, ...], priors: Priors = WEAK) -> Domain:
-    """Domain of parameters of each medium on its own."""
-    return Domain(tuple(_coordinate((f"{part}.{leaf}",), priors) for part in parts for leaf in leaves))
-
-
-def _coordinate(targets: tuple[str, ...], priors: Priors) -> Coordinate:
-    # A coordinate shared by both media has a prior only where the priors of both are equal.
-    prior, *others = (priors.get(target) for target in targets)
-    return (
-        Coordinate(targets) if prior is None or any(other != prior for other in others) else Coordinate(targets, *prior)
-    )
