@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,13 @@ class ReportPictures:
 
 
 def write_report(
-    path: Path, report: FitReport, pictures: ReportPictures, history: list[dict[str, Any]], context: dict[str, Any]
+    path: Path,
+    report: FitReport,
+    pictures: ReportPictures,
+    history: list[dict[str, Any]],
+    context: dict[str, Any],
+    *,
+    with_photographs: bool = True,
 ) -> None:
     """Write the report as one HTML file without any outside reference.
 
@@ -93,7 +99,9 @@ def write_report(
         pictures: the pictures to show.
         history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``,
             ``stage`` and ``channel``.
-        context: ``title``, ``boundary``, ``ior`` and ``provenance`` (a dict of label -> text); all optional.
+        context: ``title``, ``boundary``, ``ior``, ``lead`` (address of the picture to begin with) and ``provenance``
+            (a dict of label -> text); all optional.
+        with_photographs: whether photographs and residuals are shown beside the renders.
     """
     verdict = verdict_of(report)
     template = page_template(Path(__file__).parent / "report.html.j2")
@@ -116,7 +124,12 @@ def write_report(
         mean_thickness="" if report.enamel_thickness is None else _spread(report.enamel_thickness),
         steps=report.steps,
         seconds=_duration(report.seconds),
-        triptychs=[_triptych(picture) for picture in sorted(pictures.pictures, key=lambda p: (p.camera, p.held_out))],
+        lead=context.get("lead", ""),
+        with_photographs=with_photographs,
+        triptychs=[
+            _triptych(picture, pictures.channels, with_photographs=with_photographs)
+            for picture in sorted(pictures.pictures, key=lambda p: (p.camera, p.held_out))
+        ],
         residual_bar=gradient(DIVERGING),
         residual_limit=f"{100 * RESIDUAL_OF_WHITE:g} %",
         charts=_charts(history),
@@ -159,7 +172,7 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _triptych(picture: Picture) -> dict[str, Any]:
+def _triptych(picture: Picture, channels: tuple[str, ...], *, with_photographs: bool) -> dict[str, Any]:
     # Use one tone curve for photograph and render; its white comes from the photograph alone, so that a wrong render
     # stays visible.
     white = white_level(picture.photo, picture.valid)
@@ -167,11 +180,7 @@ def _triptych(picture: Picture) -> dict[str, Any]:
     compared = picture.valid[..., None] & np.isfinite(picture.photo)
     scale = float(np.linalg.norm(np.where(compared, np.asarray(picture.photo, dtype=np.float64), 0.0)))
     difference = float(np.linalg.norm(np.where(compared, residual, 0.0)))
-    shown = {
-        "photo": tone_map(picture.photo, white),
-        "render": tone_map(picture.render, white),
-        "residual": signed_map(residual, RESIDUAL_OF_WHITE * white, picture.valid),
-    }
+    several = len(channels) > 1 and picture.photo.shape[-1] == len(channels)
     return {
         "camera": picture.camera,
         "light": picture.light,
@@ -179,10 +188,28 @@ def _triptych(picture: Picture) -> dict[str, Any]:
         "white": f"{white:.3g}",
         "difference": _percent(difference / scale) if scale > 0 else "",
         "share": _percent(float(picture.valid.mean())),
-        "images": [(name, data_uri(enlarge(image, 200))) for name, image in shown.items()],
-        "width": shown["photo"].shape[1],
-        "height": shown["photo"].shape[0],
+        "images": _shown(picture, with_photographs=with_photographs),
+        "channels": [
+            (channel, _shown(_of_channel(picture, k), with_photographs=with_photographs))
+            for k, channel in enumerate(channels if several else ())
+        ],
+        "width": picture.photo.shape[1],
+        "height": picture.photo.shape[0],
     }
+
+
+def _of_channel(picture: Picture, k: int) -> Picture:
+    return replace(picture, photo=picture.photo[..., k : k + 1], render=picture.render[..., k : k + 1])
+
+
+def _shown(picture: Picture, *, with_photographs: bool) -> list[tuple[str, str]]:
+    # A render and its residual give the photograph, so both are left out together.
+    white = white_level(picture.photo, picture.valid)
+    shown = {"photo": tone_map(picture.photo, white)} if with_photographs else {}
+    shown["render"] = tone_map(picture.render, white)
+    if with_photographs:
+        shown["residual"] = signed_map(picture.residual, RESIDUAL_OF_WHITE * white, picture.valid)
+    return [(name, data_uri(enlarge(image, 200))) for name, image in shown.items()]
 
 
 def _charts(history: list[dict[str, Any]]) -> list[tuple[str, str]]:

@@ -17,18 +17,34 @@ def export(
     use: Annotated[
         str | None, typer.Option("--for", help="What the export is for, as the person's consent names it.")
     ] = None,
+    without_photographs: Annotated[
+        bool,
+        typer.Option(
+            "--without-photographs",
+            help="Leave out every image of the person and every hash of one; without --to, in DIR/asset-without-"
+            "photographs.",
+        ),
+    ] = False,
 ) -> None:
     """Write the asset and report of a finished fit again, or with --to its asset for other programs."""
-    if names and not to:
-        from services.core.errors import SettingsError
+    from services.core.errors import SettingsError
 
+    if names and not to:
         raise SettingsError(f"{names[0]!r} follows the folder without --to; write --to before names of exporters.")
     if to:
         from services.assets.exporters import export_to
 
-        for folder in export_to(out, tuple(dict.fromkeys((*to, *(names or ())))), use=use):
+        wanted = tuple(dict.fromkeys((*to, *(names or ()))))
+        for folder in export_to(out, wanted, use=use, with_photographs=not without_photographs):
             print(f"written: {folder}")
         return
+    if without_photographs:
+        from services.assets.photograph_free import export_without_photographs
+
+        print(f"written: {export_without_photographs(out, use=use)}")
+        return
+    if use is not None:
+        raise SettingsError("--for says what files that leave are for; give it with --to or --without-photographs.")
     from services.cli.run import run_some
     from services.core.records import JobSpec
     from services.core.store import read_record

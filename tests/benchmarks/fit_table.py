@@ -26,7 +26,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.stage import fitted_teeth
+from services.assets.fitted_job import fitted_teeth
 from services.bench.fits.tooth_capture import PreparedTooth, prepared_tooth, tissue_of
 from services.core.records import JobSpec
 from services.core.results import FitReport

@@ -28,7 +28,7 @@ import numpy as np
 
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import build_jaw
-from services.assets.stage import fitted_teeth
+from services.assets.fitted_job import fitted_teeth
 from services.bench.fits.jaw import prepared_jaw, reported_mouth
 from services.bench.fits.tooth_capture import PreparedTooth
 from services.core.records import JobSpec

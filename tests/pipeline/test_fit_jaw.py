@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.assets.stage import export, fitted_teeth
+from services.assets.fitted_job import fitted_teeth
+from services.assets.stage import export
 from services.core.errors import CaptureInputError, DentineError, InputError, SettingsError
 from services.core.records import JobSpec
 from services.core.results import FitReport, PreparedManifest

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from services.assets.stage import describe_options
+from services.assets.job_report import describe_options
 from services.core.files.content_files import StoredFile
 from services.core.records import JobSpec
 from services.fit.coordinates.instrument_errors import InstrumentErrors

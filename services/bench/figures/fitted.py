@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.anatomy.job_dentin import dentin_shape, known_dentins
 from services.assets.asset import mouth_of
-from services.assets.stage import fitted_teeth
+from services.assets.fitted_job import fitted_teeth
 from services.bench.figures.cases import job_of
 from services.bench.fits.tooth_capture import tissue_of
 from services.core.pages.pictures import Picture

@@ -1,0 +1,93 @@
+"""The report of a job's fit: its pictures, maps and facts, collected from what the job has published."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from services.assets.provenance.departing import BESIDE_PHOTOGRAPH
+from services.core.provenance.record import Provenance
+from services.core.records import JobSpec
+
+if TYPE_CHECKING:
+    from services.assets.fitted_job import FittedJob
+
+
+def write_job_report(
+    path: Path, job: FittedJob, asset: Path, provenance: Provenance | None, *, with_photographs: bool = True
+) -> None:
+    """Write the report of a fitted job as one HTML file.
+
+    Args:
+        asset: folder of its asset, which has the picture to begin with.
+        provenance: what the asset comes from; None of an asset that an earlier version wrote.
+        with_photographs: whether photographs, and pictures from which one could be computed, are shown.
+    """
+    from services.assets.fit_pictures import report_pictures
+    from services.assets.report_page import write_report
+    from services.transport.thickness import fitted_thickness
+
+    spec, prepared = job.spec, job.prepared
+    is_tooth = spec.kind == "tooth"
+    thickness = None
+    if is_tooth:
+        ((tooth, dentin, shape),) = job.shaped
+        thickness = fitted_thickness(tooth.outer, dentin, shape, job.report.shape_covariance, prepared.cameras[0])
+    pictures = report_pictures(
+        job.folder, job.channels, job.teeth[0] if is_tooth else None, prepared.cameras, thickness, job.stains
+    )
+    history = json.loads((job.folder / "history.json").read_text())
+    facts: dict[str, Any] = {
+        "title": f"Tooth {job.teeth[0].fdi}" if is_tooth else f"Jaw of {len(job.teeth)} teeth",
+        "boundary": spec.boundary,
+        "ior": spec.ior,
+        "provenance": facts_of(spec, provenance),
+    }
+    if with_photographs and (asset / BESIDE_PHOTOGRAPH).is_file():
+        facts["lead"] = f"data:image/png;base64,{base64.b64encode((asset / BESIDE_PHOTOGRAPH).read_bytes()).decode()}"
+    write_report(path, job.report, pictures, history, facts, with_photographs=with_photographs)
+
+
+def facts_of(spec: JobSpec, provenance: Provenance | None) -> Mapping[str, str]:
+    """Labels and texts on where a report comes from."""
+    facts = {"source": _source(spec), "seed": str(spec.seed), "options": describe_options(spec)}
+    if provenance is None:
+        return facts
+    files = provenance.inputs
+    photographs = [] if files is None else [file for file in files if file.is_photograph]
+    others = [] if files is None else [file for file in files if not file.is_photograph]
+    told = {
+        "date": provenance.made,
+        "job": provenance.job,
+        "subject": provenance.subject or "no label was given",
+        "consent": provenance.consent_said,
+        "version": ", ".join(f"{name} {version}" for name, version in provenance.versions.items()),
+        "machine": provenance.platform,
+    }
+    if files is None:
+        told["inputs"] = "not listed, as an earlier version prepared them"
+    elif provenance.photographs_left_out is not None:
+        told["photographs"] = f"{provenance.photographs_left_out} files, which are left out here with their hashes"
+    else:
+        told["photographs"] = f"{len(photographs)} files; their hashes are in provenance.json"
+    if others:
+        told["other inputs, SHA-256"] = "; ".join(f"{file.name} {file.sha256}" for file in others)
+    return told | facts
+
+
+def describe_options(spec: JobSpec) -> str:
+    """Options of a fit that differ from their defaults, as one sentence.
+
+    Paths are left out, because they mean nothing to the reader of a report.
+    """
+    named = spec.changed_options - {"kind", "capture", "rig", "calibration", "seed", "workers", "priority"}
+    values = spec.model_dump(mode="json", include=set(named))
+    rows = [f"{name} = {value if isinstance(value, str) else json.dumps(value)}" for name, value in values.items()]
+    return "; ".join(rows) + "; all others at their defaults" if rows else "all at their defaults"
+
+
+def _source(spec: JobSpec) -> str:
+    return spec.capture.name if spec.capture is not None else f"rig {spec.rig.dome if spec.rig else ''}"
