@@ -31,10 +31,14 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.calibration.uncertainty import TWIST
 from services.fit.coordinates.domain import Domain
 from services.fit.coordinates.instrument_errors import DEFAULT_SE, kind_of_error
 from services.fit.measurements.blocks import BlockTask, PixelBlock, read_block
 from services.fit.passes import final_uncertainty as closing
+from services.fit.passes.final_uncertainty import measure_final_uncertainty
+from services.fit.passes.moves import Changes as RenderedChanges
+from services.fit.passes.passes import TraceRow
 from services.fit.solve import covariance
 from services.fit.solve.final_uncertainty import FinalSums, positive_part
 from services.fit.solve.recombination import Recombination
@@ -68,8 +72,8 @@ class Changes:
 
     @property
     def moves(self) -> list[str]:
-        """Names of the twelve moves."""
-        return [name.removeprefix("c0_") for name in self.stored if name.startswith("c0_") and name != "c0_none"]
+        """Names of the dome's six moves, which the fit does not estimate."""
+        return [name.removeprefix("c0_") for name in self.stored if name.startswith("c0_dome")]
 
     def of_block(self, block: PixelBlock, errors: Sequence[str]) -> NDArray[np.float32]:
         """Changes (K, 2, L, N) of a block's images, twice the same: by the errors named, then by the moves."""
@@ -79,15 +83,14 @@ class Changes:
         by_name = {names.gain: image, names.flare: np.full_like(image, names.brightest)}
         for k, light in enumerate(names.lights):
             by_name[light] = np.where(np.arange(len(image))[:, None] == k, image, 0.0)
-        changes = [
-            DEFAULT_SE[kind_of_error(name)] * by_name[name] if name in by_name else np.zeros_like(image)
-            for name in errors
-        ]
+        by_se = {name: DEFAULT_SE[kind_of_error(name)] * change for name, change in by_name.items()}
+        by_se |= {f"teeth.{axis}": self._squares(block, f"teeth.{k}").mean(axis=(0, 1)) for k, axis in enumerate(TWIST)}
+        changes = [by_se.get(name, np.zeros_like(image)) for name in errors]
         moved = [self._squares(block, name).mean(axis=(0, 1)) for name in self.moves]
         return np.repeat(np.array([*changes, *moved])[:, None], 2, axis=1).astype(np.float32)
 
     def information(self, block: PixelBlock) -> Array:
-        """What a block's photographs tell of the moves, (12, 12): products of the changes of the pixels on one diagonal
+        """What a block's photographs tell of the moves, (6, 6): products of the changes of the pixels on one diagonal
         of each square with those on the other.
         """
         squares = [self._squares(block, name) for name in self.moves]
@@ -115,7 +118,7 @@ class Recorder:
     shifts: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Effect (K, F) of each change on the whitened gradient."""
     information: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """What photographs know of the moves, (12, 12), by stock's changes."""
+    """What photographs know of the moves, (6, 6), by stock's changes."""
     effect: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Change (F, K) of the solution by each change."""
     names: tuple[str, ...] = ()
@@ -136,15 +139,16 @@ class Recorder:
         def by_stock(_: Any, tasks: Sequence[BlockTask], *__: Any) -> list[list[Any]]:
             found = []
             for block in (read_block(task.block) for task in tasks):
-                found.append([self.changes.of_block(block, errors)])
+                trace = TraceRow("moves", "by-stock", 0, "", 0.0, 0.0)
+                found.append([RenderedChanges(self.changes.of_block(block, errors), trace)])
                 self.information += self.changes.information(block)
             return found
 
         with patch.object(closing, closing._changes_by_scene.__name__, by_stock):
-            stock: FinalSums = closing.measure_final_uncertainty(problem, x, whiten, held, samples, moves, *more)
+            stock: FinalSums = measure_final_uncertainty(problem, x, whiten, held, samples, moves, *more)
         self.shifts = stock.shifts[len(held) :]
         self.slopes = relative_slopes(problem.domain, problem.base, x)
-        return closing.measure_final_uncertainty(problem, x, whiten, held, samples, moves, *more)
+        return measure_final_uncertainty(problem, x, whiten, held, samples, moves, *more)
 
     def combine(
         self, domain: Domain, x: Array, sandwich: Sandwich, meats: Any, unfinished: Array, parts: int = 1
@@ -175,7 +179,7 @@ def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:
     recorder = Recorder(changes)
     with (
         tempfile.TemporaryDirectory() as folder,
-        patch.object(channel_fit, "measure_closing", recorder.measure),
+        patch.object(channel_fit, measure_final_uncertainty.__name__, recorder.measure),
         patch.object(covariance, "combine_with_prior", recorder.combine),
     ):
         found = fit(Path(folder), "none", seed, instrument="on", pixel_step=PIXEL_STEP)

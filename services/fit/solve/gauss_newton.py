@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from services.fit.coordinates.domain import Domain
 from services.fit.solve.elimination import ReducedEquations, eliminate
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
-from services.fit.solve.precision import is_settled
 from services.fit.solve.step_test import SIGNIFICANCE_Z, StepTest, judged
 from services.fit.solve.trust_region import solve_box
 
@@ -113,9 +112,6 @@ class Options:
     tolerance: float = 0.0
     """Converged where the gain predicted for a further step is at most the gain by noise alone, and that at most this
     change of F."""
-    ends_settled: bool = False
-    """Whether the fit has also converged where neither noise nor the remaining step is more than a third of any
-    standard error (``precision``)."""
     least_radius: float = 1e-3
     part_count: int = 1
     """Number of objects that the images tell apart, such as teeth. A step's length is the root mean square over them,
@@ -228,11 +224,8 @@ class GaussNewton:
 
         # Converged: nothing to gain beyond noise, and the noise itself small. Tested at full radius, so that a small
         # radius never looks like convergence.
-        whole_step, predicted_gain = self._propose(equations, x, max(state.radius, 1.0))
-        settled = options.ends_settled and is_settled(self.domain, pooled, equations, whole_step)
-        if settled or (
-            predicted_gain <= noise_gain <= options.tolerance and not self._needs_more_samples(equations, state)
-        ):
+        _, predicted_gain = self._propose(equations, x, max(state.radius, 1.0))
+        if predicted_gain <= noise_gain <= options.tolerance and not self._needs_more_samples(equations, state):
             return self._last_step(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
 
         radius, is_model_wrong = state.radius, False

@@ -45,9 +45,12 @@ FINAL_TRIALS = 2
 """Number of lengths that are tried for the step after the final uncertainty estimate."""
 FINAL_MIN_SHARE = 0.1
 """Shortest length that is tried, as a share of the one before."""
+MAX_RENDERING = 0.5
+"""Largest share of a standard error that the noise of rendering may be, where the limit of paths allows it: more paths
+would shorten the standard error by at most an eighth."""
 REPEAT_STAGE = "again"
 """Name of the stage that continues a fit from its first solution, where the prior of the instrument's errors moved that
-solution far."""
+solution far, or where the noise of rendering is too large a part of its standard errors."""
 MIN_SAMPLES = 4
 """Least number of paths per pixel, however many pixels there are."""
 
@@ -170,7 +173,6 @@ class Stages(ABC, Generic[Optics]):
             max_steps=self.spec.max_steps,
             max_samples=samples,
             tolerance=0.5 * self.spec.image_tolerance**2 * level.signal,
-            ends_settled=True,
             part_count=self.part_count,
         )
 
@@ -185,8 +187,7 @@ class Stages(ABC, Generic[Optics]):
         images' bias is larger than the noise of a few samples.
         """
         most = min(2 * self.spec.samples_per_pixel, options.max_samples)
-        tolerance = 0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal
-        return replace(options, max_samples=most, tolerance=tolerance, ends_settled=False)
+        return replace(options, max_samples=most, tolerance=0.5 * SIMILAR_TOLERANCE**2 * self.files.coarse.signal)
 
     def switch_to_full_resolution(self) -> Options:
         """Continue with images of full resolution; returns the solver limits there."""
@@ -250,11 +251,12 @@ class Stages(ABC, Generic[Optics]):
             self.full_image_samples(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)),
         )
         problem, solution, equations, known = self._with_uncertainty(problem, solution, samples)
-        if not known.is_full_step:
-            # The move is too long for one linear model: fit once more from its end.
+        needed = self._samples_needed(known, samples)
+        if not known.is_full_step or needed > samples:
+            # The move is too long for one linear model, or renders blur the result: fit once more from its end.
             self._apply_errors(problem.domain, solution.x)
-            again = replace(problem, passes=self.passes, stage=REPEAT_STAGE)
-            base, solution = self._iterate(again, self.options(self.files.full), samples)
+            again, samples = replace(problem, passes=self.passes, stage=REPEAT_STAGE), needed
+            base, solution = self._iterate(again, replace(self.options(self.files.full), max_samples=needed), samples)
             problem, solution, equations, known = self._with_uncertainty(replace(again, base=base), solution, samples)
         self._apply_errors(problem.domain, solution.x)
         samples_shown = self.full_image_samples(self.spec.max_samples_per_pixel)
@@ -273,6 +275,26 @@ class Stages(ABC, Generic[Optics]):
             problem,
             samples,
         )
+
+    def exact_options(self, samples: int) -> Options:
+        """Solver limits of the first exact stage. Where the instrument has errors, the paths stay as they are: what of
+        the standard errors more of them would take away is only known from the final uncertainty estimate.
+        """
+        options = self.options(self.files.full)
+        return replace(options, max_samples=min(samples, options.max_samples)) if self.files.errors.names else options
+
+    def _samples_needed(self, known: Uncertainty, samples: int) -> int:
+        # Paths per pixel, up to the limit, with which rendering is ``MAX_RENDERING`` of each standard error of a single
+        # tooth. Its variance falls with the number of paths, and the other parts stay.
+        count = known.domain.tissue_count
+        determined = [k for k, unit in enumerate(np.eye(len(known.x))[:count]) if known.is_determined(unit)]
+        if not known.domain.errors.names or self.part_count > 1 or not determined:
+            return samples
+        rendering, whole = (np.diag(one)[determined] for one in (known.parts["rendering"], known.covariance))
+        others = np.maximum(whole - rendering, 1e-300)
+        factor = float((rendering / others).max()) * (1 - MAX_RENDERING**2) / MAX_RENDERING**2
+        most = self.options(self.files.full).max_samples
+        return samples if factor <= 1 else min(round(factor * samples), max(most, samples))
 
     def _with_uncertainty(
         self, problem: StackProblem[Optics], solution: Solution, samples: int

@@ -194,7 +194,8 @@ class ChannelSchedule(Stages[Tissue]):
         self._reweight("exact", tissue)
         problem = StackProblem(self.passes, domain, tissue, "exact", jacobian_g=SIMILAR_G)
         is_same = self.files.full.blocks == self.files.coarse.blocks and not is_reweighted(spec.loss)
-        tissue, solution = self._iterate(problem, options, exact_samples, previous if is_same else None)
+        limits = self.exact_options(exact_samples) if spec.lobes == 1 else options
+        tissue, solution = self._iterate(problem, limits, exact_samples, previous if is_same else None)
         for again in range(1, REWEIGHTINGS + 1) if is_reweighted(spec.loss) else ():
             self._reweight(f"exact.{again}", tissue)
             problem = replace(problem, passes=self.passes, base=tissue, stage=f"exact.{again}")
