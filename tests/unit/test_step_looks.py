@@ -1,5 +1,4 @@
-"""A step is compared with a quarter of the paths first, and with the rest only where these do not decide.
-"""
+"""A step is compared with a quarter of the paths first, and with the rest only where these do not decide."""
 
 from __future__ import annotations
 

@@ -25,6 +25,7 @@ from services.fit.solve.covariance import FinalModel, Uncertainty, final_model, 
 from services.fit.solve.final_uncertainty import FinalSums
 from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State
 from services.fit.solve.normal_equations import LossChange, NormalEquations
+from services.fit.solve.precision import samples_needed
 from services.fit.solve.step_test import judged
 from services.fit.stages.step_report import StepReport, history_key, message_prefix
 from services.tasks.journal import Journal
@@ -45,9 +46,6 @@ FINAL_TRIALS = 2
 """Number of lengths that are tried for the step after the final uncertainty estimate."""
 FINAL_MIN_SHARE = 0.1
 """Shortest length that is tried, as a share of the one before."""
-MAX_RENDERING = 0.5
-"""Largest share of a standard error that the noise of rendering may be, where the limit of paths allows it: more paths
-would shorten the standard error by at most an eighth."""
 REPEAT_STAGE = "again"
 """Name of the stage that continues a fit from its first solution, where the prior of the instrument's errors moved that
 solution far, or where the noise of rendering is too large a part of its standard errors."""
@@ -251,7 +249,8 @@ class Stages(ABC, Generic[Optics]):
             self.full_image_samples(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)),
         )
         problem, solution, equations, known = self._with_uncertainty(problem, solution, samples)
-        needed = self._samples_needed(known, samples)
+        is_limited = bool(problem.domain.errors.names) and self.part_count == 1
+        needed = samples_needed(known, samples, self.options(self.files.full).max_samples) if is_limited else samples
         if not known.is_full_step or needed > samples:
             # The move is too long for one linear model, or renders blur the result: fit once more from its end.
             self._apply_errors(problem.domain, solution.x)
@@ -282,19 +281,6 @@ class Stages(ABC, Generic[Optics]):
         """
         options = self.options(self.files.full)
         return replace(options, max_samples=min(samples, options.max_samples)) if self.files.errors.names else options
-
-    def _samples_needed(self, known: Uncertainty, samples: int) -> int:
-        # Paths per pixel, up to the limit, with which rendering is ``MAX_RENDERING`` of each standard error of a single
-        # tooth. Its variance falls with the number of paths, and the other parts stay.
-        count = known.domain.tissue_count
-        determined = [k for k, unit in enumerate(np.eye(len(known.x))[:count]) if known.is_determined(unit)]
-        if not known.domain.errors.names or self.part_count > 1 or not determined:
-            return samples
-        rendering, whole = (np.diag(one)[determined] for one in (known.parts["rendering"], known.covariance))
-        others = np.maximum(whole - rendering, 1e-300)
-        factor = float((rendering / others).max()) * (1 - MAX_RENDERING**2) / MAX_RENDERING**2
-        most = self.options(self.files.full).max_samples
-        return samples if factor <= 1 else min(round(factor * samples), max(most, samples))
 
     def _with_uncertainty(
         self, problem: StackProblem[Optics], solution: Solution, samples: int
