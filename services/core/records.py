@@ -55,6 +55,9 @@ PixelStep = Annotated[
     WithJsonSchema({"anyOf": [{"type": "string", "const": AUTO}, {"type": "integer", "minimum": 1, "maximum": 64}]}),
 ]
 """Edge of the fitted squares in pixels, or ``auto``."""
+MAX_SQUARE_MM = 0.5
+"""Largest edge of a square at the teeth by ``auto``, mm. Larger ones lose what the sides of a tooth tell of its mean
+cosines."""
 JobName = Annotated[
     str, StringConstraints(strip_whitespace=True, min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")
 ]

@@ -95,7 +95,7 @@ def test_a_raw_folder_gets_its_teeth(mouth: RawMouth, tmp_path: Path) -> None:
     assert answer.exit_code == 0, answer.output
     assert "teeth: 11, 12, 13, 21, 22, 23" in answer.stdout
     # The cameras stand where a pixel covers 0.2 mm at the teeth.
-    assert "a pixel covers 0.20 mm at the teeth; with pixel_step = 3 a job fits squares of 0.59 mm" in answer.stdout
+    assert "a pixel covers 0.20 mm at the teeth; a job fits squares of 2 x 2 pixels, 0.39 mm" in answer.stdout
     record = read_record(out / "registration.json", Registration)
     beyond = (
         "Calibration calibration.json is beyond its limits: Lights' positions is 5 mm, and 2 mm is the limit; calibrate"

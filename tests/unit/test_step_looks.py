@@ -1,4 +1,4 @@
-"""A step is compared with a quarter of the paths first, and with the rest only where these do not decide."""
+"""A step is compared with a quarter of the paths first, and with all of them only where these do not decide."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def test_a_clear_step_costs_a_quarter_of_the_paths() -> None:
     assert compare.looks == [(25, 2)]
 
 
-def test_an_unclear_step_gets_all_paths_and_their_common_error() -> None:
-    """With 25 paths the error is 0.4, two and a half of which the change is; with all 100 together it is 0.2."""
+def test_an_unclear_step_gets_all_paths() -> None:
+    """With 25 paths the error is 0.4, two and a half of which the change is; with 100 it is 0.2."""
     compare = Comparisons(se_of_one_path=2.0)
     test = judged(compare, 100, 2, 0.0, VAGUE)
-    assert [samples for samples, _ in compare.looks] == [25, 75]
+    assert [samples for samples, _ in compare.looks] == [25, 100]
     assert len({trial for _, trial in compare.looks}) == 2
     assert test.change == pytest.approx(-1.0)
     assert test.change_se == pytest.approx(0.2)

@@ -7,9 +7,6 @@ from typing import Annotated
 
 import typer
 
-FITTED_SQUARE_MM = 0.5
-"""Edge in mm, at the teeth, of the squares of pixels that are advised for a fit; see docs/use/jobs.md."""
-
 
 def register(
     raw: Annotated[
@@ -32,6 +29,7 @@ def register(
     """Find where the teeth of a scan stand in the rig."""
     from services.calibrate.registration.register import MAX_MISFIT_MM, PAGE, register_folder
     from services.core.files.folders import require_folder
+    from services.core.records import MAX_SQUARE_MM
 
     if out is not None:
         require_folder(out, "--out")
@@ -43,8 +41,8 @@ def register(
     for sentence in record.warnings:
         print(sentence)
     if record.pixel_mm is not None:
-        pixel_step = max(1, round(FITTED_SQUARE_MM / record.pixel_mm))
-        squares = f"with {pixel_step = } a job fits squares of {pixel_step * record.pixel_mm:.2f} mm"
+        edge = max(1, int(MAX_SQUARE_MM / record.pixel_mm))
+        squares = f"a job fits squares of {edge} x {edge} pixels, {edge * record.pixel_mm:.2f} mm"
         print(f"a pixel covers {record.pixel_mm:.2f} mm at the teeth; {squares}")
     print(f"teeth: {', '.join(map(str, record.teeth))}; {record.repairs}")
     print(f"report: {(raw if out is None else out) / PAGE}")

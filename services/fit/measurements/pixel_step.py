@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera
-from services.core.records import AUTO, JobSpec
+from services.core.records import AUTO, MAX_SQUARE_MM, JobSpec
 from services.core.results import PreparedManifest
 from services.core.store import StoredArray
 from services.fit.measurements.levels import whole_squares
 
-MAX_SQUARE_MM = 0.5
-"""Largest edge of a square at the teeth, mm. Larger ones lose what the sides of a tooth tell of its mean cosines."""
 MIN_KEPT = 0.5
 """Least share of the valid pixels that lies in squares without a masked pixel; only such squares are compared."""
 MAX_IMAGES = 12
