@@ -6,9 +6,9 @@ import numpy as np
 
 from services.fit.solve.covariance import Uncertainty
 
-MAX_RENDERING = 0.5
+MAX_RENDERING = 0.6
 """Largest share of a standard error that the noise of rendering may be, where the limit of paths allows it: more paths
-would shorten the standard error by at most an eighth."""
+would shorten the standard error by at most a fifth."""
 
 
 def samples_needed(known: Uncertainty, samples: int, most: int) -> int:

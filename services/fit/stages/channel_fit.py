@@ -46,9 +46,9 @@ FINAL_TRIALS = 2
 """Number of lengths that are tried for the step after the final uncertainty estimate."""
 FINAL_MIN_SHARE = 0.1
 """Shortest length that is tried, as a share of the one before."""
-REPEAT_STAGE = "again"
-"""Name of the stage that continues a fit from its first solution, where the prior of the instrument's errors moved that
-solution far, or where the noise of rendering is too large a part of its standard errors."""
+REPEAT_STAGES = ("again", "again.1")
+"""Names of the stages that continue a fit from its solution, where the prior of the instrument's errors moved that far,
+or where the noise of rendering is too large a part of its standard errors."""
 MIN_SAMPLES = 4
 """Least number of paths per pixel, however many pixels there are."""
 
@@ -249,12 +249,13 @@ class Stages(ABC, Generic[Optics]):
             self.full_image_samples(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)),
         )
         problem, solution, equations, known = self._with_uncertainty(problem, solution, samples)
-        is_limited = bool(problem.domain.errors.names) and self.part_count == 1
-        needed = samples_needed(known, samples, self.options(self.files.full).max_samples) if is_limited else samples
-        if not known.is_full_step or needed > samples:
+        for stage in REPEAT_STAGES:
+            needed = samples if not known.is_full_step else self._samples_needed(known, samples)
+            if known.is_full_step and needed == samples:
+                break
             # The move is too long for one linear model, or renders blur the result: fit once more from its end.
             self._apply_errors(problem.domain, solution.x)
-            again, samples = replace(problem, passes=self.passes, stage=REPEAT_STAGE), needed
+            again, samples = replace(problem, passes=self.passes, stage=stage), needed
             base, solution = self._iterate(again, replace(self.options(self.files.full), max_samples=needed), samples)
             problem, solution, equations, known = self._with_uncertainty(replace(again, base=base), solution, samples)
         self._apply_errors(problem.domain, solution.x)
@@ -282,12 +283,18 @@ class Stages(ABC, Generic[Optics]):
         options = self.options(self.files.full)
         return replace(options, max_samples=min(samples, options.max_samples)) if self.files.errors.names else options
 
+    def _samples_needed(self, known: Uncertainty, samples: int) -> int:
+        # A jaw, and an instrument without errors, had all paths in the exact stage already.
+        if not known.domain.errors.names or self.part_count > 1:
+            return samples
+        return samples_needed(known, samples, self.options(self.files.full).max_samples)
+
     def _with_uncertainty(
         self, problem: StackProblem[Optics], solution: Solution, samples: int
     ) -> tuple[StackProblem[Optics], Solution, NormalEquations, Uncertainty]:
         # Uncertainty at a solution, moved where the instrument's errors use their prior in full. Curvature and noise
         # are rendered anew only where the solver ended without them.
-        again, equations = f".{REPEAT_STAGE}" if problem.stage == REPEAT_STAGE else "", solution.equations
+        again, equations = f".{problem.stage}" if problem.stage in REPEAT_STAGES else "", solution.equations
         if equations is None:
             self.raise_if_cancelled()
             stored, _ = self.journal.get_or_compute(
