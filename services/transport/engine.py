@@ -17,6 +17,8 @@ from services.transport.scene.checks import (
     require_finite,
     require_finite_gradient,
     require_lights,
+    require_rough,
+    require_straight,
     require_surfaces,
     require_view,
 )
@@ -63,19 +65,27 @@ class Engine:
         from services.transport.boundary.models import mesh_boundary
         from services.transport.lighting.light_maps import LightMaps
         from services.transport.lighting.lights import PointLights
+        from services.transport.lighting.lit_faces import LitFaces
         from services.transport.lighting.mouth_maps import MouthMaps
         from services.transport.scene.mesh_geometry import MeshGeometry
 
         self.recipe = recipe
         self._geometry = MeshGeometry(recipe)
-        kind = LightMaps if self._geometry.single else MouthMaps
+        kind: type[LightMaps | LitFaces] = LightMaps if self._geometry.single else MouthMaps
+        refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
+        if recipe.boundary == "rough" and refracts:
+            require_rough(recipe)
+        self._boundary = mesh_boundary(
+            recipe.boundary, recipe.ior, refracts=refracts, roughness=recipe.roughness,
+            compensated=recipe.multiple_scattering,
+        )  # fmt: skip
+        if self._boundary.bends:
+            kind = LitFaces
         maps = kind(recipe.light_positions_mm, recipe.light_intensities, recipe.vertices_mm())
         self._lights = PointLights(recipe.light_positions_mm, recipe.light_intensities, maps)
         self._lights_by_selection: dict[tuple[int, ...], PointLights] = {}
         self._shape_gradients: dict[int, ShapeGradients] = {}
         self._radius_mm = reach_mm
-        refracts = recipe.ior != 1 or (recipe.gums is not None and recipe.gums_ior != 1)
-        self._boundary = mesh_boundary(recipe.boundary, recipe.ior, refracts=refracts)
         self._lights.maps.trace(self._geometry, self._boundary)
 
     def images(
@@ -206,6 +216,7 @@ class Engine:
         """
         from services.transport.gradients.shape_gradient import ShapeGradients
 
+        require_straight(self.recipe, "the gradient to the dentin's shape")
         cotangent = np.asarray(cotangent, dtype=np.float64)
         if not 0 <= tooth < len(self.recipe.teeth) or self._geometry.modes_of[tooth] == 0:
             raise InputError(
@@ -284,6 +295,7 @@ class Engine:
         from services.transport.paths.stain_tally import StainTally
         from services.transport.paths.starts import CameraStart
 
+        require_straight(self.recipe, "the gradient to stains")
         media, lights = self._prepare(tissue, view)
         require_cotangent(cotangent, view, self.recipe)
         textures = self._geometry.textures

@@ -57,7 +57,8 @@ class PlainWalk(Walk):
         walker.scatterings.counts = [dr.select(scatters & (medium == 1), count + 1, count)]
 
         # Connect to the lights, then sample a new direction.
-        flight = Flight(medium, sigma, hit, distance, scatters, crosses, mi.Bool(False), mi.Bool(False))
+        none = mi.Bool(False)
+        flight = Flight(medium, sigma, hit, distance, scatters, crosses, none, none, walker.omega, mi.Float(0))
         self._connect(walker, flight, before, tally)
         onward = PhaseFunction(self.media, medium).sample(
             walker.omega, None, walker.rng.next_float32(), walker.rng.next_float32()

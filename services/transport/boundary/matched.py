@@ -18,6 +18,7 @@ class Matched:
     blender: ClassVar[str] = "ShaderNodeBsdfTransparent"
     plug_in: ClassVar[str | None] = None
     unaltered = True
+    bends = False
 
     def meet(
         self,
@@ -30,7 +31,7 @@ class Matched:
         rng: mi.PCG32,
     ) -> Meeting:
         """Let all walks cross, without a random number."""
-        return Meeting(mi.Float(1), mi.Bool(False))
+        return Meeting(mi.Float(1), mi.Bool(False), omega, mi.Float(0))
 
     def straight(
         self,

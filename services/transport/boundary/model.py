@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import mitsuba as mi
 
@@ -19,7 +19,11 @@ class Meeting:
     weight: mi.Float
     """Factor of the walk's weight."""
     reflects: mi.Bool
-    """Lanes that the face reflects like a mirror; the others cross it straight on."""
+    """Lanes that stay on their side; the others cross the face."""
+    onward: mi.Vector3f
+    """Unit direction after the face."""
+    roughness_score: mi.Float
+    """Derivative of the logarithm of the walk's contribution to the roughness; 0 where the model has none."""
 
 
 class Boundary(Protocol):
@@ -32,8 +36,10 @@ class Boundary(Protocol):
     plug_in: ClassVar[str | None]
     """File of the Python plug-in that stock Mitsuba needs for ``mitsuba``; None where it has the surface itself."""
     unaltered: bool
-    """Whether light crosses the face as if it was not there. Kernels then hold no code for it, and only ``meet``,
-    ``enter`` and ``leave`` are called."""
+    """Whether light crosses the face as if it was not there. Kernels then hold no code for it."""
+    bends: bool
+    """Whether light changes its direction where it crosses the face. No vertex inside then sees a light, and walks
+    connect to lights where they meet the face, by ``BendingBoundary.towards``."""
 
     def meet(
         self,
@@ -60,6 +66,30 @@ class Boundary(Protocol):
         differentiated, so a connection's scores have no term for it.
         """
 
+    @staticmethod
+    def mitsuba(ior: float, stain: Path | None = None) -> dict[str, Any]:
+        """The surface in a scene of stock Mitsuba.
+
+        Args:
+            ior: index of refraction of the inside relative to the outside.
+            stain: picture of the absorbed share of transmitted light.
+        """
+
+
+@runtime_checkable
+class BendingBoundary(Boundary, Protocol):
+    """A model whose faces change the direction of light that crosses them."""
+
+    def towards(self, omega: mi.Vector3f, normal: mi.Vector3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        """What a walk along ``omega`` that meets a face receives from a light in
+        ``direction`` outside, over the light's irradiance, 1/sr; and the derivative of its logarithm to the roughness.
+        """
+
+
+@runtime_checkable
+class FlatBoundary(Boundary, Protocol):
+    """A model that a slab's flat faces can have; every direction has one answer."""
+
     def reflectance(self, cosine: mi.Float) -> mi.Float:
         """Share of light from empty space that the face reflects at ``cosine`` to the normal."""
 
@@ -72,15 +102,6 @@ class Boundary(Protocol):
     def leave(self, cosine: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
         """For light that leaves a flat face at ``cosine`` outside: the cosine inside, the ratio of solid angle times
         cosine outside to the same inside, and the share that is reflected back.
-        """
-
-    @staticmethod
-    def mitsuba(ior: float, stain: Path | None = None) -> dict[str, Any]:
-        """The surface in a scene of stock Mitsuba.
-
-        Args:
-            ior: index of refraction of the inside relative to the outside.
-            stain: picture of the absorbed share of transmitted light.
         """
 
 

@@ -22,6 +22,7 @@ class Thin:
     blender: ClassVar[str] = "ShaderNodeBsdfTransparent under a Fresnel factor"
     plug_in: ClassVar[str | None] = "thin_boundary.py"
     unaltered = False
+    bends = False
 
     def __init__(self, ior: float) -> None:
         self.ior = dr.opaque(mi.Float, ior)
@@ -41,7 +42,9 @@ class Thin:
         mirrored = self._mirrored(geometry, omega, enclosure, geometry.beyond(enclosure, omega, hit), hit)
         reflects = meets & hit.outer & ~hit.opaque
         weight = dr.select(reflects & omits, 1 - mirrored, 1)
-        return Meeting(weight, reflects & ~omits & (rng.next_float32() < mirrored))
+        reflects &= ~omits & (rng.next_float32() < mirrored)
+        image = omega - mi.Vector3f(hit.normal) * (2 * dr.dot(omega, hit.normal))
+        return Meeting(weight, reflects, dr.select(reflects, image, omega), mi.Float(0))
 
     def straight(
         self, geometry: Geometry, direction: mi.Vector3f, before: mi.UInt32, after: mi.UInt32, hit: Hit

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from services.transport.boundary.model import Boundary
 from services.transport.lighting.light_groups import LightGroups
 from services.transport.lighting.light_maps import DARK_DEPTH, LightMaps
+from services.transport.lighting.lit_faces import LitFaces
 from services.transport.scene.border import inverse_cosine
 from services.transport.scene.geometry import Geometry
 from services.transport.scene.media import Media
@@ -35,7 +36,9 @@ DARKEST_CHANCE = 0.02
 class PointLights:
     """All lights of a rig for one channel."""
 
-    def __init__(self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], maps: LightMaps) -> None:
+    def __init__(
+        self, positions_mm: NDArray[np.float64], intensities: NDArray[np.float64], maps: LightMaps | LitFaces
+    ) -> None:
         self.count = len(positions_mm)
         self.connection_period = math.ceil(STEPS_PER_ROOT * math.sqrt(self.count))
         self.maps = maps

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from services.transport.boundary.model import Boundary
+from services.transport.lighting.light_maps import LightView
 from services.transport.lighting.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
 from services.transport.paths.scores import Plan, Scatterings, Scores
 from services.transport.paths.stain_tally import StainTally
@@ -31,6 +32,16 @@ unchecked."""
 FAINTEST = 1e-20
 """Contribution of a vertex, as a share of the lights' mean irradiance, below which it is not worth a shadow ray: it is
 below float32 resolution of any sum, and deep in a dense medium the quotient of such numbers is 0 / 0 in float32."""
+
+
+@dataclass
+class Facing:
+    """An outer face that bends light, at the vertex from which a path connects through it."""
+
+    normal: mi.Vector3f
+    """Outward unit normal."""
+    primitive: mi.UInt32
+    """Number of the triangle."""
 
 
 @dataclass
@@ -54,6 +65,8 @@ class Vertex:
     wall: list[mi.Bool]
     """Whether the vertex lies on an opaque surface, whose normal ``omega`` then is; empty in scenes without such
     surfaces."""
+    facing: list[Facing]
+    """The outer face that the vertex lies on; empty unless that face bends light."""
     stains: list[FaceCrossing]
     """One of the stained faces that the path crossed; empty unless stain derivatives are computed."""
     total: mi.Float
@@ -114,6 +127,7 @@ class Connections:
             mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.scores.unscattered(),
             zeros(len(self.plan.scores)), zeros(self.modes), [mi.Bool(False)] * (self.plan.shape is not None),
             zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque,
+            [Facing(mi.Vector3f(0, 0, 1), mi.UInt32(0)) for _ in range(self.boundary.bends)],
             [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
         )  # fmt: skip
 
@@ -207,7 +221,7 @@ class Connections:
         """Add the contributions that the light maps predict for one light of every group, and keep one of these lights
         with a probability proportional to the assumed error of its look-up.
         """
-        maps, groups = self.lights.maps, self.lights.groups
+        groups = self.lights.groups
         relative_error = MAP_RELATIVE_ERROR if self.plan.shape is None and not self.plan.stains else 1.0
 
         def step(
@@ -217,7 +231,7 @@ class Connections:
             light, brightness = groups.choose(
                 group, vertex.point, lambda direction: self._density(vertex, direction), u
             )
-            lookup = maps.look_up(light, vertex.point, vertex.enclosure, active)
+            lookup = self._look_up(light, vertex, active)
             # The kept vertex represents all that were offered with it, and the chosen light its whole group.
             weight = vertex.total / dr.maximum(vertex.max_transmittance, 1e-30) * brightness
             expected, lengths = lookup.transmittance(self.media), lookup.lengths(self.scores.sigma_media)
@@ -272,7 +286,7 @@ class Connections:
         slot, primary = self._slot(vertex, light), active & vertex.primary
         tally.add(row, slot, value, primary)
         medium = self._medium(vertex)
-        terms = PhaseFunction(self.media, medium).scores(self.scores.phase_fields, vertex.omega, direction)
+        terms = self._terms(vertex, direction)
         lengths_of = dict(zip(self.scores.sigma_media, lengths, strict=True))
         for which, score in enumerate(self.scores.complete(vertex.sums, vertex.scatterings, medium, terms, lengths_of)):
             tally.add_derivative(which, row, slot, value * score, primary)
@@ -285,6 +299,14 @@ class Connections:
         """Medium in which a vertex scatters, or the wall (number ``media.count``) where it lies on the wall."""
         medium = self.geometry.medium(vertex.enclosure)
         return dr.select(vertex.wall[0], mi.UInt32(self.media.count), medium) if vertex.wall else medium
+
+    def _look_up(self, light: mi.UInt32, vertex: Vertex, active: mi.Bool) -> LightView:
+        """What the maps say of the way from a vertex to a light."""
+        return self.lights.maps.look_up(light, vertex.point, vertex.enclosure, active)
+
+    def _terms(self, vertex: Vertex, direction: mi.Vector3f) -> dict[str, mi.Float]:
+        """Scores of the connection's change of direction, by field."""
+        return PhaseFunction(self.media, self._medium(vertex)).scores(self.scores.phase_fields, vertex.omega, direction)
 
     def _density(self, vertex: Vertex, direction: mi.Vector3f) -> mi.Float:
         """Phase function, or on a wall the diffuse reflection of a white surface, towards a direction, 1/sr."""

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from services.transport.boundary.model import Boundary
+from services.transport.boundary.model import FlatBoundary
 from services.transport.optics.free_flight import one_minus_exp
 from services.transport.paths.scores import Plan
 from services.transport.paths.tally import Tally
@@ -29,7 +29,9 @@ two cancel, and the integrand is constant."""
 class Exits:
     """Exit slots of a tally, from ``first_slot`` on: lit and far face for every cosine, then for every ring."""
 
-    def __init__(self, geometry: SlabGeometry, media: Media, plan: Plan, boundary: Boundary, first_slot: int) -> None:
+    def __init__(
+        self, geometry: SlabGeometry, media: Media, plan: Plan, boundary: FlatBoundary, first_slot: int
+    ) -> None:
         self.geometry, self.media, self.plan, self.boundary = geometry, media, plan, boundary
         self.cosines, self.edges_mm = (
             mi.Float(np.array(values, dtype=np.float32)) for values in (plan.exit_cosines, plan.ring_edges_mm)

@@ -142,6 +142,13 @@ class Scores:
             for s, total in zip(self.plan.scores, sums, strict=True)
         ]
 
+    def boundary(self, sums: list[mi.Float], roughness_score: mi.Float) -> list[mi.Float]:
+        """Scores after an outer face."""
+        return [
+            total + roughness_score if s.field == "roughness" else total
+            for s, total in zip(self.plan.scores, sums, strict=True)
+        ]
+
     def complete(
         self,
         sums: list[mi.Float],

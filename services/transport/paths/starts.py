@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from services.transport.boundary.model import Boundary
+from services.transport.boundary.model import FlatBoundary
 from services.transport.lighting.light_maps import aligned
 from services.transport.scene.recipe import View
 
@@ -172,7 +172,7 @@ class SlabStart:
 
     fixed_lanes = True
 
-    def __init__(self, rows: int, seed: int, *, diffuse: bool, boundary: Boundary, cosine: float = 1.0) -> None:
+    def __init__(self, rows: int, seed: int, *, diffuse: bool, boundary: FlatBoundary, cosine: float = 1.0) -> None:
         self.rows, self.diffuse, self.boundary = rows, diffuse, boundary
         self.cosine = mi.Float(1) if cosine == 1 else dr.opaque(mi.Float, cosine)
         self.seed = dr.opaque(mi.UInt32, seed)

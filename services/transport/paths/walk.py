@@ -9,16 +9,17 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from services.transport.boundary.model import Boundary
+from services.transport.boundary.model import Boundary, FlatBoundary
 from services.transport.lighting.lights import PointLights, shadow
 from services.transport.optics.free_flight import minus_log1m, one_minus_exp
 from services.transport.paths.connections import Connections, Vertex
+from services.transport.paths.exit_connections import ExitConnections
 from services.transport.paths.exits import Exits
 from services.transport.paths.rows import Rows
 from services.transport.paths.scores import Plan, Scores
 from services.transport.paths.starts import CameraStart, LightStart, SlabStart, no_stream
 from services.transport.paths.tally import Tally
-from services.transport.paths.walker import Flight, Walker
+from services.transport.paths.walker import Arrival, Flight, Walker
 from services.transport.scene.border import BorderScattering, inverse_cosine, no_crossing, offer
 from services.transport.scene.geometry import Geometry, SlabGeometry
 from services.transport.scene.media import Media, PhaseFunction
@@ -44,13 +45,17 @@ class Walk:
         self.boundary = boundary
         media.two_lobes |= any(score.field == "beta" for score in plan.scores)
         self.scores = Scores(plan, media)
-        self.connections = None if lights is None else Connections(geometry, media, lights, plan, self.scores, boundary)
+        self.connections: Connections | None = None
+        if lights is not None:
+            kind = ExitConnections if boundary.bends else Connections
+            self.connections = kind(geometry, media, lights, plan, self.scores, boundary)
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
         self.exits: Exits | None = None
         if plan.exit_cosines or plan.ring_edges_mm:
             assert isinstance(geometry, SlabGeometry)
+            assert isinstance(boundary, FlatBoundary)
             self.exits = Exits(geometry, media, plan, boundary, first_slot=self.slots)
             self.slots += self.exits.slots
 
@@ -136,8 +141,15 @@ class Walk:
         # by chance.
         omits = self._omits_reflection(walker, medium)
         met = self.boundary.meet(self.geometry, walker.omega, walker.enclosure, hit, meets, omits, walker.rng)
+        arrival = []
+        if self.boundary.bends:
+            # The highlight, which a camera ray that has not entered sees, is left out.
+            arrival = [Arrival(walker.omega, self._throughput(walker), meets & hit.outer & ~omits)]
         walker.weight *= met.weight
-        return Flight(medium, sigma, hit, distance, scatters, meets, met.reflects, meets & hit.opaque)
+        return Flight(
+            medium, sigma, hit, distance, scatters, meets, met.reflects, meets & hit.opaque, met.onward,
+            met.roughness_score, arrival,
+        )  # fmt: skip
 
     def _omits_reflection(self, walker: Walker, medium: mi.UInt32) -> mi.Bool:
         """Lanes whose reflection at an outer face is left out: camera rays that would mirror empty space."""
@@ -150,6 +162,7 @@ class Walk:
         sigma = self.media.extinction(medium)
         hit = self.geometry.intersect(walker.origin, walker.omega, walker.enclosure, walker.active)
         leaving = hit.valid & hit.outer
+        assert isinstance(self.boundary, FlatBoundary)
         through = 1 - self.boundary.reflectance_inside(dr.abs(dr.dot(walker.omega, hit.normal)))
 
         # Count the share that leaves through an outer face.
@@ -184,9 +197,11 @@ class Walk:
         walker.reference = dr.select(
             first, walker.weight * dr.exp(self.media.pick(self.media.log_alpha, medium)), walker.reference
         )
+        image = walker.omega - mi.Vector3f(hit.normal) * (2 * dr.dot(walker.omega, hit.normal))
         return Flight(
-            medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects, mi.Bool(False)
-        )
+            medium, sigma, hit, distance, scatters, walker.active & ~scatters & hit.valid, reflects, mi.Bool(False),
+            dr.select(reflects, image, walker.omega), mi.Float(0),
+        )  # fmt: skip
 
     def _move(self, walker: Walker, flight: Flight, throughput: mi.Float) -> None:
         hit, omega = flight.hit, walker.omega
@@ -219,7 +234,7 @@ class Walk:
             dr.fma(omega, flight.distance, walker.origin),
             dr.select(flight.meets, reached, walker.origin),
         )
-        walker.omega = dr.select(flight.reflects, omega - mi.Vector3f(hit.normal) * (2 * cosine), omega)
+        walker.omega = dr.select(flight.meets, flight.onward, omega)
         walker.enclosure = dr.select(crosses, behind, walker.enclosure)
         scattered_in = flight.medium
         if self.geometry.opaque:
@@ -229,17 +244,25 @@ class Walk:
     def _connect(self, walker: Walker, flight: Flight, before: mi.UInt64, tally: Tally) -> None:
         assert self.connections is not None
         assert walker.vertex is not None
+        if isinstance(self.connections, ExitConnections):
+            found = self.connections.exit_of(walker, flight, self.geometry)
+            self._offer(walker, found, flight.arrival[0].connects, before, tally)
+            return
         bound = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
         omega, wall = walker.omega, []
         if self.geometry.opaque:
             omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
         found = Vertex(
             walker.origin, omega, walker.enclosure, self._throughput(walker), bound, walker.scatterings, walker.sums,
-            walker.border_sums, walker.secondary, walker.shape_factor, wall, walker.stains, mi.Float(0),
+            walker.border_sums, walker.secondary, walker.shape_factor, wall, [], walker.stains, mi.Float(0),
         )  # fmt: skip
-        walker.vertex = self.connections.offer(
-            walker.vertex, found, walker.rng.next_float32(), flight.scatters | flight.bounces
-        )
+        self._offer(walker, found, flight.scatters | flight.bounces, before, tally)
+
+    def _offer(self, walker: Walker, found: Vertex, offered: mi.Bool, before: mi.UInt64, tally: Tally) -> None:
+        """Offer a vertex to the lane's reservoir, and connect what it holds where that is due."""
+        assert self.connections is not None
+        assert walker.vertex is not None
+        walker.vertex = self.connections.offer(walker.vertex, found, walker.rng.next_float32(), offered)
         self._keep_stream(walker, before)
         walker.connection_step += 1
         due = walker.working & (walker.connection_step == self.connections.period) & (walker.vertex.total > 0)
@@ -255,6 +278,7 @@ class Walk:
         walker.sums = self.scores.deflection(
             walker.sums, flight.medium, phase.scores(self.scores.phase_fields, walker.omega, onward), flight.scatters
         )
+        walker.sums = self.scores.boundary(walker.sums, flight.roughness_score)
         if self.geometry.opaque:
             diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(
                 mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
@@ -357,12 +381,8 @@ class Walk:
             walker.sample = dr.select(takes, 0, walker.sample + 1)
             walker.working = ~takes | (walker.row < rows.count)
             path = self.start.begin(walker.row, walker.sample, begins & walker.working)
-            walker.rng, walker.origin, walker.omega, walker.enclosure = (
-                path.rng,
-                path.origin,
-                path.omega,
-                path.enclosure,
-            )
+            walker.rng, walker.origin = path.rng, path.origin
+            walker.omega, walker.enclosure = path.omega, path.enclosure
             walker.weight, walker.reference = path.weight, mi.Float(path.weight)
             walker.scatterings = self.scores.unscattered()
             walker.steps = [mi.UInt32(0) for _ in walker.steps]

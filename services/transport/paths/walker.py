@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mitsuba as mi
 
@@ -63,6 +63,16 @@ class Walker:
 
 
 @dataclass
+class Arrival:
+    """A path that meets an outer face, before the face changes it."""
+
+    omega: mi.Vector3f
+    throughput: mi.Float
+    connects: mi.Bool
+    """Lanes whose path connects to the lights from there."""
+
+
+@dataclass
 class Flight:
     """Result of one free flight."""
 
@@ -78,6 +88,12 @@ class Flight:
     meets: mi.Bool
     """Whether a surface is reached."""
     reflects: mi.Bool
-    """Whether that surface reflects like a mirror."""
+    """Whether that surface reflects the path."""
     bounces: mi.Bool
     """Whether that surface is opaque and reflects diffusely. A surface that does neither is crossed."""
+    onward: mi.Vector3f
+    """Direction after that surface, unless it is opaque."""
+    roughness_score: mi.Float
+    """Score of what that surface did."""
+    arrival: list[Arrival] = field(default_factory=list)
+    """The path before it met that surface; empty unless the surface bends light."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from services.transport.boundary.model import Boundary
+from services.transport.boundary.model import FlatBoundary
 
 
 class Gloss:
@@ -15,7 +15,7 @@ class Gloss:
     continues unbent.
     """
 
-    def __init__(self, roughness: float, boundary: Boundary) -> None:
+    def __init__(self, roughness: float, boundary: FlatBoundary) -> None:
         self.facets = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, roughness)
         self.boundary = boundary
 

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from services.transport.boundary.models import mesh_boundary
+from services.transport.boundary.models import slab_boundary
 from services.transport.lighting.light_maps import DARK_DEPTH
 from services.transport.optics.free_flight import minus_log1m
 from services.transport.paths.walk import ROULETTE_WEIGHT
@@ -123,7 +123,7 @@ class ScenePaths:
 
     def __init__(self, scene: Any, teeth: SceneTeeth, optics: ToothOptics, max_depth: int) -> None:
         self.scene, self.teeth, self.media = scene, teeth, ChannelMedia(optics)
-        self.boundary = mesh_boundary(optics.boundary, optics.ior, refracts=optics.ior != 1)
+        self.boundary = slab_boundary(optics.boundary, optics.ior)
         self.gloss = None
         if not self.boundary.unaltered and optics.roughness is not None:
             self.gloss = Gloss(optics.roughness, self.boundary)

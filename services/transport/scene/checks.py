@@ -16,6 +16,11 @@ FARTHEST_MM = 1e12
 range of single precision."""
 INTENSITIES = (1e-30, 1e30)
 """Smallest and largest intensity of a light, for the same reason."""
+ROUGHNESS = (0.02, 1.0)
+"""Least and largest GGX roughness: connections through a smoother face are hits of a needle, seldom and bright."""
+MIN_ROUGH_IOR = 1.01
+"""Least index of refraction of a rough face: below it, light is bent by less than facets of a thousandth would turn it,
+and single precision no longer finds the facet that bends it to a light."""
 MAX_TEETH = 15
 """Largest number of teeth: an enclosure is 32 bits, two for each tooth and one for gums."""
 
@@ -50,6 +55,40 @@ def require_lights(positions_mm: NDArray[np.float64], intensities: NDArray[np.fl
                 f"Light {number} at position_mm = {position.tolist()} is within {reach_mm:.0f} mm of the origin, where"
                 " the tooth is; lights must be outside it, in millimetres."
             )
+
+
+def require_rough(recipe: SceneRecipe) -> None:
+    """Refuse what a ``rough`` boundary cannot be or surround.
+
+    Raises:
+        InputError: a roughness out of its range, an index too close to that of air, or more than one tooth.
+    """
+    low, high = ROUGHNESS
+    if not low <= recipe.roughness <= high:
+        raise InputError(
+            f"roughness = {recipe.roughness:g} must lie in {low:g} to {high:g}; give the GGX roughness of the surface,"
+            " such as 0.15, or choose boundary = thin."
+        )
+    if recipe.ior < MIN_ROUGH_IOR:
+        raise InputError(
+            f"ior = {recipe.ior:g} is too close to that of air for a rough surface, which needs at least"
+            f" {MIN_ROUGH_IOR:g}; choose boundary = matched."
+        )
+    if len(recipe.all_teeth) > 1 or recipe.gums is not None or recipe.cavity is not None:
+        raise InputError(
+            "boundary = rough is made for one tooth and nothing else; leave out its surroundings, or choose boundary ="
+            " thin."
+        )
+
+
+def require_straight(recipe: SceneRecipe, what: str) -> None:
+    """Refuse a gradient that needs light that crosses outer faces straight on.
+
+    Raises:
+        InputError: the scene's boundary bends light.
+    """
+    if recipe.boundary == "rough":
+        raise InputError(f"boundary = rough has not {what}; take the Jacobian, or choose boundary = thin.")
 
 
 def require_surfaces(recipe: SceneRecipe) -> None:

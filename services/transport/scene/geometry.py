@@ -76,6 +76,9 @@ class Geometry(Protocol):
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:
         """The hit point, offset to just beyond the surface where ``through``, else to just before it."""
 
+    def outside(self, point: mi.Point3f, hit: Hit, inside: mi.Bool) -> mi.Point3f:
+        """The point that ``advance`` gave, moved to the outer side of the face where it is on the ``inside``."""
+
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:
         """Ratio of the indices of refraction on the two sides of an outer face; ``ior`` is the teeth's."""
 
@@ -146,6 +149,10 @@ class SlabGeometry:
     def advance(self, origin: mi.Point3f, direction: mi.Vector3f, hit: Hit, through: mi.Bool) -> mi.Point3f:  # noqa: ARG002 - meshes need it
         """The point on the plane itself, because the layer number tells the side."""
         return dr.fma(direction, dr.select(hit.valid, hit.distance, 0), origin)
+
+    def outside(self, point: mi.Point3f, hit: Hit, inside: mi.Bool) -> mi.Point3f:  # noqa: ARG002 - meshes need them
+        """The point itself, because the layer number tells the side."""
+        return point
 
     def contrast(self, ior: mi.Float, before: mi.UInt32, after: mi.UInt32) -> mi.Float:  # noqa: ARG002 - meshes need the places
         """``ior`` itself, because all layers have one index of refraction."""

@@ -229,6 +229,14 @@ class MeshGeometry:
         offset = dr.mulsign(dr.select(through, self.epsilon, -self.epsilon), dr.dot(direction, hit.normal))
         return dr.fma(direction, hit.distance, origin) + hit.normal * offset
 
+    def outside(self, point: mi.Point3f, hit: Hit, inside: mi.Bool) -> mi.Point3f:
+        """The point that ``advance`` gave, moved to the outer side of the face where it is on the ``inside``."""
+        return mi.Point3f(point + mi.Vector3f(hit.normal) * dr.select(inside, mi.Float(2 * self.epsilon), 0))
+
+    def fixed_corners_mm(self) -> NDArray[np.float64]:
+        """Corners (F, 3, 3) of the triangles of all surfaces that never move."""
+        return np.asarray(self._fixed_mm[self._faces[: self.fixed_faces]])
+
     def velocity(self, hit: Hit, tooth: int, active: mi.Bool) -> list[mi.Float]:
         """Normal speed n . (B_m - B0) at the hit for each shape mode m, interpolated over its triangle; zero except on
         the dentin of the one tooth.

@@ -68,6 +68,8 @@ def parameter_names(recipe: SceneRecipe) -> dict[str, Parameter]:
             named |= {f"{prefix}{part}.{field}": Parameter(numbers.of(k, part), field) for field in MEDIUM_FIELDS}
         modes = 0 if tooth.dentin is None else len(tooth.dentin.modes_mm)
         named |= {f"{prefix}shape.{mode}": Parameter(0, "shape", k) for mode in range(modes)}
+    if recipe.boundary == "rough" and recipe.ior != 1:
+        named["roughness"] = Parameter(0, "roughness")
     if numbers.gums:
         named |= {f"gums.{field}": Parameter(numbers.of_gums, field) for field in MEDIUM_FIELDS}
     if numbers.cavity:

@@ -5,6 +5,7 @@ process.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera, Mesh
 from services.core.records import Boundary, Device
+
+SceneBoundary = Boundary | Literal["rough"]
+"""Boundary models of a scene of meshes."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class SceneRecipe:
     """(L, 3)"""
     light_intensities: NDArray[np.float64]
     """(L,) radiant intensity of this channel, mm as length unit."""
-    boundary: Boundary = "matched"
+    boundary: SceneBoundary = "matched"
     ior: float = 1.631
     device: Device | None = None
     """Device that traces the paths; None for the one that this process already uses, else the CPU."""
@@ -48,6 +52,10 @@ class SceneRecipe:
     """The wall of the mouth behind the teeth, an opaque diffuse surface; it need not be closed."""
     neighbours: tuple[ToothSurfaces, ...] = ()
     """Further teeth around a single one, of the same media; their dentin does not move."""
+    roughness: float = 0.15
+    """GGX roughness of a ``rough`` boundary."""
+    multiple_scattering: bool = True
+    """Whether a ``rough`` boundary gives back light that meets several of its facets; stock renderers lose it."""
 
     @property
     def all_teeth(self) -> tuple[ToothSurfaces, ...]:
@@ -68,7 +76,7 @@ def single_tooth(
     dentin: DentinShape | None,
     light_positions_mm: NDArray[np.float64],
     light_intensities: NDArray[np.float64],
-    boundary: Boundary = "matched",
+    boundary: SceneBoundary = "matched",
     ior: float = 1.631,
     device: Device | None = None,
 ) -> SceneRecipe:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,6 +16,7 @@ from services.core.geometry import Mesh
 from services.core.records import Boundary, Device
 from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
+BOUNDARIES = (*get_args(Boundary), "rough")
 SHARP_BORDER_MM = np.array(0.0)
 """Width of the borders between enamel and dentin, which are sharp. Nothing reads it: it stays in the file because fits
 find their checkpoints by the digests of the scenes."""
@@ -37,6 +39,10 @@ def write_recipe(folder: Path, recipe: SceneRecipe) -> StoredFile:
             arrays[f"stain{k}_uv"] = tooth.stain_uv
     add("gums", recipe.gums)
     add("cavity", recipe.cavity)
+    # A scene of another boundary keeps the file, and so the name, that it had before there was this one.
+    if recipe.boundary == "rough":
+        arrays["roughness"] = np.array(recipe.roughness)
+        arrays["multiple_scattering"] = np.array(recipe.multiple_scattering)
     return write_arrays(
         folder,
         "scene",
@@ -71,15 +77,19 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
         return ToothSurfaces(outer, dentin, a[f"stain{k}_uv"].astype(float) if f"stain{k}_uv" in a else None)
 
     own, others = (int(np.asarray(a[name], dtype=int)) for name in ("teeth", "neighbours"))
-    return SceneRecipe(
+    recipe = SceneRecipe(
         teeth=tuple(tooth(k) for k in range(own)),
         neighbours=tuple(tooth(k) for k in range(own, own + others)),
         light_positions_mm=a["light_positions"].astype(float),
         light_intensities=a["light_intensities"].astype(float),
-        boundary=chosen("Boundary", str(a["boundary"]), {name: name for name in get_args(Boundary)}),
+        boundary=chosen("Boundary", str(a["boundary"]), {name: name for name in BOUNDARIES}),
         ior=float(np.asarray(a["ior"], dtype=float)),
         device=chosen("Device", str(a["device"]), {"": None, **{name: name for name in get_args(Device)}}),
         gums=mesh("gums"),
         gums_ior=float(np.asarray(a["gums_ior"], dtype=float)),
         cavity=mesh("cavity"),
     )
+    if "roughness" not in a:
+        return recipe
+    roughness, multiple_scattering = (np.asarray(a[name]) for name in ("roughness", "multiple_scattering"))
+    return replace(recipe, roughness=float(roughness), multiple_scattering=bool(multiple_scattering))
