@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.assets.content import AssetContent, AssetPart
+from services.assets.textures.files import base_colour_file
 
 Colour = tuple[float, float, float]
 
@@ -33,6 +34,9 @@ class Appearance:
 
     base_colour: Colour
     """Linear reflectance under diffuse light."""
+    picture: str | None
+    """Path of a picture of the reflectance with the curve of sRGB, which stands for ``base_colour``; None where the
+    colour is the same everywhere."""
     roughness: float
     """Roughness of the highlight, 0 to 1; its square is GGX's alpha."""
     ior: float | None
@@ -45,7 +49,7 @@ class Appearance:
 
 def appearance(content: AssetContent, part: AssetPart) -> Appearance:
     """The appearance of a part. A tooth's mean free paths are those of its dentin, through which most light passes."""
-    dentin = next((one for one in content.parts if one.name == part.name.replace("_enamel", "_dentin")), part)
+    dentin = content.part(part.name.replace("_enamel", "_dentin")) or part
     # Light that meets nothing has no mean free path.
     total = dentin.scattering_reduced_per_mm() + dentin.absorption_per_mm()
     paths_mm = np.full(3, np.inf) if not total.all() else 1 / total
@@ -53,6 +57,7 @@ def appearance(content: AssetContent, part: AssetPart) -> Appearance:
     ior = None if part.tissue == "cavity" else GUMS_IOR if part.tissue == "gums" else content.ior
     return Appearance(
         base_colour=_colour(part.base_colour()),
+        picture=base_colour_file(part.name) if part.name in content.textures else None,
         roughness=1.0 if ior is None else ROUGHNESS,
         ior=ior,
         radius_mm=float(paths_mm.max()) if scatters else None,
@@ -65,10 +70,11 @@ def _colour(values: np.ndarray) -> Colour:
     return red, green, blue
 
 
-def open_pbr_inputs(look: Appearance) -> dict[str, tuple[str, float | Colour]]:
-    """Inputs of OpenPBR that differ from their defaults, name -> (MaterialX type, value)."""
-    inputs: dict[str, tuple[str, float | Colour]] = {
-        "base_color": ("color3", look.base_colour),
+def open_pbr_inputs(look: Appearance) -> dict[str, tuple[str, float | Colour | str]]:
+    """Inputs of OpenPBR that differ from their defaults, name -> (MaterialX type, value or path of a picture)."""
+    colour = look.picture or look.base_colour
+    inputs: dict[str, tuple[str, float | Colour | str]] = {
+        "base_color": ("color3", colour),
         "specular_roughness": ("float", look.roughness),
     }
     if look.ior is None:
@@ -78,7 +84,7 @@ def open_pbr_inputs(look: Appearance) -> dict[str, tuple[str, float | Colour]]:
     if look.radius_mm is not None:
         inputs |= {
             "subsurface_weight": ("float", 1.0),
-            "subsurface_color": ("color3", look.base_colour),
+            "subsurface_color": ("color3", colour),
             "subsurface_radius": ("float", look.radius_mm),
             "subsurface_radius_scale": ("color3", look.radius_scale),
             # The mean free path is that of isotropic scattering.

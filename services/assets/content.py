@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from services.assets.people_mesh import PeopleMesh, people_mesh
+from services.assets.people_mesh import PeopleMesh, mapped_people_mesh, people_mesh
 from services.core.errors import CorruptStoreError, MissingStageError
-from services.core.files.meshes import fdi_numbers, read_mesh, read_teeth
-from services.core.geometry import Mesh
+from services.core.files.meshes import fdi_numbers, read_mesh, read_teeth, read_texture_coordinates
+from services.core.geometry import Mesh, teeth_folder
 from services.core.results import AssetManifest, Estimate
 from services.core.store import open_stage
 from services.transport.optics.half_space import half_space_reflectance
@@ -23,6 +23,9 @@ from services.transport.optics.parameters import MEDIUM_FIELDS, Medium
 
 RGB = ("red", "green", "blue")
 """Names of the channels that are taken for the three colours, in their order."""
+TEXEL_MM = 0.1
+"""Largest edge of a texel on a tooth, mm: finer than stains (0.5 to 1 mm) and changes of the thickness, so that nothing
+that was measured is lost."""
 TOOTH_IOR = 1.631
 """Refractive index of enamel (teeth 2018), where the asset names none."""
 Tables = dict[str, dict[str, Estimate]]
@@ -36,12 +39,16 @@ class AssetPart:
     """``tooth_11_enamel``, ``tooth_11_dentin``, ``gums`` or ``cavity``."""
     tissue: str
     """``enamel``, ``dentin``, ``gums`` or ``cavity``."""
+    fdi: int | None
+    """Number of the tooth; None for gums and wall."""
     surface: Mesh
     """The closed surface as it was fitted, mm; a wall of the mouth may be open."""
     mesh: PeopleMesh
     """The same surface with normals and texture coordinates."""
     estimates: Mapping[str, Mapping[str, Estimate]]
     """Channel -> ``sigma``, ``alpha``, ``sigma_s_reduced`` ... -> estimate."""
+    stains: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Channel -> transmittance (H, W) in the mesh's chart, where stains were fitted."""
 
     def told_estimates(self) -> dict[str, dict[str, Any]]:
         """The estimates as JSON values: channel -> name -> value, se, unit, determined."""
@@ -87,8 +94,15 @@ class AssetContent:
     """Whether the fit behind the numbers converged."""
     folder: Path
     """Folder of the published asset, whose files are as they were published."""
-    ior: float = TOOTH_IOR
+    ior: float
     """Refractive index of the teeth."""
+    textures: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """What ``textures.json`` says of each part that has textures, by its name; every exporter finds their files in its
+    folder."""
+
+    def part(self, name: str) -> AssetPart | None:
+        """The part of a name, if there is one."""
+        return next((part for part in self.parts if part.name == name), None)
 
     @property
     def shown_channels(self) -> tuple[str, str, str]:
@@ -113,7 +127,9 @@ def read_content(job: Path) -> AssetContent:
     """
     folder, manifest = open_stage(job, "asset", AssetManifest)
     if not fdi_numbers(folder):
-        raise MissingStageError(f"The asset in {job} holds no tooth; export a job of kind tooth or jaw.")
+        raise MissingStageError(
+            f"The asset in {job} holds neither tooth nor slab; export a job of kind tooth, jaw or slab."
+        )
     path = folder / "parameters.json"
     try:
         tables = TypeAdapter(Tables).validate_json(path.read_bytes())
@@ -121,7 +137,9 @@ def read_content(job: Path) -> AssetContent:
         raise CorruptStoreError(f"{path} cannot be read; write it again with dentine export.") from problem
     parts: list[AssetPart] = []
 
-    def add(name: str, tissue: str, surface: Mesh, prefixes: tuple[str, ...]) -> None:
+    def add(name: str, tissue: str, surface: Mesh, fdi: int | None = None) -> None:
+        prefixes = (f"{tissue}.",) if fdi is None else (f"{tissue}.", f"{fdi}.{tissue}.")
+        place = teeth_folder(folder, fdi) if fdi is not None and tissue == "enamel" else None
         own = {
             channel: {
                 full.removeprefix(prefix): estimate
@@ -131,18 +149,39 @@ def read_content(job: Path) -> AssetContent:
             }
             for channel, table in tables.items()
         }
-        parts.append(AssetPart(name, tissue, surface, people_mesh(surface), own))
+        stains = {} if place is None else _stains(place, tuple(tables))
+        charted = None if place is None else read_texture_coordinates(place / "outer.ply")
+        if charted is None:
+            mesh = people_mesh(surface, None if place is None else TEXEL_MM)
+        else:
+            mesh = mapped_people_mesh(surface, charted, _size(surface, charted, stains))
+        parts.append(AssetPart(name, tissue, fdi, surface, mesh, own, stains))
 
     for tooth in read_teeth(folder):
         for tissue, surface in (("enamel", tooth.outer), ("dentin", tooth.dentin)):
             if surface is not None:
-                add(f"tooth_{tooth.fdi}_{tissue}", tissue, surface, (f"{tissue}.", f"{tooth.fdi}.{tissue}."))
+                add(f"tooth_{tooth.fdi}_{tissue}", tissue, surface, tooth.fdi)
     for tissue in ("gums", "cavity"):
         if (folder / f"{tissue}.ply").is_file():
             surface = read_mesh(folder / f"{tissue}.ply")
             surface.require_surface(f"{tissue}.ply")
-            add(tissue, tissue, surface, (f"{tissue}.",))
+            add(tissue, tissue, surface)
     return AssetContent(tuple(parts), tuple(tables), manifest.converged, folder, _ior(folder / "rig.json"))
+
+
+def _stains(place: Path, channels: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
+    files = {channel: place / f"stain_{channel}.npy" for channel in channels}
+    return {channel: np.load(file).astype(np.float64) for channel, file in files.items() if file.is_file()}
+
+
+def _size(surface: Mesh, corners_uv: NDArray[np.float64], stains: Mapping[str, NDArray[np.float64]]) -> tuple[int, int]:
+    """Height and width of textures in the chart of the stains: theirs, times the whole number that makes texels of at
+    most ``TEXEL_MM``.
+    """
+    height, width = next((stain.shape for stain in stains.values()), (1, 1))
+    edge_mm = np.sqrt(np.mean(mapped_people_mesh(surface, corners_uv, (height, width)).texel_edges_mm() ** 2))
+    times = max(1, int(np.ceil(edge_mm / TEXEL_MM)))
+    return times * height, times * width
 
 
 def _ior(rig: Path) -> float:

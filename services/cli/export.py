@@ -31,11 +31,16 @@ def export(
 
     if names and not to:
         raise SettingsError(f"{names[0]!r} follows the folder without --to; write --to before names of exporters.")
+    from services.core.records import JobSpec
+    from services.core.store import read_record
+    from services.pipeline.stages import JOB_FILE
+
     if to:
         from services.assets.exporters import export_to
 
-        wanted = tuple(dict.fromkeys((*to, *(names or ()))))
-        for folder in export_to(out, wanted, use=use, with_photographs=not without_photographs):
+        path, wanted = out / JOB_FILE, tuple(dict.fromkeys((*to, *(names or ()))))
+        spec = read_record(path, JobSpec) if path.is_file() else None
+        for folder in export_to(out, wanted, spec, use=use, with_photographs=not without_photographs):
             print(f"written: {folder}")
         return
     if without_photographs:
@@ -46,9 +51,6 @@ def export(
     if use is not None:
         raise SettingsError("--for says what files that leave are for; give it with --to or --without-photographs.")
     from services.cli.run import run_some
-    from services.core.records import JobSpec
-    from services.core.store import read_record
-    from services.pipeline.stages import JOB_FILE
 
     run_some(("export",), read_record(out / JOB_FILE, JobSpec), out, again=True)
     print(f"report: {out / 'report.html'}")

@@ -2,6 +2,6 @@
 'use strict';
 const fs = require('fs'), path = require('path'), validator = require('gltf-validator');
 const file = process.argv[2];
-const read = uri => Promise.resolve(new Uint8Array(fs.readFileSync(path.join(path.dirname(file), decodeURI(uri)))));
+const read = async uri => new Uint8Array(fs.readFileSync(path.join(path.dirname(file), decodeURI(uri))));
 validator.validateBytes(new Uint8Array(fs.readFileSync(file)), {externalResourceFunction: read})
   .then(report => console.log(JSON.stringify(report.issues.messages)));

@@ -43,11 +43,15 @@ def wrong_bounds(document: Json) -> None:
 
 
 def wrong_colour(document: Json) -> None:
-    document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][0] = 1.5
+    document["materials"][1]["pbrMetallicRoughness"]["baseColorFactor"][0] = 1.5
 
 
 def wrong_index(document: Json) -> None:
     document["materials"][0]["extensions"]["KHR_materials_ior"]["ior"] = 0.5
+
+
+def absent_picture(document: Json) -> None:
+    document["images"][0]["uri"] = "textures/absent.png"
 
 
 def long_normals(document: Json) -> None:
@@ -62,6 +66,7 @@ def long_normals(document: Json) -> None:
         (wrong_bounds, "ACCESSOR_MAX_MISMATCH"),
         (wrong_colour, "VALUE_NOT_IN_RANGE"),
         (wrong_index, "VALUE_NOT_IN_RANGE"),
+        (absent_picture, "IO_ERROR"),
         (long_normals, "ACCESSOR_VECTOR3_NON_UNIT"),
     ],
 )

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from services.assets.exporters import export_to
 from services.core.geometry import Mesh
+from services.transport.optics.half_space import half_space_reflectance
+from services.transport.optics.parameters import Medium
 from tests.support.clients import client_python, run_client
 from tests.support.prepared import sphere
 from tests.unit.test_exporters import COEFFICIENTS, published
@@ -81,6 +84,24 @@ def test_blender_gets_names_sizes_normals_and_texture_coordinates(facts: tuple[s
         assert meshes[name]["material"] == name
         assert meshes[name]["inputs"]["Roughness"] == pytest.approx(0.35, rel=1e-6)
         assert meshes[name]["inputs"]["IOR"] == pytest.approx(1.631, rel=1e-6)
+
+
+def test_blender_gets_the_pictures_of_the_colour(facts: tuple[str, Facts], job: Path) -> None:
+    name, found = facts
+    folder = job / f"asset-{name}" / "textures"
+    told = json.loads((folder / "textures.json").read_text())["tooth_11_enamel"]
+    (image,) = found["images"]
+    assert image.startswith("tooth_11_enamel_base_colour")
+    assert found["images"][image] == told["size"]
+    assert found["meshes"]["tooth_11_enamel"]["inputs"]["Base Color"] == image
+    bytes_of = np.array(Image.open(folder / told["base_colour"]["png"]))
+    # Blender's mean includes an opacity of 1.
+    assert found["pixels"][image] == pytest.approx((3 * bytes_of.mean() / 255 + 1) / 4, rel=1e-5)
+    # Dentin is of one colour.
+    expected = [
+        half_space_reflectance(Medium(own["sigma"], own["alpha"], g1=own["g1"])) for own in COEFFICIENTS.values()
+    ]
+    np.testing.assert_allclose(found["meshes"]["tooth_11_dentin"]["inputs"]["Base Color"][:3], expected, rtol=1e-6)
 
 
 def test_blender_gets_the_coefficients(facts: tuple[str, Facts]) -> None:

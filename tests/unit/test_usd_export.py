@@ -67,10 +67,27 @@ def test_the_shaders_say_the_mean_free_paths_of_the_dentin(folder: Path) -> None
     document = ElementTree.parse(folder / "asset.mtlx").getroot()
     surface = document.find("open_pbr_surface[@name='tooth_11_enamel_surface']")
     assert surface is not None
-    inputs = {one.attrib["name"]: one.attrib["value"] for one in surface}
+    inputs = {one.attrib["name"]: one.attrib.get("value") for one in surface}
     assert set(inputs) == set(re.findall(r"inputs:(\w+)", shader))
     for name, told in inputs.items():
-        np.testing.assert_array_equal(np.array(ast.literal_eval(told)), value(shader, f"inputs:{name}"))
+        if told is not None:
+            np.testing.assert_array_equal(np.array(ast.literal_eval(told)), value(shader, f"inputs:{name}"))
+
+
+def test_the_colour_of_enamel_is_a_picture_in_every_shader(folder: Path) -> None:
+    text = (folder / "asset.usda").read_text()
+    enamel, dentin = (prim(text, "Material", f"tooth_11_{tissue}") for tissue in ("enamel", "dentin"))
+    file = "textures/tooth_11_enamel_base_colour.png"
+    assert (folder / file).is_file()
+    assert enamel.count(f"inputs:file = @{file}@") == 2
+    path = "</asset/materials/tooth_11_enamel/"
+    assert f"inputs:diffuseColor.connect = {path}picture.outputs:rgb>" in enamel
+    for name in ("base_color", "subsurface_color"):
+        assert f"inputs:{name}.connect = {path}open_pbr_picture.outputs:out>" in enamel
+    assert "picture" not in dentin
+    document = ElementTree.parse(folder / "asset.mtlx").getroot()
+    (picture,) = document.findall(".//input[@type='filename']")
+    assert picture.attrib == {"name": "file", "type": "filename", "value": file, "colorspace": "srgb_texture"}
 
 
 def test_quotes_and_line_ends_stay_within_a_string() -> None:

@@ -6,9 +6,13 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from services.assets.blender.scripts import write_scripts
 from services.assets.content import AssetContent
-from services.core.errors import CorruptStoreError
+from services.core.errors import CorruptStoreError, InputError
+from services.core.files.meshes import write_mapped_mesh
+from services.core.geometry import Mesh, teeth_folder
 
 KEPT = ("*.json", "*.ply", "teeth/**/*", "surfaces/*")
 """Files of an asset that the scripts read; manifests and scenes of other programs stay behind."""
@@ -22,11 +26,15 @@ class BlenderExporter:
         """Nothing is needed: the scripts run where Blender is."""
 
     def write(self, content: AssetContent, folder: Path) -> None:
-        """Copy surfaces and numbers of the asset, and write the scripts beside them.
+        """Copy surfaces and numbers of the asset, put the textures' coordinates into the outer surfaces, and write the
+        scripts beside them.
 
         Raises:
             CorruptStoreError: the asset is of an earlier version, whose rig.json says nothing of cameras.
+            InputError: it is of a slab.
         """
+        if not any(part.fdi for part in content.parts):
+            raise InputError("The script for Blender builds teeth; export a slab with --to usd or gltf.")
         rig = content.folder / "rig.json"
         if not rig.is_file() or "views" not in json.loads(rig.read_text(encoding="utf-8")):
             raise CorruptStoreError(
@@ -39,4 +47,10 @@ class BlenderExporter:
                 if source.is_file() and source.name not in LEFT_OUT:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     shutil.copyfile(source, target)
+        for part in content.parts:
+            if part.tissue == "enamel" and part.fdi is not None:
+                outer = teeth_folder(folder, part.fdi) / "outer.ply"
+                write_mapped_mesh(
+                    outer, Mesh(part.mesh.vertices_mm, part.mesh.faces.astype(np.int32)), part.mesh.corners_uv
+                )
         write_scripts(folder)

@@ -8,6 +8,7 @@ distance, and all coefficients stand with their standard errors in the materials
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from services.assets.appearance import LOST, Appearance, appearance
 from services.assets.content import AssetContent, AssetPart
+from services.assets.textures.files import base_colour_file
 from services.core.store import write_atomic
 
 METRES_PER_MM = 1e-3
@@ -25,6 +27,7 @@ SHORT = 0.02
 """Optical depth of the attenuation distance. Blender reads the attenuation by (1 - c) / d, which is right for short
 distances alone: it is 0.97 to 0.99 of the absorption at this one, and 0.27 to 0.63 at a depth of 1."""
 FLOAT, UINT = 5126, 5125
+LINEAR, CLAMP = 9729, 33071
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
@@ -67,7 +70,11 @@ class GltfExporter:
             }
             primitive = {"attributes": attributes, "indices": accessor(mesh.faces.reshape(-1), "SCALAR"), "material": k}
             meshes.append({"name": part.name, "primitives": [primitive]})
-        materials = [_material(part, appearance(content, part)) for part in content.parts]
+        pictures = [part.name for part in content.parts if part.name in content.textures]
+        materials = [
+            _material(part, appearance(content, part), content.textures.get(part.name), pictures)
+            for part in content.parts
+        ]
         used = sorted({name for material in materials for name in material.get("extensions", {})})
         said = {"lost": LOST, "colours": content.told_colours, "converged": content.converged}
         document: dict[str, Any] = {
@@ -82,6 +89,12 @@ class GltfExporter:
             "bufferViews": views,
             "buffers": [{"uri": "asset.bin", "byteLength": len(binary)}],
         } | ({"extensionsUsed": used} if used else {})
+        if pictures:
+            document |= {
+                "images": [{"name": f"{name}_base_colour", "uri": base_colour_file(name)} for name in pictures],
+                "textures": [{"source": k, "sampler": 0} for k in range(len(pictures))],
+                "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}],
+            }
         write_atomic(folder / "asset.bin", bytes(binary))
         write_atomic(folder / "asset.gltf", (json.dumps(document, indent=1) + "\n").encode())
 
@@ -91,7 +104,9 @@ def _turned(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors[:, order] * signs
 
 
-def _material(part: AssetPart, look: Appearance) -> dict[str, Any]:
+def _material(
+    part: AssetPart, look: Appearance, textures: Mapping[str, Any] | None, pictures: Sequence[str]
+) -> dict[str, Any]:
     extensions: dict[str, Any] = {}
     if look.ior is not None:
         extensions["KHR_materials_ior"] = {"ior": look.ior}
@@ -105,10 +120,12 @@ def _material(part: AssetPart, look: Appearance) -> dict[str, Any]:
             "attenuationDistance": distance_mm * METRES_PER_MM,
             "attenuationColor": np.exp(-absorption * distance_mm).tolist(),
         }
-    surface = {
-        "baseColorFactor": [*look.base_colour, 1.0],
-        "metallicFactor": 0.0,
-        "roughnessFactor": look.roughness,
-    }
-    material = {"name": part.name, "pbrMetallicRoughness": surface, "extras": {"coefficients": part.told_estimates()}}
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": look.roughness}
+    told: dict[str, Any] = {"coefficients": part.told_estimates()}
+    if textures is None:
+        surface["baseColorFactor"] = [*look.base_colour, 1.0]
+    else:
+        surface["baseColorTexture"] = {"index": pictures.index(part.name)}
+        told["textures"] = dict(textures)
+    material = {"name": part.name, "pbrMetallicRoughness": surface, "extras": told}
     return material | ({"extensions": extensions} if extensions else {})

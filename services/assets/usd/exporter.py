@@ -7,8 +7,9 @@ Lengths are mm, z points up. Each surface has a UsdPreviewSurface and an OpenPBR
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from services.assets.appearance import LOST, Appearance, appearance, open_pbr_inputs
 from services.assets.content import AssetContent, AssetPart
@@ -36,7 +37,7 @@ class UsdExporter:
         materials = [line for name, look in looks.items() for line in _material(name, look)]
         children = prim("Scope", "materials", materials)
         for part in content.parts:
-            children += _mesh(part, content.shown_channels)
+            children += _mesh(part, content.shown_channels, content.textures.get(part.name))
         metadata = [
             f"defaultPrim = {quoted(ROOT)}",
             f"doc = {quoted(LOST)}",
@@ -54,7 +55,7 @@ class UsdExporter:
         write_atomic(folder / "asset.usda", ("\n".join(lines) + "\n").encode())
 
 
-def _mesh(part: AssetPart, channels: Sequence[str]) -> list[str]:
+def _mesh(part: AssetPart, channels: Sequence[str], textures: Mapping[str, Any] | None) -> list[str]:
     mesh = part.mesh
     # The first row of a texture lies at v = 0 in an asset, and at v = 1 in USD.
     uv = mesh.uv * [1, -1] + [0, 1]
@@ -71,6 +72,8 @@ def _mesh(part: AssetPart, channels: Sequence[str]) -> list[str]:
         'uniform token subdivisionScheme = "none"',
         *_coefficients(part, channels),
     ]
+    if textures is not None:
+        lines.append(f"custom string {USER}textures = {quoted(json.dumps(textures))}")
     return prim("Mesh", part.name, lines, ['prepend apiSchemas = ["MaterialBindingAPI"]'])
 
 
@@ -103,15 +106,20 @@ def _material(name: str, look: Appearance) -> list[str]:
     path = f"/{ROOT}/materials/{name}"
     preview = [
         'uniform token info:id = "UsdPreviewSurface"',
-        f"color3f inputs:diffuseColor = {vector(look.base_colour)}",
+        f"color3f inputs:diffuseColor.connect = <{path}/picture.outputs:rgb>"
+        if look.picture
+        else f"color3f inputs:diffuseColor = {vector(look.base_colour)}",
         f"float inputs:ior = {number(look.ior or 1.0)}",
         f"float inputs:roughness = {number(look.roughness)}",
         "token outputs:surface",
     ]
     pbr = ['uniform token info:id = "ND_open_pbr_surface_surfaceshader"']
     for key, (kind, value) in open_pbr_inputs(look).items():
-        text = number(value) if isinstance(value, float) else vector(value)
-        pbr.append(f"{USD_TYPES[kind]} inputs:{key} = {text}")
+        if isinstance(value, str):
+            pbr.append(f"{USD_TYPES[kind]} inputs:{key}.connect = <{path}/open_pbr_picture.outputs:out>")
+        else:
+            text = number(value) if isinstance(value, float) else vector(value)
+            pbr.append(f"{USD_TYPES[kind]} inputs:{key} = {text}")
     pbr.append("token outputs:surface")
     lines = [
         f"token outputs:mtlx:surface.connect = <{path}/open_pbr.outputs:surface>",
@@ -119,4 +127,35 @@ def _material(name: str, look: Appearance) -> list[str]:
         *prim("Shader", "preview", preview),
         *prim("Shader", "open_pbr", pbr),
     ]
-    return prim("Material", name, lines)
+    return prim("Material", name, lines + (_picture(path, look.picture) if look.picture else []))
+
+
+def _picture(path: str, picture: str) -> list[str]:
+    """Shaders that look a picture up at ``st``, for the preview and for OpenPBR."""
+    places = [
+        'uniform token info:id = "UsdPrimvarReader_float2"',
+        'string inputs:varname = "st"',
+        "float2 outputs:result",
+    ]
+    texture = [
+        'uniform token info:id = "UsdUVTexture"',
+        f"asset inputs:file = @{picture}@",
+        'token inputs:sourceColorSpace = "sRGB"',
+        f"float2 inputs:st.connect = <{path}/places.outputs:result>",
+        'token inputs:wrapS = "clamp"',
+        'token inputs:wrapT = "clamp"',
+        "float3 outputs:rgb",
+    ]
+    pbr_places = [
+        'uniform token info:id = "ND_geompropvalue_vector2"',
+        'string inputs:geomprop = "st"',
+        "float2 outputs:out",
+    ]
+    pbr_texture = [
+        'uniform token info:id = "ND_image_color3"',
+        f'asset inputs:file = @{picture}@ (colorSpace = "srgb_texture")',
+        f"float2 inputs:texcoord.connect = <{path}/open_pbr_places.outputs:out>",
+        "color3f outputs:out",
+    ]
+    shaders = {"places": places, "picture": texture, "open_pbr_places": pbr_places, "open_pbr_picture": pbr_texture}
+    return [line for name, lines in shaders.items() for line in prim("Shader", name, lines)]

@@ -43,6 +43,18 @@ def read_mesh(path: Path) -> Mesh:
     return Mesh(welded, index.reshape(-1)[corner.reshape(-1, 3)].astype(np.int32), len(vertices) - len(used))
 
 
+def read_texture_coordinates(path: Path) -> NDArray[np.float64] | None:
+    """Texture coordinates (F, 3, 2) of the corners of a PLY file's faces, in the order of ``read_mesh``; None where it
+    has none.
+    """
+    surface = read_surface(path)
+    points = surface.elements["vertex"]["data"] if surface.elements else None
+    if points is None or not {"u", "v"} <= set(points.dtype.names or ()):
+        return None
+    uv = np.stack([points["u"], points["v"]], axis=-1).astype(np.float64)
+    return np.asarray(uv.reshape(-1, 2)[surface.faces])
+
+
 def note_on_dropped(meshes: Mapping[str, Mesh]) -> str | None:
     """A sentence on vertices that no face uses and that were dropped, by the meshes' names; None where all are used."""
     dropped = {name: mesh.dropped_vertices for name, mesh in meshes.items() if mesh.dropped_vertices}
