@@ -1,9 +1,15 @@
-"""The grid of clearances never overstates the distance to the nearest surface, however often inner surfaces move."""
+"""The grid of clearances never overstates the distance to the nearest surface, however often inner surfaces move;
+scenes of equal surfaces measure them once.
+"""
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
+import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from services.anatomy.distance import SurfaceDistance
 from services.core.geometry import Mesh
@@ -39,3 +45,40 @@ def test_bounds_hold_and_tell_something_as_surfaces_move() -> None:
         # The bound loses twice a cell's half diagonal, the spacing of samples and the slack of a small move: a third of
         # a millimetre with cells of 0.1 mm.
         assert np.mean(true - bound) < 0.35
+
+
+def test_scenes_of_one_tooth_share_its_distances(monkeypatch: pytest.MonkeyPatch) -> None:
+    prepare_device()
+    from services.transport.scene.clearance import Clearance
+
+    measured: list[int] = []
+    measure = Clearance._measure
+
+    def counted(
+        self: Clearance, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], window: tuple[slice, ...]
+    ) -> NDArray[np.float64]:
+        measured.append(len(faces))
+        return measure(self, vertices_mm, faces, window)
+
+    monkeypatch.setattr(Clearance, "_measure", counted)
+    outer, inner, other = ball(0.31), ball(0.3), ball(0.45)
+    outer = Mesh(2 * outer.vertices_mm, outer.faces)
+    scenes = []
+    for _ in range(3):
+        scene = Clearance(outer.vertices_mm.copy(), outer.faces.copy())
+        scene.move_inner([Mesh(inner.vertices_mm.copy(), inner.faces)])
+        scenes.append(scene)
+    assert len(measured) == 2, "a second scene of equal surfaces measures nothing"
+    # A scene whose surface moved measures it, and leaves the others' distances as they are.
+    tables = [np.array(scene._table) for scene in scenes]
+    scenes[0].move_inner([other])
+    assert len(measured) == 3
+    assert not np.array_equal(np.array(scenes[0]._table), tables[0])
+    np.testing.assert_array_equal(np.array(scenes[1]._table), tables[1])
+    np.testing.assert_array_equal(tables[1], tables[0])
+    # They are let go with the last scene that holds them.
+    del scene
+    scenes.clear()
+    gc.collect()
+    Clearance(outer.vertices_mm, outer.faces)
+    assert len(measured) == 4

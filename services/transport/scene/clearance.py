@@ -2,12 +2,17 @@
 
 The distance to a surface changes by at most the distance moved, so ``d(cell centre) - |x - centre|`` is a lower bound
 everywhere in the cell: a flight shorter than that meets nothing, exactly and not approximately.
+
+A process builds several scenes of the same teeth: a channel's, the one with held-out lights, those in which the
+instrument moves. They share the distances to equal surfaces, which are most of the time of building a scene.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
+from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -30,6 +35,8 @@ REBUILD_MM = 0.1
 MARGIN_MM = 1.5
 """Margin in mm around an inner surface's box within which its distance is measured, where there are several such
 surfaces; all other places are taken to be just as far away."""
+_distances: WeakValueDictionary[bytes, NDArray[np.float64]] = WeakValueDictionary()
+"""Distances to surfaces of the scenes that this process holds, by content of the surface and its grid."""
 
 
 def surface_samples(
@@ -114,6 +121,20 @@ class Clearance:
         )
 
     def _distance(
+        self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], window: tuple[slice, ...]
+    ) -> NDArray[np.float64]:
+        # Distance to one surface within a window, measured unless another scene holds it.
+        content = blake2b(repr((window, self._cell_mm, self._corner.tolist(), vertices_mm.dtype, faces.dtype)).encode())
+        for array in (vertices_mm, faces):
+            content.update(array.tobytes())
+        found = _distances.get(content.digest())
+        if found is None:
+            found = self._measure(vertices_mm, faces, window)
+            found.setflags(write=False)
+            _distances[content.digest()] = found
+        return found
+
+    def _measure(
         self, vertices_mm: NDArray[np.float64], faces: NDArray[np.int32], window: tuple[slice, ...]
     ) -> NDArray[np.float64]:
         first = np.array([one.start for one in window])
