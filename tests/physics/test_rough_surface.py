@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 
 from services.core.errors import InputError
 from services.transport.engine import Engine
+from services.transport.optics.ggx_albedo import ANGLES, albedo_tables
+from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.rough_truths import CASES, STORED, TISSUE, scene_recipe, view
 from tests.support.small_mouth import mouth_recipe
+from tests.support.small_tooth import camera_at, whole_view
+from tests.support.z_scores import student_to_normal
 
 
 def escaping_weight(cosine: NDArray[np.float32], roughness: float, ior: float, *, leaving: bool) -> NDArray[np.float32]:
@@ -46,6 +50,60 @@ def test_a_lossless_face_gives_all_light_back_or_through_at_every_angle(
     # A furnace is 1 within 0.003, and this many values lie within 4 standard errors of it.
     assert np.all(np.abs(weights.mean(axis=1) - 1) <= 0.003 + 4 * error)
     assert np.abs(weights.mean() - 1) <= 0.001
+
+
+@pytest.mark.parametrize("leaving", [False, True])
+def test_the_score_of_roughness_is_the_derivative_of_the_logarithm(leaving: bool) -> None:
+    prepare_device()
+    import drjit as dr
+    import mitsuba as mi
+
+    from services.transport.boundary.rough import Rough
+
+    count, step, rng = 4096, 0.004, mi.PCG32(size=4096, initstate=3)
+    below = mi.warp.square_to_uniform_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    light = mi.warp.square_to_uniform_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    omega, normal = below if leaving else -below, mi.Vector3f(0, 0, 1)
+    value, score = Rough(1.63, 0.3, compensated=False).towards(omega, normal, light)
+    up, down = (
+        np.array(Rough(1.63, 0.3 + h, compensated=False).towards(omega, normal, light)[0]) for h in (step, -step)
+    )
+    seen = np.array(value + dr.zeros(mi.Float, count)) > 1e-3
+    assert seen.sum() > count / 10
+    slope = (up[seen] - down[seen]) / (2 * step * np.array(value)[seen])
+    # Third derivatives times the step squared, and roundings of 1e-7 over the step; scores reach 20.
+    np.testing.assert_allclose(np.array(score)[seen], slope, rtol=5e-3, atol=5e-3)
+
+
+def test_the_score_of_the_compensation_is_its_derivative() -> None:
+    step = 0.05
+    _, scores = albedo_tables(0.3, 1.63)
+    above, below = (np.log(albedo_tables(0.3 * np.exp(sign * step), 1.63)[0]) for sign in (1, -1))
+    # From the dense side the critical angle leaves an error of 1e-3 in a table's values, which is divided by the step.
+    np.testing.assert_allclose(scores, (above - below) / (2 * step), atol=0.02)
+    np.testing.assert_allclose(scores[0], (above - below)[0] / (2 * step), atol=1e-3)
+
+
+@pytest.mark.parametrize("leaving", [False, True])
+def test_facets_lose_as_much_light_as_those_of_stock_mitsuba(leaving: bool) -> None:
+    prepare_device()
+    import drjit as dr
+    import mitsuba as mi
+
+    from services.transport.boundary.rough import Rough
+
+    # Diffuse light from one side; stock Mitsuba's weight is what one scattering leaves of it.
+    count, rng, mode = 2**18, mi.PCG32(size=2**18, initstate=7), mi.TransportMode.Importance
+    arriving = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.wi = mi.Vector3f(arriving.x, arriving.y, -arriving.z if leaving else arriving.z)
+    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    _, weight = mi.load_dict(Rough.mitsuba(1.63, roughness=0.3)).sample(mi.BSDFContext(mode), si, u, v)
+    left = np.array(weight).reshape(-1)
+    cosines = np.linspace(0, 1, ANGLES) ** 2
+    table = np.trapezoid(2 * cosines * albedo_tables(0.3, 1.63)[0][int(leaving)], cosines)
+    # Some 0.958 and 0.823; the rule of trapezia over this table errs by 1e-5.
+    assert abs(left.mean() - table) < 4 * left.std() / np.sqrt(count) + 1e-4
 
 
 def test_images_are_those_of_stock_mitsuba() -> None:
@@ -85,3 +143,76 @@ def test_gradients_that_need_straight_light_are_refused() -> None:
         engine.stain_gradient(TISSUE, view(), np.zeros((2, 64)), seed=1, samples=16)
     with pytest.raises(InputError, match="boundary = rough has not the gradient to the dentin's shape"):
         engine.shape_gradient(TISSUE, view(), np.zeros((2, 64)), seed=1, samples=16)
+
+
+def test_white_walks_carry_all_their_weight_out_of_a_closed_surface() -> None:
+    prepare_device()
+    import mitsuba as mi
+
+    from services.transport.boundary.models import mesh_boundary
+    from services.transport.paths.scores import Plan
+    from services.transport.paths.starts import CameraStart
+    from services.transport.paths.tally import Tally
+    from services.transport.paths.walk import Walk
+    from services.transport.paths.walker import Flight, Walker
+    from services.transport.scene.media import Media
+    from services.transport.scene.mesh_geometry import MeshGeometry
+
+    class Furnace(Walk):
+        """Walks that count their weight where they leave for good: a furnace as seen by the camera."""
+
+        def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
+            self.tally = tally
+            return super()._step(walker, tally, limit)
+
+        def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
+            gone = walker.active & ~flight.scatters & ~flight.meets
+            self.tally.add(walker.lane, mi.UInt32(0), self._throughput(walker), gone)
+            return super()._end(walker, flight)
+
+    white = Media([Medium(1.0, 1.0, g1=0.5)])
+    geometry = MeshGeometry(scene_recipe(0.15, 1.63))
+    start = CameraStart(whole_view(camera_at((0.2, 1, 0.1), size=16, span_mm=2.0)), 4, seed=7, radius_mm=2.0)
+    boundary = mesh_boundary("rough", 1.63, roughness=0.15)
+    sums, _ = Furnace(geometry, white, None, start, Plan(), boundary).run(256).arrays()
+    lanes = sums[:, 0] / 256
+    error = lanes.std(ddof=1) / np.sqrt(len(lanes))
+    assert error <= 1e-3
+    # Without compensation it is 0.85.
+    assert abs(lanes.mean() - 1) <= 0.003 + 2 * error
+
+
+@pytest.mark.dear("Differences need many paths, five seeds of them.")
+def test_derivatives_are_differences_of_images() -> None:
+    medium, seeds, paths = Medium(2.0, 0.97, g1=0.4), range(1, 6), 2048
+    tissue, scene = Tissue(medium, medium), replace(scene_recipe(0.3, 1.5), multiple_scattering=True)
+    engine = Engine(scene, 2)
+    steps = {"enamel.sigma": 0.25, "enamel.alpha": 0.01, "enamel.g1": 0.1, "roughness": 0.04}
+
+    def totals(engine: Engine, tissue: Tissue) -> NDArray[np.float64]:
+        return np.stack([engine.images(tissue, view(), seed=seed, samples=paths).mean.sum(axis=1) for seed in seeds])
+
+    scores = np.stack(
+        [engine.jacobian(tissue, view(), tuple(steps), seed=seed, samples=paths).jacobian.sum(axis=2) for seed in seeds]
+    )
+    z, found = [], {}
+    for number, (name, step) in enumerate(steps.items()):
+        sides = []
+        for change in (step, -step):
+            if name == "roughness":
+                sides.append(totals(Engine(replace(scene, roughness=0.3 + change), 2), tissue))
+            else:
+                field = name.removeprefix("enamel.")
+                moved = replace(medium, **{field: getattr(medium, field) + change})
+                sides.append(totals(engine, Tissue(moved, moved)))
+        # Both sides have the same random numbers, and so has the score.
+        deviation = (sides[0] - sides[1]) / (2 * step) - scores[:, number]
+        error = deviation.std(axis=0, ddof=1) / np.sqrt(len(seeds))
+        z.append(student_to_normal(deviation.mean(axis=0) / error, np.full(2, len(seeds) - 1.0)))
+        found[name] = np.abs(scores[:, number].mean(axis=0)) / error
+    # Of 8 values one exceeds 4 by chance once in 2,000 runs.
+    assert np.abs(z).max() < 4
+    # A score of another sign, or of half the size, would be seen.
+    assert found["enamel.alpha"].min() > 10
+    assert found["enamel.sigma"].max() > 5
+    assert found["roughness"].max() > 2

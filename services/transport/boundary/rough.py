@@ -16,7 +16,7 @@ import numpy as np
 
 from services.transport.boundary.model import Meeting
 from services.transport.optics import fresnel, ggx
-from services.transport.optics.ggx_albedo import ANGLES, albedo_table, score_table
+from services.transport.optics.ggx_albedo import ANGLES, albedo_tables
 from services.transport.scene.geometry import Geometry, Hit
 
 MIN_COSINE = 1e-6
@@ -37,7 +37,7 @@ class Rough:
         self.compensated = compensated
         if compensated:
             self._albedos, self._scores = (
-                mi.Float(table(roughness, ior).reshape(-1).astype(np.float32)) for table in (albedo_table, score_table)
+                mi.Float(table.reshape(-1).astype(np.float32)) for table in albedo_tables(roughness, ior)
             )
             dr.eval(self._albedos, self._scores)
 

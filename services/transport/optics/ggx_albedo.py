@@ -17,24 +17,19 @@ Array = NDArray[np.float64]
 ANGLES = 128
 """Number of cosines of a table, the squares of equal steps from 0 to 1, because the albedo bends most where light
 grazes; between them it is interpolated linearly."""
-RADII, AZIMUTHS = 64, 48
+RADII, AZIMUTHS = 96, 64
 """Number of Gauss nodes over the visible facets."""
 MIN_COSINE = 1e-5
 """Cosine that stands for 0, where the albedo has its limit."""
-STEP = 0.02
-"""Half step of ln roughness for the tables' derivative."""
 
 
 @cache
-def albedo_table(roughness: float, ior: float) -> Array:
-    """Albedos (2, ANGLES) of light that arrives from the thin and from the dense side, by its cosine."""
-    return np.stack([_albedo(roughness, eta) for eta in (ior, 1 / ior)])
-
-
-def score_table(roughness: float, ior: float) -> Array:
-    """D ln albedo / d ln roughness, in the same form."""
-    above, below = (np.log(albedo_table(roughness * np.exp(sign * STEP), ior)) for sign in (1, -1))
-    return np.asarray((above - below) / (2 * STEP))
+def albedo_tables(roughness: float, ior: float) -> tuple[Array, Array]:
+    """Albedos (2, ANGLES) of light that arrives from the thin and from the dense side, by its cosine, and the
+    derivatives d ln albedo / d ln roughness.
+    """
+    thin, dense = _albedo(roughness, ior), _albedo(roughness, 1 / ior)
+    return np.stack([thin[0], dense[0]]), np.stack([thin[1], dense[1]])
 
 
 def fresnel_reflectance(cosine: Array, eta: float) -> Array:
@@ -45,8 +40,10 @@ def fresnel_reflectance(cosine: Array, eta: float) -> Array:
     return np.where(q2 > 0, 0.5 * (s**2 + p**2), 1.0)
 
 
-def _albedo(roughness: float, eta: float) -> Array:
-    """Mean of Smith's G1 of the outgoing direction over the visible facets, reflected and refracted."""
+def _albedo(roughness: float, eta: float) -> tuple[Array, Array]:
+    """Mean of Smith's G1 of the outgoing direction over the visible facets, reflected and refracted; and its
+    logarithmic derivative, which is the mean of the scores of all three factors that depend on the roughness.
+    """
     cosine = np.maximum(np.linspace(0, 1, ANGLES) ** 2, MIN_COSINE)[:, None, None]
     sine = np.sqrt(1 - cosine**2)
     nodes, weights = np.polynomial.legendre.leggauss(RADII)
@@ -65,17 +62,30 @@ def _albedo(roughness: float, eta: float) -> Array:
     normal_y = z * stretched_y - y * stretched_z
     normal_z = np.maximum(z * stretched_z + y * stretched_y, 1e-6)
     scale = np.sqrt((roughness * x) ** 2 + (roughness * normal_y) ** 2 + normal_z**2)
-    facet_y, facet_z = roughness * normal_y / scale, normal_z / scale
+    facet_x, facet_y, facet_z = roughness * x / scale, roughness * normal_y / scale, normal_z / scale
 
     arriving = np.clip(facet_y * sine + facet_z * cosine, 0, 1)
     mirrored = fresnel_reflectance(arriving, eta)
     refracted = np.sqrt(np.maximum(1 - (1 - arriving**2) / eta**2, 0))
     back = 2 * arriving * facet_z - cosine
     through = -(facet_z * (arriving / eta - refracted) - cosine / eta)
-    total = mirrored * _visible_share(back, roughness) + (1 - mirrored) * _visible_share(through, roughness)
-    return np.asarray((weight * total).sum(axis=(1, 2)))
+    of_distribution = 2 - 4 * (roughness * facet_z) ** 2 / ((roughness * facet_z) ** 2 + facet_x**2 + facet_y**2)
+    score = of_distribution + _score_of_visible_share(cosine, roughness)
+    total, slope = np.zeros(ANGLES), np.zeros(ANGLES)
+    for share, away in ((mirrored, back), (1 - mirrored, through)):
+        lobe = weight * share * _visible_share(away, roughness)
+        total += lobe.sum(axis=(1, 2))
+        slope += (lobe * (score + _score_of_visible_share(np.clip(away, 0, 1), roughness))).sum(axis=(1, 2))
+    return total, slope / total
 
 
 def _visible_share(cosine: Array, roughness: float) -> Array:
     clipped = np.clip(cosine, 0, 1)
     return np.where(cosine > 0, 2 * clipped / (clipped + np.sqrt(clipped**2 + roughness**2 * (1 - clipped**2))), 0)
+
+
+def _score_of_visible_share(cosine: Array, roughness: float) -> Array:
+    """D ln G1 / d ln roughness."""
+    stretched2 = roughness**2 * (1 - cosine**2)
+    length = np.sqrt(cosine**2 + stretched2)
+    return np.asarray(-stretched2 / (length * (cosine + length)))
