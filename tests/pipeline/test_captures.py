@@ -62,8 +62,9 @@ def files_below(data: Path, *folders: str) -> set[Path]:
 def test_a_capture_is_uploaded_committed_and_used_by_a_job(serve: Serve, tmp_path: Path) -> None:
     seen: dict[str, bytes] = {}
 
-    def read_capture(spec: JobSpec, _folder: Path, _events: EventAddress) -> None:
+    def read_capture(spec: JobSpec, folder: Path, _events: EventAddress) -> None:
         assert spec.capture is not None
+        assert (folder / "subject.txt").read_text() == "p-017\n"
         seen.update(contents_of(spec.capture))
 
     client = serve(read_capture)

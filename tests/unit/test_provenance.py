@@ -74,6 +74,7 @@ def test_masks_and_calibrations_are_inputs_and_masks_show_the_person(tmp_path: P
 
 def test_provenance_tells_options_versions_and_seeds_but_no_folder_and_no_name(tmp_path: Path) -> None:
     rig = RigSpec(mouth=Path("/secret/mouth"), dome="10.0.0.7:502", assessment=None)
+    (tmp_path / "subject.txt").write_text("P07\n")
     told = provenance_of(JobSpec(rig=rig, seed=7, boundary="matched"), tmp_path, tmp_path, NOW)
     text = told.model_dump_json()
     assert "/secret" not in text
@@ -83,6 +84,7 @@ def test_provenance_tells_options_versions_and_seeds_but_no_folder_and_no_name(t
     assert told.options["max_steps"] == 12  # also those that were not given
     assert {"dentine", "numerics", "python", "numpy", "mitsuba"} <= told.versions.keys()
     assert told.consent_said == ABSENT
+    assert told.subject == "P07"
     assert options_of(JobSpec(capture=Path("/secret/tooth")))["capture"] == "tooth"
 
 

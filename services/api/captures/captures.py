@@ -243,6 +243,13 @@ class Captures:
             return spec
         return spec.model_copy(update={"capture": self._data / spec.capture})
 
+    def subject_of(self, spec: JobSpec) -> str | None:
+        """Label of the person in a job's uploaded capture; None without one, and of a capture by its path."""
+        path = spec.capture if spec.rig is None else spec.rig.mouth
+        if path is None or path.parent != self._data / FOLDER:
+            return None
+        return self._table.get(path.name).subject
+
     def _file_detail(self, row: FileRow) -> CaptureFile:
         is_known, received = self.uploads.is_known(row), self.uploads.received_bytes(row)
         return CaptureFile(

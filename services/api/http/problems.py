@@ -34,6 +34,7 @@ from services.client.errors import (
     UnknownWebhookError,
 )
 from services.core.errors import (
+    ConsentError,
     DentineError,
     DiskFullError,
     DomeBusyError,
@@ -116,6 +117,7 @@ _STATUS: dict[type[DentineError], int] = {
     BodyTooLargeError: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
     UnauthenticatedError: HTTPStatus.UNAUTHORIZED,
     ScopeError: HTTPStatus.FORBIDDEN,
+    ConsentError: HTTPStatus.FORBIDDEN,
     SetupLinkError: HTTPStatus.FORBIDDEN,
     RateError: HTTPStatus.TOO_MANY_REQUESTS,
     UnknownCaptureError: HTTPStatus.NOT_FOUND,

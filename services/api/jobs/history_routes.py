@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
 
+from services.api.auth.departures import Use, require_departure, said_use
 from services.api.auth.scopes import needs
 from services.api.http.artifacts import ANSWERS, artifact_response, list_artifacts, open_artifact
 from services.api.http.json_responses import JSON, in_json
@@ -101,10 +102,13 @@ def build_observe_router(jobs: Jobs, database_pool: ThreadPool, file_pool: Threa
         tags=["artifacts"],
         dependencies=[needs("read", audited=True)],
     )
-    def archive(job_id: str) -> Response:
-        """All artifacts as one zip file, made while it is sent."""
+    def archive(job_id: str, request: Request, use: Annotated[Use, Query(alias="for")] = None) -> Response:
+        """All artifacts as one zip file, made while it is sent. It is refused where the person's consent has ended or
+        does not list its use.
+        """
         job = jobs.repository.get(job_id)
         root = jobs.present_folder(job.id)
+        require_departure(root, "", said_use(request, use))
         names = [artifact.path for artifact in list_artifacts(root)]
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.zip"', "Cache-Control": "no-store"}
         return StreamingResponse(stream_zip(root, names), headers=headers, media_type="application/zip")
@@ -117,12 +121,14 @@ def build_observe_router(jobs: Jobs, database_pool: ThreadPool, file_pool: Threa
         dependencies=[needs("read", audited=True)],
     )
     @file_pool.wrap_handler
-    def parameters(job_id: str) -> Response:
+    def parameters(job_id: str, request: Request, use: Annotated[Use, Query(alias="for")] = None) -> Response:
         """What the job has measured, for a spreadsheet: a row per channel and parameter with value, standard error and
-        unit.
+        unit. It is refused where the person's consent has ended or does not list its use.
         """
         job = jobs.repository.get(job_id)
-        table = parameter_table(job.id, open_artifact(jobs.present_folder(job.id), PARAMETERS))
+        folder = jobs.present_folder(job.id)
+        require_departure(folder, PARAMETERS, said_use(request, use))
+        table = parameter_table(job.id, open_artifact(folder, PARAMETERS))
         headers = {"Content-Disposition": f'attachment; filename="dentine-{job.id}.csv"', "Cache-Control": "no-store"}
         return Response(table, headers=headers, media_type="text/csv")
 

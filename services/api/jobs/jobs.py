@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from services.api.auth.departures import departures
 from services.api.calibrations.calibrations import Calibrations, is_stored
 from services.api.captures.captures import Captures, is_uploaded
 from services.api.captures.reading import SubprocessReader
@@ -33,10 +34,11 @@ from services.core.light.flash_record import used_in
 from services.core.light.safety import FlashAcknowledgement
 from services.core.masks import is_stale
 from services.core.owners import LOCAL_VIEWER, Viewer
+from services.core.provenance.record import SUBJECT_FILE
 from services.core.records import JobSpec
 from services.core.settings import ServerSettings
 from services.core.stage import StageName
-from services.core.store import is_published
+from services.core.store import is_published, write_atomic
 from services.pipeline.event_log import EventAddress
 from services.pipeline.machine_class import machine_class
 from services.pipeline.stages import stages_of
@@ -92,6 +94,8 @@ class Jobs:
 
         def run_within_limits(spec: JobSpec, folder: Path, events: EventAddress) -> object:
             self._stores.require(spec)
+            if (subject := self.captures.subject_of(spec)) is not None:
+                write_atomic(folder / SUBJECT_FILE, f"{subject}\n".encode())
             return run(self._light_limits.lowered(spec), folder, events)
 
         self._runner = Runner(
@@ -254,7 +258,8 @@ class Jobs:
                 return self.repository.deletion(job_id)  # a round of the runner has finished this deletion
             erased = erase(self.folder(job_id))
             self._opened.require_present()  # no receipt for files that were moved away meanwhile
-            receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest)
+            exports = departures(self.repository.engine, job_id)  # now that nothing more can leave
+            receipt = self.repository.forget(job_id, erased.files, erased.bytes, erased.digest, exports)
             forget_listing(self.folder(job_id))
             return receipt
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 from pydantic import Field
 
+from services.api.auth.departures import Departure
 from services.api.jobs.server_paths import without_folders
 from services.api.tables.lifecycle import JobState
 from services.core.errors import DentineError
@@ -78,6 +81,19 @@ class Deletion(Record):
     digest: str = Field(
         description="SHA-256 over the removed files' paths, sizes and SHA-256, to compare with a copy made before"
     )
+    exports: tuple[Departure, ...] = Field(
+        default=(), description="what had left the server before, by the audit log; such copies are not removed"
+    )
+
+    def as_row(self) -> dict[str, Any]:
+        """Columns of the table of receipts."""
+        return self.model_dump() | {"exports": json.dumps([one.model_dump() for one in self.exports])}
+
+    @classmethod
+    def of_row(cls, row: Mapping[Any, Any]) -> Self:
+        """The receipt of a row; those of earlier versions name no exports."""
+        columns = {name: row[name] for name in cls.model_fields}
+        return cls.model_validate(columns | {"exports": json.loads(row["exports"] or "[]")})
 
 
 @dataclass(frozen=True)

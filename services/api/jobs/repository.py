@@ -15,6 +15,7 @@ from typing import Any
 
 import sqlalchemy as sql
 
+from services.api.auth.departures import Departure
 from services.api.jobs.past_runs import PastRuns, past_run_table
 from services.api.jobs.records import Creation, Deletion, Failure, Job, Lease
 from services.api.jobs.verdicts import Verdicts
@@ -272,8 +273,8 @@ class Repository:
                 self._apply(connection, job_id, Trigger.LOSE)
         return ids
 
-    def forget(self, job_id: str, files: int, size: int, digest: str) -> Deletion:
-        """Delete the rows of a job whose files are gone, and store a receipt.
+    def forget(self, job_id: str, files: int, size: int, digest: str, exports: tuple[Departure, ...] = ()) -> Deletion:
+        """Delete the rows of a job whose files are gone, and store a receipt, which names the exports that left.
 
         Raises:
             UnknownJobError: there is no such job. JobStateError: it is not being deleted.
@@ -283,10 +284,9 @@ class Repository:
             if job.state is not JobState.DELETING:
                 raise JobStateError(f"Job {job_id} is {job.state}; delete it first.")
             collect_changes(connection, self._clock())  # before the events are deleted with the job
-            receipt = Deletion(
-                job=job_id, deleted_s=self._clock(), submitted_s=job.created_s, files=files, bytes=size, digest=digest
-            )
-            connection.execute(deletion_table.insert().values(receipt.model_dump() | {"owner": job.owner}))
+            times = {"deleted_s": self._clock(), "submitted_s": job.created_s}
+            receipt = Deletion(job=job_id, files=files, bytes=size, digest=digest, exports=exports, **times)
+            connection.execute(deletion_table.insert().values(receipt.as_row() | {"owner": job.owner}))
             for column in (event_table.c.job, lease_table.c.job, past_run_table.c.job, job_table.c.id):
                 connection.execute(column.table.delete().where(column == job_id))
             return receipt
@@ -303,7 +303,7 @@ class Repository:
             )
         if row is None:
             raise unknown_deletion(job_id)
-        return Deletion(**{name: row[name] for name in Deletion.model_fields})
+        return Deletion.of_row(row)
 
     def ended_before(self, time_s: float) -> list[str]:
         """Return the ids of the jobs that ended before a time and of those whose deletion was begun, in the order of

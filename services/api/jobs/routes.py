@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import Field, StringConstraints
 
+from services.api.auth.departures import Use, require_departure, said_use
 from services.api.auth.scopes import CurrentViewer, needs, require
 from services.api.auth.tokens import Scope
 from services.api.http.artifacts import ANSWERS, Artifact, artifact_response, list_artifacts, open_artifact
@@ -284,9 +285,13 @@ def build_router(
         dependencies=[needs("read", audited=True)],
     )
     @file_pool.wrap_handler
-    def artifact(job_id: str, path: str, request: Request) -> Response:
-        """One file; takes Range and If-None-Match."""
-        return artifact_response(request, open_artifact(jobs.present_folder(jobs.repository.get(job_id).id), path))
+    def artifact(job_id: str, path: str, request: Request, use: Annotated[Use, Query(alias="for")] = None) -> Response:
+        """One file; takes Range and If-None-Match. A result is refused where the person's consent has ended or does not
+        list its use.
+        """
+        folder = jobs.present_folder(jobs.repository.get(job_id).id)
+        require_departure(folder, path, said_use(request, use))
+        return artifact_response(request, open_artifact(folder, path))
 
     @router.get("/options", response_model=dict[str, Any], tags=["options"], dependencies=[needs("read")])
     async def options() -> Response:

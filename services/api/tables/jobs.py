@@ -43,6 +43,7 @@ deletion_table = sql.Table(
     sql.Column("files", sql.Integer, nullable=False),
     sql.Column("bytes", sql.BigInteger, nullable=False),
     sql.Column("digest", sql.Text, nullable=False),
+    sql.Column("exports", sql.Text),
     sql.Column("owner", sql.Text, nullable=False, server_default=DEFAULT_GROUP),
 )
 

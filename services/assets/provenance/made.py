@@ -11,7 +11,7 @@ from typing import Any
 
 from services.core.consent import ABSENT
 from services.core.provenance.inputs import recorded_inputs, stated_by
-from services.core.provenance.record import Provenance
+from services.core.provenance.record import SUBJECT_FILE, Provenance
 from services.core.records import JobSpec
 from services.transport.numerics import numerics_name
 from services.transport.platform import import_renderer
@@ -52,7 +52,7 @@ def provenance_of(spec: JobSpec, job: Path, prepared: Path, now: datetime) -> Pr
     return Provenance(
         made=now.astimezone(UTC).isoformat(timespec="seconds"),
         job=job.resolve().name,
-        subject=None if stated is None else stated.subject,
+        subject=(None if stated is None else stated.subject) or _uploaded_subject(job),
         source=spec.capture.name if spec.capture is not None else "rig",
         versions=versions(),
         platform=machine(),
@@ -87,6 +87,11 @@ def options_of(spec: JobSpec) -> dict[str, Any]:
     if spec.rig is not None:
         told["rig"] = spec.rig.model_dump(mode="json", exclude={"mouth", "dome", "assessment", "flashes"})
     return told
+
+
+def _uploaded_subject(job: Path) -> str | None:
+    file = job / SUBJECT_FILE
+    return file.read_text(encoding="utf-8").strip() if file.is_file() else None
 
 
 def _version(package: str) -> str:

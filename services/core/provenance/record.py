@@ -15,6 +15,10 @@ INPUTS = "inputs.json"
 """Name of the file in the folder of a preparation."""
 
 
+SUBJECT_FILE = "subject.txt"
+"""Name of the file in a job's folder with the label of the person that an upload gave."""
+
+
 class InputFile(Record):
     """One file that a result was made from."""
 
