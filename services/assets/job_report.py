@@ -13,7 +13,9 @@ from services.core.provenance.record import Provenance
 from services.core.records import JobSpec
 
 if TYPE_CHECKING:
+    from services.assets.appearance.sections import Appearance
     from services.assets.fitted_job import FittedJob
+    from services.assets.report_page import ReportPictures
 
 
 def write_job_report(
@@ -26,6 +28,7 @@ def write_job_report(
         provenance: what the asset comes from; None of an asset that an earlier version wrote.
         with_photographs: whether photographs, and pictures from which one could be computed, are shown.
     """
+    from services.assets.appearance.sections import appearance_sections
     from services.assets.fit_pictures import report_pictures
     from services.assets.report_page import write_report
     from services.transport.thickness import fitted_thickness
@@ -46,9 +49,46 @@ def write_job_report(
         "ior": spec.ior,
         "provenance": facts_of(spec, provenance),
     }
+    facts["appearance"] = appearance_sections(_appearance(job, asset, pictures), with_photographs=with_photographs)
     if with_photographs and (asset / BESIDE_PHOTOGRAPH).is_file():
         facts["lead"] = f"data:image/png;base64,{base64.b64encode((asset / BESIDE_PHOTOGRAPH).read_bytes()).decode()}"
     write_report(path, job.report, pictures, history, facts, with_photographs=with_photographs)
+
+
+def _appearance(job: FittedJob, asset: Path, pictures: ReportPictures) -> Appearance:
+    """Colours of a job with red, green and blue; empty of any other."""
+    import numpy as np
+
+    from services.assets.appearance.differences import colour_difference
+    from services.assets.appearance.sections import Appearance
+    from services.assets.appearance.shade import read_shade
+    from services.assets.appearance.translucency import translucencies
+    from services.assets.appearance.white import camera_white, diffuser_radiance
+
+    whites = {camera.name: camera_white(asset, camera.name) for camera in job.prepared.cameras}
+    first = whites[job.prepared.cameras[0].name]
+    if first is None:
+        return Appearance()
+    vertices = np.concatenate([tooth.outer.vertices_mm for tooth in job.teeth])
+    x, y, z = ((vertices.min(axis=0) + vertices.max(axis=0)) / 2).tolist()
+    index = [job.prepared.channels.index(channel) for channel in job.channels]
+    radiance = {
+        light.name: np.broadcast_to(diffuser_radiance(light, (x, y, z)), len(job.prepared.channels))[index]
+        for light in job.prepared.lights
+    }
+    compared = [
+        colour_difference(picture, radiance[picture.light], white)
+        for picture in sorted(pictures.pictures, key=lambda p: (p.camera, p.held_out))
+        if (white := whites.get(picture.camera)) is not None
+    ]
+    tables = {fdi: tooth.parameters for fdi, tooth in job.report.teeth.items()} or {"": job.report.parameters}
+    layers = [
+        (fdi, one)
+        for fdi, table in tables.items()
+        for one in translucencies(table, job.spec.boundary, job.spec.ior, first)
+    ]
+    found = [one for one in compared if one is not None]
+    return Appearance(first.source, found, layers, read_shade(asset.parent, asset))
 
 
 def facts_of(spec: JobSpec, provenance: Provenance | None) -> Mapping[str, str]:

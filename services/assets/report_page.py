@@ -99,8 +99,8 @@ def write_report(
         pictures: the pictures to show.
         history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``,
             ``stage`` and ``channel``.
-        context: ``title``, ``boundary``, ``ior``, ``lead`` (address of the picture to begin with) and ``provenance``
-            (a dict of label -> text); all optional.
+        context: ``title``, ``boundary``, ``ior``, ``lead`` (address of the picture to begin with) ``provenance``
+            (a dict of label -> text) and ``appearance`` (see ``appearance_sections``); all optional.
         with_photographs: whether photographs and residuals are shown beside the renders.
     """
     verdict = verdict_of(report)
@@ -146,6 +146,7 @@ def write_report(
         stains=_stains(pictures),
         caveat=THIN_CAVEAT if boundary == "thin" else "",
         provenance=_provenance(boundary, context),
+        appearance=context.get("appearance"),
     )
     write_atomic(path, page.encode())
 

@@ -69,6 +69,7 @@ def build_app() -> typer.Typer:
     from services.cli.run import run
     from services.cli.secrets import build_secrets_app
     from services.cli.serve import serve
+    from services.cli.shade import shade
     from services.cli.slab import simulate_slab_command
     from services.cli.sphere import sphere_command
     from services.cli.token import build_token_app
@@ -83,7 +84,8 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_root)
-    local = serve, dome_sim, capture, run, options, export, verify, reproduce, landmarks, register, phantom, bench
+    of_assets = export, shade, verify, reproduce
+    local = serve, dome_sim, capture, run, options, *of_assets, landmarks, register, phantom, bench
     kept = keep_calibration, calibrations
     for command in (*local, upload, submit, watch, jobs, cancel, retry, delete, download, demo, *kept):
         app.command()(command)

@@ -62,7 +62,7 @@ def fit_once(root: Path, engine: str, **options: Any) -> None:
 
 
 def answer(root: Path) -> dict[str, Any]:
-    return open_stage(root, "fit", FitReport)[1].model_dump(exclude={"seconds"})
+    return open_stage(root, "fit", FitReport)[1].model_dump(exclude={"seconds", "seconds_by_purpose"})
 
 
 def trace(root: Path) -> list[dict[str, Any]]:

@@ -150,7 +150,8 @@ def test_white_walks_carry_all_their_weight_out_of_a_closed_surface() -> None:
     import mitsuba as mi
 
     from services.transport.boundary.models import mesh_boundary
-    from services.transport.paths.scores import Plan
+    from services.transport.paths.rows import Rows
+from services.transport.paths.scores import Plan
     from services.transport.paths.starts import CameraStart
     from services.transport.paths.tally import Tally
     from services.transport.paths.walk import Walk
@@ -161,13 +162,13 @@ def test_white_walks_carry_all_their_weight_out_of_a_closed_surface() -> None:
     class Furnace(Walk):
         """Walks that count their weight where they leave for good: a furnace as seen by the camera."""
 
-        def _step(self, walker: Walker, tally: Tally, limit: mi.UInt32) -> Walker:
+        def _step(self, walker: Walker, tally: Tally, rows: Rows) -> Walker:
             self.tally = tally
-            return super()._step(walker, tally, limit)
+            return super()._step(walker, tally, rows)
 
         def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
             gone = walker.active & ~flight.scatters & ~flight.meets
-            self.tally.add(walker.lane, mi.UInt32(0), self._throughput(walker), gone)
+            self.tally.add(walker.row, mi.UInt32(0), self._throughput(walker), gone)
             return super()._end(walker, flight)
 
     white = Media([Medium(1.0, 1.0, g1=0.5)])

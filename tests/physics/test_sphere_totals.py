@@ -12,7 +12,7 @@ from services.slab.cell.interface import Interface
 from services.slab.sphere.invert import interface_of
 from services.slab.sphere.records import Sphere, SphereFile, TotalsReading
 from services.slab.sphere.spectrometer import expected
-from services.slab.sphere.totals import Optics, Totals, slab_totals
+from services.transport.optics.slab_totals import Optics, Totals, slab_totals
 from tests.support.slab_tables import total_cases
 
 GLASS = Cell(width_mm=1, index=1.34, glass=Glass(index=1.5, thickness_mm=1))

@@ -42,7 +42,7 @@ def fit(root: Path, attempt: int = 1, events: list[StageEvent] | None = None, **
 
 
 def without_time(report: FitReport) -> dict[str, Any]:
-    return report.model_dump(exclude={"seconds"})
+    return report.model_dump(exclude={"seconds", "seconds_by_purpose"})
 
 
 @pytest.fixture(scope="module")
@@ -182,16 +182,17 @@ def test_dentin_of_every_tooth_that_is_seen_is_fitted(tmp_path: Path) -> None:
     }  # fmt: skip
     write_prepared_jaw(tmp_path, FAKE, (11, 12, 21), hidden=(21,), shape=truth, noise=0.003, samples=20_000)
     report = fit(tmp_path, **options)
+    # Sixty pixels determine a weight to 0.2 to 0.5, and the weak prior halves that. So all six together are required to
+    # be nearer to the truth than at the start.
+    found = np.array([report.teeth[fdi].shape for fdi in ("11", "12")])
+    assert np.sqrt(((found - truth) ** 2).mean()) < 0.75 * np.sqrt(((SHAPE[0] - np.array(truth)) ** 2).mean()), found
     for fdi in ("11", "12"):
         tooth = report.teeth[fdi]
-        for k, (found, true) in enumerate(zip(tooth.shape, truth, strict=True)):
-            # Sixty pixels determine a weight to 0.2 to 0.5, and the weak prior halves that. The test requires that the
-            # weight is nearer to the truth than at the start.
-            assert abs(found - true) < 0.75 * abs(SHAPE[0] - true), (fdi, tooth.shape)
+        for k, (weight, true) in enumerate(zip(tooth.shape, truth, strict=True)):
             estimate = tooth.parameters["green"][f"shape.{k}"]
-            assert estimate.value == found
+            assert estimate.value == weight
             assert estimate.se is not None
-            assert abs(found - true) < 4.5 * estimate.se
+            assert abs(weight - true) < 4.5 * estimate.se
         assert tooth.enamel_thickness is not None
         assert tooth.enamel_thickness.se is not None
     # The hidden tooth keeps the initial shape, and its thickness is unknown.

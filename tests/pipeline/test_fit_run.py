@@ -40,7 +40,7 @@ def fit(root: Path, attempt: int = 1, events: list[StageEvent] | None = None, **
 
 
 def without_time(report: FitReport) -> dict[str, Any]:
-    return report.model_dump(exclude={"seconds"})
+    return report.model_dump(exclude={"seconds", "seconds_by_purpose"})
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from services.slab.sphere.invert import ASSUMED_SE, ASSUMED_UNSCATTERED_SHARE, f
 from services.slab.sphere.records import SphereFile
 from services.slab.sphere.results import SphereFit
 from services.slab.sphere.spectrometer import expected
-from services.slab.sphere.totals import NODES, Optics, slab_totals
+from services.transport.optics.slab_totals import NODES, Optics, slab_totals
 
 WIDTH_MM = 2.0
 TRUTH_SHARE = 2e-3

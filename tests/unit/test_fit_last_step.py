@@ -34,7 +34,9 @@ class FakeModel:
 
 @dataclass
 class FakeProblem:
-    """Compares the loss: the whole step gives ``change`` ± 359; the parabola begins with ``slope``."""
+    """Compares the loss: the whole step gives ``change`` ± 359; the parabola begins with ``slope``. What a quarter of
+    the paths does not accept is compared again with all of them.
+    """
 
     change: float
     slope: float = -2000.0
@@ -65,7 +67,7 @@ def test_a_step_that_is_contradicted_is_tried_at_the_parabolas_least() -> None:
     # lowest at 2000 / 4600, with -435 ± 156 where -681 ± 91 was promised.
     problem = FakeProblem(300.0)
     assert taken(problem, part_count=14) == pytest.approx(2000 / 4600)
-    assert len(problem.asked) == FINAL_TRIALS
+    assert len(set(problem.asked)) == FINAL_TRIALS
 
 
 def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
@@ -73,14 +75,14 @@ def test_a_step_that_is_worse_at_any_length_is_refused() -> None:
     # errors.
     problem = FakeProblem(1100.0, slope=2400.0)
     assert taken(problem, part_count=14) == 0
-    assert len(problem.asked) == FINAL_TRIALS
+    assert len(set(problem.asked)) == FINAL_TRIALS
 
 
 @pytest.mark.parametrize("change", [50_000.0, 1e12])
 def test_a_step_is_shortened_to_a_tenth_at_most(change: float) -> None:
     problem = FakeProblem(change)
     taken(problem, part_count=1)
-    assert problem.asked == pytest.approx([1, FINAL_MIN_SHARE])
+    assert list(dict.fromkeys(problem.asked)) == pytest.approx([1, FINAL_MIN_SHARE])
 
 
 def test_a_step_that_promises_nothing_is_not_compared() -> None:

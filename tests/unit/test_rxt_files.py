@@ -11,7 +11,7 @@ from services.slab.sphere.invert import fit_readings
 from services.slab.sphere.readings import read_readings
 from services.slab.sphere.records import SphereFile, TotalsReading
 from services.slab.sphere.spectrometer import expected
-from services.slab.sphere.totals import Totals
+from services.transport.optics.slab_totals import Totals
 from tests.support.shared_data import shared_path
 
 SPHERE = "203.2 25.4 12.7 1 0.96"

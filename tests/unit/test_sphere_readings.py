@@ -17,8 +17,8 @@ from services.slab.sphere.readings import read_readings
 from services.slab.sphere.records import SphereFile
 from services.slab.sphere.results import SphereQuantity
 from services.slab.sphere.spectrometer import expected
-from services.slab.sphere.totals import Optics, slab_totals
 from services.slab.sphere.translucency import lab_of, over_backing, translucency_of
+from services.transport.optics.slab_totals import Optics, slab_totals
 from tests.support.shared_data import shared_path
 
 RXT = """IAD1

@@ -17,7 +17,7 @@ from services.core.verdict import NOT_CONVERGED_STATUS
 from services.slab.sphere.invert import fit_readings, interface_of
 from services.slab.sphere.records import SphereFile
 from services.slab.sphere.spectrometer import expected
-from services.slab.sphere.totals import Optics, slab_totals
+from services.transport.optics.slab_totals import Optics, slab_totals
 from tests.support.drawn_slabs import Drawn, drawn, is_at_truth, is_determined, outcome, random_slab
 
 THICK = [(1.234, 42.7, 0.9405, 0.594), (1.039, 40.1, 0.9469, 0.613), (1.128, 12.6, 0.9127, 0.264)]

@@ -14,7 +14,7 @@ from PIL import Image
 from services.anatomy.templates.incisor import build_incisor
 from services.assets.content import read_content
 from services.assets.exporters import export_to
-from services.assets.stage import fitted_dentins
+from services.assets.fitted_job import fitted_dentins
 from services.assets.textures.job import bake_textures
 from services.assets.textures.texels import texels_of
 from services.assets.textures.thickness import thicknesses

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.appearance import LOST, Appearance, appearance
 from services.assets.content import AssetContent, AssetPart
+from services.assets.surface_material import LOST, Appearance, appearance
 from services.assets.textures.files import base_colour_file
 from services.core.store import write_atomic
 

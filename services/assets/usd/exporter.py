@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from services.assets.appearance import LOST, Appearance, appearance, open_pbr_inputs
 from services.assets.content import AssetContent, AssetPart
+from services.assets.surface_material import LOST, Appearance, appearance, open_pbr_inputs
 from services.assets.usd.materialx import document
 from services.assets.usd.text import INDENT, array, number, prim, quoted, vector
 from services.core.store import write_atomic

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from xml.etree import ElementTree
 
-from services.assets.appearance import Appearance, open_pbr_inputs
+from services.assets.surface_material import Appearance, open_pbr_inputs
 from services.assets.usd.text import number
 
 VERSION = "1.39"

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.calibrate.colour.cie import D50, delta_e_2000, lab_from_xyz
 from services.core.calibration.colours import root_terms
+from services.core.colour.cie import D50, delta_e_2000, lab_from_xyz
 from services.core.errors import CaptureInputError
 
 Floats = NDArray[np.float64]

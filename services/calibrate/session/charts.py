@@ -16,9 +16,9 @@ from services.calibrate.colour.chart import (
     patch_means,
     read_reference,
 )
-from services.calibrate.colour.cie import delta_e_2000, lab_from_xyz
 from services.calibrate.colour.transform import ColourFit, fit_colour, least_squares_matrix
 from services.calibrate.session.photos import Channels, Photos, to_eight_bit
+from services.core.colour.cie import delta_e_2000, lab_from_xyz
 from services.core.errors import CaptureInputError
 from services.core.raw.records import RawFrame
 

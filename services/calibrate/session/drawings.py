@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.calibrate.cameras.bundle import BundleFit
 from services.calibrate.cameras.projection import image_grid, projection_sigma
-from services.calibrate.colour.cie import D50
+from services.core.colour.cie import D50
 
 Floats = NDArray[np.float64]
 WIDTH = 360.0

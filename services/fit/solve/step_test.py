@@ -29,11 +29,6 @@ class StepTest:
     significance_z: float = SIGNIFICANCE_Z
 
     @property
-    def is_decided(self) -> bool:
-        """Whether more paths would not be needed to judge the step."""
-        return self.is_worse or self.is_contradicted or self.is_better(self.significance_z)
-
-    @property
     def is_worse(self) -> bool:
         """Whether the comparison is significantly worse."""
         return self.change > self.significance_z * self.change_se
@@ -59,10 +54,10 @@ def judged(
     model: tuple[float, float],
     significance_z: float = SIGNIFICANCE_Z,
 ) -> StepTest:
-    """Judge a step by a comparison with a quarter of the paths, and where that does not decide by one with all of them.
+    """Judge a step by a comparison with a quarter of the paths, and where that is not clearly better by one with all.
 
-    The second is used alone: the noise of a product of two renders falls faster than the number of paths grows, so the
-    first would add nothing.
+    The first only accepts a step: with few paths its noise has long tails, which would refuse good ones. The second is
+    used alone, because the noise of a product of two renders falls faster than the number of paths grows.
 
     Args:
         compare: compares the data's loss at both ends with so many paths per pixel, as the trial of this number.
@@ -80,7 +75,7 @@ def judged(
         if not math.isfinite(found.change) or not math.isfinite(found.variance):
             raise NonFiniteError("The loss of a step is not finite; check the capture for invalid radiance.")
         test = StepTest(found.change + prior_change, found.se, *model, significance_z)
-        if test.is_decided:
+        if test.is_better(significance_z):
             break
     return test
 

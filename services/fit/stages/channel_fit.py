@@ -250,7 +250,9 @@ class Stages(ABC, Generic[Optics]):
         )
         problem, solution, equations, known = self._with_uncertainty(problem, solution, samples)
         for stage in REPEAT_STAGES:
-            needed = samples if not known.is_full_step else self._samples_needed(known, samples)
+            needed = samples
+            if known.is_full_step and self.has_usual_precision:
+                needed = samples_needed(known, samples, self.options(self.files.full).max_samples)
             if known.is_full_step and needed == samples:
                 break
             # The move is too long for one linear model, or renders blur the result: fit once more from its end.
@@ -276,18 +278,20 @@ class Stages(ABC, Generic[Optics]):
             samples,
         )
 
+    @property
+    def has_usual_precision(self) -> bool:
+        """Whether the paths of a single tooth may be those that its standard errors need. A job that asks for more, and
+        one without errors of the instrument, takes as many as noise requires from the first exact stage on.
+        """
+        usual = float(JobSpec.model_fields["image_tolerance"].default)
+        return bool(self.files.errors.names) and self.part_count == 1 and self.spec.image_tolerance >= usual
+
     def exact_options(self, samples: int) -> Options:
-        """Solver limits of the first exact stage. Where the instrument has errors, the paths stay as they are: what of
-        the standard errors more of them would take away is only known from the final uncertainty estimate.
+        """Solver limits of the first exact stage. Its paths stay as they are where the final uncertainty estimate tells
+        how many are needed.
         """
         options = self.options(self.files.full)
-        return replace(options, max_samples=min(samples, options.max_samples)) if self.files.errors.names else options
-
-    def _samples_needed(self, known: Uncertainty, samples: int) -> int:
-        # A jaw, and an instrument without errors, had all paths in the exact stage already.
-        if not known.domain.errors.names or self.part_count > 1:
-            return samples
-        return samples_needed(known, samples, self.options(self.files.full).max_samples)
+        return replace(options, max_samples=min(samples, options.max_samples)) if self.has_usual_precision else options
 
     def _with_uncertainty(
         self, problem: StackProblem[Optics], solution: Solution, samples: int

@@ -40,7 +40,7 @@ from services.slab.sphere.search import (
     thick_reflectance,
 )
 from services.slab.sphere.spectrometer import Readings, expected
-from services.slab.sphere.totals import NODES, Optics, Totals
+from services.transport.optics.slab_totals import NODES, Optics, Totals
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from scipy.ndimage import minimum_filter
 from scipy.optimize import brentq, least_squares
 
 from services.slab.cell.interface import Interface
-from services.slab.sphere.totals import Optics, Totals, slab_totals
+from services.transport.optics.slab_totals import Optics, Totals, slab_totals
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 
 from services.slab.sphere.records import Sphere, SphereFile, TotalsReading
-from services.slab.sphere.totals import Totals
+from services.transport.optics.slab_totals import Totals
 
 
 @dataclass(frozen=True)

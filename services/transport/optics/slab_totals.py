@@ -19,12 +19,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 from numpy.typing import NDArray
-
-from services.slab.cell.interface import Interface
 
 Array = NDArray[np.float64]
 
@@ -39,6 +38,27 @@ WHITE_RATE = 1e-22
 may make its square negative."""
 MIN_DEPTH = 1e-12
 """Half the optical thickness below which a slab counts as clear."""
+
+
+class Interface(Protocol):
+    """What lies between the medium of a slab and the outside."""
+
+    def __hash__(self) -> int:
+        """Equal interfaces share a quadrature."""
+
+    @property
+    def index(self) -> float:
+        """Index of refraction of the medium."""
+
+    @property
+    def index_outside(self) -> float:
+        """Index of refraction outside."""
+
+    def inside_sine(self, angle_deg: float) -> float:
+        """Sine of the angle in the medium of light at ``angle_deg`` outside, signed."""
+
+    def transmittance(self, inside_sine: float) -> float:
+        """Share of light that passes, the same in both directions."""
 
 
 @dataclass(frozen=True)

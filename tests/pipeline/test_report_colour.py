@@ -1,0 +1,103 @@
+"""The report of a job in red, green and blue shows colour differences, translucency and shade; the command
+that computes the shade writes it anew.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from services.assets.appearance.shade import NOT_FOR, read_shade
+from services.assets.content import RGB
+from services.assets.photograph_free import export_without_photographs
+from services.assets.stage import export
+from services.cli.app import build_app
+from services.core.errors import CaptureInputError
+from services.core.records import JobSpec
+from services.core.stage import LocalContext
+from services.core.store import write_record
+from services.fit.stage import run as fit
+from tests.support.prepared import FAKE, write_prepared
+
+OPTIONS: dict[str, Any] = {
+    "boundary": "matched", "dentin": "known", "samples_per_pixel": 16, "max_samples_per_pixel": 16, "max_steps": 1,
+    "search_candidates": 200, "instrument": "off", "advise": False,
+}  # fmt: skip
+GUIDE = "tab,geometry,L,a,b,se\nlight,45/0,90,0,5,0.3\ndark,45/0,40,2,9,0.3\n"
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("colour")
+    write_prepared(root, channels=RGB)
+    spec = JobSpec(capture=root, **OPTIONS)
+    write_record(root / "job.json", spec)
+    fit(spec, LocalContext(root), engine=FAKE)
+    export(spec, LocalContext(root))
+    return root
+
+
+def test_differences_and_translucency_are_shown(job: Path) -> None:
+    page = (job / "report.html").read_text()
+    assert "<h2>Colour differences ΔE00</h2>" in page
+    assert "0.8 is just seen and 1.8 accepted by half of observers" in page
+    assert page.count('alt="Colour difference, camera') == page.count('alt="photo, camera') > 1
+    medians = [float(found) for found in re.findall(r"median ([0-9.]+), 95 % below", page)]
+    assert min(medians) > 0.5  # noise of one per cent alone gives as much
+    (told,) = re.findall(r"median over these pictures ([0-9.]+)[.]", page)
+    assert float(told) == pytest.approx(np.median(medians), abs=0.1)
+    rows = re.findall(r'<th scope="row"> (enamel|dentin)</th><td>([0-9.]+) <span class="pm">± ([0-9.]+)</span>', page)
+    assert [tissue for tissue, _, _ in rows] == ["enamel", "dentin"]
+    assert all(0 < float(value) < 100 and float(se) > 0 for _, value, se in rows)
+    assert "<h2>Shade</h2>" not in page
+    assert "red, green and blue are taken for linear sRGB" in page
+
+
+def test_without_photographs_no_difference_from_one_is_shown(job: Path) -> None:
+    page = (export_without_photographs(job) / "report.html").read_text()
+    assert "<h2>Colour differences ΔE00</h2>" not in page
+    assert "<h2>Translucency</h2>" in page
+
+
+def test_the_shades_command_writes_the_report_again(job: Path, tmp_path: Path) -> None:
+    guide = tmp_path / "own.csv"
+    guide.write_text(GUIDE)
+    done = CliRunner().invoke(build_app(), ["shade", str(job), str(guide)])
+    assert done.exit_code == 0, done.output
+    assert done.output.startswith("tooth 11: ΔE00 ")
+    assert "(45/0, D65)" in done.output
+    assert NOT_FOR in done.output
+    page = (job / "report.html").read_text()
+    assert "<h2>Shade</h2>" in page
+    assert NOT_FOR in page
+    assert "guide own under D65" in page
+    shade = read_shade(job, job / "asset")
+    assert shade is not None
+    (tooth,) = shade.teeth
+    assert {one.tab for one in tooth.tabs} == {"light", "dark"}
+    assert all(one.se > 0 for one in tooth.tabs)
+
+
+def test_a_shade_of_an_earlier_fit_is_not_shown(job: Path, tmp_path: Path) -> None:
+    guide = tmp_path / "own.csv"
+    guide.write_text(GUIDE)
+    assert CliRunner().invoke(build_app(), ["shade", str(job), str(guide)]).exit_code == 0
+    told = json.loads((job / "shade.json").read_text())
+    (job / "shade.json").write_text(json.dumps(told | {"parameters_sha256": "0" * 64}))
+    assert read_shade(job, job / "asset") is None
+
+
+def test_a_guide_with_a_missing_tab_is_refused_and_nothing_is_written(job: Path, tmp_path: Path) -> None:
+    guide = tmp_path / "own.csv"
+    guide.write_text(GUIDE.replace("40,2,9", ",,"))
+    before = (job / "report.html").read_bytes()
+    done = CliRunner().invoke(build_app(), ["shade", str(job), str(guide)])
+    assert isinstance(done.exception, CaptureInputError)
+    assert "misses tab dark: it has no value of L" in done.exception.message
+    assert (job / "report.html").read_bytes() == before
