@@ -151,7 +151,7 @@ def test_white_walks_carry_all_their_weight_out_of_a_closed_surface() -> None:
 
     from services.transport.boundary.models import mesh_boundary
     from services.transport.paths.rows import Rows
-from services.transport.paths.scores import Plan
+    from services.transport.paths.scores import Plan
     from services.transport.paths.starts import CameraStart
     from services.transport.paths.tally import Tally
     from services.transport.paths.walk import Walk

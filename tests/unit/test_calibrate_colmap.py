@@ -198,3 +198,61 @@ def test_lights_have_an_intensity_for_each_channel(tmp_path: Path) -> None:
     (tmp_path / "lights.csv").write_text("name,x,y,z,intensity_red,intensity_blue\nL1,1,2,3,4,5\n")
     (light,) = read_lights(tmp_path / "lights.csv", ["blue", "red"], 10.0)
     assert (light.position_mm, light.intensity) == ((10.0, 20.0, 30.0), (5.0, 4.0))
+
+
+def model_of(folder: Path, cameras: tuple[Any, ...], mm_per_unit: float) -> None:
+    """A COLMAP model of cameras of a rig: image ``NAME.png`` of each, and three points about the subject."""
+    pycolmap = pytest.importorskip("pycolmap", reason=NOT_INSTALLED)
+    model = pycolmap.Reconstruction()
+    for number, camera in enumerate(cameras, start=1):
+        K, pose = np.array(camera.K), np.array(camera.camera_from_world)
+        params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *(camera.distortion or (0.0,) * 4)[:4]]
+        width, height = camera.size
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="OPENCV", width=width, height=height, params=params, camera_id=number)
+        )
+        image = pycolmap.Image(name=f"{camera.name}.png", camera_id=number, image_id=number)
+        world = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3] / mm_per_unit)
+        model.add_image_with_trivial_frame(image, world)
+    for point in ((0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 10.0, 0.0)):
+        model.add_point3D(np.array(point) / mm_per_unit, pycolmap.Track(), np.zeros(3, np.uint8))
+    folder.mkdir(parents=True)
+    model.write_binary(str(folder))
+
+
+def test_a_mirror_sphere_shows_the_lights_of_a_model(tmp_path: Path) -> None:
+    from services.phantom.lab.rig import RigSize, true_rig
+    from services.phantom.lab.sensor import Sensor
+    from services.phantom.lab.session import write_session
+
+    pytest.importorskip("pycolmap", reason=NOT_INSTALLED)
+    sensor = Sensor(mosaic="none")
+    rig = true_rig(RigSize((640, 480), 0.13, 2, 4), sensor.black, 1)
+    write_session(tmp_path / "raw", rig, sensor, 1, n_boards=1, n_mirror=2, n_white=1)
+    model_of(tmp_path / "sparse", rig.cameras, 25.0)
+    given = ("colmap", "sparse", "--out", "calibration.json", "--scale", "25", "--raw", "raw")
+    ran = dentine(*given, folder=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    record = read_record(tmp_path / "calibration.json", Calibration)
+    assert [camera.name for camera in record.cameras] == [camera.name for camera in rig.cameras]
+    assert all(camera.radiance_per_count is not None for camera in record.cameras)
+    assert record.uncertainty is not None
+    truth = {light.name: light for light in rig.lights}
+    names, matrix = list(record.uncertainty.names), record.uncertainty.matrix
+    off = []
+    for light in record.lights:
+        own = [names.index(f"light.{light.name}.{axis}") for axis in "xyz"]
+        error = np.array(light.position_mm) - truth[light.name].position_mm
+        off.append(np.linalg.solve(np.linalg.cholesky(matrix[np.ix_(own, own)]), error))
+    # Twelve values: a rms of whitened errors beyond 1.7 has a chance below 0.1 %.
+    assert np.sqrt(np.mean(np.square(off))) < 1.7
+    # The photographs' noise and the lights' places leave about 1 % of the relative intensities open.
+    found = np.array([light.intensity for light in record.lights])
+    expected = np.array([truth[light.name].intensity for light in record.lights])
+    np.testing.assert_allclose(found / found.mean(axis=0), expected / expected.mean(axis=0), rtol=0.05)
+
+
+def test_lights_are_told_in_one_way(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse")
+    ran = dentine("colmap", "sparse", "--out", "calibration.json", "--scale", "1", folder=tmp_path)
+    assert (ran.returncode, "by either --lights or --raw" in ran.stderr) == (2, True)

@@ -91,6 +91,19 @@ class ColmapModel:
             )
         return known.distance_mm / distance
 
+    @property
+    def distance(self) -> float:
+        """Median distance between the model's points and the centres of its images, in its unit.
+
+        Raises:
+            CaptureInputError: the model has no points.
+        """
+        points = np.array([point.xyz for point in self._model.points3D.values()]).reshape(-1, 3)
+        if len(points) == 0:
+            raise CaptureInputError(f"The model in {self.folder} has no 3D points; export it with points3D.")
+        centres = np.array([self._place(image) for image in self.images])
+        return float(np.median(np.linalg.norm(points[None] - centres[:, None], axis=-1)))
+
     def camera(self, image: str, name: str, mm_per_unit: float) -> CalibratedCamera:
         """The camera that took an image, with the pose that it had then.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from services.calibrate.photogrammetry.colmap import ColmapModel, KnownDistance, named_images
 from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight
 from services.core.calibration.record import Calibration, require_consistent
+from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.errors import CaptureInputError
 
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -49,11 +50,13 @@ def calibration_of(
     lights: Sequence[CalibratedLight],
     channels: Sequence[str],
     others: Sequence[Path] = (),
+    uncertainty: CalibrationUncertainty | None = None,
 ) -> Calibration:
     """The calibration of cameras and lights.
 
     Args:
         others: files that it was made from besides the model.
+        uncertainty: of the lights; None where it was not measured.
 
     Raises:
         CaptureInputError: they contradict each other, or a length or an intensity is impossible.
@@ -64,6 +67,7 @@ def calibration_of(
         channels=tuple(channels),
         cameras=tuple(cameras),
         lights=tuple(lights),
+        uncertainty=uncertainty,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
         inputs={path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files},
     )
@@ -73,6 +77,6 @@ def calibration_of(
 
 def with_scale_of_counts(
     cameras: Sequence[CalibratedCamera], per_count: float, channels: int
-) -> list[CalibratedCamera]:
+) -> tuple[CalibratedCamera, ...]:
     """The cameras with the radiance of one count, at 1 s and gain 1, in the unit of the lights' intensities per mm²."""
-    return [camera.model_copy(update={"radiance_per_count": (per_count,) * channels}) for camera in cameras]
+    return tuple(camera.model_copy(update={"radiance_per_count": (per_count,) * channels}) for camera in cameras)

@@ -46,7 +46,7 @@ def record_of(
         units="mm",
         channels=folder.channels,
         cameras=tuple(
-            _camera(
+            camera_record(
                 name,
                 camera,
                 black[name],
@@ -56,7 +56,7 @@ def record_of(
             for number, (name, camera) in enumerate(zip(cameras.names, posed_cameras, strict=True))
         ),
         lights=tuple(
-            _light(folder.light[number].name, where, number, intensity, len(folder.channels), positions)
+            light_record(folder.light[number].name, where, number, intensity, len(folder.channels), positions)
             for number, where in positions.items()
         ),
         uncertainty=uncertainty_of(folder, cameras, lights, intensity),
@@ -113,14 +113,15 @@ def twist_derivative(pose: Floats) -> Floats:
 
 
 def uncertainty_of(
-    folder: RawFolder, cameras: CamerasStep, lights: LightsStep | None, intensity: IntensityStep | None
+    folder: RawFolder, cameras: CamerasStep | None, lights: LightsStep | None, intensity: IntensityStep | None
 ) -> CalibrationUncertainty:
     """Return the joint covariance of cameras, lights and intensities; errors of the cameras are propagated to the
-    lights, and errors of the lights to the intensities.
+    lights, and errors of the lights to the intensities. Without ``cameras`` theirs count as exact.
     """
-    posed_cameras = cameras.posed_cameras if lights is None else lights.fit.cameras
-    names, rows = _camera_rows(cameras.names, posed_cameras)
-    covariance = cameras.camera_covariance
+    names, rows, covariance = list[str](), np.zeros((0, 0)), np.zeros((0, 0))
+    if cameras is not None:
+        names, rows = _camera_rows(cameras.names, cameras.posed_cameras if lights is None else lights.fit.cameras)
+        covariance = cameras.camera_covariance
     first = 0
     if lights is not None:
         covariance, count = lights.fit.covariance, 3 * len(lights.fit.lights)
@@ -180,9 +181,10 @@ def _camera_rows(names: Sequence[str], posed_cameras: Sequence[PosedCamera]) -> 
     return error_names, np.concatenate(blocks)
 
 
-def _camera(
+def camera_record(
     name: str, camera: PosedCamera, black: Black, vignetting: tuple[float, float, float] | None, scale: Floats | None
 ) -> CalibratedCamera:
+    """Return the record of a camera; ``scale`` is its radiance per count, by channel."""
     return CalibratedCamera.model_validate(
         {
             "name": name,
@@ -198,7 +200,7 @@ def _camera(
     )
 
 
-def _light(
+def light_record(
     name: str,
     where: Floats,
     number: int,

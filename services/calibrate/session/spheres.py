@@ -78,14 +78,14 @@ class IntensityStep:
 
 
 def find_lights(
-    photos: Photos, cameras: Sequence[PosedCamera], covariance: Floats, distance_mm: float
+    photos: Photos, cameras: Sequence[PosedCamera], covariance: Floats | None, distance_mm: float
 ) -> LightsStep | None:
     """Find the positions of the lights from the folder's mirror spheres; None without any.
 
     Args:
         photos: the folder's frames.
         cameras: the calibrated cameras.
-        covariance: covariance (C, C) of the lens values and pose of each camera in turn.
+        covariance: covariance (C, C) of the lens values and pose of each camera in turn; None for exact cameras.
         distance_mm: approximate distance of the spheres from the cameras.
 
     Raises:
@@ -127,7 +127,7 @@ def place_lights(
     view_names: Sequence[str],
     cameras: Sequence[PosedCamera],
     light_names: Sequence[str],
-    covariance: Floats,
+    covariance: Floats | None,
     listed_mm: Floats,
     missed: tuple[str, ...] = (),
 ) -> LightsStep:
@@ -138,7 +138,7 @@ def place_lights(
         view_names: names of the views, for messages.
         cameras: the calibrated cameras.
         light_names: names of the lights.
-        covariance: covariance (C, C) of the lens values and pose of each camera in turn.
+        covariance: covariance (C, C) of the lens values and pose of each camera in turn; None for exact cameras.
         listed_mm: positions that raw.toml lists (L, 3), NaN where it lists none.
         missed: files in which no highlight was found.
 
