@@ -47,7 +47,8 @@ from services.assets.mitsuba.scene_xml import SceneParameter, write_scene
 from services.assets.stains import write_textures
 from services.core.errors import InputError
 from services.core.files.meshes import write_mapped_mesh, write_mesh
-from services.core.geometry import Camera, Light, Mesh, Tooth, Vector3, teeth_folder
+from services.core.geometry import Camera, Light, Mesh, Tooth, Vector3, inner_file, teeth_folder
+from services.core.object_words import PARTS
 from services.core.records import Boundary
 from services.core.results import Estimate, FitReport
 from services.core.store import write_atomic
@@ -93,13 +94,14 @@ def write_asset(
     files = {}
     for tooth in teeth:
         place = teeth_folder(Path(), tooth.fdi)
-        files[str(tooth.fdi)] = (place / "outer.ply", place / "dentin.ply" if tooth.dentin is not None else None)
+        inner = place / inner_file(tooth.fdi)
+        files[str(tooth.fdi)] = (place / "outer.ply", inner if tooth.dentin is not None else None)
         if stains is None:
             write_mesh(folder / place / "outer.ply", tooth.outer)
         else:
             write_mapped_mesh(folder / place / "outer.ply", tooth.outer, stains.corners_uv)
         if tooth.dentin is not None:
-            write_mesh(folder / place / "dentin.ply", tooth.dentin)
+            write_mesh(folder / inner, tooth.dentin)
     for name, mesh in (("gums.ply", gums), ("cavity.ply", cavity)):
         if mesh is not None:
             write_mesh(folder / name, mesh)
@@ -189,8 +191,9 @@ def write_shell_scene(path: Path, scenes: dict[str, SceneDict]) -> str:
 
 
 def tissue_of(table: dict[str, Estimate]) -> Tissue:
-    """Tissue of a table of estimates; a part that was not modelled is an empty medium."""
-    return Tissue(_medium_of(table, "enamel"), _medium_of(table, "dentin"))
+    """Tissue of a table of estimates, of a tooth or an object; a part that was not modelled is an empty medium."""
+    outer, inner = PARTS.values() if any(name.startswith("body.") for name in table) else PARTS
+    return Tissue(_medium_of(table, outer), _medium_of(table, inner))
 
 
 def mouth_of(report: FitReport, channel: str) -> Mouth:

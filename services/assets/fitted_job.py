@@ -74,7 +74,7 @@ def fitted_dentins(
     prepared_folder: Path, prepared: PreparedManifest, spec: JobSpec, report: FitReport
 ) -> list[tuple[Tooth, DentinShape | None, tuple[float, ...]]]:
     """Each tooth as it was prepared, its dentin as it was modelled, and the fitted weights of its blend modes."""
-    from services.anatomy.job_dentin import dentin_shape, jaw_dentins
+    from services.anatomy.job_dentin import dentin_shape, jaw_dentins, known_dentins
     from services.core.files.meshes import read_teeth
 
     teeth = read_teeth(prepared_folder, prepared.fdi)
@@ -86,6 +86,8 @@ def fitted_dentins(
         ]
         return [(tooth, dentin, shape) for tooth, dentin, (shape, _) in zip(teeth, dentins, shapes, strict=True)]
     (tooth,) = teeth
+    if spec.kind == "object":
+        return [(tooth, known_dentins(teeth)[0], ())]
     return [(tooth, dentin_shape(tooth, prepared.cameras, spec), report.shape)]
 
 

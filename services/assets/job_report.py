@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from services.assets.provenance.departing import BESIDE_PHOTOGRAPH
+from services.core.choices import chosen
 from services.core.provenance.record import Provenance
 from services.core.records import JobSpec
 
@@ -43,8 +44,9 @@ def write_job_report(
         job.folder, job.channels, job.teeth[0] if is_tooth else None, prepared.cameras, thickness, job.stains
     )
     history = json.loads((job.folder / "history.json").read_text())
+    titles = {"tooth": f"Tooth {job.teeth[0].fdi}", "jaw": f"Jaw of {len(job.teeth)} teeth", "object": "Object"}
     facts: dict[str, Any] = {
-        "title": f"Tooth {job.teeth[0].fdi}" if is_tooth else f"Jaw of {len(job.teeth)} teeth",
+        "title": chosen("Kind of fit", spec.kind, titles),
         "boundary": spec.boundary,
         "ior": spec.ior,
         "provenance": facts_of(spec, provenance),

@@ -37,6 +37,8 @@ from services.transport.thickness import ThicknessMap
 PART_LABELS = {
     "enamel": "Enamel",
     "dentin": "Dentin",
+    "body": "Body",
+    "core": "Core",
     "shape": "Dentin shape",
     "gums": "Gums",
     "cavity": "Wall of the mouth",

@@ -30,6 +30,15 @@ def phantom(
     jaw: Annotated[
         bool, typer.Option("--jaw", help="A whole upper jaw with gums and the mouth's wall instead of one tooth.")
     ] = False,
+    shape: Annotated[
+        str | None,
+        typer.Option(
+            "--object",
+            metavar="SHAPE",
+            help="An object that is no tooth: sphere, cube, or the file of a closed surface.",
+        ),
+    ] = None,
+    core: Annotated[Path | None, typer.Option(help="Surface of the object's core, of another medium.")] = None,
     subject: Annotated[
         int | None, typer.Option(min=0, help="Whose jaw: a number draws shapes and optics; default: the average.")
     ] = None,
@@ -74,6 +83,11 @@ def phantom(
     of_jaw = {"--scan": scan is not None, "--lips": lips}
     of_tooth = {"--outer": outer is not None, "--dentin": dentin is not None, "--fdi": fdi is not None}
     of_tooth |= {"--highlights": highlights, "--gums": gums, "--stains": stains}
+    if shape is None and core is not None:
+        raise InputError("Option --core is for an object; add --object.")
+    of_teeth = {"--jaw": jaw, "--subject": subject is not None}
+    if shape is not None and (other := next((o for o, given in (of_teeth | of_jaw | of_tooth).items() if given), None)):
+        raise InputError(f"Option {other} is for teeth; leave out either it or --object.")
     for option, given in (of_tooth if jaw else of_jaw).items():
         if given:
             raise InputError(
@@ -92,7 +106,11 @@ def phantom(
     rig |= {"boundary": boundary.value, "renderer": renderer.value} | (
         {} if pixel_mm is None else {"pixel_mm": pixel_mm}
     )
-    if jaw:
+    if shape is not None:
+        from services.phantom.object import write_object_phantom
+
+        write_object_phantom(out, shape=shape, core=core, **rig)
+    elif jaw:
         from services.phantom.jaw import write_jaw_phantom
 
         write_jaw_phantom(out, subject=subject, scan=scan, lips=lips, **rig)

@@ -185,9 +185,15 @@ class Mesh:
             raise MeshError(f"Mesh {name} is inside out (negative volume); flip its face orientation.")
 
 
+OBJECT = 0
+"""Number, in place of an FDI number, of an object that is no tooth: its body stands for enamel, its core for dentin."""
+
+
 @dataclass(frozen=True)
 class Tooth:
-    """One tooth by FDI number: the enamel's outer surface, and the dentin's where it is known."""
+    """One tooth by FDI number: the enamel's outer surface, and the dentin's where it is known. Or, under the number
+    ``OBJECT``, any object: its outer surface, and that of its core where it has one.
+    """
 
     fdi: int
     outer: Mesh
@@ -195,5 +201,12 @@ class Tooth:
 
 
 def teeth_folder(root: Path, fdi: int) -> Path:
-    """Folder of one tooth's meshes in a capture or prepared folder: ``teeth/<FDI>/outer.ply`` and ``dentin.ply``."""
-    return root / "teeth" / str(fdi)
+    """Folder of one tooth's meshes in a capture or prepared folder: ``teeth/<FDI>/outer.ply`` and ``dentin.ply``, or
+    ``object/outer.ply`` and ``core.ply``.
+    """
+    return root / "object" if fdi == OBJECT else root / "teeth" / str(fdi)
+
+
+def inner_file(fdi: int) -> str:
+    """Name of the file, in that folder, of the surface inside the outer one."""
+    return "core.ply" if fdi == OBJECT else "dentin.ply"

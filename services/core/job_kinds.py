@@ -35,6 +35,8 @@ class JobKind:
     """Options besides the common ones; None for all options that no other kind lists as its own."""
     fixed_options: Mapping[str, Any] = field(default_factory=dict)
     """Options that have only one possible value in this kind's fit, with that value."""
+    lacking_options: frozenset[str] = frozenset()
+    """Options that other kinds share and this one does not have."""
 
     @property
     def has_rig(self) -> bool:
@@ -54,6 +56,8 @@ _SLAB: Mapping[StageName, str] = {"fit": "services.slab.stage:run", "export": "s
 
 SLAB_OPTIONS = frozenset({"effort", "dictionary", "particle_index", "particle_absorption"})
 """Options that only a slab has."""
+OPTIONS_OF_TEETH = frozenset({"fdi", "surroundings", "dentin", "prior", "stains", "rig"})
+"""Options that presume teeth, or a mouth before a dome."""
 _OF_A_JAW: Mapping[str, Any] = {
     "fdi": None,
     "surroundings": "auto",
@@ -71,6 +75,17 @@ JOB_KINDS: Mapping[str, JobKind] = MappingProxyType(
         "tooth": JobKind("one tooth", ("prepare", "fit", "export"), _TEETH, None),
         "jaw": JobKind(
             "all teeth with gums and the wall of the mouth", ("prepare", "fit", "export"), _TEETH, None, _OF_A_JAW
+        ),
+        "object": JobKind(
+            "any closed object, homogeneous or with a known core",
+            ("prepare", "fit", "export"),
+            {
+                "prepare": "services.preprocess.stage:run_object",
+                "fit": "services.fit.stage:run",
+                "export": "services.assets.stage:export",
+            },
+            None,
+            lacking_options=OPTIONS_OF_TEETH,
         ),
         "slab": JobKind("a material in a cell", ("fit", "export"), _SLAB, SLAB_OPTIONS),
         "calibration": JobKind(
@@ -106,4 +121,4 @@ def foreign_options(kind: str, options: frozenset[str]) -> frozenset[str]:
     """Return those of the given options that jobs of this kind do not have."""
     own = job_kinds()[kind].own_options
     others = frozenset().union(*(other.own_options or () for name, other in job_kinds().items() if name != kind))
-    return options - COMMON_OPTIONS - own if own is not None else options & others
+    return options - COMMON_OPTIONS - own if own is not None else options & (others | job_kinds()[kind].lacking_options)

@@ -24,6 +24,7 @@ from services.core.light.safety import (
     DoseOfOneLight,
     FlashAcknowledgement,
 )
+from services.core.object_words import PARTS
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
 
 
@@ -240,7 +241,7 @@ class JobSpec(Record):
             " the tooth's media; auto: where they come from a registered scan"
         ),
     )
-    boundary: Boundary = Field(default="thin", description="model of the enamel surface")
+    boundary: Boundary = Field(default="thin", description="model of the surface of enamel, or of an object")
     ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
     dentin: Literal["known", "fit", "none"] = Field(
         default="fit",
@@ -249,12 +250,14 @@ class JobSpec(Record):
     held: dict[str, float] = Field(
         default={},
         max_length=MAX_HELD,
-        description="parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}",
+        description=(
+            "parameters that are known and not fitted, such as {'enamel.sigma' = 4.5}; of an object, of body and core"
+        ),
     )
     instrument: Literal["on", "off"] = Field(
         default="on",
         description=(
-            "of a tooth or jaw: fit the instrument's errors too (gain, lights, flare), within the calibration's ±"
+            "of all kinds but slab: fit the instrument's errors too (gain, lights, flare), within the calibration's ±"
         ),
     )
     loss: Loss = Field(
@@ -408,10 +411,11 @@ class JobSpec(Record):
             raise ValueError("max_samples_per_pixel must be at least samples_per_pixel")
         for name, value in self.held.items():
             part, _, leaf = name.partition(".")
-            if part not in {"enamel", "dentin"} or leaf not in HELD_RANGES:
+            outer, inner = PARTS.values() if self.kind == "object" else PARTS
+            if part not in {outer, inner} or leaf not in HELD_RANGES:
                 raise ValueError(
-                    f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of enamel and dentin, such as"
-                    " enamel.sigma"
+                    f"held names '{name}'; it can hold {', '.join(HELD_RANGES)} of {outer} and {inner}, such as"
+                    f" {outer}.sigma"
                 )
             low, high = HELD_RANGES[leaf]
             if not low < value < high:

@@ -55,13 +55,18 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     """
     from services.fit.stages.attempt import Attempt
     from services.fit.stages.jaw.driver import JawDriver
+    from services.fit.stages.object_driver import ObjectDriver
     from services.fit.stages.tooth.driver import FitDriver
 
     context.report(StageEvent(stage="fit", kind="started"))
     context.raise_if_cancelled()
     writer = StageWriter(context.root, "fit", context.attempt)
     attempt = Attempt(spec, context, writer, engine)
-    kinds: dict[str, Callable[[Attempt], FitDriver | JawDriver]] = {"tooth": FitDriver, "jaw": JawDriver}
+    kinds: dict[str, Callable[[Attempt], FitDriver | JawDriver | ObjectDriver]] = {
+        "tooth": FitDriver,
+        "jaw": JawDriver,
+        "object": ObjectDriver,
+    }
     driver = chosen("Kind of fit", spec.kind, kinds)(attempt)
     notes = open_stage(context.root, "prepared", PreparedManifest, verify=False)[1].notes
     report = driver.run(time.time())

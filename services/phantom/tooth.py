@@ -14,7 +14,7 @@ from services.anatomy.templates.incisor import build_incisor
 from services.assets.stains import write_textures
 from services.core.errors import InputError
 from services.core.files.meshes import read_mesh, write_mapped_mesh, write_mesh
-from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
+from services.core.geometry import Camera, Light, Mesh, Tooth, inner_file, teeth_folder
 from services.core.records import Boundary
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import (
@@ -106,7 +106,7 @@ def write_phantom(
     tissues = TRUE_TISSUE if subject is None else subject_tissues(subject, names)
     rig_lights = dome_lights(lights, names, seed)
     rig_cameras = dome_cameras(cameras, pixel_mm, (tooth.outer,))
-    _write_meshes(out, tooth, shown_gums)
+    write_meshes(out, tooth, shown_gums)
     painted = painted_stains(tooth.outer, names, seed) if stains else None
     if painted is not None:
         store_stains(out, painted)
@@ -119,7 +119,7 @@ def write_phantom(
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
         stacks = [
-            _render(out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples,
+            render_tooth(out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples,
                     seed + 7919 * number, painted)
             for c, name in enumerate(names)
         ]  # fmt: skip
@@ -173,16 +173,17 @@ def _tooth(outer: Path | None, dentin: Path | None, fdi: int) -> tuple[Tooth, Me
     return Tooth(fdi, Mesh(shell.vertices_mm - centre, shell.faces), core), incisor.gums
 
 
-def _write_meshes(out: Path, tooth: Tooth, gums: Mesh | None) -> None:
+def write_meshes(out: Path, tooth: Tooth, gums: Mesh | None) -> None:
+    """Write the surfaces of a tooth or an object, and of the gums, below a capture's folder."""
     folder = teeth_folder(out, tooth.fdi)
     write_mesh(folder / "outer.ply", tooth.outer)
     if tooth.dentin is not None:
-        write_mesh(folder / "dentin.ply", tooth.dentin)
+        write_mesh(folder / inner_file(tooth.fdi), tooth.dentin)
     if gums is not None:
         write_mesh(out / "gums.ply", gums)
 
 
-def _render(
+def render_tooth(
     out: Path,
     tooth: Tooth,
     camera: Camera,
@@ -207,7 +208,7 @@ def _render(
             shell = folder / "stained.ply"
             write_mapped_mesh(shell, tooth.outer, painted.corners_uv)
             stain_textures = {str(tooth.fdi): tuple(write_textures(folder, painted).values())[channel]}
-        files = {str(tooth.fdi): (shell, folder / "dentin.ply" if tooth.dentin is not None else None)}
+        files = {str(tooth.fdi): (shell, folder / inner_file(tooth.fdi) if tooth.dentin is not None else None)}
         scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0, stains=stain_textures)
         return render_mitsuba(scene, lights, channel, samples, seed)
     from services.transport.engine import Engine

@@ -10,6 +10,7 @@ import numpy as np
 from services.core.calibration.record import Calibration, lit_at, published_capture, recalibrated
 from services.core.calibration.state import broken_limits, require_within_limits, warning_of_age
 from services.core.files.meshes import read_teeth
+from services.core.geometry import OBJECT
 from services.core.raw.folder import is_raw_folder
 from services.core.raw.registration import teeth_root
 from services.core.records import JobSpec
@@ -77,7 +78,8 @@ def _calibrated(
     if broken := broken_limits(calibration):
         source.notes += (f"Calibration {name} was accepted beyond its limits: {broken[0]}.",)
     if any(light.lobe is not None for light in calibration.lights):
-        vertices = np.concatenate([tooth.outer.vertices_mm for tooth in read_teeth(source.root)])
+        numbers = (OBJECT,) if spec.kind == "object" else None
+        vertices = np.concatenate([tooth.outer.vertices_mm for tooth in read_teeth(source.root, numbers)])
         x, y, z = (float(one) for one in vertices.mean(axis=0))
         source.description = lit_at(source.description, (x, y, z))
     return source

@@ -63,7 +63,9 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
             f"Option 'channels' names {min(unknown)}, but the capture has {', '.join(channels)}; correct it."
         )
     masks = HandMasks(context.root, source.description)
-    subject = read_subject(source.root, spec.kind == "jaw", spec.fdi, spec.surroundings)
+    subject = read_subject(
+        source.root, spec.kind == "jaw", spec.fdi, spec.surroundings, is_object=spec.kind == "object"
+    )
     require_plausible_scale(cameras, source.description.lights, subject.teeth)
     if subject.note is not None:
         context.report(StageEvent(stage="prepare", kind="log", message=subject.note))
@@ -118,3 +120,18 @@ def run(spec: JobSpec, context: StageContext) -> PreparedManifest:
     files.end()
     progress.finish()
     return manifest
+
+
+def run_object(spec: JobSpec, context: StageContext) -> PreparedManifest:
+    """As ``run``, of an object that is no tooth; what is wrong with its capture is said of an object.
+
+    Raises:
+        As ``run``.
+    """
+    from services.core.errors import CaptureInputError, MeshError
+    from services.core.object_words import of_an_object
+
+    try:
+        return run(spec, context)
+    except (CaptureInputError, MeshError) as problem:
+        raise type(problem)(of_an_object(problem.message)) from problem

@@ -65,7 +65,7 @@ def test_without_its_package_the_kind_is_refused_with_those_that_there_are(tmp_p
     command = [sys.executable, "-m", "services", "run", str(job_file(tmp_path)), "--out", str(tmp_path / "out")]
     answer = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert answer.returncode != 0
-    assert "there is no kind of job 'weight'; the kinds are tooth, jaw, slab, calibration" in answer.stderr
+    assert "there is no kind of job 'weight'; the kinds are tooth, jaw, object, slab, calibration" in answer.stderr
 
 
 def test_an_option_of_another_kind_is_refused(tmp_path: Path, environment: dict[str, str]) -> None:

@@ -286,7 +286,7 @@ def test_a_slab_goes_through_no_capture_and_no_preparation(spec: JobSpec) -> Non
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"kind": "slap"}, "there is no kind of job 'slap'; the kinds are tooth, jaw, slab"),
+        ({"kind": "slap"}, "there is no kind of job 'slap'; the kinds are tooth, jaw, object, slab"),
         (
             {"kind": "slab", "dentin": "none"},
             "a job of kind slab has no option 'dentin'; it has capture, dictionary, effort",

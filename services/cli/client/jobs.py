@@ -24,7 +24,9 @@ def jobs(
     state: Annotated[
         list[str] | None, typer.Option(help="Only jobs in this state, such as failed; may be given several times.")
     ] = None,
-    kind: Annotated[str | None, typer.Option(help="Only jobs of this kind: tooth, jaw, slab or calibration.")] = None,
+    kind: Annotated[
+        str | None, typer.Option(help="Only jobs of this kind: tooth, jaw, object, slab or calibration.")
+    ] = None,
     capture: Annotated[
         str | None, typer.Option(help="Only jobs with this text in the path of their capture or rig's mouth.")
     ] = None,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError, MeshError
 from services.core.files.surface_files import read_surface, require_file, require_triangles
-from services.core.geometry import Mesh, Tooth, teeth_folder
+from services.core.geometry import OBJECT, Mesh, Tooth, inner_file, teeth_folder
 
 FDI_NUMBERS = frozenset(
     10 * quadrant + place for quadrant in range(1, 9) for place in range(1, 9 if quadrant < 5 else 6)
@@ -20,6 +20,8 @@ FDI_NUMBERS = frozenset(
 """FDI numbers of all teeth: permanent teeth in quadrants 1 to 4, milk teeth in 5 to 8."""
 TOOTH_EXTENT_MM = (2.0, 45.0)
 """Smallest and largest extent of a tooth, mm; the longest tooth ever measured has 37 mm."""
+OBJECT_EXTENT_MM = (0.5, 1000.0)
+"""Smallest and largest extent of an object that is no tooth, mm: beyond, single precision or a rig's cameras end."""
 MIN_SPACING_MM = 2.0
 """Smallest distance between the centres of two teeth, mm; the narrowest teeth, lower incisors, stand 5 mm apart."""
 
@@ -103,14 +105,15 @@ def read_teeth(root: Path, fdi: tuple[int, ...] | None = None, *, verify: bool =
     """Read and check every tooth below ``root/teeth``.
 
     Args:
-        fdi: numbers of the teeth to read; None for all.
+        fdi: numbers of the teeth to read, or ``OBJECT`` alone; None for all teeth.
         verify: whether the surfaces are checked, which takes longer than to read them.
 
     Raises:
         CaptureInputError: no tooth is there. MeshError: a surface cannot bound a medium.
     """
     numbers = fdi_numbers(root) if fdi is None else fdi
-    if unknown := next((number for number in numbers if number not in FDI_NUMBERS), None):
+    known = FDI_NUMBERS if fdi is None else FDI_NUMBERS | {OBJECT}
+    if (unknown := next((number for number in numbers if number not in known), None)) is not None:
         what = f"{root / 'teeth' / str(unknown)} is of tooth {unknown}, which is no FDI number"
         raise CaptureInputError(
             f"{what}; permanent teeth are 11 to 18, 21 to 28, 31 to 38 and 41 to 48, milk teeth 51 to 55 and so on"
@@ -120,14 +123,15 @@ def read_teeth(root: Path, fdi: tuple[int, ...] | None = None, *, verify: bool =
         raise CaptureInputError(f"No tooth mesh below {root / 'teeth'}; put teeth/<FDI>/outer.ply there.")
     teeth = []
     for number in numbers:
-        folder = teeth_folder(root, number)
-        outer = read_mesh(folder / "outer.ply")
+        outer_name, inner_name = (teeth_folder(Path(), number) / name for name in ("outer.ply", inner_file(number)))
+        extent_mm = OBJECT_EXTENT_MM if number == OBJECT else TOOTH_EXTENT_MM
+        outer = read_mesh(root / outer_name)
         if verify:
-            outer.require_solid(f"teeth/{number}/outer.ply", TOOTH_EXTENT_MM)
-            outer.require_one_shell(f"teeth/{number}/outer.ply")
-        dentin = read_mesh(folder / "dentin.ply") if (folder / "dentin.ply").exists() else None
+            outer.require_solid(str(outer_name), extent_mm)
+            outer.require_one_shell(str(outer_name))
+        dentin = read_mesh(root / inner_name) if (root / inner_name).exists() else None
         if verify and dentin is not None:
-            dentin.require_solid(f"teeth/{number}/dentin.ply", TOOTH_EXTENT_MM)
+            dentin.require_solid(str(inner_name), extent_mm)
         teeth.append(Tooth(number, outer, dentin))
     if verify:
         _require_apart(teeth)

@@ -14,14 +14,14 @@ from services.core.results import PreparedManifest
 
 def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.bool_]:
     """Mask (camera, light) of the held-out images: the job's choice, else the capture's, else every fourth light, at
-    least one.
+    least one. An object may be fitted to images under one light alone; then none of them is held out by default.
 
     Raises:
         SettingsError: a light or camera is unknown, or no image is left to fit.
         CaptureInputError: fewer than two lights.
     """
     cameras, lights = [c.name for c in manifest.cameras], [light.name for light in manifest.lights]
-    if len(lights) < 2:
+    if len(lights) < 2 and spec.kind != "object":
         raise CaptureInputError(
             f"The capture has {len(lights)} light; a fit needs at least two, one of them to test with, so capture more"
             " lights."
@@ -34,7 +34,7 @@ def held_out_images(manifest: PreparedManifest, spec: JobSpec) -> NDArray[np.boo
     elif manifest.held_out:
         for camera, light in manifest.held_out:
             chosen[cameras.index(camera), lights.index(light)] = True
-    else:
+    elif len(lights) > 1:
         chosen[:, 3::4] = True
         chosen[:, -1] |= not chosen.any()
     chosen |= _named("held_out_cameras", spec.held_out_cameras, cameras)[:, None]

@@ -151,7 +151,7 @@ def read_observations(root: Path, spec: JobSpec) -> Observations:
     held_out = held_out_images(manifest, spec)
     centre_mm = np.concatenate([tooth.outer.vertices_mm for tooth in teeth]).mean(axis=0)
     step = chosen_pixel_step(folder, manifest, centre_mm, spec)
-    if spec.kind == "tooth" and not manifest.surroundings:
+    if spec.kind != "jaw" and not manifest.surroundings:
         return Observations(folder, manifest, teeth, held_out, pixel_step=step)
     gums, cavity = (
         read_mesh(path) if path.is_file() else None for path in (folder / "gums.ply", folder / "cavity.ply")
@@ -212,9 +212,7 @@ def read_channel(observations: Observations, channel: str, spec: JobSpec) -> tup
             " millimetres."
         )
     require_signal(views, f"Channel {channel}")
-    if (spec.held_out_lights != () or spec.held_out_cameras) and not any(
-        (v.valid & v.held_out[:, None]).any() for v in views
-    ):
+    if observations.held_out.any() and not any((v.valid & v.held_out[:, None]).any() for v in views):
         raise CaptureInputError(
             "No pixel is valid in any held-out image; name others in held_out_lights or held_out_cameras."
         )

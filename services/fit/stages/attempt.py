@@ -114,6 +114,8 @@ class Attempt:
     writer: StageWriter
     engine: str
     trace: list[TraceRow] = field(default_factory=list)
+    names: Callable[[Mapping[str, float]], dict[str, float]] = dict
+    """Gives a table by parameters the names under which it is told."""
 
     @property
     def inputs(self) -> Path:
@@ -164,7 +166,7 @@ class Attempt:
         """
 
         def report(step: StepReport, evaluation: Evaluation) -> None:
-            data = asdict(step)
+            data = asdict(step) | {"parameters": self.names(step.parameters)}
             prefix = message_prefix(step.channel, step.tooth)
             message = f"{prefix} {step.stage} step {step.stage_step}: loss {step.loss:.3e}, {step.verdict}."
             journal.get_or_compute(history_key(step.channel, step.step), lambda: data)

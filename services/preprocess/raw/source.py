@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.files.meshes import fdi_numbers
+from services.core.geometry import OBJECT
 from services.core.raw.description import described, read_calibration
 from services.core.raw.folder import read_raw_folder
 from services.core.raw.records import RawFrame
@@ -125,7 +126,7 @@ class RawSource:
                 self._frames_root, self._folder, self._cameras[name], self._noise, view.scratch
             )
             self.notes += tuple(self._measured[name].notes)
-        motion = ViewMotion(view, jaws(fdi_numbers(self.root)), self._table(name), self._how)
+        motion = ViewMotion(view, jaws(fdi_numbers(self.root) or (OBJECT,)), self._table(name), self._how)
         return RawView(
             self._frames_root, self._measured[name], view, motion, self.description.channels, self._memory_bytes
         )

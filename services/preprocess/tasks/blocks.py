@@ -76,7 +76,10 @@ class PreparationBlock:
         # The stage has checked them both.
         source = open_source(self.spec, context.root, verify=False)
         whole = self.spec.kind == "jaw"
-        subject = read_subject(source.root, whole, self.spec.fdi, self.spec.surroundings, verify=False)
+        is_object = self.spec.kind == "object"
+        subject = read_subject(
+            source.root, whole, self.spec.fdi, self.spec.surroundings, is_object=is_object, verify=False
+        )
         if self.step == "locate":
             _locate(self.files, source, subject, self.camera)
             return

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from services.core.errors import CaptureInputError
-from services.core.geometry import teeth_folder
+from services.core.geometry import OBJECT, inner_file, teeth_folder
+from services.core.object_words import of_an_object
 from services.core.results import PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import write_record
@@ -82,6 +83,8 @@ def summarise(
     if subject.surroundings:
         around = [*(["gums"] if subject.gums is not None else []), *(str(tooth.fdi) for tooth in subject.others)]
         notes.append(f"Rendered around tooth {fdi[0]}, with light passing between them: {', '.join(around)}.")
+    if fdi == (OBJECT,):
+        notes = [of_an_object(note) for note in notes]
     for note in notes:
         context.report(StageEvent(stage="prepare", kind="log", message=note))
     covered = tuple(
@@ -128,7 +131,7 @@ def _images(files: AttemptFiles, source: Source) -> list[ImageDone]:
 
 
 def _copy_meshes(source: Path, target: Path, fdi: tuple[int, ...]) -> None:
-    mesh_files = [teeth_folder(Path(), number) / name for number in fdi for name in ("outer.ply", "dentin.ply")]
+    mesh_files = [teeth_folder(Path(), number) / name for number in fdi for name in ("outer.ply", inner_file(number))]
     for relative in [*mesh_files, Path("gums.ply"), Path("cavity.ply")]:
         if (source / relative).is_file():
             (target / relative).parent.mkdir(parents=True, exist_ok=True)

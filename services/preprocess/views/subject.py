@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import CaptureInputError
 from services.core.files.meshes import note_on_dropped, read_mesh, read_teeth
-from services.core.geometry import Camera, Mesh, Tooth
+from services.core.geometry import OBJECT, Camera, Mesh, Tooth, inner_file, teeth_folder
 from services.core.raw.registration import REGISTRATION
 from services.preprocess.views.projection import Footprint, project
 from services.preprocess.views.source import View
@@ -64,8 +64,12 @@ class Subject:
     @property
     def note(self) -> str | None:
         """A sentence on vertices of the files that were left out; None where there are none."""
-        named = {f"teeth/{tooth.fdi}/outer.ply": tooth.outer for tooth in (*self.teeth, *self.others)}
-        named |= {f"teeth/{tooth.fdi}/dentin.ply": tooth.dentin for tooth in self.teeth if tooth.dentin is not None}
+
+        def name(tooth: Tooth, file: str) -> str:
+            return str(teeth_folder(Path(), tooth.fdi) / file)
+
+        named = {name(tooth, "outer.ply"): tooth.outer for tooth in (*self.teeth, *self.others)}
+        named |= {name(one, inner_file(one.fdi)): one.dentin for one in self.teeth if one.dentin is not None}
         around = {"gums.ply": self.gums, "cavity.ply": self.cavity}
         return note_on_dropped(named | {name: mesh for name, mesh in around.items() if mesh is not None})
 
@@ -110,21 +114,25 @@ def read_subject(
     fdi: int | None = None,
     surroundings: Literal["auto", "on", "off"] = "off",
     *,
+    is_object: bool = False,
     verify: bool = True,
 ) -> Subject:
-    """Read ``teeth/``, ``gums.ply`` and, if everything is fitted, ``cavity.ply`` of a capture.
+    """Read ``teeth/``, ``gums.ply`` and, if everything is fitted, ``cavity.ply`` of a capture; or its ``object/``.
 
     Args:
         root: folder of the capture.
         whole: whether gums and wall are fitted too.
         fdi: number of the only tooth to fit; None for all.
         surroundings: whether the fit of a tooth renders gums and other teeth; auto for where they were registered.
+        is_object: whether the capture shows an object that is no tooth, and nothing else.
         verify: whether the surfaces are checked.
 
     Raises:
         CaptureInputError: there is no tooth, or not the one asked for, or a file cannot be read. MeshError: a surface
             cannot bound a medium.
     """
+    if is_object:
+        return Subject(read_teeth(root, (OBJECT,), verify=verify), None, None, whole=False)
     teeth, gums = read_teeth(root, verify=verify), _optional(root / "gums.ply")
     chosen = tuple(tooth for tooth in teeth if fdi in {None, tooth.fdi})
     if not chosen:

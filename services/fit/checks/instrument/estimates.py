@@ -47,6 +47,6 @@ def instrument_report(
             assumed,
             manifest.uncertainty,
             found=found,
-            is_alone=spec.kind == "tooth" and not manifest.surroundings,
+            is_alone=spec.kind != "jaw" and not manifest.surroundings,
         ),
     }

@@ -146,7 +146,7 @@ def _faults(
     spec: JobSpec, errors: Mapping[str, InstrumentErrors], faults: Mapping[str, Sequence[Fault]], *, is_alone: bool
 ) -> Iterator[str]:
     alone = " Light from gums and other teeth is rendered with surroundings = 'on'." if is_alone else ""
-    has_one_lobe = spec.kind == "tooth" and spec.lobes == 1
+    has_one_lobe = spec.kind != "jaw" and spec.lobes == 1
     options = f"Look also at the option{'s boundary and lobes' if has_one_lobe else ' boundary'}."
     for channel, every in faults.items():
         names = errors[channel].names

@@ -124,6 +124,6 @@ def instrument_of(
         stated,
         stated is not manifest.uncertainty,
         max_gains,
-        has_pose=spec.kind == "tooth",
-        shifts_px=shift_errors_px(prepared, pixel_step) if prepared is not None and spec.kind == "tooth" else {},
+        has_pose=spec.kind != "jaw",
+        shifts_px=shift_errors_px(prepared, pixel_step) if prepared is not None and spec.kind != "jaw" else {},
     )
