@@ -168,3 +168,15 @@ def test_an_export_needs_consent_and_says_it_in_one_sentence(job: Path) -> None:
     assert line.startswith("dentine: The person's consent is for research and not for film; ")
     done = dentine("export", str(job), "--for", "film")
     assert "--for says what files that leave are for" in done.stderr
+
+
+def test_a_consent_that_has_ended_is_told_when_the_asset_is_written_again(job: Path, tmp_path: Path) -> None:
+    root = tmp_path / "again"
+    shutil.copytree(job.parent, root)
+    tree = json.loads((root / "capture" / "capture.json").read_text())
+    write_tree(root / "capture", tree | {"consent": {"uses": ["research"], "until": "2020-01-01"}})
+    before = (root / "job" / "asset" / "manifest.json").read_bytes()
+    spec = JobSpec(capture=root / "capture", **OPTIONS | {"channels": None})
+    with pytest.raises(ConsentError, match=r"ended on 2020-01-01; ask for a new one and write its date"):
+        export(spec, LocalContext(root / "job", 2))
+    assert (root / "job" / "asset" / "manifest.json").read_bytes() == before

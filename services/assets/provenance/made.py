@@ -13,7 +13,7 @@ from services.core.consent import ABSENT
 from services.core.provenance.inputs import recorded_inputs, stated_by
 from services.core.provenance.record import SUBJECT_FILE, Provenance
 from services.core.records import JobSpec
-from services.transport.numerics import numerics_name
+from services.transport.numerics import NUMERICS
 from services.transport.platform import import_renderer
 
 PACKAGES = (
@@ -66,7 +66,7 @@ def provenance_of(spec: JobSpec, job: Path, prepared: Path, now: datetime) -> Pr
 
 def versions() -> dict[str, str]:
     """Versions of dentine, of its numerics, of Python, of the compiler of kernels and of the packages that compute."""
-    found = {"dentine": _version("dentine"), "numerics": numerics_name(), "python": platform.python_version()}
+    found = {"dentine": _version("dentine"), "numerics": str(NUMERICS), "python": platform.python_version()}
     found["llvm"] = ".".join(map(str, import_renderer()[0].detail.llvm_version()))
     return found | {name: told for name in PACKAGES if (told := _version(name))}
 
