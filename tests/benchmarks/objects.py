@@ -1,0 +1,103 @@
+"""Table of the accuracy of jobs of kind object: shapes of known optics with a matched surface, rendered by stock
+Mitsuba in one camera, fitted with the lights' strength given.
+
+python -m tests.benchmarks.objects --shapes sphere,cube --lights 1,3 --json objects.json
+
+``error`` and ``se`` are relative to the truth. A figure is reached when its error is below the limit, or, where the
+standard error alone exceeds the limit, within two standard errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from services.core.records import FolderCapture, JobSpec
+from services.core.stage import LocalContext
+from services.core.store import read_record, write_record
+from services.fit.stage import run
+from services.phantom.object import write_object_phantom
+from services.preprocess.stage import run_object
+from services.transport.platform import prepare_device
+
+LIMITS = {"sigma_s_reduced": 0.03, "sigma_a": 0.05}
+"""Largest relative error of reduced scattering and of absorption."""
+SIGMAS = 2.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One quantity of one fit; ``seconds`` is the processor time of the fit."""
+
+    shape: str
+    images: int
+    quantity: str
+    error: float
+    se: float
+    seconds: float
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether the error keeps its limit, or a standard error above the limit twice."""
+        limit = LIMITS[self.quantity]
+        return abs(self.error) <= (limit if self.se <= limit else SIGMAS * self.se)
+
+
+def rows(
+    folder: Path, shape: str, lights: tuple[int, ...], *, pixel_mm: float, samples: int, max_samples: int
+) -> Iterator[Row]:
+    """Render a shape under as many lights as the largest number asks for, and fit the images of the first ones."""
+    prepare_device()
+    capture = folder / shape
+    write_object_phantom(
+        capture, shape=shape, cameras=1, lights=max(lights), pixel_mm=pixel_mm, samples=samples, renderer="mitsuba",
+        held_out=0,
+    )  # fmt: skip
+    whole = read_record(capture / "capture.json", FolderCapture)
+    truth = json.loads((capture / "truth.json").read_text())["channels"]["green"]["body"]
+    known = {"sigma_s_reduced": truth["sigma_s_reduced"], "sigma_a": (1 - truth["alpha"]) * truth["sigma"]}
+    for count in lights:
+        part = whole.model_copy(update={"lights": whole.lights[:count], "images": whole.images[:count]})
+        write_record(capture / "capture.json", part)
+        spec = JobSpec(
+            kind="object", capture=capture, boundary="matched", instrument="off", held_out_lights=(), advise=False,
+            max_samples_per_pixel=max_samples, image_tolerance=0.001, max_steps=30,
+        )  # fmt: skip
+        job, begun_s = LocalContext(folder / f"{shape}-{count}"), time.process_time()
+        run_object(spec, job)
+        table = run(spec, job).parameters["green"]
+        for quantity, true in known.items():
+            estimate = table[f"body.{quantity}"]
+            error, se = estimate.value / true - 1, (estimate.se or 0.0) / true
+            yield Row(shape, count, quantity, error, se, time.process_time() - begun_s)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shapes", default="sphere,cube")
+    parser.add_argument("--lights", default="1,3")
+    parser.add_argument("--pixel-mm", type=float, default=0.5)
+    parser.add_argument("--samples", type=int, default=8192)
+    parser.add_argument("--max-samples", type=int, default=4096)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    found: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for shape in given.shapes.split(","):
+            lights = tuple(int(one) for one in given.lights.split(","))
+            options = {"pixel_mm": given.pixel_mm, "samples": given.samples, "max_samples": given.max_samples}
+            for row in rows(Path(folder), shape, lights, **options):
+                found.append(row)
+                print(f"{row.shape}, {row.images} images, {row.quantity}: {row.error:+.2%} ± {row.se:.2%}", flush=True)
+    if given.json is not None:
+        given.json.write_text(json.dumps([asdict(row) for row in found], indent=1))
+
+
+if __name__ == "__main__":
+    main()
