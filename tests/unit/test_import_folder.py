@@ -126,6 +126,12 @@ def test_what_one_camera_lacks_is_said(photographs: Path) -> None:
     assert "# squares = [?, ?]" in (photographs / "raw.toml").read_text()
 
 
+def test_an_object_needs_no_teeth(photographs: Path) -> None:
+    (photographs / "object").mkdir()
+    said = import_folder(photographs, 0.02, "GBRG", None).missing
+    assert not any("teeth" in one for one in said)
+
+
 def test_an_exposure_that_nothing_says(photographs: Path) -> None:
     (photographs / "left" / "L3.png").write_bytes((photographs / "left" / "L1_10ms.png").read_bytes())
     with pytest.raises(CaptureInputError, match=r"File left/L3\.png does not say the exposure; rename .*--exposure-s"):

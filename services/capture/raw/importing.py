@@ -253,7 +253,7 @@ def _missing(root: Path, folder: RawFolder, scans: Sequence[str]) -> Iterator[st
         yield "No frame shows teeth under a light (kind light)."
     if folder.calibration is None:
         yield "No calibration is named; add [calibration] file, or give a job one by its option 'calibration'."
-    if not (root / "teeth").is_dir() and folder.scan is None:
+    if not any((root / subject).is_dir() for subject in ("teeth", "object")) and folder.scan is None:
         found = f"; lines to be filled in for {scans[0]} stand at the end of {DESCRIPTION}" if scans else ""
         yield (
             "There are no teeth; add teeth/<FDI>/outer.ply, or a [scan] and landmarks, which are clicked in the page of"
