@@ -87,13 +87,15 @@ def test_what_a_scene_lacks_stays_absent(tmp_path: Path, missing: str) -> None:
 
 
 class Recorder:
-    """A host that renders zeros and remembers which lights it was asked for."""
+    """A host that renders zeros and remembers which lights it was asked for, and in how many batches."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[int, ...] | None] = []
+        self.batches: list[int] = []
 
     def call(self, method: str, recipe: StoredFile, tissue: Tissue, view: View, *names: Any, **options: Any) -> Any:  # noqa: ARG002 - signature of the host
         self.asked.append(view.lights)
+        self.batches.append(options.get("batches", 0))
         shape = (3, len(view))
         if method == "images":
             return StackEstimate(np.zeros(shape), np.zeros(shape))
@@ -121,6 +123,16 @@ def test_every_task_of_the_fit_asks_for_fitted_lights_alone(task: BlockTask) -> 
     compare_task(host, task, task.tissue, (1, 2))
     orders_task(host, task, np.array([0, 2, 9]), 1)
     assert host.asked == [(1, 2)] * 9
+
+
+def test_what_needs_no_variance_of_its_own_is_rendered_as_one_batch(task: BlockTask) -> None:
+    # More batches than one round the paths up, and each ends with paths for which other lanes wait.
+    host = Recorder()
+    residual = image_task(host, task, (1, 2))
+    jacobian_task(host, task, Differentiation(("enamel.sigma",), np.ones((1, 1))), (1, 2), residual, None)
+    compare_task(host, task, task.tissue, (1, 2))
+    evaluate_task(host, task, (1, 2), ())
+    assert host.batches == [1] * 10
 
 
 def test_the_evaluation_adds_what_is_held_out(task: BlockTask) -> None:

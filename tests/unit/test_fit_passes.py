@@ -64,6 +64,7 @@ class Linear:
         *,
         samples: int,
         seed: int,  # noqa: ARG002
+        batches: int,  # noqa: ARG002
     ) -> Any:
         self.asked.append((method, samples))
         if method == "images":
@@ -141,6 +142,7 @@ class Teeth:
         *,
         samples: int,
         seed: int,  # noqa: ARG002
+        batches: int,  # noqa: ARG002
     ) -> Any:
         self.asked.append((method, samples))
         if method != "images":

@@ -296,7 +296,10 @@ def advice_task(
     start, block = time.time(), block_of(task)
     view, half = block.fitted_view, max(task.samples // 2, 1)
     images = [
-        np.asarray(host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed).mean, dtype=np.float64)
+        np.asarray(
+            host.call("images", task.recipe, task.tissue, view, samples=half, seed=seed, batches=1).mean,
+            dtype=np.float64,
+        )
         for seed in image_seeds
     ]
     expected = 0.5 * (images[0] + images[1])

@@ -105,7 +105,10 @@ class Differentiation:
             # Images (L, N) by seed; an end that several secants share is rendered once.
             key = id(tissue), samples
             if key not in images:
-                stacks = [host.call("images", task.recipe, tissue, view, samples=samples, seed=seed) for seed in seeds]
+                stacks = [
+                    host.call("images", task.recipe, tissue, view, samples=samples, seed=seed, batches=1)
+                    for seed in seeds
+                ]
                 images[key] = [np.asarray(stack.mean, dtype=np.float64) for stack in stacks]
             return images[key]
 
@@ -125,7 +128,7 @@ class Differentiation:
             if self.parameters:
                 samples = max(task.samples // self.path_divisor, 1)
                 estimate: JacobianEstimate = host.call(
-                    "jacobian", task.recipe, task.tissue, view, self.parameters, samples=samples, seed=seed
+                    "jacobian", task.recipe, task.tissue, view, self.parameters, samples=samples, seed=seed, batches=1
                 )
                 rows = np.asarray(
                     self.chain.T @ np.asarray(estimate.jacobian, dtype=np.float64).reshape(len(self.parameters), -1)

@@ -221,7 +221,9 @@ def evaluate_task(
     used = np.any((block.fit_weight > 0) | block.held_out, axis=1)
     used[[light for name, light in shown if name == block.view.camera.name]] = True
     stacks = [
-        host.call("images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed)
+        host.call(
+            "images", task.recipe, task.tissue, block.view_under(used), samples=task.samples, seed=seed, batches=1
+        )
         for seed in seeds
     ]
     first, second = (photographed(stack.mean, block, dict(task.errors)) for stack in stacks)

@@ -132,7 +132,9 @@ def displacements_task(
         weights = np.zeros(2 * scene.count)
         weights[mode] = 1.0
         moved = replace(tissue, shape=(*tissue.shape, *weights.tolist()))
-        stacks = [host.call("images", scene.recipe, moved, view, samples=task.samples, seed=seed) for seed in seeds]
+        stacks = [
+            host.call("images", scene.recipe, moved, view, samples=task.samples, seed=seed, batches=1) for seed in seeds
+        ]
         return np.stack([np.asarray(stack.mean, dtype=np.float64) for stack in stacks])
 
     changes = [0.5 * (images(k) - images(scene.count + k)) for k in range(scene.count)]
@@ -162,7 +164,7 @@ def final_task(
 
     def image(tissue: Tissue | Mouth, seed: int, samples: int) -> Array:
         return np.asarray(
-            host.call("images", task.recipe, tissue, view, samples=samples, seed=seed).mean, dtype=np.float64
+            host.call("images", task.recipe, tissue, view, samples=samples, seed=seed, batches=1).mean, dtype=np.float64
         ).reshape(-1)
 
     renders = [image(task.tissue, seed, task.samples) for seed in image_seeds]

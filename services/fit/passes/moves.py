@@ -48,7 +48,7 @@ def moves_task(
 
     def image(recipe: StoredFile, camera: Camera, first: int, seed: int) -> Array:
         chosen = View(camera, view.pixels, tuple(first + light for light in lit))
-        stack = host.call("images", recipe, tissue, chosen, samples=task.samples, seed=seed)
+        stack = host.call("images", recipe, tissue, chosen, samples=task.samples, seed=seed, batches=1)
         return np.asarray(stack.mean[first : first + count], dtype=np.float64)
 
     base = [image(moves[0].recipe, view.camera, 0, seed) for seed in seeds]

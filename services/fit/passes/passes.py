@@ -7,6 +7,9 @@
 The Jacobian task renders its two seeds in one process and multiplies them there, by each other and by the residual. So
 Jacobians never leave their task; only residuals and sums over the block leave a worker. A task whose worker dies runs
 again elsewhere from the same seeds, with the same result.
+
+Pairs of seeds tell the noise of residuals and derivatives. So these are rendered as one batch, which traces exactly the
+paths asked for and takes a tenth less time a path; batches are for images whose own variance enters a sum.
 """
 
 from __future__ import annotations
@@ -86,7 +89,8 @@ def image_task(host: EngineHost, task: BlockTask, seeds: tuple[int, int]) -> Res
     start, block = time.time(), block_of(task)
     half = max(task.samples // 2, 1)
     stacks: list[StackEstimate] = [
-        host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed) for seed in seeds
+        host.call("images", task.recipe, task.tissue, block.fitted_view, samples=half, seed=seed, batches=1)
+        for seed in seeds
     ]
     first, second = (photographed(stack.mean, block, dict(task.errors)) - block.reference for stack in stacks)
     images = (stacks[0].mean, stacks[1].mean) if task.errors else None
@@ -172,7 +176,9 @@ def compare_task(
 
     def residuals(tissue: Tissue | Mouth, errors: Errors) -> tuple[Array, Array]:
         view = placed(block, dict(errors)).fitted_view
-        stacks = [host.call("images", task.recipe, tissue, view, samples=task.samples, seed=seed) for seed in seeds]
+        stacks = [
+            host.call("images", task.recipe, tissue, view, samples=task.samples, seed=seed, batches=1) for seed in seeds
+        ]
         first, second = ((photographed(one.mean, block, dict(errors)) - block.reference).reshape(-1) for one in stacks)
         return first, second
 
