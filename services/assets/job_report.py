@@ -12,6 +12,7 @@ from services.assets.provenance.departing import BESIDE_PHOTOGRAPH
 from services.core.choices import chosen
 from services.core.provenance.record import Provenance
 from services.core.records import JobSpec
+from services.core.results import FitReport
 
 if TYPE_CHECKING:
     from services.assets.appearance.sections import Appearance
@@ -49,7 +50,7 @@ def write_job_report(
         "title": chosen("Kind of fit", spec.kind, titles),
         "boundary": spec.boundary,
         "ior": spec.ior,
-        "provenance": facts_of(spec, provenance),
+        "provenance": {**facts_of(spec, provenance), **facts_of_fit(job.report)},
     }
     facts["appearance"] = appearance_sections(_appearance(job, asset, pictures), with_photographs=with_photographs)
     if with_photographs and (asset / BESIDE_PHOTOGRAPH).is_file():
@@ -91,6 +92,19 @@ def _appearance(job: FittedJob, asset: Path, pictures: ReportPictures) -> Appear
     ]
     found = [one for one in compared if one is not None]
     return Appearance(first.source, found, layers, read_shade(asset.parent, asset))
+
+
+def facts_of_fit(report: FitReport) -> Mapping[str, str]:
+    """What the fit compared and what its time was for, by label."""
+    told = {}
+    if report.pixel_edge_mm is not None:
+        told["squares"] = (
+            f"{report.pixel_step} × {report.pixel_step} pixels, {report.pixel_edge_mm:.2f} mm at the teeth"
+        )
+    if total := sum(report.seconds_by_purpose.values()):
+        shares = {name: 100 * seconds / total for name, seconds in report.seconds_by_purpose.items()}
+        told["time by purpose"] = ", ".join(f"{name} {share:.0f} %" for name, share in shares.items() if share >= 0.5)
+    return told
 
 
 def facts_of(spec: JobSpec, provenance: Provenance | None) -> Mapping[str, str]:
