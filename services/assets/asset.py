@@ -48,7 +48,7 @@ from services.assets.stains import write_textures
 from services.core.errors import InputError
 from services.core.files.meshes import write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, Vector3, inner_file, teeth_folder
-from services.core.object_words import PARTS
+from services.core.pages.object_words import PARTS
 from services.core.records import Boundary
 from services.core.results import Estimate, FitReport
 from services.core.store import write_atomic

@@ -5,14 +5,13 @@ from __future__ import annotations
 from enum import IntFlag
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, Strict, StringConstraints, WithJsonSchema, model_validator
+from pydantic import AfterValidator, Field, StringConstraints, WithJsonSchema, model_validator
 from pydantic_core import PydanticCustomError
 
 from services.core.calibration.cameras_and_lights import CameraColour, is_absent
 from services.core.calibration.uncertainty import CalibrationUncertainty
-from services.core.consent import Consent, Subject
 from services.core.files.store_url import StoreUrl
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
@@ -24,47 +23,15 @@ from services.core.light.safety import (
     DoseOfOneLight,
     FlashAcknowledgement,
 )
-from services.core.object_words import PARTS
+from services.core.pages.object_words import PARTS
+from services.core.provenance.consent import Consent, Subject
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
+from services.core.values import AUTO, Number, PixelStep, Positive, Unit, Whole
 
-
-def _no_stand_in(value: Any) -> Any:
-    if isinstance(value, bool | str):
-        raise PydanticCustomError("int_type", "give a number, neither a text nor true or false")
-    return value
-
-
-Number = Annotated[float, Strict()]
-"""A number that is given as a number: a text, true or false is refused, so that no light burns at full level because
-somebody wrote "level": true."""
-Whole = Annotated[int, BeforeValidator(_no_stand_in)]
-"""A whole number under the same rule; 2.0 counts as whole."""
-
-
-def _auto_or_whole(value: Any) -> Any:
-    if value == AUTO:
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | float) or int(value) != value or not 1 <= value <= 64:
-        raise PydanticCustomError("pixel_step_type", 'give "auto" or a whole number from 1 to 64')
-    return int(value)
-
-
-AUTO: Literal["auto"] = "auto"
-PixelStep = Annotated[
-    int | Literal["auto"],
-    BeforeValidator(_auto_or_whole),
-    WithJsonSchema({"anyOf": [{"type": "string", "const": AUTO}, {"type": "integer", "minimum": 1, "maximum": 64}]}),
-]
-"""Edge of the fitted squares in pixels, or ``auto``."""
-MAX_SQUARE_MM = 0.5
-"""Largest edge of a square at the teeth by ``auto``, mm. Larger ones lose what the sides of a tooth tell of its mean
-cosines."""
 JobName = Annotated[
     str, StringConstraints(strip_whitespace=True, min_length=1, max_length=80, pattern=r"^[^\x00-\x1f\x7f]*$")
 ]
 """A label that a person gives a job: one line, as long as a list of jobs can show."""
-Unit = Annotated[Number, Field(ge=0, le=1)]
-Positive = Annotated[Number, Field(gt=0)]
 Device = Literal["llvm", "cuda"]
 Boundary = Literal["matched", "thin"]
 KindName = Annotated[str, AfterValidator(known_kind), WithJsonSchema({"type": "string", "enum": list(JOB_KINDS)})]

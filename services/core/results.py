@@ -12,7 +12,8 @@ from services.core.calibration.cameras_and_lights import CameraColour, is_absent
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.geometry import Camera, Light, Record, Vector3
 from services.core.light.safety import FlashAcknowledgement
-from services.core.records import FolderCapture, Positive, Unit
+from services.core.records import FolderCapture
+from services.core.values import Positive, Unit
 
 
 class Estimate(Record):

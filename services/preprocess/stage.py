@@ -129,7 +129,7 @@ def run_object(spec: JobSpec, context: StageContext) -> PreparedManifest:
         As ``run``.
     """
     from services.core.errors import CaptureInputError, MeshError
-    from services.core.object_words import of_an_object
+    from services.core.pages.object_words import of_an_object
 
     try:
         return run(spec, context)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.core.object_words import of_an_object, part_of_a_tooth, part_of_an_object, renamed
+from services.core.pages.object_words import of_an_object, part_of_a_tooth, part_of_an_object, renamed
 from services.fit.checks.identifiability import NOT_EXPLAINED, PARTLY_EXPLAINED
 
 

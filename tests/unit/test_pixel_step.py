@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from services.core.geometry import Camera
-from services.core.records import MAX_SQUARE_MM, JobSpec
+from services.core.records import JobSpec
 from services.core.store import create_array
+from services.core.values import MAX_SQUARE_MM
 from services.fit.measurements.pixel_step import MIN_KEPT, chosen_pixel_step, kept_share
 
 PIXEL_MM, DISTANCE_MM, EDGE = 0.064, 300.0, 84

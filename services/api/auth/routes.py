@@ -16,7 +16,7 @@ from services.api.http.bodies import BodyRoute, ValidatedBody
 from services.api.http.problems import refusals
 from services.client.errors import SetupLinkError, UnauthenticatedError
 from services.core.geometry import Record
-from services.core.records import Number
+from services.core.values import Number
 from services.pipeline.database import MAX_ID
 
 

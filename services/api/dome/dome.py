@@ -23,8 +23,9 @@ from services.core.dome import DomeAnswer, DomeStatus
 from services.core.errors import DentineError, DomeBusyError, RigUnreachableError, SettingsError
 from services.core.geometry import Record
 from services.core.owners import LOCAL_VIEWER, Viewer
-from services.core.records import Number, RigSpec, Unit, Whole
+from services.core.records import RigSpec
 from services.core.settings import DomeSettings
+from services.core.values import Number, Unit, Whole
 
 ANSWER_S = 30.0
 """Longest time in s that a command takes, unless it is a preflight or the first attempt of ALL OFF."""

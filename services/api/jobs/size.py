@@ -13,7 +13,8 @@ from services.api.captures.descriptions import Describe, describe, description_f
 from services.core.errors import DentineError
 from services.core.geometry import Record
 from services.core.light.safety import FREE_FLASHES_PER_S
-from services.core.records import AUTO, JobSpec
+from services.core.records import JobSpec
+from services.core.values import AUTO
 
 DEMO_VALUES = 16_896
 """Number of values that the demonstration fits: 8 lights in 3 images of about 21 by 33 pixels, one channel."""

@@ -29,7 +29,7 @@ def register(
     """Find where the teeth of a scan stand in the rig."""
     from services.calibrate.registration.register import MAX_MISFIT_MM, PAGE, register_folder
     from services.core.files.folders import require_folder
-    from services.core.records import MAX_SQUARE_MM
+    from services.core.values import MAX_SQUARE_MM
 
     if out is not None:
         require_folder(out, "--out")

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from services.core.geometry import Name, Record, Vector3
-from services.core.records import FileName, Number, Positive, Unit, Whole
+from services.core.records import FileName
+from services.core.values import Number, Positive, Unit, Whole
 
 Pixel = tuple[Number, Number]
 """Position in an image, x then y, pixels; the first pixel's centre is (0.5, 0.5)."""

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera
-from services.core.records import AUTO, MAX_SQUARE_MM, JobSpec
+from services.core.records import JobSpec
 from services.core.results import PreparedManifest
 from services.core.store import StoredArray
+from services.core.values import AUTO, MAX_SQUARE_MM
 from services.fit.measurements.levels import whole_squares
 
 MIN_KEPT = 0.5

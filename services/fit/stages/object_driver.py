@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from services.core.object_words import of_an_object, part_of_a_tooth, renamed
+from services.core.pages.object_words import of_an_object, part_of_a_tooth, renamed
 from services.core.results import FitReport, PreparedManifest
 from services.core.store import open_stage
 from services.fit.stages.attempt import Attempt

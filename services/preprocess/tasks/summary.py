@@ -9,7 +9,7 @@ import numpy as np
 
 from services.core.errors import CaptureInputError
 from services.core.geometry import OBJECT, inner_file, teeth_folder
-from services.core.object_words import of_an_object
+from services.core.pages.object_words import of_an_object
 from services.core.results import PreparedManifest
 from services.core.stage import StageContext, StageEvent
 from services.core.store import write_record
