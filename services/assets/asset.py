@@ -10,7 +10,10 @@
     surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
     teeth/<FDI>/stain_*        per channel, where stains were fitted: a_t as .npy, and 1 - a_t as .png, on the outer
                                surface's u, v
-    rig.json                   cameras, lights and channels by name
+    scene_srgb.xml             of a tooth without stains, boundary ``matched``: its media in linear sRGB, a white light
+    scene_spectral.xml         the same as upsampled spectra under daylight D65
+    colour.json                media in linear sRGB, in ACEScg and as spectra
+    rig.json                   cameras, lights and channels by name; colours of the cameras
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number,
                                ``11.enamel.sigma``
     errors.json                fitted and held-out image error, whether the fit converged, correlations, which
@@ -32,7 +35,9 @@ from typing import Any
 import numpy as np
 
 from services.assets.colour.develop import CapturedColours, rig_colours
+from services.assets.colour.tables import colour_tables, coloured_media
 from services.assets.content import RGB
+from services.assets.mitsuba.coloured import spectral_scene, srgb_scene
 from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.assets.mitsuba.rgb import colour_scene
 from services.assets.mitsuba.scene import (
@@ -137,6 +142,16 @@ def write_asset(
         write_scene(folder / f"scene_{channel}.xml", scenes[channel])
     colour = "none" if boundary == "thin" else write_shell_scene(folder / "scene.xml", scenes)
 
+    names = tuple(camera.name for camera in cameras)
+    known = colours or CapturedColours()
+    media = coloured_media(media_of(report), known, names)
+    if media:
+        _write_json(folder / "colour.json", colour_tables(media))
+    if media and boundary == "matched" and not report.teeth and stains is None:
+        scene, white = scenes[channels[0]], float(np.mean(first.intensity))
+        write_scene(folder / "scene_srgb.xml", srgb_scene(scene, media, white))
+        write_scene(folder / "scene_spectral.xml", spectral_scene(scene, media, white))
+
     rig = {
         "units": "mm",
         "boundary": boundary,
@@ -147,8 +162,7 @@ def write_asset(
         "views": {camera.name: camera.model_dump(exclude={"name"}) for camera in shown},
         "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},
     }
-    names = tuple(camera.name for camera in cameras)
-    told = rig_colours(colours or CapturedColours(), channels, names, middle_of(teeth))
+    told = rig_colours(known, channels, names, middle_of(teeth))
     _write_json(folder / "rig.json", rig if told is None else rig | {"colour": told})
     _write_json(folder / "parameters.json", parameters_json(report))
     _write_json(folder / "errors.json", errors_json(report))
@@ -202,6 +216,18 @@ def mouth_of(report: FitReport, channel: str) -> Mouth:
     gums = _medium_of(table, "gums") if "gums.sigma" in table else None
     reflectance = table["cavity.reflectance"].value if "cavity.reflectance" in table else None
     return Mouth(tuple(tissue_of(tooth.parameters[channel]) for tooth in report.teeth.values()), gums, reflectance)
+
+
+def media_of(report: FitReport) -> dict[str, dict[str, Medium]]:
+    """All media of a report by name, a jaw's with the tooth's number such as ``11.enamel``, and by channel."""
+    found: dict[str, dict[str, Medium]] = {}
+    tables = [("", report.parameters), *((f"{fdi}.", tooth.parameters) for fdi, tooth in report.teeth.items())]
+    for prefix, by_channel in tables:
+        for channel, table in by_channel.items():
+            for part in ("enamel", "dentin", "gums"):
+                if f"{part}.sigma" in table:
+                    found.setdefault(prefix + part, {})[channel] = _medium_of(table, part)
+    return found
 
 
 def _medium_of(table: dict[str, Estimate], part: str) -> Medium:

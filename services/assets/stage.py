@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from services.core.consent import require_allowed
 from services.core.installed import require_packages
-from services.core.provenance.consent import require_allowed
 from services.core.provenance.record import PROVENANCE
 from services.core.records import JobSpec
 from services.core.results import AssetManifest, FitReport

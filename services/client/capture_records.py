@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from services.core.consent import SUBJECT
 from services.core.geometry import Record
 from services.core.owners import DEFAULT_GROUP
-from services.core.provenance.consent import SUBJECT
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 

@@ -20,10 +20,10 @@ from services.client.capture_paths import path_fault, require_paths
 from services.client.capture_records import CaptureDetail, CaptureFile, ManifestFile, UploadManifest
 from services.client.errors import UploadError
 from services.client.flows import BlockingCall, Flow, HttpRequest, Pause, answer, error_in
+from services.core.consent import SUBJECT
 from services.core.errors import CaptureInputError, PlatformError
 from services.core.files.image_metadata import metadata_fault
 from services.core.geometry import Record
-from services.core.provenance.consent import SUBJECT
 
 if TYPE_CHECKING:
     import httpx

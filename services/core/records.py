@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from services.core.calibration.cameras_and_lights import CameraColour, is_absent
 from services.core.calibration.uncertainty import CalibrationUncertainty
+from services.core.consent import Consent, Subject
 from services.core.files.store_url import StoreUrl
 from services.core.geometry import Camera, Light, Name, Record
 from services.core.job_kinds import JOB_KINDS, foreign_options, known_kind
@@ -24,7 +25,6 @@ from services.core.light.safety import (
     FlashAcknowledgement,
 )
 from services.core.pages.object_words import PARTS
-from services.core.provenance.consent import Consent, Subject
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
 from services.core.values import AUTO, Number, PixelStep, Positive, Unit, Whole
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from services.api.presets import find_preset
-from services.core.asset import load_asset
 from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
+from services.core.files.asset import load_asset
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.settings import job_from_tree

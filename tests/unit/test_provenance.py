@@ -12,8 +12,8 @@ import pytest
 
 from services.assets.exporters import export_to
 from services.assets.provenance.made import options_of, provenance_of
+from services.core.consent import ABSENT, Consent, require_allowed
 from services.core.errors import CaptureInputError, ConsentError, CorruptStoreError, MissingStageError
-from services.core.provenance.consent import ABSENT, Consent, require_allowed
 from services.core.provenance.hash_list import require_unedited, write_hash_list
 from services.core.provenance.inputs import hashed_inputs, recorded_inputs
 from services.core.provenance.record import PROVENANCE, Provenance

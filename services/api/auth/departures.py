@@ -12,10 +12,10 @@ import sqlalchemy as sql
 from pydantic import Field
 
 from services.api.auth.audit import audit_table
+from services.core.consent import Consent, require_allowed
 from services.core.errors import CaptureInputError, CorruptStoreError
 from services.core.files.json_text import parse_json
 from services.core.geometry import Record
-from services.core.provenance.consent import Consent, require_allowed
 from services.core.provenance.record import PROVENANCE
 
 if TYPE_CHECKING:

@@ -24,6 +24,7 @@ TAGS = {
     "mask": "bsdf",
     "bitmap": "texture",
     "uniform": "spectrum",
+    "d65": "spectrum",
     "homogeneous": "medium",
     "hg": "phase",
     "blendphase": "phase",
@@ -46,6 +47,14 @@ class SceneParameter:
 
     name: str
     default: float | int
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Values of a quantity at some wavelengths, linear between them."""
+
+    wavelengths_nm: tuple[float, ...]
+    values: tuple[float, ...]
 
 
 def write_scene(path: Path, scene: SceneDict) -> None:
@@ -88,6 +97,9 @@ def _append(parent: ET.Element, name: str, value: Any, *, top: bool = False) -> 
         )
     elif isinstance(value, Colour):
         ET.SubElement(parent, "rgb", name=name, value=", ".join(map(repr, value.values)))
+    elif isinstance(value, Spectrum):
+        pairs = zip(value.wavelengths_nm, value.values, strict=True)
+        ET.SubElement(parent, "spectrum", name=name, value=", ".join(f"{nm!r}:{one!r}" for nm, one in pairs))
     elif isinstance(value, SceneParameter):
         ET.SubElement(parent, VALUE_TAGS[type(value.default)], name=name, value=_text(value))
     else:

@@ -7,8 +7,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
+from services.core.consent import ABSENT, require_allowed
 from services.core.errors import CaptureInputError, CorruptStoreError
-from services.core.provenance.consent import ABSENT, require_allowed
 from services.core.provenance.hash_list import write_hash_list
 from services.core.provenance.inputs import stated_by
 from services.core.provenance.record import PROVENANCE, Provenance

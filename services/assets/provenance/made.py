@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from services.core.provenance.consent import ABSENT
+from services.core.consent import ABSENT
 from services.core.provenance.inputs import recorded_inputs, stated_by
 from services.core.provenance.record import SUBJECT_FILE, Provenance
 from services.core.records import JobSpec

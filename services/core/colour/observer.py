@@ -12,9 +12,14 @@ def daylight_weights() -> tuple[Floats, Floats]:
     """Wavelengths (31,) in nm, every 10 from 400 to 700, and weights (31, 3) whose sum with a reflectance gives XYZ;
     their own sum is the white, with Y = 1.
     """
-    table = np.array(_OBSERVER)
-    weights = table[:, :3] * table[:, 3:]
-    return np.arange(400.0, 701.0, 10.0), weights / weights[:, 1].sum()
+    table = observer_under_d65()
+    weights = table[:, 1:4] * table[:, 4:]
+    return table[:, 0], weights / weights[:, 1].sum()
+
+
+def observer_under_d65() -> Floats:
+    """Wavelength in nm, colour matching functions and power of D65 (31, 5), every 10 nm."""
+    return np.column_stack([np.arange(400.0, 701.0, 10.0), np.array(_OBSERVER)])
 
 
 _OBSERVER = (

@@ -6,8 +6,8 @@ from typing import Any
 
 from pydantic import Field
 
+from services.core.consent import ABSENT, Consent
 from services.core.geometry import Record
-from services.core.provenance.consent import ABSENT, Consent
 
 PROVENANCE = "provenance.json"
 """Name of the file in an asset's folder."""

@@ -10,10 +10,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from services.core.consent import Consent
 from services.core.errors import CaptureInputError
 from services.core.files.validation import fault_text
 from services.core.geometry import Record
-from services.core.provenance.consent import Consent
 from services.core.raw.records import RawCamera, RawFolder, RawFrame, RawLight
 from services.core.raw.targets import Board, CalibrationFile, Chart, Landmark, ScanFile, SeenPoint, Sphere
 

@@ -14,8 +14,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from services.core.calibration.cameras_and_lights import is_absent
+from services.core.consent import Consent, Subject
 from services.core.geometry import Record, Vector3
-from services.core.provenance.consent import Consent, Subject
 from services.core.raw.targets import Board, CalibrationFile, Chart, Label, Landmark, Pixel, RawName, ScanFile, Sphere
 from services.core.records import FileName
 from services.core.values import Number, Positive, Unit, Whole
