@@ -29,6 +29,16 @@ def node_facts(material: Any) -> dict[str, Any]:
     return {"kinds": kinds, "volumes": coefficients}
 
 
+def uv_range(mesh: Any) -> list[list[float]]:
+    """Least and greatest u and v of the first layer."""
+    if not mesh.uv_layers:
+        return []
+    uv = np.zeros(2 * len(mesh.loops), dtype=np.float32)
+    mesh.uv_layers[0].data.foreach_get("uv", uv)
+    pairs = uv.reshape(-1, 2)
+    return [pairs.min(axis=0).tolist(), pairs.max(axis=0).tolist()]
+
+
 def mesh_facts(thing: Any) -> dict[str, Any]:
     """Size, volume and what the faces carry."""
     mesh = thing.data
@@ -42,6 +52,7 @@ def mesh_facts(thing: Any) -> dict[str, Any]:
         "volume": float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6),
         "faces": len(mesh.polygons),
         "uv_layers": [layer.name for layer in mesh.uv_layers],
+        "uv_range": uv_range(mesh),
         "attributes": sorted(one.name for one in mesh.attributes if not one.name.startswith(".")),
         "smooth": all(face.use_smooth for face in mesh.polygons),
         "material": node_facts(mesh.materials[0]),

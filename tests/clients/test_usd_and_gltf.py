@@ -15,8 +15,9 @@ from services.core.geometry import Mesh
 from services.transport.optics.half_space import half_space_reflectance
 from services.transport.optics.parameters import Medium
 from tests.support.clients import client_python, run_client
-from tests.support.prepared import sphere
+from tests.support.prepared import camera, sphere
 from tests.unit.test_exporters import COEFFICIENTS, published
+from tests.unit.test_mouth_and_slab_exports import WALL, published_mouth, published_slab
 
 HERE = Path(__file__).parent
 FILES = {"usd": "asset.usda", "gltf": "asset.gltf"}
@@ -27,6 +28,12 @@ SEMI_AXES_MM = np.array([3.0, 2.5, 4.5])
 CENTRE_MM = np.array([0.5, -1.0, 7.0])
 """Three unequal lengths and a place, so that a turned or mirrored axis is seen."""
 
+RIG = {
+    "boundary": "matched", "ior": 1.631, "channels": list(COEFFICIENTS), "cameras": ["c0"],
+    "views": {"c0": camera("c0").model_dump(exclude={"name"})},
+    "lights": {"l0": {"position_mm": [0, 500, 100], "intensity": [1e6] * 3}},
+}  # fmt: skip
+
 
 def ellipsoid(share: float) -> Mesh:
     ball = sphere(1.0)
@@ -35,8 +42,8 @@ def ellipsoid(share: float) -> Mesh:
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = published(tmp_path_factory.mktemp("job"), ellipsoid(1.0), dentin=ellipsoid(0.75))
-    export_to(root, tuple(FILES))
+    root = published(tmp_path_factory.mktemp("job"), ellipsoid(1.0), RIG, ellipsoid(0.75))
+    export_to(root, (*FILES, "blender"))
     return root
 
 
@@ -116,6 +123,42 @@ def test_blender_gets_the_coefficients(facts: tuple[str, Facts]) -> None:
             tables = mesh["material_properties"]["coefficients"]
             told = [[tables[channel][leaf][key] for channel in COEFFICIENTS] for key in ("value", "se")]
         np.testing.assert_allclose(told, [expected, expected / 8], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_blender_gets_a_mouth_and_a_slab(name: str, tmp_path: Path) -> None:
+    client_python("bpy")
+    sizes_mm: dict[str, list[float]] = {
+        "tooth_11_enamel": [8, 8, 8], "tooth_11_dentin": [6, 6, 6], "tooth_21_enamel": [8, 8, 8], "gums": [16, 9.6, 4],
+        "cavity": [19, 0, 10],
+    }  # fmt: skip
+    export_to(published_mouth(tmp_path / "mouth"), (name,))
+    meshes = imported(tmp_path / "mouth" / f"asset-{name}" / FILES[name])["meshes"]
+    assert set(meshes) == set(sizes_mm)
+    for part, size_mm in sizes_mm.items():
+        found = np.ptp(1000 * np.array(meshes[part]["metres"]), axis=0)
+        # The balls' facets reach their radius along the axes.
+        np.testing.assert_allclose(found, size_mm, rtol=1e-3, atol=1e-4)
+    wall = meshes["cavity"]
+    np.testing.assert_allclose(wall["inputs"]["Base Color"][:3], [0.3] * 3, rtol=1e-6)
+    np.testing.assert_allclose(1000 * np.array(wall["metres"])[:, 1], WALL.vertices_mm[0, 1], rtol=1e-5)
+    export_to(published_slab(tmp_path / "slab"), (name,))
+    (plate,) = imported(tmp_path / "slab" / f"asset-{name}" / FILES[name])["meshes"].values()
+    np.testing.assert_allclose(np.ptp(1000 * np.array(plate["metres"]), axis=0), [20, 20, 2], rtol=1e-3)
+
+
+def test_the_script_for_blender_has_the_names_and_coordinates_of_the_textures(job: Path, tmp_path: Path) -> None:
+    client_python("bpy")
+    folder = job / "asset-blender"
+    done = run_client("bpy", folder / "blender" / "blender_scene.py", "--save", tmp_path / "tooth.blend")
+    assert done.returncode == 0, done.stderr
+    done = run_client("bpy", HERE / "blender_facts.py", tmp_path / "tooth.blend")
+    meshes = json.loads(done.stdout.strip().splitlines()[-1])["scenes"]["teeth"]["meshes"]
+    assert set(meshes) == {"tooth_11_enamel", "tooth_11_dentin"}
+    # The enamel's shell has faces of the outer surface, each with its place in the textures, and of the dentin's.
+    low, high = meshes["tooth_11_enamel"]["uv_range"]
+    assert 0 <= low[0] < 0.1
+    assert 0.9 < high[0] <= 1
 
 
 def test_the_validators_find_nothing_in_usd_and_materialx(job: Path) -> None:
