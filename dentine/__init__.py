@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from services.client.client import AsyncClient as AsyncClient
     from services.client.client import Client as Client
-    from services.core.files.asset import load_asset as load_asset
+    from services.core.provenance.asset import load_asset as load_asset
     from services.core.records import JobSpec as JobSpec
     from services.pipeline.stages import run_job as run
     from services.slab.simulate import simulate_slab as simulate_slab
@@ -35,7 +35,7 @@ _PLACES = MappingProxyType(
         "AsyncClient": "services.client.client:AsyncClient",
         "Client": "services.client.client:Client",
         "JobSpec": "services.core.records:JobSpec",
-        "load_asset": "services.core.files.asset:load_asset",
+        "load_asset": "services.core.provenance.asset:load_asset",
         "register_mitsuba": "services.transport.plugin.integrator:register_integrator",
         "run": "services.pipeline.stages:run_job",
         "simulate_slab": "services.slab.simulate:simulate_slab",

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from services.core.geometry import Mesh
 
 MAX_CHART_SHARE = 0.1
-"""Largest chart, as a share of the surface. xatlas takes many times as long to grow a chart over a whole dentin of CT,
-and ends with more charts."""
+"""Largest chart, as a share of the surface."""
+MAX_CHART_FACES = 2000
+"""Mean number of triangles in a largest chart. xatlas grows a chart in a time that rises faster than its triangles: a
+dentin of 31,000 took 13 s in charts of any size and ended with 280 of them, and 4 s with charts of this size."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ def people_mesh(mesh: Mesh, texel_mm: float | None = None) -> PeopleMesh:
     packing.padding, packing.bilinear = 2, True
     if texel_mm is not None:
         packing.texels_per_unit = 1 / texel_mm
-    charts.max_chart_area = MAX_CHART_SHARE * float(_doubled_areas(mesh.vertices_mm[mesh.faces]).sum()) / 2
+    share = min(MAX_CHART_SHARE, MAX_CHART_FACES / len(mesh.faces))
+    charts.max_chart_area = share * float(_doubled_areas(mesh.vertices_mm[mesh.faces]).sum()) / 2
     atlas.generate(charts, packing)
     source, faces, uv = atlas[0]
     return _split(mesh, np.asarray(source), np.asarray(faces), np.asarray(uv), (int(atlas.height), int(atlas.width)))

@@ -14,7 +14,7 @@ import pytest
 
 from services.api.presets import find_preset
 from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
-from services.core.files.asset import load_asset
+from services.core.provenance.asset import load_asset
 from services.core.records import JobSpec
 from services.core.results import AssetManifest
 from services.core.settings import job_from_tree

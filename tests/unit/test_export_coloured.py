@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from services.calibrate.colour.cie import D65, delta_e_2000, lab_from_xyz
 
 from services.assets.asset import write_asset
 from services.assets.colour.develop import CapturedColours
 from services.assets.content import RGB
+from services.core.colour.cie import D65, delta_e_2000, lab_from_xyz
 from services.core.geometry import Mesh, Tooth
 from services.transport.optics.parameters import Medium, Tissue
 from tests.support.colour_job import COLOURS, LIGHTS, report

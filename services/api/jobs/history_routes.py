@@ -21,7 +21,7 @@ from services.api.jobs.jobs import Jobs
 from services.api.jobs.parameter_table import parameter_table
 from services.api.presets import Preset, find_preset, list_presets
 from services.client.errors import UnknownJobError
-from services.core.files.asset import PARAMETERS
+from services.core.provenance.asset import PARAMETERS
 from services.core.stage import StageName
 from services.pipeline.database import MAX_ID
 from services.pipeline.event_log import EventLog
