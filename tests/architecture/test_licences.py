@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Iterator
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
@@ -15,13 +16,19 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
 LOCK_OF_THE_PAGE = ROOT / "services" / "api" / "dashboard" / "package-lock.json"
-ROLES = ("api", "postgres", "capture", "worker", "bench")
+_PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = tuple(sorted(_PROJECT["optional-dependencies"].keys() - {"dev"}))
+"""Every extra that users install; the tools of developers are not given on."""
 PERMISSIVE = re.compile(
     r"\b(MIT(-0|-CMU)?|0?BSD(-[23]-Clause)?|ISCL?|Apache(-2\.0)?|PSF(-2\.0)?|Python Software Foundation"
     r"|Zlib|CC0-1\.0|Unlicense|HPND|MPL(-2\.0)?|Mozilla)\b"
 )
 """Pattern of licences that allow redistribution. The Mozilla licence is among them, as it binds changes to its own
 files alone."""
+BSD_3_CLAUSES = (
+    "Redistribution and use in source and binary forms, with or without modification, are permitted",
+    "Neither the name of the copyright holder nor the names of its contributors may be used to endorse",
+)
 LINKED = {"psycopg": "LGPL-3.0-only", "psycopg-binary": "LGPL-3.0-only"}
 """Packages with a weak copyleft licence: it allows their use as unchanged libraries that users can replace, as they can
 an installed Python package."""
@@ -33,7 +40,13 @@ def licence(of: Distribution) -> str:
     told = of.metadata
     classified = [one.rpartition(" :: ")[2] for one in told.get_all("Classifier", []) if one.startswith("License ::")]
     expression, plain = (next(iter(told.get_all(name, [])), "") for name in ("License-Expression", "License"))
-    return str(expression or "; ".join(classified) or plain.partition("\n")[0])
+    return str(expression or "; ".join(classified) or plain.partition("\n")[0] or _of_its_text(of))
+
+
+def _of_its_text(of: Distribution) -> str:
+    """Name of a licence whose text a package brings without naming it; empty where the text is of another one."""
+    texts = [" ".join(file.read_text().split()) for file in of.files or () if "licenses/" in str(file)]
+    return "BSD-3-Clause" if len(texts) == 1 and all(clause in texts[0] for clause in BSD_3_CLAUSES) else ""
 
 
 def dependencies(name: str, extras: tuple[str, ...], seen: set[str]) -> Iterator[Distribution]:
@@ -55,8 +68,8 @@ def dependencies(name: str, extras: tuple[str, ...], seen: set[str]) -> Iterator
 
 
 def test_every_python_package_may_be_given_on() -> None:
-    found = {one.name.lower().replace("_", "-"): licence(one) for one in dependencies("dentine", ROLES, set())}
-    assert {"mitsuba", "psycopg", "numpy", "fastapi"} <= found.keys()
+    found = {one.name.lower().replace("_", "-"): licence(one) for one in dependencies("dentine", EXTRAS, set())}
+    assert {"mitsuba", "psycopg", "numpy", "fastapi", "rawpy", "obstore"} <= found.keys()
     for name, text in found.items():
         assert text, f"{name} names no licence"
         allowed = LINKED[name] == text if name in LINKED else bool(PERMISSIVE.search(text)) and not STRONG.search(text)
