@@ -49,15 +49,34 @@ def test_the_gltf_validator_notices_a_broken_file(tmp_path: Path) -> None:
 def test_usd_and_materialx_notice_a_broken_file(tmp_path: Path) -> None:
     usd, materialx = str(client_python("pxr")), str(client_python("MaterialX"))
     file = tmp_path / "asset.usda"
-    file.write_text('#usda 1.0\n(defaultPrim = "tooth"\nmetersPerUnit = 0.001\nupAxis = "Y")\ndef Xform "tooth" {}\n')
+    stage = """#usda 1.0
+(
+    defaultPrim = "tooth"
+    metersPerUnit = 0.001
+    upAxis = "Y"
+)
+def Xform "tooth"
+{{
+    def Material "m"
+    {{
+        token outputs:surface.connect = </tooth/m/s.outputs:surface>
+        def Shader "s"
+        {{
+            uniform token info:id = "{}"
+            token outputs:surface
+        }}
+    }}
+}}
+"""
+    # Nodes of MaterialX are unknown to the package from the index, and are left to MaterialX's own check.
+    file.write_text(stage.format("ND_open_pbr_surface_surfaceshader"))
     whole = check_usd(file, usd)
     assert whole is not None
     assert whole.findings == ()
-    file.write_text('#usda 1.0\n(defaultPrim = "tooth"\nmetersPerUnit = 0.001\nupAxis = "Y")\n'
-                    'def Xform "tooth" { rel material:binding = </nowhere> }\n')  # fmt: skip
+    file.write_text(stage.format("NoSuchSurface"))
     broken = check_usd(file, usd)
     assert broken is not None
-    assert broken.findings
+    assert any("NoSuchSurface" in finding for finding in broken.findings)
     file = tmp_path / "asset.mtlx"
     material = '<open_pbr_surface name="s" type="surfaceshader">{}</open_pbr_surface>'
     surface = f'<materialx version="1.39">{material}</materialx>'

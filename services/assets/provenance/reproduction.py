@@ -45,8 +45,8 @@ def open_asset(place: Path) -> Asset:
     folder = place / "asset" if (place / "asset").is_dir() else place
     if not (folder / PROVENANCE).is_file():
         raise MissingStageError(
-            f"{folder} holds no {PROVENANCE}, so what it was made from is unknown; write the asset again with dentine"
-            " export."
+            f"{folder} holds no {PROVENANCE}, as assets of slabs and of earlier versions, so what it was made from is"
+            " unknown; write that of a tooth or mouth again with dentine export."
         )
     require_unedited(folder)
     try:
