@@ -37,7 +37,7 @@ LEFT_OUT = (
     " reflections are left out."
 )
 SAMPLES = 1024
-"""Paths a pixel and channel: some 0.1 of a unit of CIELAB over the spot of an incisor."""
+"""Paths a pixel and channel: the noise is below half a unit of CIELAB over the spot of an incisor, for a second each."""
 DRAWS = 400
 """Number of colours drawn for the standard error of a difference, which is then known to 4 %."""
 SEED = 11
@@ -190,7 +190,7 @@ def relative_radiance(
     images = engine.images(tissue, at.view, seed=SEED, samples=samples)
     count = images.mean.shape[1]
     value = images.mean.sum(axis=0).mean() / at.white_radiance
-    # Lights share paths, so their noise may be equal in sign; the sum of standard errors is the largest it can be.
+    # Lights share paths, so their noise may be equal in sign; the sum of standard errors is the largest that it can be.
     noise = (np.sqrt(images.variance).sum(axis=0) ** 2).sum() / (count * at.white_radiance) ** 2
     slopes = engine.jacobian(tissue, at.view, names, seed=SEED + 1, samples=samples)
     slope = dict(zip(names, slopes.jacobian.sum(axis=1).mean(axis=1) / at.white_radiance, strict=True))
