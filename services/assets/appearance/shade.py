@@ -37,7 +37,7 @@ LEFT_OUT = (
     " reflections are left out."
 )
 SAMPLES = 1024
-"""Paths a pixel and channel: the noise is below half a unit of CIELAB over the spot of an incisor, for a second each."""
+"""Paths a pixel and channel: the noise is below half a unit of CIELAB over the spot, in a second each."""
 DRAWS = 400
 """Number of colours drawn for the standard error of a difference, which is then known to 4 %."""
 SEED = 11
