@@ -23,8 +23,9 @@ GUMS_IOR = 1.33
 LOST = (
     "The surfaces have the colour of their tissue under even light, and the highlight of a wet tooth, which no fit"
     " measured. Light within the media, layers under each other, phase functions and light from behind are lost:"
-    " an incisor was 13 % too dark under even light, with a median colour difference of 4.1 by CIEDE2000, and 30 % too"
-    " bright under a lamp from the front. The coefficients stand beside the surfaces."
+    " an incisor was 13 % too dark under even light, with a median colour difference of 4.1 by CIEDE2000, 30 % too"
+    " bright under a lamp from the front, and had 2 % of its light with the lamp behind it. The coefficients stand"
+    " beside the surfaces."
 )
 """What a surface material cannot say, for the file. The figures are those of
 ``python -m tests.benchmarks.surface_materials``, without the highlight."""
