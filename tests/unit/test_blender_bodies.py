@@ -117,14 +117,14 @@ def test_bodies_of_a_mouth_fill_it_without_touching(tmp_path: Path) -> None:
     table = {f"{part}.sigma": 1.0 for part in ("11.enamel", "11.dentin", "12.enamel", "gums")}
     write_numbers(tmp_path, "thin", {"red": table | {name.replace("sigma", "alpha"): 0.5 for name in table}})
     found = {body.name: body for body in READER.Asset(tmp_path).bodies()}
-    assert set(found) == {"11_enamel", "11_dentin", "12_enamel", "gums"}
+    assert set(found) == {"tooth_11_enamel", "tooth_11_dentin", "tooth_12_enamel", "gums"}
     for body in found.values():
         assert closed(body).signed_volume_mm3() > 0
         assert (closed(body).edge_counts() == 2).all(), body.name
     # Every surface but a tooth's own stands in two bodies, of which one is moved.
-    assert found["11_enamel"].moved
+    assert found["tooth_11_enamel"].moved
     assert not found["gums"].moved
-    contrasts = {round(side.ior, 4) for side in found["11_enamel"].sides}
+    contrasts = {round(side.ior, 4) for side in found["tooth_11_enamel"].sides}
     assert contrasts == {IOR, round(IOR / GUMS_IOR, 4), 1.0}
     assert {side.ior for side in found["gums"].sides} == {GUMS_IOR, 1.0}
 

@@ -27,7 +27,8 @@ LIGHT: dict[str, Any] = {"name": "l0", "position_mm": [0, 0, -500], "intensity":
 
 
 def calibration(camera: dict[str, Any], **more: Any) -> Calibration:
-    tree = {"units": "mm", "channels": ["green", "blue"], "cameras": [CAMERA | camera], "lights": [LIGHT], **more}
+    own = {"units": "mm", "channels": ["green", "blue"], "cameras": [CAMERA | camera], "lights": [LIGHT]}
+    tree = own | more
     return Calibration.model_validate_json(json.dumps(tree))
 
 
@@ -43,14 +44,15 @@ def test_all_that_is_measured_is_kept() -> None:
     camera = {
         "distortion": [0.1, -0.2, 0.001, 0.002, 0.0],
         "vignetting": [-0.3, 0.1, 0.0],
-        "radiance_per_count": [2e-3, 3e-3],
+        "radiance_per_count": [2e-3, 3e-3, 3e-3],
         "black_counts": 64.0,
         "read_noise_counts": 1.5,
         "counts_per_electron": 0.25,
-        "crosstalk": [[1.0, 0.05], [0.02, 1.0]],
+        "crosstalk": [[1.0, 0.05, 0.0], [0.02, 1.0, 0.0], [0.0, 0.0, 1.0]],
     }
     colour = {"c0": {"xyz_from_rgb": np.eye(3).tolist(), "root_polynomial": None}}
     more = {"made": "2026-11-25T10:00:00Z", "valid_days": 30, "inputs": {"raw.toml": "ab"}, "colour": colour}
+    more |= {"channels": ["red", "green", "blue"], "lights": [LIGHT | {"intensity": [1.0, 1.0, 1.0]}]}
     made = calibration(camera, **more)
     require_consistent(made, "It")
     assert Calibration.model_validate_json(made.model_dump_json()) == made
