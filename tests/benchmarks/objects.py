@@ -1,5 +1,5 @@
 """Table of the accuracy of jobs of kind object: shapes of known optics with a matched surface, rendered by stock
-Mitsuba in one camera, fitted with the lights' strength given.
+Mitsuba and fitted with the lights' strength given. Each image is of a camera and a light of its own.
 
 python -m tests.benchmarks.objects --shapes sphere,cube --lights 1,3 --json objects.json
 
@@ -51,22 +51,27 @@ class Row:
 def rows(
     folder: Path, shape: str, lights: tuple[int, ...], *, pixel_mm: float, samples: int, max_samples: int
 ) -> Iterator[Row]:
-    """Render a shape under as many lights as the largest number asks for, and fit the images of the first ones."""
+    """Render a shape in as many cameras and under as many lights as the largest number asks for, and fit an image of
+    each of the first ones.
+    """
     prepare_device()
-    capture = folder / shape
+    capture, most = folder / shape, max(lights)
     write_object_phantom(
-        capture, shape=shape, cameras=1, lights=max(lights), pixel_mm=pixel_mm, samples=samples, renderer="mitsuba",
+        capture, shape=shape, cameras=most, lights=most, pixel_mm=pixel_mm, samples=samples, renderer="mitsuba",
         held_out=0,
     )  # fmt: skip
     whole = read_record(capture / "capture.json", FolderCapture)
     truth = json.loads((capture / "truth.json").read_text())["channels"]["green"]["body"]
     known = {"sigma_s_reduced": truth["sigma_s_reduced"], "sigma_a": (1 - truth["alpha"]) * truth["sigma"]}
     for count in lights:
-        part = whole.model_copy(update={"lights": whole.lights[:count], "images": whole.images[:count]})
+        cameras, own = whole.cameras[:count], whole.lights[:count]
+        pairs = {(camera.name, light.name) for camera, light in zip(cameras, own, strict=True)}
+        images = tuple(image for image in whole.images if (image.camera, image.light) in pairs)
+        part = whole.model_copy(update={"cameras": cameras, "lights": own, "images": images})
         write_record(capture / "capture.json", part)
         spec = JobSpec(
             kind="object", capture=capture, boundary="matched", instrument="off", held_out_lights=(), advise=False,
-            max_samples_per_pixel=max_samples, image_tolerance=0.001, max_steps=30,
+            max_samples_per_pixel=max_samples,
         )  # fmt: skip
         job, begun_s = LocalContext(folder / f"{shape}-{count}"), time.process_time()
         run_object(spec, job)
@@ -82,8 +87,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", default="sphere,cube")
     parser.add_argument("--lights", default="1,3")
-    parser.add_argument("--pixel-mm", type=float, default=0.5)
-    parser.add_argument("--samples", type=int, default=8192)
+    parser.add_argument("--pixel-mm", type=float, default=0.8)
+    parser.add_argument("--samples", type=int, default=2048)
     parser.add_argument("--max-samples", type=int, default=4096)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

@@ -18,6 +18,6 @@ def test_a_figure_is_reached_by_its_limit_or_by_its_bound() -> None:
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("shape", ["sphere", "cube"])
 def test_one_image_and_three_tell_scattering_and_absorption(tmp_path: Path, shape: str) -> None:
-    found = list(rows(tmp_path, shape, (1, 3), pixel_mm=0.8, samples=4096, max_samples=2048))
+    found = list(rows(tmp_path, shape, (1, 3), pixel_mm=0.8, samples=2048, max_samples=4096))
     assert len(found) == 4
     assert [row for row in found if not row.is_reached] == []
