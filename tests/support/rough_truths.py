@@ -1,74 +1,121 @@
-"""Images of a rough dielectric ball by stock Mitsuba, stored because they take minutes;
-``python -m tests.support.rough_truths`` renders them anew.
+"""Images of rough dielectric surfaces by stock Mitsuba, stored because they take minutes;
+``python -m tests.support.rough_truths`` renders them anew: two balls, and the micro-CT incisor where it is shared.
 
-Each image is ``prbvolpath``'s, less the image of the same ball filled with black ink: what is left has come out of the
-ball, as an engine without highlights shows it.
+Each image is ``prbvolpath``'s, less the image of the same surface around black ink: what is left has come out of the
+object, as an engine without highlights shows it.
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.mitsuba.scene import lit_scene, load_scene, medium_dict, render_batches, sensor_dict, surface_dict
-from services.core.files.meshes import write_mesh
-from services.core.geometry import Mesh
+from services.anatomy.dentin_shape import DentinShape
+from services.assets.mitsuba.scene import load_scene, nested_scene, render_batches, surface_dict
+from services.core.files.meshes import read_teeth, write_mesh
+from services.core.geometry import Camera
+from services.core.records import FolderCapture
+from services.core.store import read_record
 from services.transport.boundary.rough import Rough
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import SceneRecipe, View, single_tooth
 from tests.support.pictures import BATCHES
+from tests.support.shared_data import shared_path
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, camera_at, sphere, whole_view
 
 STORED = Path(__file__).parents[1] / "data" / "rough_truths.npz"
-MILK = Medium(2.0, 0.995, g1=0.3)
-INK = Medium(1e4, 1e-6)
-TISSUE = Tissue(MILK, MILK)
+TISSUE = Tissue(Medium(2.0, 0.995, g1=0.3), Medium(2.0, 0.995, g1=0.3))
+INCISOR_TISSUE = Tissue(Medium(6.0, 0.99, g1=0.8), Medium(11.0, 0.98, g1=0.7))
+INK = Tissue(Medium(1e4, 1e-6), Medium(1e4, 1e-6))
 CASES = ((0.15, 1.63), (0.3, 1.33))
-"""Roughness and index of refraction. Smoother balls have images with rare bright paths."""
+"""Roughness and index of refraction of the balls. Smoother ones have images with rare bright paths."""
+INCISOR_CASE = (0.3, 1.63)
 LIGHTS = LIGHTS_MM[[1, 3]]
-SAMPLES = 2048
+SAMPLES = 4096
+INCISOR_SAMPLES = 49_152
+COARSER = 4
+"""Pixels of the incisor's view in one pixel here, along each edge: 0.5 mm become 2 mm."""
 
 
-def ball() -> Mesh:
-    """The ball, of 1,280 flat faces, as both renderers see it."""
-    return sphere(2.0)
+@dataclass(frozen=True)
+class RoughTruth:
+    """One scene of both renderers."""
+
+    name: str
+    recipe: SceneRecipe
+    """The scene as the engine takes it, without compensation, which stock Mitsuba lacks."""
+    tissue: Tissue
+    view: View
+    samples: int
 
 
 def scene_recipe(roughness: float, ior: float) -> SceneRecipe:
-    """The scene as the engine takes it, without compensation, which stock Mitsuba lacks."""
-    plain = single_tooth(ball(), None, LIGHTS, np.full(len(LIGHTS), INTENSITY), "rough", ior)
+    """A ball of 1,280 flat faces under two lights."""
+    plain = single_tooth(sphere(2.0), None, LIGHTS, np.full(len(LIGHTS), INTENSITY), "rough", ior)
     return replace(plain, roughness=roughness, multiple_scattering=False)
 
 
 def view() -> View:
-    """The view of both renderers, 8 x 8 pixels across the ball."""
+    """The view of the balls, 8 x 8 pixels."""
     return whole_view(camera_at((0.2, 1, 0.1), size=8, span_mm=4.4))
 
 
-def images(roughness: float, ior: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and variance of the mean, (lights, H, W) each, of the light that has come out of the ball."""
+def ball(roughness: float, ior: float) -> RoughTruth:
+    """A ball of milk."""
+    return RoughTruth(f"ball-{roughness}", scene_recipe(roughness, ior), TISSUE, view(), SAMPLES)
+
+
+def incisor() -> RoughTruth:
+    """The incisor with its dentin under two lights; skips where it is not shared."""
+    root = shared_path("data/tooth-ur1-truth")
+    capture, tooth = read_record(root / "capture.json", FolderCapture), read_teeth(root)[0]
+    assert tooth.dentin is not None
+    lights, fine = (capture.lights[0], capture.lights[-1]), capture.cameras[0]
+    matrix = np.array(fine.K)
+    matrix[:2] /= COARSER
+    rows: Any = tuple(map(tuple, matrix.tolist()))
+    width, height = fine.size
+    size = (width // COARSER, height // COARSER)
+    camera = Camera(name="c0", size=size, K=rows, camera_from_world=fine.camera_from_world)
+    positions, intensities = (
+        np.array([light.position_mm for light in lights]),
+        np.array([light.intensity[0] for light in lights]),
+    )
+    roughness, ior = INCISOR_CASE
+    plain = single_tooth(tooth.outer, DentinShape.known(tooth.dentin), positions, intensities, "rough", ior)
+    recipe = replace(plain, roughness=roughness, multiple_scattering=False)
+    return RoughTruth("incisor", recipe, INCISOR_TISSUE, whole_view(camera), INCISOR_SAMPLES)
+
+
+def images(truth: RoughTruth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and variance of the mean, (lights, H, W) each, of the light that has come out."""
     prepare_device()
-    found = []
+    found, recipe = [], truth.recipe
+    (tooth,) = recipe.teeth
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "ball.ply"
-        write_mesh(path, ball())
-        surface = surface_dict(path, Rough.mitsuba(ior, roughness=roughness))
-        for number, light in enumerate(LIGHTS):
+        outer, dentin = Path(folder) / "outer.ply", None
+        write_mesh(outer, tooth.outer)
+        if tooth.dentin is not None:
+            dentin = Path(folder) / "dentin.ply"
+            write_mesh(dentin, tooth.dentin.base)
+        surface = surface_dict(outer, Rough.mitsuba(recipe.ior, roughness=recipe.roughness))
+        for number, (light, intensity) in enumerate(
+            zip(recipe.light_positions_mm, recipe.light_intensities, strict=True)
+        ):
             parts: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
-            for medium in (MILK, INK):
-                scene = lit_scene(light, INTENSITY) | {
-                    "medium": medium_dict(medium),
-                    "ball": surface | {"interior": {"type": "ref", "id": "medium"}},
-                    "camera": sensor_dict(view().camera, 64),
-                }
-                parts.append(render_batches(load_scene(scene), 0, SAMPLES, 31 + 2 * number + len(parts), BATCHES))
+            for tissue in (truth.tissue, INK):
+                scene = nested_scene(
+                    {"11": (outer, dentin)}, tissue, (truth.view.camera,), light.tolist(), float(intensity)
+                )
+                scene["outer_11"] = surface | {"interior": {"type": "ref", "id": "medium_enamel"}}
+                parts.append(render_batches(load_scene(scene), 0, truth.samples, 31 + number, BATCHES))
             (whole, noise), (highlight, highlight_noise) = parts
             found.append((whole - highlight, noise + highlight_noise))
     mean, variance = (np.stack(arrays) for arrays in zip(*found, strict=True))
@@ -77,8 +124,8 @@ def images(roughness: float, ior: float) -> tuple[NDArray[np.float64], NDArray[n
 
 if __name__ == "__main__":
     arrays: dict[str, Any] = {}
-    for case in CASES:
-        mean, variance = images(*case)
-        arrays |= {f"mean/{case[0]}": mean.astype(np.float32), f"variance/{case[0]}": variance.astype(np.float32)}
-        sys.stderr.write(f"{case}: {np.sqrt(variance.sum()) / mean.sum():.2%}\n")
+    for truth in (*(ball(*case) for case in CASES), incisor()):
+        mean, variance = images(truth)
+        arrays |= {f"mean/{truth.name}": mean.astype(np.float32), f"variance/{truth.name}": variance.astype(np.float32)}
+        sys.stderr.write(f"{truth.name}: {np.sqrt(variance.sum()) / mean.sum():.2%}\n")
     np.savez(STORED, **arrays)
