@@ -6,7 +6,7 @@ BIN := .venv/bin
 # test files are kept, also where the environment forbids bytecode: reading them takes half the time of making them.
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
 
-demo: setup ## simulated rig -> capture -> preparation -> fit -> asset and report, below demo/
+demo: setup ## simulated rig -> capture -> preparation -> fit of three channels -> asset, report and a picture, below demo/
 	@$(BIN)/dentine demo --out demo
 
 lab-demo: setup ## virtual laboratory: raw frames -> calibration -> registration -> preparation -> fit -> comparison with the truth, below lab/

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -40,6 +40,15 @@ def run_and_report(spec: JobSpec, out: Path, workers: int | None, *, as_json: bo
         typer.Exit: the fit did not converge.
     """
     from services.cli.verdict import require_converged
+
+    asset = run_to_asset(spec, out, workers)
+    print(json.dumps(asset_values(asset, out)) if as_json else "\n".join(asset_lines(asset, out)))
+    if asset.verdict is not None:
+        require_converged(asset.verdict)
+
+
+def run_to_asset(spec: JobSpec, out: Path, workers: int | None) -> AssetManifest:
+    """Run a job and show its progress; the first Ctrl-C cancels it in order."""
     from services.client.progress import ProgressView
     from services.pipeline.stages import run_job
 
@@ -51,21 +60,24 @@ def run_and_report(spec: JobSpec, out: Path, workers: int | None, *, as_json: bo
         asset = run_job(spec, out, view, workers)
     if not view.events:
         print("Every stage was published already; nothing ran.", file=sys.stderr)
-    report = out / "report.html"
-    if as_json:
-        result = {
-            "converged": asset.converged,
-            "held_out_error": asset.held_out_error,
-            "verdict": None if asset.verdict is None else asset.verdict.model_dump(mode="json"),
-            "report": str(report),
-            "parameters": str(parameters) if (parameters := out / "parameters.json").exists() else None,
-            "files": list(asset.files),
-        }
-        print(json.dumps(result))
-    else:
-        print(f"{_errors(asset)}\nreport: {report}")
-    if asset.verdict is not None:
-        require_converged(asset.verdict)
+    return asset
+
+
+def asset_values(asset: AssetManifest, out: Path) -> dict[str, Any]:
+    """What a program is told of a job's results."""
+    return {
+        "converged": asset.converged,
+        "held_out_error": asset.held_out_error,
+        "verdict": None if asset.verdict is None else asset.verdict.model_dump(mode="json"),
+        "report": str(out / "report.html"),
+        "parameters": str(parameters) if (parameters := out / "parameters.json").exists() else None,
+        "files": list(asset.files),
+    }
+
+
+def asset_lines(asset: AssetManifest, out: Path) -> list[str]:
+    """What a person is told of a job's results: how well it fits, and where the report is."""
+    return [_errors(asset), f"report: {out / 'report.html'}"]
 
 
 def _errors(asset: AssetManifest) -> str:

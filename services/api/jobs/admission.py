@@ -32,8 +32,8 @@ MIN_DISK_BYTES = 64 * 2**20
 """Bytes that a job stores however small its capture is: pictures, checkpoint and asset."""
 RIG_CAPTURE_BYTES = 2 * 2**30
 """Assumed size in bytes of a capture that a rig is about to take."""
-DEMO_CAPTURE_BYTES = 2**20
-"""Assumed size in bytes of the capture that the demonstration's rig takes; 0.3 MB were measured."""
+DEMO_CAPTURE_BYTES = 2**23
+"""Assumed size in bytes of the capture that the demonstration's rig takes; its mouth's images take 2.1 MB."""
 WORKER_BYTES = 3 * 2**29
 """Memory in bytes of one worker and its rendering process in the fit of a jaw; 1.1 GiB were measured."""
 MAX_FILES = 5_000

@@ -16,8 +16,8 @@ from services.core.light.safety import FREE_FLASHES_PER_S
 from services.core.records import JobSpec
 from services.core.values import AUTO
 
-DEMO_VALUES = 16_896
-"""Number of values that the demonstration fits: 8 lights in 3 images of about 21 by 33 pixels, one channel."""
+DEMO_VALUES = 252_288
+"""Number of values in the demonstration's images: 8 lights in 3 images of about 48 by 73 pixels, three channels."""
 _METHOD = ("kind", "boundary", "dentin", "loss", "solver", "prior", "stains", "lobes", "advise", "workers", "device")
 """Options that make up the method of a job. The others change only its size, or nothing that takes time."""
 
