@@ -3,8 +3,8 @@ Mitsuba and fitted with the lights' strength given. Each image is of a camera an
 
 python -m tests.benchmarks.objects --shapes sphere,cube --lights 1,3 --json objects.json
 
-``error`` and ``se`` are relative to the truth. A figure is reached when its error is below the limit, or, where the
-standard error alone exceeds the limit, within two standard errors.
+``error`` and ``se`` are relative to the truth. A figure is reached when its error is below the limit, or below two
+standard errors where these exceed the limit, so that the images do not allow it.
 """
 
 from __future__ import annotations
@@ -43,9 +43,8 @@ class Row:
 
     @property
     def is_reached(self) -> bool:
-        """Whether the error keeps its limit, or a standard error above the limit twice."""
-        limit = LIMITS[self.quantity]
-        return abs(self.error) <= (limit if self.se <= limit else SIGMAS * self.se)
+        """Whether the error keeps its limit, or two standard errors where these are larger."""
+        return abs(self.error) <= max(LIMITS[self.quantity], SIGMAS * self.se)
 
 
 def rows(
