@@ -12,7 +12,7 @@ import typer
 from services.assets.colour.beside import BACKGROUND, MIN_SIDE_PX, Beside, beside, picture
 from services.assets.colour.develop import developed
 from services.assets.colour.spaces import LINEAR_SRGB
-from services.cli.demo_end import PICTURE, tell_end
+from services.cli.client.demo_end import PICTURE, tell_end
 from services.core.errors import CorruptStoreError, InputError
 from services.core.pages.pictures import tone_map
 from services.core.results import AssetManifest, Figure, Verdict
@@ -101,7 +101,7 @@ def verdict(*, converged: bool) -> Verdict:
 def test_the_last_line_is_the_pictures_path(
     job: Path, converged: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.cli.demo_end.PICTURE_SAMPLES", 4)
+    monkeypatch.setattr("services.cli.client.demo_end.PICTURE_SAMPLES", 4)
     asset = AssetManifest(files=(), held_out_error=0.03, converged=converged, verdict=verdict(converged=converged))
     (job / PICTURE).unlink(missing_ok=True)
     if converged:
@@ -121,7 +121,7 @@ def test_the_last_line_is_the_pictures_path(
 def test_a_program_is_told_the_same(
     job: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.cli.demo_end.PICTURE_SAMPLES", 4)
+    monkeypatch.setattr("services.cli.client.demo_end.PICTURE_SAMPLES", 4)
     asset = AssetManifest(files=(), held_out_error=0.03, verdict=verdict(converged=True))
     tell_end(asset, job, as_json=True)
     told = json.loads(capsys.readouterr().out)

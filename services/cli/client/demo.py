@@ -34,7 +34,7 @@ def demo(
 
     spec = JobSpec.model_validate(find_preset("demo").options)
     if server is None:
-        from services.cli.demo_end import tell_end
+        from services.cli.client.demo_end import tell_end
         from services.cli.run import run_to_asset
 
         tell_end(run_to_asset(spec, out, None), out, as_json=as_json)
