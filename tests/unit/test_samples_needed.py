@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,12 @@ def test_the_paths_bring_rendering_to_its_share_of_the_worst_standard_error() ->
     needed = samples_needed(known((1e-4, 4e-4), (4e-4, 4e-4)), 100, 10_000)
     rendering = 4e-4 * 100 / needed
     assert rendering / (rendering + 4e-4) == pytest.approx(MAX_RENDERING**2, rel=0.01)
+
+
+def test_a_step_that_noise_left_unfinished_asks_for_paths() -> None:
+    enough = known((1e-4, 1e-4), (4e-4, 4e-4))
+    left = replace(enough, parts={**enough.parts, "unfinished": np.diag([0.0, 3e-4])})
+    assert samples_needed(left, 100, 10_000) > samples_needed(enough, 100, 10_000) == 100
 
 
 def test_enough_paths_are_enough() -> None:
