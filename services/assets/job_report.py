@@ -66,7 +66,8 @@ def _appearance(job: FittedJob, asset: Path, pictures: ReportPictures) -> Appear
     from services.assets.appearance.sections import Appearance
     from services.assets.appearance.shade import read_shade
     from services.assets.appearance.translucency import translucencies
-    from services.assets.appearance.white import camera_white, diffuser_radiance
+    from services.assets.appearance.white import camera_white
+    from services.assets.colour.develop import diffuser_radiance
 
     whites = {camera.name: camera_white(asset, camera.name) for camera in job.prepared.cameras}
     first = whites[job.prepared.cameras[0].name]
@@ -98,9 +99,7 @@ def facts_of_fit(report: FitReport) -> Mapping[str, str]:
     """What the fit compared and what its time was for, by label."""
     told = {}
     if report.pixel_edge_mm is not None:
-        told["squares"] = (
-            f"{report.pixel_step} × {report.pixel_step} pixels, {report.pixel_edge_mm:.2f} mm at the teeth"
-        )
+        told["squares"] = f"{report.pixel_step} × {report.pixel_step} pixels, {report.pixel_edge_mm:.2f} mm wide"
     if total := sum(report.seconds_by_purpose.values()):
         shares = {name: 100 * seconds / total for name, seconds in report.seconds_by_purpose.items()}
         told["time by purpose"] = ", ".join(f"{name} {share:.0f} %" for name, share in shares.items() if share >= 0.5)

@@ -18,7 +18,7 @@ from services.core.verdict import VERDICT, verdict_of
 ENGINE = "services.transport.engine:Engine"
 
 
-PACKAGES = ("drjit", "jinja2", "manifold3d", "mitsuba", "numba", "PIL", "rtree", "scipy", "xatlas")
+PACKAGES = ("drjit", "jinja2", "manifold3d", "mitsuba", "numba", "OpenEXR", "PIL", "rtree", "scipy", "xatlas")
 """Packages of the extra ``fit``, by the names under which they are imported."""
 
 

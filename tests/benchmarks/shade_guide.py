@@ -15,7 +15,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from services.assets.appearance.white import ASSUMED, CameraWhite, xyz_from_srgb
+from services.assets.appearance.white import ASSUMED, CameraWhite
+from services.assets.colour.develop import xyz_from_assumed
 from services.assets.mitsuba.scene import SceneDict, nested_scene
 from services.core.files.meshes import write_mesh
 from tests.support.shade_tabs import CHANNELS, NAMES, dentin, outer, spot, tissues
@@ -69,7 +70,7 @@ def main() -> None:
     import tempfile
 
     mi.set_variant("llvm_ad_mono")
-    white = CameraWhite(xyz_from_srgb(), ASSUMED)
+    white = CameraWhite(xyz_from_assumed(), ASSUMED)
     OUT.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place, OUT.open("w", newline="") as stream:
         folder = Path(place)

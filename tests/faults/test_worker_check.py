@@ -29,7 +29,7 @@ from tests.support.live_server import toy_server
 from tests.support.small_system import PATIENCE_S, ROOT, free_port
 
 pytestmark = pytest.mark.timeout(600)
-IMPORTED_AS = {"pillow": "PIL", "opencv-contrib-python-headless": "cv2"}
+IMPORTED_AS = {"pillow": "PIL", "opencv-contrib-python-headless": "cv2", "openexr": "OpenEXR"}
 
 
 def environment(folder: Path, *, broken: str | None = None) -> dict[str, str]:

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,18 @@ XYZ_FROM_SRGB = np.array(
 )
 
 
+RENDER = """
+import json, sys
+import mitsuba as mi
+import numpy as np
+scene, variant, width, height, samples = sys.argv[1:]
+mi.set_variant(variant)
+loaded = mi.load_file(scene, optimize=False, width_0=int(width), height_0=int(height))
+image = np.array(mi.render(loaded, spp=int(samples), seed=3), dtype=np.float64)[..., :3]
+print(json.dumps(image.mean(axis=(0, 1)).tolist()))
+"""
+
+
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball of enamel and dentin with the dense media."""
@@ -60,13 +74,11 @@ def channels(asset: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def shown(asset: Path, scene: str, variant: str) -> np.ndarray:
     """The ball's mean linear sRGB by a scene in colour, 1 for a white diffuser that faces the light."""
-    import mitsuba as mi
-
-    mi.set_variant(variant)
+    # A process keeps one variant, so another one renders.
     width, height = camera("c0").size
-    loaded = mi.load_file(str(asset / scene), optimize=False, width_0=width, height_0=height)
-    image = np.array(mi.render(loaded, spp=SAMPLES, seed=3), dtype=np.float64)[..., :3]
-    return np.asarray(image.mean(axis=(0, 1)) * PER_RADIANCE)
+    given = str(asset / scene), variant, str(width), str(height), str(SAMPLES)
+    done = subprocess.run([sys.executable, "-c", RENDER, *given], capture_output=True, text=True, check=True)
+    return np.array(json.loads(done.stdout.splitlines()[-1])) * PER_RADIANCE
 
 
 def difference(one: np.ndarray, other: np.ndarray, white: float) -> float:

@@ -16,7 +16,7 @@ def test_squares_and_shares_of_the_time() -> None:
         BARE.model_copy(update={"pixel_step": 7, "pixel_edge_mm": 0.448, "seconds_by_purpose": seconds})
     )
     assert found == {
-        "squares": "7 × 7 pixels, 0.45 mm at the teeth",
+        "squares": "7 × 7 pixels, 0.45 mm wide",
         "time by purpose": "images 75 %, comparison of steps 25 %",
     }
 

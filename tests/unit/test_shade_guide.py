@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from services.assets.appearance.guide import read_guide
-from services.assets.appearance.white import camera_white, xyz_from_srgb
+from services.assets.appearance.white import camera_white
+from services.assets.colour.develop import xyz_from_assumed
 from services.core.colour.cie import D50
 from services.core.errors import CaptureInputError
 
@@ -86,11 +87,11 @@ def test_an_absent_guide_is_one_sentence(tmp_path: Path) -> None:
 def test_channels_without_a_matrix_are_taken_for_srgb_and_white_stays_white(tmp_path: Path) -> None:
     # The matrix of sRGB adapted to D50, as ICC profiles hold it (IEC 61966-2-1 with the Bradford adaptation).
     np.testing.assert_allclose(
-        xyz_from_srgb(),
+        xyz_from_assumed(),
         [[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]],
         atol=2e-4,
     )
-    np.testing.assert_allclose(xyz_from_srgb().sum(axis=1), D50, atol=1e-9)
+    np.testing.assert_allclose(xyz_from_assumed().sum(axis=1), D50, atol=1e-9)
     (tmp_path / "rig.json").write_text('{"channels": ["red", "green", "blue"], "cameras": ["c0"]}')
     white = camera_white(tmp_path)
     assert white is not None

@@ -7,14 +7,15 @@ import pytest
 
 from services.assets.appearance.differences import colour_difference
 from services.assets.appearance.translucency import THICKNESS_MM, ThinFace, translucencies
-from services.assets.appearance.white import ASSUMED, CameraWhite, xyz_from_srgb
+from services.assets.appearance.white import ASSUMED, CameraWhite
+from services.assets.colour.develop import xyz_from_assumed
 from services.assets.content import RGB
 from services.core.colour.cie import delta_e_2000, lab_from_xyz
 from services.core.pages.pictures import Picture
 from services.core.results import Estimate
 from services.transport.optics.slab_totals import Optics, slab_totals
 
-WHITE = CameraWhite(xyz_from_srgb(), ASSUMED)
+WHITE = CameraWhite(xyz_from_assumed(), ASSUMED)
 
 
 def table(scattering: float, absorption: float, g: float = 0.0, relative_se: float = 0.0) -> dict[str, Estimate]:
@@ -42,7 +43,7 @@ def test_a_grey_layer_without_absorption_is_that_of_the_slab_formula() -> None:
     totals = slab_totals(Optics(0.0, 1.0, 0.0), THICKNESS_MM, ThinFace(1.0))
     assert totals.reflectance_diffuse == pytest.approx(0.4466, abs=5e-4)
     grey = np.full((1, 3), 0.4466)
-    black, white = (lab_from_xyz(one @ xyz_from_srgb().T) for one in (grey, np.ones((1, 3))))
+    black, white = (lab_from_xyz(one @ xyz_from_assumed().T) for one in (grey, np.ones((1, 3))))
     assert tp00(1.0, 0.0)[0] == pytest.approx(float(delta_e_2000(black, white)[0]), abs=0.03)
 
 

@@ -233,7 +233,11 @@ class FoundOffset:
     def length_se_px(self) -> float:
         """Standard error of ``length_px``, with the errors to the right and down taken as independent."""
         along = np.array([self.right_px, self.down_px]) / max(self.length_px, 1e-9)
-        return float(np.hypot(along[0] * self.right_se_px, along[1] * self.down_se_px))
+        # An unknown error across the offset does not count, though 0 times infinity is no number.
+        right, down = (
+            a * se if a != 0 else 0.0 for a, se in zip(along.tolist(), (self.right_se_px, self.down_se_px), strict=True)
+        )
+        return float(np.hypot(right, down))
 
 
 def best_offset(shifted_render: ShiftedRender, pixel_mm: float) -> FoundOffset | None:
