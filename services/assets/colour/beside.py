@@ -76,7 +76,9 @@ def beside(job: Path, samples: int) -> Beside:
     lamp = lamp.model_copy(update={"intensity": tuple(by_channel[channel] for channel in colours.channels)})
     white = diffuser_radiance(lamp, tuple(rig["colour"]["diffuser_mm"]))
     script = runpy.run_path(str(asset / "render.py"))
-    image = script["render"](asset, camera, light, samples)[..., [rig["channels"].index(c) for c in colours.channels]]
+    integrator = "prbvolpath" if rig["boundary"] == "matched" else ""
+    image = script["render"](asset, camera, light, samples, integrator=integrator)
+    image = image[..., [rig["channels"].index(channel) for channel in colours.channels]]
     own = colours.cameras.get(camera)
     photo, render = (developed(one / white, own, LINEAR_SRGB) for one in (photos[camera, light], image))
     matrix = rig["colour"]["cameras"][camera]["source"]

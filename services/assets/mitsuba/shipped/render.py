@@ -16,6 +16,10 @@ import mitsuba as mi
 import numpy as np
 
 
+DEPTHS = {"max_depth": 5000, "rr_depth": 100}
+"""Limits of an integrator that takes the place of the scenes' own, whose limits these are."""
+
+
 def render(
     folder: Path,
     camera: str,
@@ -24,8 +28,13 @@ def render(
     seed: int = 0,
     variant: str = "llvm_ad_mono",
     large: bool = False,
+    integrator: str = "",
 ) -> np.ndarray:
-    """Linear radiance (H, W, C) of one camera under one light, from so many paths per pixel of the result."""
+    """Linear radiance (H, W, C) of one camera under one light, from so many paths per pixel of the result.
+
+    Args:
+        integrator: in place of the scenes' own; ``prbvolpath`` takes 2.7 times as long and has no bright specks.
+    """
     if mi.variant() != variant:
         mi.set_variant(variant)
     rig = json.loads((folder / "rig.json").read_text())
@@ -39,7 +48,8 @@ def render(
     for channel, intensity in zip(rig["channels"], rig["lights"][light]["intensity"], strict=True):
         given = {"light_x": x, "light_y": y, "light_z": z, "intensity": intensity} | film
         scene = mi.load_file(str(folder / f"scene_{channel}.xml"), optimize=False, **given)
-        planes.append(np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed))[..., 0])
+        chosen = mi.load_dict({"type": integrator, **DEPTHS}) if integrator else scene.integrator()
+        planes.append(np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed, integrator=chosen))[..., 0])
     return np.stack(planes, axis=-1)
 
 
