@@ -15,7 +15,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-
 DEPTHS = {"max_depth": 5000, "rr_depth": 100}
 """Limits of an integrator that takes the place of the scenes' own, whose limits these are."""
 
