@@ -12,8 +12,8 @@ from services.fit.solve.normal_equations import LossChange
 SIGNIFICANCE_Z = 3.0
 """A change is significant beyond this many standard errors: a worse step passes with probability at most 1.3e-3."""
 FIRST_SHARE = 4
-"""Divisor of the paths of the first look at a step. Most steps are decided by it, far from the solution by the
-comparison and near to it by the prediction."""
+"""Divisor of the paths of the first look at a step. It suffices where the step is clearly better: by the comparison far
+from the solution, and by the prediction near to it."""
 SECOND_LOOK = 1_000
 """Added to the number of a trial, which seeds its renders, for its second look."""
 
