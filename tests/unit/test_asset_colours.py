@@ -89,9 +89,11 @@ def test_a_colour_goes_to_a_space_and_back() -> None:
 
 def plate(white: float) -> np.ndarray:
     """Radiance (1, 1, 3) of a diffuse plate that faces the light, of ``white`` reflectance, by stock Mitsuba."""
+    from services.transport.platform import prepare_device
+
+    prepare_device()
     import mitsuba as mi
 
-    mi.set_variant("scalar_rgb")
     towards = np.array(LIGHT.position_mm)
     eye = towards / np.linalg.norm(towards) * 100 + [1.0, 2.0, 0.0]
     planes = []
