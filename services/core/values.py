@@ -24,7 +24,7 @@ Whole = Annotated[int, BeforeValidator(_no_stand_in)]
 def _auto_or_whole(value: Any) -> Any:
     if value == AUTO:
         return value
-    if isinstance(value, bool) or not isinstance(value, int | float) or int(value) != value or not 1 <= value <= 64:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= 64 or int(value) != value:
         raise PydanticCustomError("pixel_step_type", 'give "auto" or a whole number from 1 to 64')
     return int(value)
 
@@ -37,7 +37,7 @@ PixelStep = Annotated[
 ]
 """Edge of the fitted squares in pixels, or ``auto``."""
 MAX_SQUARE_MM = 0.5
-"""Largest edge of a square at the teeth by ``auto``, mm. Larger ones lose what the sides of a tooth tell of its mean
-cosines."""
+"""Largest edge of a square at the teeth by ``auto``, mm. Squares of 0.26 and of 0.45 mm left the photographs' part of
+the standard errors as it was; larger ones were not tried."""
 Unit = Annotated[Number, Field(ge=0, le=1)]
 Positive = Annotated[Number, Field(gt=0)]

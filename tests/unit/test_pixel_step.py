@@ -57,7 +57,7 @@ def test_stains_and_a_given_number_are_not_overruled(tmp_path: Path) -> None:
     assert choose(tmp_path / "b", everything, pixel_step=4) == 4
 
 
-@pytest.mark.parametrize("wrong", [0, 65, 2.5, "fine", True, None])
+@pytest.mark.parametrize("wrong", [0, 65, 2.5, "fine", True, None, float("inf"), float("nan")])
 def test_another_value_is_refused_in_words(tmp_path: Path, wrong: object) -> None:
     with pytest.raises(ValidationError, match='give "auto" or a whole number from 1 to 64'):
         JobSpec.model_validate({"capture": tmp_path, "pixel_step": wrong})

@@ -56,8 +56,8 @@ def judged(
 ) -> StepTest:
     """Judge a step by a comparison with a quarter of the paths, and where that is not clearly better by one with all.
 
-    The first only accepts a step: with few paths its noise has long tails, which would refuse good ones. The second is
-    used alone, because the noise of a product of two renders falls faster than the number of paths grows.
+    The first only accepts a step, so that few paths refuse none. The second is used alone: where the noise of both
+    renders' product prevails, its variance falls with the square of the paths, and the first would add nothing.
 
     Args:
         compare: compares the data's loss at both ends with so many paths per pixel, as the trial of this number.

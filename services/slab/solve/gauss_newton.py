@@ -50,7 +50,7 @@ UNCONVERGED_RATIO = 5.0
 FAR_RATIO = 50.0
 """The same ratio, above which a thin cell's fit returns to the search, whose steps are judged by the misfit. Steps of
 the last stages that begin far from the minimum are mostly noise of the matrix: one fit went from 7.2 of an extinction
-of 3 per mm to 2.8, where it was thin, and then to and fro. Of 17 other fits the largest ratio was 8."""
+of 3 per mm to 2.8, where it was thin, and then to and fro. Of three other fits the largest ratio was 8."""
 MAX_STEPS_BEFORE_RETURN = 30
 """Number of steps of a fit after which it returns to no search."""
 SETTLED_MOVE = 1 / 3

@@ -16,7 +16,7 @@ from services.transport.optics.parameters import Tissue
 
 COSINE_DRIFT = 0.1
 """Standard deviation of the change of the enamel's mean cosine from channel to channel, in its coordinate atanh g: 0.05
-at g = 0.7."""
+at g = 0.7. An assumption: no source at hand gives it by wavelength."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ layered       the same                                         similar   converg
 shape         the same and the dentin's blend weights          exact     converged, or max_steps; where they are fitted
 exact         the same                                         exact     converged, or max_steps
 phase         g1, beta, g2 too                                 exact     converged, or max_steps; only with two lobes
-again         the same                                         exact     as before; only where errors moved x far
+again, …      the same                                         exact     as before; where errors moved x far, or noise
+                                                                         is too much of a standard error
 stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; where fitted
 ============  ===============================================  ========  ===============================================
 
@@ -66,8 +67,8 @@ HOMOGENEOUS_STEPS = 4
 """Largest number of steps of the homogeneous tooth before layers, and of each refit of the media but the last in the
 stain stage."""
 EXACT_SAMPLES = 4
-"""Paths per pixel at the beginning of the exact stages, relative to those of the start, for three views; they double
-where noise requires it."""
+"""Paths per pixel at the beginning of the exact stages, relative to those of the start, for three views. Where standard
+errors do not tell how many are needed (``has_usual_precision``), they double where noise requires it."""
 MIN_EXACT_SAMPLES = 32
 """Least number of paths per pixel at the beginning of the exact stages, where the limit allows it. With fewer,
 comparisons of full images decide little: a large stack takes longer from 11 to its limit of 21 than at 21 alone."""
