@@ -157,7 +157,7 @@ def write_asset(
         "boundary": boundary,
         "ior": ior,
         "channels": list(channels),
-        "cameras": [camera.name for camera in cameras],
+        "cameras": list(names),
         "scene.xml": colour,
         "views": {camera.name: camera.model_dump(exclude={"name"}) for camera in shown},
         "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},

@@ -68,11 +68,11 @@ class AssetPart:
     def absorption_per_mm(self) -> NDArray[np.float64]:
         """Absorption coefficient, 1/mm, of red, green and blue."""
         found = {channel: (1 - medium.alpha) * medium.sigma for channel, medium in self.media().items()}
-        return _as_rgb(found, unknown=0.0)
+        return in_rgb(found, unknown=0.0)
 
     def scattering_reduced_per_mm(self) -> NDArray[np.float64]:
         """Reduced scattering coefficient, 1/mm, of red, green and blue."""
-        return _as_rgb({channel: medium.sigma_s_reduced for channel, medium in self.media().items()}, unknown=0.0)
+        return in_rgb({channel: medium.sigma_s_reduced for channel, medium in self.media().items()}, unknown=0.0)
 
     def base_colour(self) -> NDArray[np.float64]:
         """Linear red, green and blue of the surface under diffuse light: the reflectance of a half space of the medium
@@ -81,7 +81,7 @@ class AssetPart:
         found = {channel: half_space_reflectance(medium) for channel, medium in self.media().items()}
         if not found:
             found = {channel: t["reflectance"].value for channel, t in self.estimates.items() if "reflectance" in t}
-        return np.clip(_as_rgb(found), 0.0, 1.0)
+        return np.clip(in_rgb(found), 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -130,11 +130,7 @@ def read_content(job: Path) -> AssetContent:
         raise MissingStageError(
             f"The asset in {job} holds neither tooth nor slab; export a job of kind tooth, jaw or slab."
         )
-    path = folder / "parameters.json"
-    try:
-        tables = TypeAdapter(Tables).validate_json(path.read_bytes())
-    except (OSError, ValidationError) as problem:
-        raise CorruptStoreError(f"{path} cannot be read; write it again with dentine export.") from problem
+    tables = read_tables(folder)
     parts: list[AssetPart] = []
 
     def add(name: str, tissue: str, surface: Mesh, fdi: int | None = None) -> None:
@@ -169,6 +165,19 @@ def read_content(job: Path) -> AssetContent:
     return AssetContent(tuple(parts), tuple(tables), manifest.converged, folder, _ior(folder / "rig.json"))
 
 
+def read_tables(folder: Path) -> Tables:
+    """The estimates of an asset's ``parameters.json``, channel -> name -> estimate.
+
+    Raises:
+        CorruptStoreError: the file cannot be read.
+    """
+    path = folder / "parameters.json"
+    try:
+        return TypeAdapter(Tables).validate_json(path.read_bytes())
+    except (OSError, ValidationError) as problem:
+        raise CorruptStoreError(f"{path} cannot be read; write it again with dentine export.") from problem
+
+
 def _stains(place: Path, channels: tuple[str, ...]) -> dict[str, NDArray[np.float64]]:
     files = {channel: place / f"stain_{channel}.npy" for channel in channels}
     return {channel: np.load(file).astype(np.float64) for channel, file in files.items() if file.is_file()}
@@ -190,8 +199,14 @@ def _ior(rig: Path) -> float:
     return TOOTH_IOR if told is None else float(told)
 
 
-def _as_rgb(values: Mapping[str, float], unknown: float = 0.5) -> NDArray[np.float64]:
-    # Channels of other names than red, green and blue give a grey, their mean.
+def in_rgb(values: Mapping[str, float | NDArray[np.float64]], unknown: float = 0.5) -> NDArray[np.float64]:
+    """Red, green and blue (..., 3) of values (...) by channel; a grey, their mean, of other channels.
+
+    Args:
+        values: channel -> number, or picture.
+        unknown: the grey where there is no channel.
+    """
     if set(RGB) <= values.keys():
-        return np.array([values[channel] for channel in RGB])
-    return np.full(3, float(np.mean(list(values.values()))) if values else unknown)
+        return np.stack([values[channel] for channel in RGB], axis=-1)
+    grey = np.mean([np.asarray(one) for one in values.values()], axis=0) if values else unknown
+    return np.repeat(np.asarray(grey)[..., None], 3, axis=-1)

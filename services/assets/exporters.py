@@ -36,7 +36,6 @@ EXPORTERS: Mapping[str, str] = MappingProxyType(
 )
 """Name of an exporter -> ``module:class``, imported when it is used."""
 
-
 PACKAGES = ("OpenEXR", "PIL", "scipy", "xatlas")
 """Packages of the extra ``fit`` that charts and textures need, by the names under which they are imported."""
 

@@ -67,17 +67,17 @@ def _appearance(job: FittedJob, asset: Path, pictures: ReportPictures) -> Appear
     from services.assets.appearance.shade import read_shade
     from services.assets.appearance.translucency import translucencies
     from services.assets.appearance.white import camera_white
+    from services.assets.asset import middle_of
     from services.assets.colour.develop import diffuser_radiance
 
     whites = {camera.name: camera_white(asset, camera.name) for camera in job.prepared.cameras}
     first = whites[job.prepared.cameras[0].name]
     if first is None:
         return Appearance()
-    vertices = np.concatenate([tooth.outer.vertices_mm for tooth in job.teeth])
-    x, y, z = ((vertices.min(axis=0) + vertices.max(axis=0)) / 2).tolist()
+    middle_mm = middle_of(job.teeth)
     index = [job.prepared.channels.index(channel) for channel in job.channels]
     radiance = {
-        light.name: np.broadcast_to(diffuser_radiance(light, (x, y, z)), len(job.prepared.channels))[index]
+        light.name: np.broadcast_to(diffuser_radiance(light, middle_mm), len(job.prepared.channels))[index]
         for light in job.prepared.lights
     }
     compared = [

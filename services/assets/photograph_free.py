@@ -9,10 +9,10 @@ from pathlib import Path
 from services.assets.exporters import write_anew
 from services.assets.fitted_job import read_fitted
 from services.assets.job_report import write_job_report
-from services.assets.provenance.departing import BESIDE_PHOTOGRAPH, JOB, departing, seal
+from services.assets.provenance.departing import BESIDE_PHOTOGRAPH, departing, seal
 from services.core.errors import MissingStageError
 from services.core.provenance.record import PROVENANCE
-from services.core.records import JobSpec
+from services.core.records import JOB_FILE, JobSpec
 from services.core.results import AssetManifest
 from services.core.store import MANIFEST, open_stage, read_record
 
@@ -34,7 +34,7 @@ def export_without_photographs(job: Path, *, use: str | None = None) -> Path:
         StoreError: the asset or the fit is absent or damaged. ConsentError: the person has not agreed.
     """
     folder, _ = open_stage(job, "asset", AssetManifest)
-    spec = read_record(job / JOB, JobSpec)
+    spec = read_record(job / JOB_FILE, JobSpec)
     if spec.kind not in {"tooth", "jaw"}:
         raise MissingStageError(f"The asset in {job} holds no tooth, so it shows no person; hand it out as it is.")
     provenance = departing(job, folder, use, datetime.now(UTC), with_photographs=False)

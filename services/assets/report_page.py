@@ -101,7 +101,7 @@ def write_report(
         pictures: the pictures to show.
         history: one entry per step with ``step``, ``loss`` and, where known, ``held_out_error``, ``held_out_se``,
             ``stage`` and ``channel``.
-        context: ``title``, ``boundary``, ``ior``, ``lead`` (address of the picture to begin with) ``provenance``
+        context: ``title``, ``boundary``, ``ior``, ``lead`` (address of the picture to begin with), ``provenance``
             (a dict of label -> text) and ``appearance`` (see ``appearance_sections``); all optional.
         with_photographs: whether photographs and residuals are shown beside the renders.
     """

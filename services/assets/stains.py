@@ -47,6 +47,11 @@ def stain_image(outer: Mesh, stains: ToothStains, camera: Camera) -> NDArray[np.
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
     uv = np.einsum("nc,ncd->nd", weights, stains.corners_uv[hits.face[hits.hit]])
     for k, stain in enumerate(stains.textures.values()):
-        texels, mixed = bilinear_texels(uv, (stain.transmittance.shape[0], stain.transmittance.shape[1]))
-        image[hits.hit, k] = (stain.transmittance.reshape(-1)[texels] * mixed).sum(axis=1)
+        image[hits.hit, k] = looked_up(stain.transmittance, uv)
     return image.reshape(height, width, -1)
+
+
+def looked_up(picture: NDArray[np.float64], uv: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values (N,) of a picture (H, W) at texture coordinates (N, 2), linear between the centres of texels."""
+    texels, weights = bilinear_texels(uv, (picture.shape[0], picture.shape[1]))
+    return np.asarray((picture.reshape(-1)[texels] * weights).sum(axis=1))

@@ -112,7 +112,7 @@ _EXTRAS = MappingProxyType(
         "capture": "capture",
         "dome-sim": "capture",
         "bench": "worker,bench",
-        "colmap": "colmap",
+        "colmap": "calibrate,colmap,preprocess",
         "import": "preprocess",
         "landmarks": "calibrate,preprocess",
         "register": "calibrate,preprocess",

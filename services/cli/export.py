@@ -31,9 +31,8 @@ def export(
 
     if names and not to:
         raise SettingsError(f"{names[0]!r} follows the folder without --to; write --to before names of exporters.")
-    from services.core.records import JobSpec
+    from services.core.records import JOB_FILE, JobSpec
     from services.core.store import read_record
-    from services.pipeline.stages import JOB_FILE
 
     if to:
         from services.assets.exporters import export_to

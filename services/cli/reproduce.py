@@ -49,7 +49,10 @@ def reproduce(
             print("\n".join(found))
             print("The inputs differ, so nothing was run.")
             raise typer.Exit(DIFFERS_STATUS)
-        print("\n".join([*_unknown(first.provenance.inputs is None), *changed_machine(first)]))
+        if first.provenance.inputs is None:
+            print("An earlier version prepared this asset and listed no inputs, so they cannot be compared.")
+        for line in changed_machine(first):
+            print(line)
         _run(spec, again, workers)
         count, found = changed_results(first.folder, again / "asset")
     if found:
@@ -57,11 +60,6 @@ def reproduce(
         print(f"{len(found)} of {count} numbers and surfaces differ.")
         raise typer.Exit(DIFFERS_STATUS)
     print(f"All {count} numbers and surfaces are equal to the last digit.")
-
-
-def _unknown(is_unknown: bool) -> list[str]:
-    words = "An earlier version prepared this asset and listed no inputs, so they cannot be compared."
-    return [words] if is_unknown else []
 
 
 def _new_folder(out: Path | None, otherwise: Path) -> Path:

@@ -50,12 +50,13 @@ def run_and_report(spec: JobSpec, out: Path, workers: int | None, *, as_json: bo
 def run_to_asset(spec: JobSpec, out: Path, workers: int | None) -> AssetManifest:
     """Run a job and show its progress; the first Ctrl-C cancels it in order."""
     from services.client.progress import ProgressView
+    from services.core.records import JOB_FILE
     from services.pipeline.stages import run_job
 
     require_apart(spec, out)
     with cancelling_on_signals(out), ProgressView() as view:
         # A job that goes on was read before, and may need its capture no more.
-        if not (out / "job.json").is_file():
+        if not (out / JOB_FILE).is_file():
             require_readable(spec)
         asset = run_job(spec, out, view, workers)
     if not view.events:

@@ -45,10 +45,10 @@ def _write_report_again(job: Path, asset: Path) -> None:
     from services.assets.fitted_job import read_fitted
     from services.assets.job_report import write_job_report
     from services.core.provenance.record import PROVENANCE, Provenance
-    from services.core.records import JobSpec
+    from services.core.records import JOB_FILE, JobSpec
     from services.core.store import read_record
 
     path = asset / PROVENANCE
     provenance = read_record(path, Provenance) if path.is_file() else None
-    fitted = read_fitted(job, read_record(job / "job.json", JobSpec))
+    fitted = read_fitted(job, read_record(job / JOB_FILE, JobSpec))
     write_job_report(job / "report.html", fitted, asset, provenance)

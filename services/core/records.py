@@ -179,6 +179,10 @@ MAX_HELD = 1000
 """Largest number of parameters that a job may hold: more than any model has."""
 
 
+JOB_FILE = "job.json"
+"""Name of the file in a job's folder that holds its options."""
+
+
 class JobSpec(Record):
     """One job, as in JOB.toml and in POST /v1/jobs. Every option appears here with its default, unit and help."""
 
@@ -224,7 +228,8 @@ class JobSpec(Record):
     instrument: Literal["on", "off"] = Field(
         default="on",
         description=(
-            "of all kinds but slab: fit the instrument's errors too (gain, lights, flare), within the calibration's ±"
+            "of all kinds but slab and calibration: fit the instrument's errors too (gain, lights, flare), within the"
+            " calibration's ±"
         ),
     )
     loss: Loss = Field(

@@ -88,6 +88,12 @@ def sync_to_disk(path: Path) -> None:
         os.close(descriptor)
 
 
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def write_record(path: Path, record: Record) -> None:
     """Write a record as readable JSON, atomically."""
     write_atomic(path, (record.model_dump_json(indent=1) + "\n").encode())
@@ -157,7 +163,7 @@ class StageWriter:
         ):
             name, size = path.relative_to(self.folder).as_posix(), path.stat().st_size
             known_size, known_sha256 = known.get(name, (-1, ""))
-            files[name] = {"bytes": size, "sha256": known_sha256 if known_size == size else _sha256(path)}
+            files[name] = {"bytes": size, "sha256": known_sha256 if known_size == size else sha256_of(path)}
         manifest = {
             "format": FORMAT_VERSION,
             "stage": self.stage,
@@ -256,7 +262,7 @@ def _require_intact(folder: Path, stage: str, files: dict[str, Any]) -> None:
                 " (truncated?)"
             )
             raise CorruptStoreError(f"{what}; {_remedy(stage)}.")
-        if _sha256(path) != expected["sha256"]:
+        if sha256_of(path) != expected["sha256"]:
             raise CorruptStoreError(
                 f"{path} of published stage {stage} differs from its published checksum; {_remedy(stage)}."
             )
@@ -375,8 +381,3 @@ def translate_disk_errors(root: Path) -> Iterator[None]:
                 f"The store is read-only at {place}; make it writable, the job goes on from what it had published."
             ) from problem
         raise
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -63,8 +63,7 @@ def write_object_phantom(
     Args:
         out: folder to write.
         shape: one of ``SHAPES``, or the path of a closed surface in mm.
-        core: surface of a core of another medium, in mm, in the frame of the shape's own centre; None for a homogeneous
-            object.
+        core: surface of a core of another medium, in mm and in the frame of the shape; None for a homogeneous object.
         pixel_mm: size of a pixel at the object.
         cameras, lights: numbers of cameras and lights.
         channels: 1 (green) or 3 (red, green, blue).
@@ -78,7 +77,7 @@ def write_object_phantom(
         InputError: the combination of options is impossible. MeshError: a surface is open or inside out.
     """
     require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
-    solid = Tooth(OBJECT, outer_surface(shape), None if core is None else _solid(core))
+    solid = object_surfaces(shape, core)
     names = CHANNELS[channels]
     rig_lights = dome_lights(lights, names, seed)
     rig_cameras = dome_cameras(cameras, pixel_mm, (solid.outer,))
@@ -104,8 +103,21 @@ def write_object_phantom(
     write_description(out, names, rig_cameras, rig_lights, entries, truth)
 
 
+def object_surfaces(shape: str, core: Path | None) -> Tooth:
+    """The surfaces of a shape and of its core, moved together so that the middle of the shape lies at the origin, where
+    single precision is best.
+
+    Raises:
+        InputError: there is no such shape and no such file. MeshError: a surface is open or inside out.
+    """
+    outer, inner = outer_surface(shape), None if core is None else _solid(core)
+    middle = (outer.vertices_mm.min(axis=0) + outer.vertices_mm.max(axis=0)) / 2
+    moved_core = None if inner is None else Mesh(inner.vertices_mm - middle, inner.faces)
+    return Tooth(OBJECT, Mesh(outer.vertices_mm - middle, outer.faces), moved_core)
+
+
 def outer_surface(shape: str) -> Mesh:
-    """The surface of ``SHAPES``, or that of a file; its middle lies at the origin, where single precision is best.
+    """The surface of ``SHAPES``, about the origin, or that of a file.
 
     Raises:
         InputError: there is no such shape and no such file. MeshError: the file's surface is open or inside out.
@@ -126,5 +138,4 @@ def outer_surface(shape: str) -> Mesh:
 def _solid(path: Path) -> Mesh:
     mesh = read_mesh(path)
     mesh.require_solid(str(path), OBJECT_EXTENT_MM)
-    centre = (mesh.vertices_mm.min(axis=0) + mesh.vertices_mm.max(axis=0)) / 2
-    return Mesh(mesh.vertices_mm - centre, mesh.faces)
+    return mesh

@@ -119,8 +119,10 @@ def write_phantom(
     for number, camera in enumerate(rig_cameras):
         surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
         stacks = [
-            render_tooth(out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples,
-                    seed + 7919 * number, painted)
+            render_tooth(
+                out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples,
+                seed + 7919 * number, painted,
+            )
             for c, name in enumerate(names)
         ]  # fmt: skip
         mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
@@ -197,7 +199,7 @@ def render_tooth(
     seed: int,
     painted: ToothStains | None = None,
 ) -> Stack:
-    """Render one channel's light that was inside the tooth, under each light."""
+    """Render one channel's light that was inside a tooth or an object, under each light."""
     prepare_device()
     if renderer == "mitsuba":
         from services.assets.mitsuba.scene import nested_scene

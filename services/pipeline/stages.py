@@ -35,7 +35,7 @@ from services.core.errors import (
 from services.core.job_kinds import job_kinds
 from services.core.masks import is_stale
 from services.core.raw.registration import lacks_pose
-from services.core.records import LIMITS_OF_A_RIG, JobSpec
+from services.core.records import JOB_FILE, LIMITS_OF_A_RIG, JobSpec
 from services.core.results import AssetManifest
 from services.core.stage import CANCEL_FLAG, StageName
 from services.core.store import (
@@ -52,7 +52,6 @@ from services.pipeline.following import Listener, Watch, follow_stage, never
 from services.pipeline.stage_task import PUBLISHED_AS, StageTask
 from services.pipeline.workers import Workers
 
-JOB_FILE = "job.json"
 CANCEL_RESERVE = ".cancel"
 """Name of an empty file in a job's folder, which becomes the flag of a cancel where the disk is full."""
 DAMAGE_FLAG = ".damaged"

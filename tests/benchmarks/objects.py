@@ -32,7 +32,7 @@ SIGMAS = 2.0
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity of one fit; ``seconds`` is the processor time of the fit."""
+    """One quantity of one fit; ``seconds`` is the processor time of preparation and fit."""
 
     shape: str
     images: int

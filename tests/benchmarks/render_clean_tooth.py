@@ -1,8 +1,8 @@
 """Render the photographs of a full-size tooth with little noise, resumable: one channel, 3 views under 54 lights at
-0.064 mm, about 24,000 pixels a view, on which the speed of fits is judged.
+0.064 mm, about 24,000 pixels a view, to judge the speed of a fit by.
 
 python -m tests.benchmarks.render_clean_tooth --passes 90
-python -m tests.benchmarks.render_clean_tooth --pack tests/data/clean-tooth.npz
+python -m tests.benchmarks.render_clean_tooth --pack .cache/clean-tooth.npz
 python -m tests.benchmarks.render_clean_tooth --unpack FOLDER
 
 The photographs of ``dentine bench tooth --case scale`` have 64 paths a pixel and 41 % noise a value, more than any real
@@ -36,6 +36,7 @@ from services.transport.platform import prepare_device
 from services.transport.scene.recipe import View, single_tooth
 
 SUMS = Path(".cache") / "clean-tooth"
+PACKED = SUMS.with_suffix(".npz")
 SAMPLES, SUBJECT, SEED, CHANNEL = 64, 1, 1, "green"
 STEPS_PER_ERROR = 256
 """Steps of a stored relative standard error per unit."""
@@ -149,7 +150,7 @@ def main() -> None:
     parser.add_argument("--passes", type=int, default=0, help="render until each camera has so many passes")
     parser.add_argument("--pack", type=Path, help="store what was rendered in this file")
     parser.add_argument("--unpack", type=Path, help="folder to write the capture to")
-    parser.add_argument("--file", type=Path, default=Path("tests/data/clean-tooth.npz"), help="file to unpack")
+    parser.add_argument("--file", type=Path, default=PACKED, help="file to unpack")
     arguments = parser.parse_args()
     if arguments.passes:
         render(arguments.passes)

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import csv
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from services.assets.appearance.white import ASSUMED, CameraWhite
-from services.assets.colour.develop import xyz_from_assumed
+from services.assets.appearance.white import CameraWhite
 from services.assets.mitsuba.scene import SceneDict, nested_scene
 from services.core.files.meshes import write_mesh
 from tests.support.shade_tabs import CHANNELS, NAMES, dentin, outer, spot, tissues
@@ -67,10 +67,8 @@ def relative(folder: Path, name: str, channel: int) -> tuple[float, float]:
 
 def main() -> None:
     """Render all tabs and write the guide."""
-    import tempfile
-
     mi.set_variant("llvm_ad_mono")
-    white = CameraWhite(xyz_from_assumed(), ASSUMED)
+    white = CameraWhite(None)
     OUT.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place, OUT.open("w", newline="") as stream:
         folder = Path(place)

@@ -23,7 +23,7 @@ from services.core.store import open_stage
 from services.fit.stage import run
 from services.tasks.executors import DaskExecutor, executor
 from services.tasks.journal import read_entries as read_entries_of
-from tests.support.prepared import FAKE, write_prepared
+from tests.support.prepared import FAKE, without_time, write_prepared
 from tests.support.small_jaw import jaw_spec, write_prepared_jaw
 
 pytestmark = pytest.mark.timeout(3600)
@@ -62,7 +62,7 @@ def fit_once(root: Path, engine: str, **options: Any) -> None:
 
 
 def answer(root: Path) -> dict[str, Any]:
-    return open_stage(root, "fit", FitReport)[1].model_dump(exclude={"seconds", "seconds_by_purpose"})
+    return without_time(open_stage(root, "fit", FitReport)[1])
 
 
 def trace(root: Path) -> list[dict[str, Any]]:

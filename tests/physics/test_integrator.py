@@ -6,8 +6,6 @@ such a comparison in 500. Seeds are fixed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +24,7 @@ from services.transport.engine import Engine
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import single_tooth
+from tests.support.mitsuba_variants import variant
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, dentin_shape, ellipsoid, whole_view
 
@@ -68,19 +67,6 @@ def write_tooth(folder: Path) -> Path:
 def tooth(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the small tooth's two surfaces; the plug-in is registered."""
     return write_tooth(tmp_path_factory.mktemp("tooth"))
-
-
-@contextmanager
-def variant(name: str) -> Iterator[None]:
-    """Use another variant of Mitsuba for the time of the block."""
-    import mitsuba as mi
-
-    before = mi.variant()
-    mi.set_variant(name)
-    try:
-        yield
-    finally:
-        mi.set_variant(before)
 
 
 def properties(*tissues: Tissue, **others: Any) -> SceneDict:

@@ -23,6 +23,7 @@ from services.fit.stage import ENGINE, run
 from services.fit.stages.jaw.schedule import TIED_SD
 from services.transport.platform import prepare_device
 from services.transport.thickness import enamel_thickness_mm
+from tests.support.prepared import without_time
 from tests.support.small_jaw import FDI, TRUE_GUMS, TRUE_REFLECTANCE, TRUE_TEETH, jaw_spec, write_prepared_jaw
 
 FAKE = "tests.support.fake_mouth:FakeMouthEngine"
@@ -39,10 +40,6 @@ def fit(root: Path, attempt: int = 1, events: list[StageEvent] | None = None, **
         LocalContext(root, attempt, events.append if events is not None else None),
         engine=FAKE,
     )
-
-
-def without_time(report: FitReport) -> dict[str, Any]:
-    return report.model_dump(exclude={"seconds", "seconds_by_purpose"})
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from services.core.verdict import VERDICT, verdict_of
 from services.fit.checks.identifiability import NOT_EXPLAINED, PARTLY_EXPLAINED
 from services.fit.stage import run
 from services.transport.numerics import NUMERICS, numerics_name
-from tests.support.prepared import FAKE, TRUTH, write_prepared
+from tests.support.prepared import FAKE, TRUTH, without_time, write_prepared
 
 
 def spec_for(root: Path, **options: Any) -> JobSpec:
@@ -37,10 +37,6 @@ def spec_for(root: Path, **options: Any) -> JobSpec:
 def fit(root: Path, attempt: int = 1, events: list[StageEvent] | None = None, **options: Any) -> FitReport:
     listener = events.append if events is not None else None
     return run(spec_for(root, **options), LocalContext(root, attempt, listener), engine=FAKE)
-
-
-def without_time(report: FitReport) -> dict[str, Any]:
-    return report.model_dump(exclude={"seconds", "seconds_by_purpose"})
 
 
 @pytest.fixture(scope="module")

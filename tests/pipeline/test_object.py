@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from pydantic import ValidationError
 
 from services.assets.stage import export
@@ -21,11 +20,12 @@ from services.core.results import FitReport
 from services.core.stage import LocalContext, StageEvent
 from services.core.store import read_record, write_record
 from services.fit.stage import run
-from services.phantom.object import outer_surface, write_object_phantom
+from services.phantom.object import object_surfaces, outer_surface, write_object_phantom
 from services.preprocess.stage import run_object
 from tests.support.command_line import dentine
 from tests.support.computed_once import folder_once
 from tests.support.prepared import FAKE
+from tests.support.prepared import sphere as ball
 
 SMALL: dict[str, Any] = {"pixel_mm": 1.6, "cameras": 1, "lights": 1, "samples": 16, "held_out": 0}
 
@@ -33,11 +33,6 @@ SMALL: dict[str, Any] = {"pixel_mm": 1.6, "cameras": 1, "lights": 1, "samples": 
 def spec_for(capture: Path, **options: Any) -> JobSpec:
     quick: dict[str, Any] = {"max_steps": 1, "search_candidates": 800, "samples_per_pixel": 32, "boundary": "matched"}
     return JobSpec(kind="object", capture=capture, instrument="off", **(quick | options))
-
-
-def ball(radius_mm: float) -> Mesh:
-    made = trimesh.creation.icosphere(subdivisions=2, radius=radius_mm)
-    return Mesh(np.asarray(made.vertices), np.asarray(made.faces, dtype=np.int32))
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +70,19 @@ def test_one_image_of_a_sphere_becomes_an_asset_without_teeth(sphere: Path, tmp_
     assert "<h1>Object" in page or "<title>Object" in page
     text = re.sub(r"<style.*?</style>|data:[^\"']*", "", page, flags=re.DOTALL)
     assert not re.findall(r"(?i)\b(?:tooth|teeth|enamel|dentin)\b", text)
+
+
+def test_a_core_keeps_its_place_in_its_shape(tmp_path: Path) -> None:
+    shift, off = np.array([30.0, -20.0, 10.0]), np.array([1.0, 0.0, 0.0])
+    for name, mesh, place in (("outer", ball(5.0), shift), ("core", ball(3.0), shift + off)):
+        write_mesh(tmp_path / f"{name}.ply", Mesh(mesh.vertices_mm + place, mesh.faces))
+    for shape, core_mm in ((str(tmp_path / "outer.ply"), off), ("sphere", shift + off)):
+        solid = object_surfaces(shape, tmp_path / "core.ply")
+        assert solid.dentin is not None
+        for found, expected_mm in ((solid.outer, np.zeros(3)), (solid.dentin, core_mm)):
+            ends_mm = found.vertices_mm.min(axis=0), found.vertices_mm.max(axis=0)
+            # Single precision of lengths of some tens of mm.
+            np.testing.assert_allclose(np.mean(ends_mm, axis=0), expected_mm, atol=1e-5)
 
 
 def test_a_core_is_a_second_medium(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,12 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture
+def own_job(job: Path, tmp_path: Path) -> Path:
+    """A copy of the job whose report a test may write again."""
+    return Path(shutil.copytree(job, tmp_path / "job"))
+
+
 def test_differences_and_translucency_are_shown(job: Path) -> None:
     page = (job / "report.html").read_text()
     assert "<h2>Colour differences ΔE00</h2>" in page
@@ -65,32 +72,33 @@ def test_without_photographs_no_difference_from_one_is_shown(job: Path) -> None:
     assert "<h2>Translucency</h2>" in page
 
 
-def test_the_shades_command_writes_the_report_again(job: Path, tmp_path: Path) -> None:
+def test_the_shades_command_writes_the_report_again(own_job: Path, tmp_path: Path) -> None:
     guide = tmp_path / "own.csv"
     guide.write_text(GUIDE)
-    done = CliRunner().invoke(build_app(), ["shade", str(job), str(guide)])
+    done = CliRunner().invoke(build_app(), ["shade", str(own_job), str(guide)])
     assert done.exit_code == 0, done.output
     assert done.output.startswith("tooth 11: ΔE00 ")
     assert "(45/0, D65)" in done.output
     assert NOT_FOR in done.output
-    page = (job / "report.html").read_text()
+    page = (own_job / "report.html").read_text()
     assert "<h2>Shade</h2>" in page
     assert NOT_FOR in page
     assert "guide own under D65" in page
-    shade = read_shade(job, job / "asset")
+    shade = read_shade(own_job, own_job / "asset")
     assert shade is not None
     (tooth,) = shade.teeth
     assert {one.tab for one in tooth.tabs} == {"light", "dark"}
     assert all(one.se > 0 for one in tooth.tabs)
 
 
-def test_a_shade_of_an_earlier_fit_is_not_shown(job: Path, tmp_path: Path) -> None:
+def test_a_shade_of_an_earlier_fit_is_not_shown(own_job: Path, tmp_path: Path) -> None:
     guide = tmp_path / "own.csv"
     guide.write_text(GUIDE)
-    assert CliRunner().invoke(build_app(), ["shade", str(job), str(guide)]).exit_code == 0
-    told = json.loads((job / "shade.json").read_text())
-    (job / "shade.json").write_text(json.dumps(told | {"parameters_sha256": "0" * 64}))
-    assert read_shade(job, job / "asset") is None
+    assert CliRunner().invoke(build_app(), ["shade", str(own_job), str(guide)]).exit_code == 0
+    assert read_shade(own_job, own_job / "asset") is not None
+    told = json.loads((own_job / "shade.json").read_text())
+    (own_job / "shade.json").write_text(json.dumps(told | {"parameters_sha256": "0" * 64}))
+    assert read_shade(own_job, own_job / "asset") is None
 
 
 def test_a_guide_with_a_missing_tab_is_refused_and_nothing_is_written(job: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -15,7 +16,7 @@ from services.core.calibration.uncertainty import TWIST, CalibrationUncertainty
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh
 from services.core.records import MaskBit
-from services.core.results import PreparedManifest
+from services.core.results import FitReport, PreparedManifest
 from services.core.store import StageWriter, create_array
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.scene.recipe import View, single_tooth
@@ -41,6 +42,11 @@ def camera(name: str) -> Camera:
     pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 500.0), (0.0, 0.0, 0.0, 1.0))
     k = ((1000.0, 0.0, SIZE[0] / 2), (0.0, 1000.0, SIZE[1] / 2), (0.0, 0.0, 1.0))
     return Camera(name=name, size=SIZE, K=k, camera_from_world=pose)
+
+
+def without_time(report: FitReport) -> dict[str, Any]:
+    """What two fits of equal answers have in common: all but how long they took."""
+    return report.model_dump(exclude={"seconds", "seconds_by_purpose"})
 
 
 def write_prepared(

@@ -14,11 +14,12 @@ import pytest
 
 from services.assets.asset import SHIPPED
 from services.assets.colour.develop import CapturedColours, developed, diffuser_radiance, rig_colours
-from services.assets.colour.spaces import ACESCG, BRADFORD, D50, LINEAR_SRGB, ColourSpace, adaptation
+from services.assets.colour.spaces import ACESCG, BRADFORD, LINEAR_SRGB, ColourSpace, adaptation
 from services.assets.content import RGB
 from services.core.calibration.cameras_and_lights import CameraColour
 from services.core.calibration.colours import colours_among, require_colours, xyz_of
 from services.core.calibration.record import Calibration, recalibrated, require_consistent
+from services.core.colour.cie import D50
 from services.core.errors import CaptureInputError
 from services.core.geometry import Light
 from services.core.records import FolderCapture

@@ -22,6 +22,7 @@ from services.phantom.files import XYZ_FROM_CAMERA
 from services.phantom.tooth import TRUE_TISSUE
 from services.transport.optics.half_space import albedo_of_reflectance, half_space_reflectance
 from services.transport.optics.parameters import Medium
+from tests.support.mitsuba_variants import variant
 
 CHANNELS = ("red", "green", "blue")
 ENAMEL, DENTIN = ([TRUE_TISSUE[channel].medium(part) for channel in CHANNELS] for part in ("enamel", "dentin"))
@@ -116,11 +117,10 @@ def test_white_under_d65_is_white() -> None:
     assert observer_under_d65().shape == (31, 5)
 
 
-def slab_images(variant: str, medium: dict[str, Any], light: Any) -> np.ndarray:
+def slab_images(medium: dict[str, Any], light: Any) -> np.ndarray:
     """Mean linear sRGB that stock Mitsuba shows of a thick slab under a white sky."""
     import mitsuba as mi
 
-    mi.set_variant(variant)
     scene = {
         "type": "scene",
         "integrator": {"type": "volpathmis", "max_depth": 400, "rr_depth": 50},
@@ -156,7 +156,9 @@ def test_stock_mitsuba_shows_a_spectral_medium_in_the_colour_of_its_channels() -
         "sigma_t": spectrum(nm, found.extinction, largest),
         "albedo": spectrum(nm, found.sigma_s_reduced / found.extinction),
     }
-    in_rgb = slab_images("llvm_ad_rgb", one, {"type": "rgb", "value": [1.0, 1.0, 1.0]})
-    in_spectra = slab_images("llvm_ad_spectral", other, {"type": "d65"})
+    with variant("llvm_ad_rgb"):
+        in_rgb = slab_images(one, {"type": "rgb", "value": [1.0, 1.0, 1.0]})
+    with variant("llvm_ad_spectral"):
+        in_spectra = slab_images(other, {"type": "d65"})
     # Thirty thousand paths leave 0.3 %, and four standard errors of the difference are 1.7 %.
     np.testing.assert_allclose(in_spectra, in_rgb, rtol=0.017)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.assets.colour.spaces import D50
+from services.core.colour.cie import D50
 from services.core.records import ImageEntry, JobSpec
 from services.phantom.files import XYZ_FROM_CAMERA, write_description
 from services.preprocess.opening import open_source

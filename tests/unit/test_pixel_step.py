@@ -43,7 +43,9 @@ def test_the_largest_square_that_is_not_longer_than_half_a_millimetre(tmp_path: 
 
 
 def test_smaller_squares_where_masks_break_the_large_ones(tmp_path: Path) -> None:
-    """Every fifth pixel in x and y is masked, so no square of 5 or more is whole; of those of 2 pixels most are."""
+    """Every fifth pixel in x and y is masked, so no square of 5 or more is whole; of those of 4 pixels a third is,
+    of those of 3 two thirds.
+    """
     valid = np.ones((EDGE, EDGE), dtype=bool)
     valid[::5, ::5] = False
     assert choose(tmp_path, valid) == 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,12 @@ import pytest
 
 from services.assets.appearance.guide import read_guide
 from services.assets.appearance.white import camera_white
-from services.assets.colour.develop import xyz_from_assumed
-from services.core.colour.cie import D50
+from services.assets.colour.develop import CapturedColours, rig_colours, xyz_from_assumed
+from services.assets.content import RGB
+from services.core.calibration.cameras_and_lights import CameraColour
+from services.core.colour.cie import D50, lab_from_xyz
 from services.core.errors import CaptureInputError
+from services.phantom.files import XYZ_FROM_CAMERA
 
 GOOD = "tab,geometry,illuminant,L,a,b,se\nA,45/0,D65,72.1,1.9,17.4,0.3\nB,45/0,D65,70,2.5,19,\n"
 
@@ -100,3 +104,20 @@ def test_channels_without_a_matrix_are_taken_for_srgb_and_white_stays_white(tmp_
         np.testing.assert_allclose(white.lab(np.ones((1, 3)), illuminant), [[100, 0, 0]], atol=1e-6)
     (tmp_path / "rig.json").write_text('{"channels": ["green"], "cameras": ["c0"]}')
     assert camera_white(tmp_path) is None
+    (tmp_path / "rig.json").unlink()
+    assert camera_white(tmp_path) is None
+
+
+def test_a_cameras_root_polynomial_counts_before_its_matrix(tmp_path: Path) -> None:
+    roots = ((0.6, 0.2, 0.1, 0.02, 0.02, 0.02422), (0.3, 0.6, 0.02, 0.04, 0.02, 0.02), (0, 0.1, 0.65, 0, 0.05, 0.02521))
+    own = CameraColour(xyz_from_rgb=XYZ_FROM_CAMERA, root_polynomial=roots)
+    told = rig_colours(CapturedColours(RGB, {"c0": own}), RGB, ("c0",), (0.0, 0.0, 0.0))
+    (tmp_path / "rig.json").write_text(json.dumps({"channels": RGB, "cameras": ["c0"], "colour": told}))
+    white = camera_white(tmp_path)
+    assert white is not None
+    assert "sRGB" not in white.source
+    colours = np.array([[0.6, 0.4, 0.2], [0.1, 0.2, 0.3]])
+    red, green, blue = colours.T
+    terms = np.stack([red, green, blue, np.sqrt(red * green), np.sqrt(green * blue), np.sqrt(red * blue)], axis=1)
+    np.testing.assert_allclose(white.lab(colours), lab_from_xyz(terms @ np.array(roots).T), rtol=1e-12)
+    np.testing.assert_allclose(white.lab(np.ones((1, 3)), "D65"), [[100, 0, 0]], atol=1e-6)

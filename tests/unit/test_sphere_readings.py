@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from services.cli.sphere import sphere_command
+from services.core.colour.cie import lab_from_xyz
 from services.core.errors import CaptureInputError, SettingsError
 from services.slab.sphere.invert import Fitted, fit_readings, interface_of
 from services.slab.sphere.readings import read_readings
 from services.slab.sphere.records import SphereFile
 from services.slab.sphere.results import SphereQuantity
 from services.slab.sphere.spectrometer import expected
-from services.slab.sphere.translucency import lab_of, over_backing, translucency_of
+from services.slab.sphere.translucency import over_backing, translucency_of
 from services.transport.optics.slab_totals import Optics, slab_totals
 from tests.support.shared_data import shared_path
 
@@ -267,8 +268,8 @@ def lightness_gain(optics: Optics, file: SphereFile) -> float:
 def test_lab_of_a_known_colour() -> None:
     # sRGB's red primary under D65: L 53.24, a 80.09, b 67.20 by the standard's matrix.
     red, white = np.array([0.4124564, 0.2126729, 0.0193339]), np.array([0.95047, 1, 1.08883])
-    assert lab_of(red, white) == pytest.approx([53.24, 80.09, 67.20], abs=0.01)
-    assert lab_of(white, white) == pytest.approx([100, 0, 0], abs=1e-12)
+    assert lab_from_xyz(red, white) == pytest.approx([53.24, 80.09, 67.20], abs=0.01)
+    assert lab_from_xyz(white, white) == pytest.approx([100, 0, 0], abs=1e-12)
 
 
 def test_a_backing_sends_light_back_through_the_slab() -> None:

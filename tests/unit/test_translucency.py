@@ -7,7 +7,7 @@ import pytest
 
 from services.assets.appearance.differences import colour_difference
 from services.assets.appearance.translucency import THICKNESS_MM, ThinFace, translucencies
-from services.assets.appearance.white import ASSUMED, CameraWhite
+from services.assets.appearance.white import CameraWhite
 from services.assets.colour.develop import xyz_from_assumed
 from services.assets.content import RGB
 from services.core.colour.cie import delta_e_2000, lab_from_xyz
@@ -15,7 +15,7 @@ from services.core.pages.pictures import Picture
 from services.core.results import Estimate
 from services.transport.optics.slab_totals import Optics, slab_totals
 
-WHITE = CameraWhite(xyz_from_assumed(), ASSUMED)
+WHITE = CameraWhite(None)
 
 
 def table(scattering: float, absorption: float, g: float = 0.0, relative_se: float = 0.0) -> dict[str, Estimate]:

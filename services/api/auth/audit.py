@@ -48,7 +48,7 @@ class AuditEntry(Record):
     ids: dict[str, str] = Field(
         description=(
             "what the route's path names; 'made' is the address of what was created, 'flashes' the acknowledgement of"
-            " faster flashes"
+            " faster flashes, 'use' what the caller said that a file is for"
         )
     )
     outcome: int = Field(description="HTTP status of the answer")

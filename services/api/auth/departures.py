@@ -13,7 +13,7 @@ from pydantic import Field
 
 from services.api.auth.audit import audit_table
 from services.core.consent import Consent, require_allowed
-from services.core.errors import CaptureInputError, CorruptStoreError
+from services.core.errors import CaptureInputError, ConsentError, CorruptStoreError
 from services.core.files.json_text import parse_json
 from services.core.geometry import Record
 from services.core.provenance.record import PROVENANCE
@@ -52,9 +52,11 @@ def require_departure(job: Path, path: str, use: str | None) -> None:
         use: what it is for; None where that is not said.
 
     Raises:
-        ConsentError: the consent has ended, or does not list the use.
+        ConsentError: the consent has ended, or does not list the use. CorruptStoreError: what was recorded of it cannot
+            be read.
     """
-    if path and not path.startswith(EXPORTED):
+    # Of two spellings of one path, such as report.html and ./report.html, both are the result.
+    if path and not str(PurePosixPath(path)).startswith(EXPORTED):
         return
     file = job / "asset" / PROVENANCE
     if not file.is_file():
@@ -64,9 +66,14 @@ def require_departure(job: Path, path: str, use: str | None) -> None:
         consent = None if recorded is None else Consent.model_validate(recorded)
     except (ValueError, KeyError, TypeError, RecursionError, CaptureInputError) as problem:
         raise CorruptStoreError(
-            "The provenance of the asset cannot be read, so nothing says what the person agreed to; retry the job."
+            "The provenance of the asset cannot be read, so nothing says what the person agreed to; restore it, or run"
+            " the job anew."
         ) from problem
-    require_allowed(consent, use, datetime.now(UTC))
+    try:
+        require_allowed(consent, use, datetime.now(UTC))
+    except ConsentError as refused:
+        what = refused.message.removesuffix(".")
+        raise ConsentError(f"{what}; a job takes up a changed consent when it is run anew.") from refused
 
 
 def said_use(request: Request, use: str | None) -> str | None:

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import shutil
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from services.core.errors import DiskFullError
-from services.core.store import sync_to_disk
+from services.core.store import sha256_of, sync_to_disk
 
 Write = Callable[[int, memoryview], int]
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -102,9 +101,7 @@ class Blobs:
         between the file is found complete.
         """
         partial, final = self._partial_path(capture, number), self.path(sha256)
-        with partial.open("rb") as stream:
-            is_right = hashlib.file_digest(stream, "sha256").hexdigest() == sha256
-        if not is_right:
+        if sha256_of(partial) != sha256:
             partial.unlink()
             return False
         final.parent.mkdir(parents=True, exist_ok=True)

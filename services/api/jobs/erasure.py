@@ -11,7 +11,7 @@ from pathlib import Path
 
 from services.core.errors import StoreError
 from services.core.files.object_store import discard_remote
-from services.core.store import write_atomic
+from services.core.store import sha256_of, write_atomic
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,7 @@ def _listing(folder: Path) -> Path:
 def _measure(folder: Path) -> Erased:
     lines, size = [], 0
     for path in sorted(path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()):
-        with path.open("rb") as stream:
-            content = hashlib.file_digest(stream, "sha256").hexdigest()
-        length = path.stat().st_size
+        content, length = sha256_of(path), path.stat().st_size
         lines.append(f"{path.relative_to(folder).as_posix()} {length} {content}\n")
         size += length
     return Erased(len(lines), size, hashlib.sha256("".join(lines).encode()).hexdigest())

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from services.assets.appearance.instrument import GEOMETRIES
 from services.core.colour.cie import D65, lab_from_xyz
-from services.core.colour.observer import daylight_weights
+from services.core.colour.observer import FIRST_NM, LAST_NM, MAX_GAP_NM, daylight_weights
 from services.core.errors import CaptureInputError
 from services.core.files.tables import Row, read_rows
 
@@ -31,9 +31,6 @@ Floats = NDArray[np.float64]
 LAB = ("L", "a", "b")
 ILLUMINANTS = ("D65", "D50")
 MIN_TABS = 2
-FIRST_NM, LAST_NM, MAX_GAP_NM = 420.0, 680.0, 25.0
-"""A spectrum begins at 420 nm or before and ends at 680 nm or after, in steps of at most 25 nm, as for a slab's
-colour."""
 MAX_REFLECTANCE = 1.5
 """Largest reflectance that is taken for a share: at a mirror reflection it may exceed 1, and 100 would be per cent."""
 
@@ -117,7 +114,8 @@ def _tab(cells: Mapping[str, str], names: tuple[str, ...], illuminant: str, what
         if not 0 <= lab[0] <= 100:
             raise CaptureInputError(f"{what} gives tab {tab} L = {lab[0]:g}, which lies between 0 and 100; correct it.")
         return Tab(tab, lab, se)
-    nodes = sorted(float(name) for name in names if name.replace(".", "", 1).isdigit())
+    by_node = {float(name): name for name in names if name.replace(".", "", 1).isdigit()}
+    nodes = sorted(by_node)
     if not nodes:
         raise CaptureInputError(f"{what} has neither columns L, a, b nor columns named by wavelengths in nm; add them.")
     if nodes[0] > FIRST_NM or nodes[-1] < LAST_NM or max(np.diff(nodes)) > MAX_GAP_NM:
@@ -127,7 +125,6 @@ def _tab(cells: Mapping[str, str], names: tuple[str, ...], illuminant: str, what
         )
     if illuminant != ILLUMINANTS[0]:
         raise CaptureInputError(f"{what} gives spectra the illuminant {illuminant}; they are seen under D65.")
-    by_node = {float(name): name for name in names if name.replace(".", "", 1).isdigit()}
     spectrum = np.array([_number(cells, by_node[node], tab, what) for node in nodes])
     if spectrum.min() < 0 or spectrum.max() > MAX_REFLECTANCE:
         raise CaptureInputError(

@@ -64,12 +64,10 @@ def _map(one: ColourDifference) -> dict[str, Any]:
 
 
 def _shade(shade: Shade) -> dict[str, Any]:
-    names = sorted({one.tab for tooth in shade.teeth for one in tooth.tabs})
     return {
         "guide": shade.guide,
         "illuminant": shade.illuminant,
         "sentences": shade.sentences,
-        "tabs": names,
         "teeth": [
             {
                 "fdi": str(tooth.fdi),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,20 +9,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field
 
 from services.anatomy.dentin_shape import DentinShape
 from services.assets.appearance.guide import Guide
 from services.assets.appearance.instrument import APERTURE_MM, Placed, placed, spot_towards
 from services.assets.appearance.white import CameraWhite, camera_white
 from services.assets.asset import tissue_of
-from services.assets.content import RGB, Tables
+from services.assets.content import RGB, Tables, read_tables
 from services.core.colour.cie import delta_e_2000
-from services.core.errors import CorruptStoreError, InputError
+from services.core.errors import InputError
 from services.core.files.meshes import read_teeth
 from services.core.geometry import Camera, Record, Tooth
 from services.core.records import Boundary
 from services.core.results import Estimate
+from services.core.store import read_record, sha256_of, write_record
 from services.transport.engine import Engine
 from services.transport.optics.parameters import Medium
 from services.transport.scene.recipe import single_tooth
@@ -90,12 +90,7 @@ def shade_of(asset: Path, guide: Guide, *, samples: int = SAMPLES) -> Shade:
             f"The asset in {asset} has other channels than {', '.join(RGB)}, so it has no colour; fit these channels."
         )
     rig = json.loads((asset / "rig.json").read_text(encoding="utf-8"))
-    try:
-        tables = TypeAdapter(Tables).validate_json((asset / "parameters.json").read_bytes())
-    except (OSError, ValidationError) as problem:
-        raise CorruptStoreError(
-            f"{asset / 'parameters.json'} cannot be read; write the asset again with dentine export."
-        ) from problem
+    tables = read_tables(asset)
     eye = _mean_eye(rig)
     teeth = tuple(
         _shade(tooth, _of_tooth(tables, tooth.fdi), rig["boundary"], rig["ior"], eye, guide, white, samples)
@@ -107,7 +102,7 @@ def shade_of(asset: Path, guide: Guide, *, samples: int = SAMPLES) -> Shade:
         " light covers the whole tooth."
     )
     return Shade(
-        parameters_sha256=_digest(asset),
+        parameters_sha256=sha256_of(asset / "parameters.json"),
         guide=guide.name,
         geometry=guide.geometry,
         aperture_mm=APERTURE_MM,
@@ -120,8 +115,6 @@ def shade_of(asset: Path, guide: Guide, *, samples: int = SAMPLES) -> Shade:
 
 def write_shade(job: Path, shade: Shade) -> None:
     """Write ``shade.json`` into a job's folder."""
-    from services.core.store import write_record
-
     write_record(job / SHADE, shade)
 
 
@@ -129,14 +122,9 @@ def read_shade(job: Path, asset: Path) -> Shade | None:
     """The shade that was last computed of a job; None where there is none, or where it is of another asset than this
     one, which was fitted anew since.
     """
-    from services.core.store import read_record
-
     found = read_record(job / SHADE, Shade) if (job / SHADE).is_file() else None
-    return found if found is not None and found.parameters_sha256 == _digest(asset) else None
-
-
-def _digest(asset: Path) -> str:
-    return hashlib.sha256((asset / "parameters.json").read_bytes()).hexdigest()
+    is_same = found is not None and found.parameters_sha256 == sha256_of(asset / "parameters.json")
+    return found if is_same else None
 
 
 def _shade(

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.colour.develop import CapturedColours, developed, diffuser_radiance
+from services.assets.colour.develop import ASSUMED, CapturedColours, developed, diffuser_radiance
 from services.assets.colour.spaces import LINEAR_SRGB
 from services.core.errors import InputError
 from services.core.geometry import Light
@@ -44,7 +44,7 @@ class Beside:
     photo: Floats
     render: Floats
     matrix: str
-    """Where the camera's matrix comes from."""
+    """Where the camera's colours come from, as ``rig.json`` says it."""
 
 
 def beside(job: Path, samples: int) -> Beside:
@@ -111,7 +111,8 @@ def picture(found: Beside, made_by: str) -> Image8:
         f"{made_by}\ncamera {found.camera}, light {found.light},\n{seen}",
         "The asset, rendered by Mitsuba\nin the same view and light",
     )
-    below = f"Linear radiance to sRGB by the matrix of {found.matrix}; the same exposure."
+    how = "taken for linear sRGB" if found.matrix == ASSUMED else f"brought to sRGB by {found.matrix}"
+    below = f"Linear radiance {how}; the same exposure."
     font = ImageFont.load_default(FONT_PX)
     width, height = pictures[0].size
     column = max(width, *(int(font.getlength(line)) + 1 for text in captions for line in text.split("\n")))

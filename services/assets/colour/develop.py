@@ -48,9 +48,15 @@ def developed(relative: NDArray[np.floating], colour: CameraColour | None, space
         colour: the camera's colour; None where there is none, and its channels are taken for linear sRGB.
         space: the colours' space.
     """
+    return np.asarray(xyz_d50(relative, colour) @ space.rgb_from_xyz().T)
+
+
+def xyz_d50(relative: NDArray[np.floating], colour: CameraColour | None) -> Floats:
+    """XYZ (..., 3) under D50 of the same radiance, by the camera's root polynomial where it has one, else by its
+    matrix.
+    """
     values = np.asarray(relative, dtype=np.float64)
-    xyz = values @ xyz_from_assumed().T if colour is None else xyz_of(values, colour)
-    return np.asarray(xyz @ space.rgb_from_xyz().T)
+    return np.asarray(values @ xyz_from_assumed().T) if colour is None else xyz_of(values, colour)
 
 
 def xyz_from_assumed() -> Floats:

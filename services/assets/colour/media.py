@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.assets.colour.spaces import ACESCG, LINEAR_SRGB, ColourSpace
-from services.core.colour.observer import observer_under_d65
+from services.core.colour.observer import daylight_weights
 from services.transport.optics.half_space import albedo_of_reflectance, half_space_reflectance
 from services.transport.optics.parameters import Medium
 
@@ -86,7 +86,7 @@ def upsampled(medium: ReducedMedium) -> tuple[Floats, ReducedMedium]:
     under D65. The reduced extinction is interpolated between the primaries' dominant wavelengths and constant beyond.
     Both are assumptions: three channels do not tell a spectrum.
     """
-    nm = observer_under_d65()[:, 0]
+    nm, _ = daylight_weights()
     reflectance = smooth_spectrum(medium.reflectance)
     extinction = np.exp(np.interp(nm, PRIMARIES_NM, np.log(medium.extinction[::-1])))
     return nm, ReducedMedium.of_reflectance(reflectance, extinction)
@@ -94,11 +94,8 @@ def upsampled(medium: ReducedMedium) -> tuple[Floats, ReducedMedium]:
 
 def srgb_of_spectrum(reflectance: Floats) -> Floats:
     """Linear sRGB (..., 3) under D65 of reflectances (..., 31) from 400 to 700 nm."""
-    observer = observer_under_d65()
-    weights = observer[:, 1:4] * observer[:, 4:5]
-    weights = weights / weights[:, 1].sum()
-    white = weights.sum(axis=0)
-    return np.asarray(reflectance @ weights @ LINEAR_SRGB.rgb_from_xyz(white).T)
+    _, weights = daylight_weights()
+    return np.asarray(reflectance @ weights @ LINEAR_SRGB.rgb_from_xyz(weights.sum(axis=0)).T)
 
 
 def smooth_spectrum(rgb: Floats) -> Floats:
@@ -106,7 +103,7 @@ def smooth_spectrum(rgb: Floats) -> Floats:
     three coefficients Newton's method finds with halved steps.
     """
     target = np.clip(rgb, MIN_REFLECTANCE, MAX_REFLECTANCE)
-    nm = observer_under_d65()[:, 0]
+    nm, _ = daylight_weights()
     t = (nm - nm.mean()) / (nm[-1] - nm[0])
     powers = np.stack([np.ones_like(t), t, t**2], axis=1)
     middle = 2 * target.mean() - 1

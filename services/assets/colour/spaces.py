@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.colour.cie import D50
+
 Floats = NDArray[np.float64]
 Chromaticity = tuple[float, float]
 
-D50 = np.array([0.96422, 1.0, 0.82521])
-"""XYZ of the white of illuminant D50, 2° observer (ICC.1:2022, section 7.2.16): the white of a camera's colours."""
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 """Cone responses from XYZ of the Bradford adaptation (ICC.1:2022, annex E.3)."""
 

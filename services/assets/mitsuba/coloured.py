@@ -5,7 +5,7 @@ They are the scene of one channel with other media, a white light and a film of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.assets.colour.media import ReducedMedium, upsampled
 from services.assets.colour.tables import ColouredMedium
-from services.assets.mitsuba.rgb import COLOUR_INTEGRATOR, Colour
+from services.assets.mitsuba.rgb import COLOUR_INTEGRATOR, Colour, colour_of, homogeneous
 from services.assets.mitsuba.scene import SceneDict
 from services.assets.mitsuba.scene_xml import Spectrum
 
@@ -29,12 +29,7 @@ def srgb_scene(scene: SceneDict, media: Mapping[str, ColouredMedium], intensity:
         media: media by name.
         intensity: radiant intensity of the white light in each channel.
     """
-
-    def colour(values: NDArray[np.float64]) -> Colour:
-        red, green, blue = values.tolist()
-        return Colour((red, green, blue))
-
-    found = {f"medium_{name}": _medium(one.srgb, one.mean_cosine, colour) for name, one in media.items()}
+    found = {f"medium_{name}": _medium(one.srgb, one.mean_cosine, colour_of) for name, one in media.items()}
     return _with(scene, found, {"type": "rgb", "value": Colour((intensity,) * 3)})
 
 
@@ -52,18 +47,10 @@ def spectral_scene(scene: SceneDict, media: Mapping[str, ColouredMedium], intens
     return _with(scene, found, {"type": "d65", "scale": intensity})
 
 
-def _medium(medium: ReducedMedium, mean_cosine: float, values: Any) -> SceneDict:
+def _medium(medium: ReducedMedium, mean_cosine: float, written: Callable[[NDArray[np.float64]], Any]) -> SceneDict:
     scattering = medium.sigma_s_reduced / (1 - mean_cosine)
     extinction = scattering + medium.sigma_a
-    # Mitsuba takes colours of media from 0 to 1, so the largest extinction stands apart.
-    largest = float(extinction.max())
-    return {
-        "type": "homogeneous",
-        "scale": largest,
-        "sigma_t": values(extinction / largest),
-        "albedo": values(scattering / extinction),
-        "phase": {"type": "hg", "g": mean_cosine},
-    }
+    return homogeneous(extinction, scattering / extinction, {"type": "hg", "g": mean_cosine}, written)
 
 
 def _with(scene: SceneDict, media: SceneDict, intensity: SceneDict) -> SceneDict:

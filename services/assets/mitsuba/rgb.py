@@ -8,14 +8,17 @@ thick media then agree, as their light has scattered many times; those of thin l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.assets.mitsuba.scene import MAX_DEPTH, ROULETTE_DEPTH, SceneDict
 from services.core.errors import InputError
+
+Floats = NDArray[np.float64]
 
 COLOUR_INTEGRATOR: SceneDict = {"type": "volpathmis", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH}
 """Integrator that samples free paths of all channels together. ``volpath`` samples one channel's and weighs it for the
@@ -62,10 +65,10 @@ def _joined(nodes: list[Any], exact: list[bool]) -> Any:
     if kind == "homogeneous":
         return _medium(nodes, exact)
     if kind == "uniform":
-        return {"type": "rgb", "value": _colour([node["value"] for node in nodes])}
+        return {"type": "rgb", "value": colour_of([node["value"] for node in nodes])}
     own: SceneDict = {"pixel_format": "rgb"} if kind == "hdrfilm" else {}
     if kind == "point":
-        own["intensity"] = _colour([_number(node["intensity"]) for node in nodes])
+        own["intensity"] = colour_of([_number(node["intensity"]) for node in nodes])
     return {key: own.get(key) or _joined([node[key] for node in nodes], exact) for key in first}
 
 
@@ -73,9 +76,30 @@ def _number(value: Any) -> float:
     return float(getattr(value, "default", value))
 
 
-def _colour(values: Sequence[float]) -> Colour:
+def colour_of(values: Sequence[float] | Floats) -> Colour:
+    """The colour of three values."""
     red, green, blue = (float(value) for value in values)
     return Colour((red, green, blue))
+
+
+def homogeneous(extinction: Floats, albedo: Floats, phase: SceneDict, written: Callable[[Floats], Any]) -> SceneDict:
+    """A medium with a value for each colour or wavelength.
+
+    Args:
+        extinction: extinction (N,), 1/mm.
+        albedo: single-scattering albedo (N,).
+        phase: the phase function.
+        written: makes of N values what ``scene_xml`` writes.
+    """
+    # Mitsuba takes colours of media from 0 to 1, so the largest extinction stands apart.
+    largest = float(extinction.max())
+    return {
+        "type": "homogeneous",
+        "scale": largest,
+        "sigma_t": written(extinction / largest if largest > 0 else extinction),
+        "albedo": written(albedo),
+        "phase": phase,
+    }
 
 
 def _medium(media: list[SceneDict], exact: list[bool]) -> SceneDict:
@@ -91,15 +115,7 @@ def _medium(media: list[SceneDict], exact: list[bool]) -> SceneDict:
         extinction = scattering + absorption
         albedo = np.divide(scattering, extinction, out=np.zeros(3), where=extinction > 0)
         phase = {"type": "hg", "g": float(cosines.mean())}
-    # Mitsuba takes colours of media from 0 to 1, so the largest extinction stands apart.
-    largest = float(extinction.max())
-    return {
-        "type": "homogeneous",
-        "scale": largest,
-        "sigma_t": _colour((extinction / largest if largest > 0 else extinction).tolist()),
-        "albedo": _colour(albedo.tolist()),
-        "phase": phase,
-    }
+    return homogeneous(extinction, albedo, phase, colour_of)
 
 
 def _mean_cosine(phase: SceneDict) -> float:

@@ -12,13 +12,11 @@ from services.core.errors import CaptureInputError, CorruptStoreError
 from services.core.provenance.hash_list import write_hash_list
 from services.core.provenance.inputs import stated_by
 from services.core.provenance.record import PROVENANCE, Provenance
-from services.core.records import JobSpec
+from services.core.records import JOB_FILE, JobSpec
 from services.core.store import read_record, write_record
 
 BESIDE_PHOTOGRAPH = "render_beside_photograph.png"
-"""Picture in an asset's folder that shows a photograph beside a render; it is there where the asset has colours."""
-JOB = "job.json"
-"""File of a job's folder that holds its options."""
+"""Picture of a photograph beside a render, with which the report begins where somebody has put one into the asset."""
 
 
 def departing(
@@ -29,7 +27,8 @@ def departing(
     The consent is the one that the capture states at present, or else the one that the asset recorded.
 
     Args:
-        job: the job's folder. asset: the folder of its asset.
+        job: the job's folder.
+        asset: the folder of its asset.
         use: what the export is for; None where that is not said.
         now: the present, with its time zone.
 
@@ -44,8 +43,8 @@ def departing(
             f"{asset / PROVENANCE} cannot be read; write the asset again with dentine export."
         ) from problem
     consent = None if provenance is None else provenance.consent
-    if (job / JOB).is_file():
-        stated = stated_by(read_record(job / JOB, JobSpec).capture)
+    if (job / JOB_FILE).is_file():
+        stated = stated_by(read_record(job / JOB_FILE, JobSpec).capture)
         consent = consent if stated is None else stated.consent
     require_allowed(consent, use, now)
     if provenance is None:

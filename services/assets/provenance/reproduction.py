@@ -17,7 +17,7 @@ from services.core.files.validation import fault_of, first_error
 from services.core.provenance.hash_list import require_unedited
 from services.core.provenance.inputs import hashed_inputs
 from services.core.provenance.record import PROVENANCE, Provenance
-from services.core.records import JobSpec
+from services.core.records import JOB_FILE, JobSpec
 from services.core.store import read_record
 
 NUMBERS = ("parameters.json", "errors.json")
@@ -68,7 +68,7 @@ def job_again(asset: Asset, capture: Path | None, calibration: Path | None) -> J
         SettingsError: a file is not found, or this version does not have an option of the asset's job.
     """
     options = dict(asset.provenance.options)
-    stored = read_record(asset.job / "job.json", JobSpec) if (asset.job / "job.json").is_file() else None
+    stored = read_record(asset.job / JOB_FILE, JobSpec) if (asset.job / JOB_FILE).is_file() else None
     is_of_rig = options.pop("rig", None) is not None
     if capture is None and stored is not None:
         capture = asset.job / "capture" if is_of_rig else stored.capture
@@ -130,7 +130,8 @@ def changed_results(before: Path, after: Path) -> tuple[int, list[str]]:
     """Number of values and surfaces that were compared, and where two assets differ, as sentences.
 
     Args:
-        before, after: folders of the assets.
+        before: folder of the first asset.
+        after: folder of the second.
     """
     count, found = 0, []
     for name in NUMBERS:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.content import RGB
+from services.assets.content import RGB, in_rgb
 from services.assets.textures.tooth import ToothTextures
 from services.core.pages.pictures import png16_bytes, png_bytes, tone_map
 from services.core.store import write_atomic
@@ -42,7 +42,7 @@ def write_textures(folder: Path, sets: Mapping[str, ToothTextures]) -> dict[str,
 
 def _write(folder: Path, name: str, textures: ToothTextures) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
-    colour = _as_rgb(textures.base_colour)
+    colour = in_rgb(textures.base_colour)
     height, width = colour.shape[:2]
     told: dict[str, Any] = {
         "size": [width, height],
@@ -80,13 +80,6 @@ def _write(folder: Path, name: str, textures: ToothTextures) -> dict[str, Any]:
             "meaning": "transmittance of the stain, 1 where it absorbs nothing; light passes it on its way in and out",
         }
     return told
-
-
-def _as_rgb(colours: Mapping[str, Picture]) -> Picture:
-    """Red, green and blue (H, W, 3); a grey, their mean, of other channels."""
-    if set(RGB) <= colours.keys():
-        return np.stack([colours[channel] for channel in RGB], axis=-1)
-    return np.repeat(np.mean(list(colours.values()), axis=0)[..., None], 3, axis=-1)
 
 
 def _write_exr(path: Path, planes: Mapping[str, Picture]) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.assets.people_mesh import PeopleMesh
+from services.assets.stains import looked_up
 from services.assets.textures.texels import texels_of
 from services.assets.textures.thickness import Thickness
 from services.transport.optics.half_space import half_space_reflectance
 from services.transport.optics.layer_reflectance import layer_reflectance
 from services.transport.optics.parameters import Medium
-from services.transport.scene.stain_uv import bilinear_texels
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def bake(
     """
     texels = texels_of(mesh)
     found = None if thickness is None else thickness.at(texels.points_mm)
-    passed = {channel: _looked_up(stain, texels.uv) for channel, stain in stains.items()}
+    passed = {channel: looked_up(stain, texels.uv) for channel, stain in stains.items()}
     colours = {}
     for channel, medium in enamel.items():
         if found is None or channel not in dentin:
@@ -78,8 +78,3 @@ def bake(
         why_no_se="" if thickness is None else thickness.why_no_se,
         stains={channel: texels.picture(values) for channel, values in passed.items()},
     )
-
-
-def _looked_up(picture: Array, uv: Array) -> Array:
-    texels, weights = bilinear_texels(uv, (picture.shape[0], picture.shape[1]))
-    return np.asarray((picture.reshape(-1)[texels] * weights).sum(axis=1))

@@ -101,8 +101,8 @@ class ColmapModel:
         points = np.array([point.xyz for point in self._model.points3D.values()]).reshape(-1, 3)
         if len(points) == 0:
             raise CaptureInputError(f"The model in {self.folder} has no 3D points; export it with points3D.")
-        centres = np.array([self._place(image) for image in self.images])
-        return float(np.median(np.linalg.norm(points[None] - centres[:, None], axis=-1)))
+        centres = [self._image(image).projection_center() for image in self.images]
+        return float(np.median([np.linalg.norm(points - centre, axis=-1) for centre in centres]))
 
     def camera(self, image: str, name: str, mm_per_unit: float) -> CalibratedCamera:
         """The camera that took an image, with the pose that it had then.
@@ -183,7 +183,7 @@ def named_images(images: Sequence[str], chosen: Sequence[str] = ()) -> dict[str,
         chosen: ``CAMERA=IMAGE`` each; empty for all images, by their names without folder and ending.
 
     Raises:
-        CaptureInputError: an entry names no image of the model or no camera, or two images would be of one camera.
+        CaptureInputError: an entry is not CAMERA=IMAGE, or two images would be of one camera.
     """
     found: dict[str, str] = {}
     for entry in chosen or tuple(f"{PurePosixPath(image).stem}={image}" for image in images):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +11,7 @@ from services.core.calibration.cameras_and_lights import CalibratedCamera, Calib
 from services.core.calibration.record import Calibration, require_consistent
 from services.core.calibration.uncertainty import CalibrationUncertainty
 from services.core.errors import CaptureInputError
+from services.core.store import sha256_of
 
 MODEL_FILES = ("cameras", "images", "points3D")
 """Names, without their endings, of the files of a COLMAP model that are read."""
@@ -69,7 +69,7 @@ def calibration_of(
         lights=tuple(lights),
         uncertainty=uncertainty,
         made=datetime.now(UTC).isoformat(timespec="seconds"),
-        inputs={path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files},
+        inputs={path.name: sha256_of(path) for path in files},
     )
     require_consistent(record, f"The calibration by {model.folder}")
     return record

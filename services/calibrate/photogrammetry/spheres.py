@@ -13,7 +13,7 @@ from services.calibrate.cameras.rotations import pose_vector
 from services.calibrate.lights.mirror import PosedCamera
 from services.calibrate.session.flats import measure_vignetting
 from services.calibrate.session.photos import Photos
-from services.calibrate.session.record import camera_record, light_positions, light_record, uncertainty_of
+from services.calibrate.session.record import camera_records, light_positions, light_records, uncertainty_of
 from services.calibrate.session.spheres import find_lights, measure_intensity
 from services.core.calibration.cameras_and_lights import CalibratedCamera, CalibratedLight
 from services.core.calibration.uncertainty import CalibrationUncertainty
@@ -77,20 +77,8 @@ def lights_by_spheres(root: Path, cameras: Sequence[CalibratedCamera], distance_
     intensity = measure_intensity(photos, posed, places, distance_mm, vignettings)
     return LitRig(
         folder.channels,
-        tuple(
-            camera_record(
-                name,
-                camera,
-                photos.black[name],
-                vignettings.get(name),
-                None if intensity is None else intensity.fit.radiance_per_count[number],
-            )
-            for number, (name, camera) in enumerate(zip(names, posed, strict=True))
-        ),
-        tuple(
-            light_record(folder.light[number].name, where, number, intensity, len(folder.channels), positions)
-            for number, where in positions.items()
-        ),
+        camera_records(names, posed, photos.black, vignettings, intensity),
+        light_records(folder, positions, intensity),
         uncertainty_of(folder, None, lights, intensity),
     )
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from services.calibrate.cameras.bundle import BundleFit
 from services.calibrate.cameras.projection import image_grid, projection_sigma
 from services.core.colour.cie import D50
+from services.core.pages.pictures import tone_map
 
 Floats = NDArray[np.float64]
 WIDTH = 360.0
@@ -113,9 +114,7 @@ def srgb(xyz: Floats) -> Floats:
 
 
 def _hex(linear: Floats) -> str:
-    clipped = np.clip(linear, 0, 1)
-    encoded = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-    return "#" + "".join(f"{round(255 * float(value)):02x}" for value in encoded)
+    return "#" + tone_map(linear[None, None], 1.0).tobytes().hex()
 
 
 def _safe(text: str) -> str:

@@ -45,20 +45,8 @@ def record_of(
     return Calibration(
         units="mm",
         channels=folder.channels,
-        cameras=tuple(
-            camera_record(
-                name,
-                camera,
-                black[name],
-                vignettings.get(name),
-                None if intensity is None else intensity.fit.radiance_per_count[number],
-            )
-            for number, (name, camera) in enumerate(zip(cameras.names, posed_cameras, strict=True))
-        ),
-        lights=tuple(
-            light_record(folder.light[number].name, where, number, intensity, len(folder.channels), positions)
-            for number, where in positions.items()
-        ),
+        cameras=camera_records(cameras.names, posed_cameras, black, vignettings, intensity),
+        lights=light_records(folder, positions, intensity),
         uncertainty=uncertainty_of(folder, cameras, lights, intensity),
         made=made,
         valid_days=valid_days,
@@ -181,10 +169,36 @@ def _camera_rows(names: Sequence[str], posed_cameras: Sequence[PosedCamera]) -> 
     return error_names, np.concatenate(blocks)
 
 
-def camera_record(
+def camera_records(
+    names: Sequence[str],
+    cameras: Sequence[PosedCamera],
+    black: Mapping[str, Black],
+    vignettings: Mapping[str, tuple[float, float, float]],
+    intensity: IntensityStep | None,
+) -> tuple[CalibratedCamera, ...]:
+    """Return the records of the cameras; without intensities none has a radiance per count."""
+    scales = [None] * len(names) if intensity is None else intensity.fit.radiance_per_count
+    return tuple(
+        _camera(name, camera, black[name], vignettings.get(name), scale)
+        for name, camera, scale in zip(names, cameras, scales, strict=True)
+    )
+
+
+def light_records(
+    folder: RawFolder, positions: Mapping[int, Floats], intensity: IntensityStep | None
+) -> tuple[CalibratedLight, ...]:
+    """Return the records of the lights whose positions, by number, are known; one without a photograph of a white
+    sphere gets the mean intensity, 1.
+    """
+    return tuple(
+        _light(folder.light[number].name, where, number, intensity, len(folder.channels))
+        for number, where in positions.items()
+    )
+
+
+def _camera(
     name: str, camera: PosedCamera, black: Black, vignetting: tuple[float, float, float] | None, scale: Floats | None
 ) -> CalibratedCamera:
-    """Return the record of a camera; ``scale`` is its radiance per count, by channel."""
     return CalibratedCamera.model_validate(
         {
             "name": name,
@@ -200,19 +214,11 @@ def camera_record(
     )
 
 
-def light_record(
-    name: str,
-    where: Floats,
-    number: int,
-    step: IntensityStep | None,
-    channels: int,
-    positions: Mapping[int, Floats],
-) -> CalibratedLight:
-    """Return the record of a light; one without a photograph of a white sphere gets the mean intensity, 1."""
+def _light(name: str, where: Floats, number: int, step: IntensityStep | None, channels: int) -> CalibratedLight:
     known = step is not None and bool(np.isfinite(step.fit.intensity[number, 0]))
     lobe = None
     if step is not None and step.fit.exponent > 0:
-        axis = np.array(step.middle_mm) - positions[number]
+        axis = np.array(step.middle_mm) - where
         lobe = Lobe.model_validate({"axis": (axis / np.linalg.norm(axis)).tolist(), "exponent": step.fit.exponent})
     intensity = step.fit.intensity[number].tolist() if step is not None and known else [1.0] * channels
     x, y, z = (float(one) for one in where)

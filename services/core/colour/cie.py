@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 D50 = np.array([0.96422, 1.0, 0.82521])
-"""XYZ of the white of illuminant D50, 2° observer (ICC)."""
+"""XYZ of the white of illuminant D50, 2° observer (ICC.1:2022, section 7.2.16): the white of a camera's colours."""
 D65 = np.array([0.95047, 1.0, 1.08883])
 """XYZ of the white of illuminant D65, 2° observer."""
 OPPOSITE = 1e-9
@@ -15,11 +15,11 @@ OPPOSITE = 1e-9
 
 
 def lab_from_xyz(xyz: Floats, white: Floats = D50) -> Floats:
-    """Return the CIE 1976 L*, a*, b* (N, 3) of XYZ (N, 3), in which the white has Y = 1."""
+    """Return the CIE 1976 L*, a*, b* (..., 3) of XYZ (..., 3), in which the white has Y = 1."""
     t = np.asarray(xyz) / white
     epsilon, kappa = (6 / 29) ** 3, (29 / 6) ** 2 / 3
     f = np.where(t > epsilon, np.cbrt(np.maximum(t, epsilon)), kappa * t + 4 / 29)
-    return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
+    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
 
 
 def delta_e_2000(one: Floats, two: Floats) -> Floats:

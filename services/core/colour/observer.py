@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+FIRST_NM, LAST_NM, MAX_GAP_NM = 420.0, 680.0, 25.0
+"""A spectrum that gives a colour begins at 420 nm or before and ends at 680 nm or after, in steps of at most 25 nm."""
 
 
 def daylight_weights() -> tuple[Floats, Floats]:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 
 from services.core.errors import CorruptStoreError, MissingStageError
-from services.core.store import FORMAT_VERSION, MANIFEST, write_atomic
+from services.core.store import FORMAT_VERSION, MANIFEST, sha256_of, write_atomic
 
 
 def write_hash_list(folder: Path, name: str) -> None:
     """List size and SHA-256 of all files below a folder in its ``manifest.json``."""
     files = {
-        path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": _sha256(path)}
+        path.relative_to(folder).as_posix(): {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
         for path in _files(folder)
     }
     manifest = {"format": FORMAT_VERSION, "stage": name, "files": files}
@@ -44,7 +43,7 @@ def require_unedited(folder: Path) -> tuple[str, ...]:
                 f"{folder / name} was removed since the asset was written; restore it, or write the asset again with"
                 " dentine export."
             )
-        if _sha256(folder / name) != sha256:
+        if sha256_of(folder / name) != sha256:
             raise CorruptStoreError(
                 f"{folder / name} was edited since the asset was written; restore it, or write the asset again with"
                 " dentine export."
@@ -54,8 +53,3 @@ def require_unedited(folder: Path) -> tuple[str, ...]:
 
 def _files(folder: Path) -> list[Path]:
     return [path for path in sorted(folder.rglob("*")) if path.is_file() and path != folder / MANIFEST]
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from services.core.raw.folder import DESCRIPTION, is_raw_folder, parse_raw_folde
 from services.core.raw.records import RawFolder
 from services.core.raw.registration import REGISTRATION
 from services.core.records import FolderCapture, JobSpec
-from services.core.store import MANIFEST, read_record
+from services.core.store import MANIFEST, read_record, sha256_of
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,8 @@ def hashed_inputs(spec: JobSpec, root: Path, between: Callable[[], None] = lambd
     found = []
     for one in paths_of_inputs(spec, root):
         between()
-        with one.path.open("rb") as stream:
-            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-        found.append(
-            InputFile(name=one.name, bytes=one.path.stat().st_size, sha256=sha256, is_photograph=one.is_photograph)
-        )
+        size, sha256 = one.path.stat().st_size, sha256_of(one.path)
+        found.append(InputFile(name=one.name, bytes=size, sha256=sha256, is_photograph=one.is_photograph))
     return tuple(found)
 
 

@@ -15,7 +15,6 @@ that were being made. The records are ``RecordFiles``, because every worker writ
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ import zarr
 
 from services.core.files.object_store import RemoteFolder, StoredObject, discard, new_remote_folder, remote_folder
 from services.core.geometry import Camera, Record
-from services.core.store import StageWriter, writable_array, write_record
+from services.core.store import StageWriter, sha256_of, writable_array, write_record
 from services.preprocess.tasks.records import FlowDone, FrameMotion, ImageDone, StoredFile, ViewDone
 from services.preprocess.views.projection import Footprint
 from services.preprocess.views.scratch import write_array
@@ -186,9 +185,8 @@ class AttemptFiles:
         found = {}
         for path in [*shards, picture]:
             if path.is_file() and not path.name.endswith(".partial"):
-                with path.open("rb") as stream:
-                    sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-                found[path.relative_to(self.folder).as_posix()] = StoredFile(bytes=path.stat().st_size, sha256=sha256)
+                name, sha256 = path.relative_to(self.folder).as_posix(), sha256_of(path)
+                found[name] = StoredFile(bytes=path.stat().st_size, sha256=sha256)
         return found
 
     def objects_of(self, camera: int, light: int) -> dict[str, StoredObject]:

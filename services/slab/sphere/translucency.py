@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.core.colour.observer import daylight_weights
+from services.core.colour.cie import lab_from_xyz
+from services.core.colour.observer import FIRST_NM, LAST_NM, MAX_GAP_NM, daylight_weights
 from services.core.geometry import Record
 from services.core.slab.folder import Cell
 from services.slab.sphere.invert import MIN_STEP, Fitted, interface_of
@@ -20,11 +21,6 @@ from services.slab.sphere.search import DIFFERENCE
 from services.transport.optics.slab_totals import Optics, Totals, slab_totals
 
 Array = NDArray[np.float64]
-
-MAX_GAP_NM = 25.0
-"""Largest step of a spectrum that gives a colour. A spectrum must also begin at 420 nm or before and end at 680 nm or
-after."""
-FIRST_NM, LAST_NM = 420.0, 680.0
 
 
 class Lab(Record):
@@ -62,14 +58,6 @@ def over_backing(totals: Totals, backing: float) -> float:
     """Reflectance of a slab for a beam along the normal, over a diffuse backing: light goes to and fro between them."""
     returned = totals.transmittance * backing * totals.transmittance_diffuse
     return totals.reflectance + returned / (1 - backing * totals.reflectance_diffuse)
-
-
-def lab_of(xyz: Array, white: Array) -> Array:
-    """CIELAB (..., 3) of tristimulus values (..., 3); ``white`` holds those of the illuminant."""
-    ratio = xyz / white
-    edge = 6 / 29
-    f = np.where(ratio > edge**3, np.cbrt(ratio), ratio / (3 * edge**2) + 4 / 29)
-    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
 
 
 def translucency_of(file: SphereFile, fits: list[Fitted], black: float, white: float) -> Translucency | None:
@@ -136,5 +124,5 @@ def _appearance(nm: Array, reflectance: Array) -> Array:
     nodes_nm, weights = daylight_weights()
     spectra = np.array([np.interp(nodes_nm, nm, row) for row in reflectance])
     xyz = spectra @ weights
-    lab = lab_of(xyz, weights.sum(axis=0))
+    lab = lab_from_xyz(xyz, weights.sum(axis=0))
     return np.concatenate([[np.linalg.norm(lab[0] - lab[1]), xyz[0, 1] / xyz[1, 1]], lab[0], lab[1]])

@@ -68,7 +68,14 @@ def test_a_receipt_names_what_has_left(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["artifacts/asset/tooth.ply", "artifacts/report.html", "artifacts.zip", "parameters.csv"]
+    "path",
+    [
+        "artifacts/asset/tooth.ply",
+        "artifacts/report.html",
+        "artifacts/%2E/report.html",
+        "artifacts.zip",
+        "parameters.csv",
+    ],
 )
 def test_a_use_or_a_day_beyond_the_consent_is_refused(tmp_path: Path, path: str) -> None:
     with guarded(tmp_path, write_asset) as server:
@@ -81,6 +88,7 @@ def test_a_use_or_a_day_beyond_the_consent_is_refused(tmp_path: Path, path: str)
         refused = ask(**{"for": "film"})
         assert (refused["status"], refused["code"]) == (403, "no-consent")
         assert "for research and not for film" in refused["detail"]
+        assert refused["detail"].endswith("a job takes up a changed consent when it is run anew.")
         assert ask(**{"for": "research"})["status"] in {200, 404}  # there are no parameters
         limit_consent(server, job, "2020-01-01")
         assert "ended on 2020-01-01" in ask()["detail"]

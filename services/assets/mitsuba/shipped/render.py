@@ -2,8 +2,8 @@
 
 Each colour channel is its own scene, because scattering differs per channel and Mitsuba's phase functions hold one
 number. The image has the photographs' pixels; ``--large`` writes the film's, which are at least 512 on an edge.
-``--colour srgb`` or ``acescg`` develops the camera's red, green and blue by the calibration's matrix, with 1 for a
-white diffuser that faces the light. A file name that ends with .png gives a picture in sRGB.
+``--colour srgb`` or ``acescg`` develops the camera's red, green and blue by the calibration's root polynomial or
+matrix, with 1 for a white diffuser that faces the light. A file name that ends with .png gives a picture in sRGB.
 """
 
 import argparse
@@ -59,7 +59,7 @@ def develop(image: np.ndarray, folder: Path, camera: str, light: str, colour: st
     """Linear colours (..., 3) of radiance (..., C) that ``render`` has returned, 1 for a white diffuser in that light.
 
     Args:
-        colour: ``srgb`` or ``acescg``; ``rig.json`` says where a camera's matrix comes from.
+        colour: ``srgb`` or ``acescg``; ``rig.json`` says where a camera's colours come from.
     """
     rig = json.loads((folder / "rig.json").read_text())
     told, lamp = rig["colour"], rig["lights"][light]
