@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from services.fit.passes.evaluate import ErrorSums
-from services.fit.solve.gauss_newton import Result
+from services.fit.solve.outcome import Result
 from services.fit.stages.attempt import Assessment, assess_convergence
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.normal_equations import LossChange
-from services.fit.stages.channel_fit import FINAL_MIN_SHARE, FINAL_TRIALS, last_step
+from services.fit.stages.last_step import FINAL_MIN_SHARE, FINAL_TRIALS, last_step
 
 WHOLE = 0.5
 
@@ -34,9 +34,7 @@ class FakeModel:
 
 @dataclass
 class FakeProblem:
-    """Compares the loss: the whole step gives ``change`` ± 359; the parabola begins with ``slope``. What a quarter of
-    the paths does not accept is compared again with all of them.
-    """
+    """Compares the loss: the whole step gives ``change`` ± 359; the parabola begins with ``slope``."""
 
     change: float
     slope: float = -2000.0
@@ -52,7 +50,7 @@ class FakeProblem:
 def taken(problem: Any, part_count: int, **model: float) -> float:
     """The length of the step taken, as a share of the whole step."""
     fake: Any = FakeModel(**model)
-    return float(last_step(problem, np.zeros(1), fake, part_count, 64)[0]) / WHOLE
+    return float(last_step(problem, np.zeros(1), fake, part_count, 64)[0][0]) / WHOLE
 
 
 def test_many_teeth_are_wrong_independently() -> None:
@@ -89,3 +87,18 @@ def test_a_step_that_promises_nothing_is_not_compared() -> None:
     problem = FakeProblem(-1000.0)
     assert taken(problem, part_count=14, promised=20.0) == 0
     assert not problem.asked
+
+
+def test_what_comparisons_refuted_does_not_count_as_unfinished() -> None:
+    fake: Any = FakeModel()
+    # With 300 at the whole step the minimum is at 2000 / 4600 of it. With 1100 it is at 2000 / 6200, where 639 is found
+    # against a slope of -645: at 645 / 2568 of that.
+    step, share = last_step(cast("Any", FakeProblem(300.0)), np.zeros(1), fake, 14, 64)
+    assert share == pytest.approx(2000 / 4600)
+    step, share = last_step(cast("Any", FakeProblem(1100.0, slope=2400.0)), np.zeros(1), fake, 14, 64)
+    assert not step.any()
+    assert share == pytest.approx(2000 / 6200 * 645 / 2568, rel=1e-3)
+    # Where nothing refutes it, all of it counts.
+    step, share = last_step(cast("Any", FakeProblem(100.0)), np.zeros(1), fake, 1, 64)
+    assert not step.any()
+    assert share == 1

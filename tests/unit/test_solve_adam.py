@@ -12,7 +12,7 @@ import pytest
 from services.core.errors import NonFiniteError
 from services.fit.coordinates.domain import Coordinate, Domain
 from services.fit.solve.adam import ADVICE_MORE_STEPS, Adam, Gradient, Options, State, state_from, state_record
-from services.fit.solve.gauss_newton import Result
+from services.fit.solve.outcome import Result
 
 DOMAIN = Domain(tuple(Coordinate((f"{part}.{leaf}",)) for part in ("enamel", "dentin") for leaf in ("sigma", "alpha")))
 BEST = np.array([1.0, 2.5, 2.0, 2.0])

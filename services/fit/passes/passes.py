@@ -132,6 +132,9 @@ def jacobian_task(
     )
     if differentiation.errors and block.motion is not None:
         equations = equations.without_noise(*slope_noise(block, differentiation.errors))
+    none = np.zeros_like(r1)
+    loss = loss_change(none, none, r1, r2, weight, len(block.reference), block.cell)
+    equations = replace(equations, loss=loss.change, loss_variance=loss.variance)
     return Products(equations, (residual.trace, rendered, trace_row("products", task, start)))
 
 

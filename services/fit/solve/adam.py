@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
 from services.fit.coordinates.domain import Domain
-from services.fit.solve.gauss_newton import ADVICE, Result, Solution
+from services.fit.solve.outcome import ADVICE, Result, Solution
 
 Array = NDArray[np.float64]
 

@@ -264,6 +264,7 @@ def uncertainty(
     step: Array | None = None,
     moved: Sequence[str] = (),
     part_count: int = 1,
+    unfinished: float = 1.0,
 ) -> Uncertainty:
     """Uncertainty at a solution, from the normal equations there.
 
@@ -276,6 +277,7 @@ def uncertainty(
         moved: kind, ``shape``, ``teeth`` or ``dome``, of each of the last changes of the final uncertainty estimate;
             the earlier changes are those of held mean cosines.
         part_count: number of objects that the fit treats as separate in the images, such as the teeth of a jaw.
+        unfinished: share of the remaining step to the minimum that counts; less than 1 where comparisons refuted it.
     """
     misfit = max(1.0, equations.squares / equations.expected_squares) if equations.expected_squares > 0 else 1.0
     whitened = whitening(domain, equations)
@@ -312,7 +314,8 @@ def uncertainty(
         )
 
     # Count the remaining step along the determined directions as error.
-    remaining = FinalModel(domain, x, whitened, inverse, remaining_gradient, parts["rendering"]).remaining_step()
+    model = FinalModel(domain, x, whitened, inverse, remaining_gradient, parts["rendering"])
+    remaining = unfinished * model.remaining_step()
     combined = combine_with_prior(
         domain, x, Sandwich(t, inverse, meat, misfit, weighing), parts, np.outer(remaining, remaining), part_count
     )

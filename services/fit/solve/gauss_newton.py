@@ -1,72 +1,48 @@
 """Gauss-Newton with Monte Carlo Jacobians, as init, step, terminate and finish; the outcome is a value.
 
 The objective is F(x) = 1/2 sum w r(x)^2 + 1/2 sum precision (x - prior)^2 in the unbounded domain. Each step renders
-normal equations (curvature from two independent seeds, residual from a third), pools them with those of earlier steps
-carried to the present point, solves a trust-region subproblem that damps past the most negative curvature, and tests
-the proposed step.
+normal equations (curvature from two independent seeds, residual from a third and a fourth), pools them with those of
+earlier steps carried to the present point, solves a trust-region subproblem that damps past the most negative
+curvature, and proposes a step. The next step renders the equations where the proposal ends, and tests it there.
 
-Two independent estimates of the change of F test a step. The comparison renders the loss at both ends with common
-random numbers, from seeds that neither gradient nor curvature used. The model's prediction comes from the quadratic
-model; its standard error covers the noise of gradient and curvature and a model error that grows with the step. Far
-from the optimum the comparison decides; close to it, where losses hardly differ, the prediction is the more precise.
-With z = 3 standard errors:
+Two independent estimates of the change of F test a proposal. The comparison is the difference of the losses at both
+ends, each the product of the residuals of two seeds: rendered for the equations in any case, it costs nothing. The
+model's prediction comes from the quadratic model; its standard error covers the noise of gradient and curvature and a
+model error that grows with the step. Far from the optimum the comparison decides; close to it, where losses hardly
+differ, the prediction is the more precise. With z = 3 standard errors:
 
 * the two combined are significantly better and do not contradict each other: the step is accepted;
-* the comparison is significantly worse or contradicts the prediction: the curvature is wrong, the radius shrinks;
-* otherwise noise stops progress: the samples double; at their limit the fit ends, as good as its noise allows.
+* the comparison is significantly worse or contradicts the prediction: the curvature is wrong, and a shorter step is
+  proposed from the same equations;
+* otherwise noise stops progress: the proposal is taken where both combined favour it by one standard error, and the
+  samples double; at their limit the fit ends, as good as its noise allows.
 
 A fit that ends by noise lies within a few standard errors of the minimum, biased towards its start. So a last Newton
-step goes to the minimum of the pooled model, along the directions whose curvature exceeds its noise. It is refused
-where the comparison is significantly worse, or, where derivatives are not those of the images, where both estimates
-combined are not better by one standard error. The solution's error is then that of the pooled gradient, without bias.
+step goes to the minimum of the pooled model, along the directions whose curvature exceeds its noise, unless a
+comparison from seeds of its own is significantly worse. The solution's error is then that of the pooled gradient,
+without bias. Where derivatives are not those of the images, this step is left to the final uncertainty estimate, which
+measures how the images respond.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from enum import StrEnum
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.core.errors import NonFiniteError
 from services.fit.coordinates.domain import Domain
 from services.fit.solve.elimination import ReducedEquations, eliminate
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
-from services.fit.solve.step_test import SIGNIFICANCE_Z, StepTest, judged
+from services.fit.solve.outcome import ADVICE, Result, Solution
+from services.fit.solve.solver_state import Proposal, State
+from services.fit.solve.step_test import LAST_STEP_Z, SIGNIFICANCE_Z, StepTest, compared
 from services.fit.solve.trust_region import solve_box
 
 Array = NDArray[np.float64]
-
-
-class Result(StrEnum):
-    """How a fit ended. ``running`` is the only one that continues."""
-
-    RUNNING = "running"
-    CONVERGED = "converged"
-    NOISE_LIMITED = "noise limited"
-    MAX_STEPS = "step limit"
-    STALLED = "stalled"
-
-    @property
-    def converged(self) -> bool:
-        """Whether the optimum was reached within the precision that the samples allow."""
-        return self in {Result.CONVERGED, Result.NOISE_LIMITED}
-
-
-ADVICE = {
-    Result.RUNNING: "The fit has not ended.",
-    Result.CONVERGED: "",
-    Result.NOISE_LIMITED: (
-        "Further steps would be smaller than noise; raise max_samples_per_pixel for a smaller standard error."
-    ),
-    Result.MAX_STEPS: "The fit still improved at its last step; raise max_steps.",
-    Result.STALLED: (
-        "No step along the gradient lowers the error; check that the mesh, the lights and the boundary model match the"
-        " capture."
-    ),
-}
 
 
 DETERMINED = 3.0
@@ -80,9 +56,11 @@ LONGEST_CURVED_STEP = 2.0
 """Largest length of such a move, in scales."""
 SIGNIFICANT_MOVE = 3.0
 """Least ratio of such a move to its own noise."""
-LAST_STEP_Z = 1.0
-"""Standard errors by which both estimates combined must favour the last step; no step follows that an error could
-mislead."""
+
+WORSE = "worse: radius reduced"
+"""Verdict on a proposal that is refused."""
+TAKEN, LEFT = "noise: taken", "noise: left"
+"""Verdicts on a proposal of which noise does not let tell: taken where both witnesses favour it, or else left."""
 
 
 class Problem(Protocol):
@@ -116,50 +94,6 @@ class Options:
     part_count: int = 1
     """Number of objects that the images tell apart, such as teeth. A step's length is the root mean square over them,
     so that each may move as far as a single one would."""
-
-
-@dataclass(frozen=True)
-class State:
-    """State of the solver between steps."""
-
-    x: Array
-    samples: int
-    radius: float = 1.0
-    step: int = 0
-    accepted: int = 0
-    result: Result = Result.RUNNING
-    memory: NormalEquations | None = None
-    """Pooled normal equations of earlier steps, carried to x."""
-    memory_samples: float = 0.0
-    verdict: str = ""
-    """Outcome of the last step, for the log."""
-
-
-def state_record(state: State) -> dict[str, Any]:
-    """A state as JSON values; floats survive exactly."""
-    memory = None if state.memory is None else state.memory.record()
-    return {f.name: getattr(state, f.name) for f in fields(State)} | {"x": state.x.tolist(), "memory": memory}
-
-
-def state_from(record: dict[str, Any]) -> State:
-    """The state of a record."""
-    memory = None if record["memory"] is None else NormalEquations.of(record["memory"])
-    return State(**(record | {"x": np.array(record["x"]), "result": Result(record["result"]), "memory": memory}))
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Outcome of a fit: the solution, how the fit ended, and what to do about it."""
-
-    x: Array
-    result: Result
-    advice: str
-    steps: int
-    samples: int
-    equations: NormalEquations | None
-    """Pooled normal equations at x; None where the last step discarded them."""
-    equation_samples: float = 0.0
-    """Paths per pixel that ``equations`` are worth."""
 
 
 @dataclass(frozen=True)
@@ -199,83 +133,133 @@ class GaussNewton:
         )
 
     def step(self, problem: Problem, state: State) -> State:
-        """One linearisation and up to ``max_trials`` comparisons.
+        """One linearisation: where a proposal ends, which it tests, or else where the fit stands; then the next
+        proposal.
 
         Raises:
             NonFiniteError: the problem returned NaN or infinity.
         """
-        options, x = self.options, state.x
-        pooled, samples = problem.linearise(x, samples=state.samples, step=state.step), float(state.samples)
-        if state.memory is not None:
-            pooled, samples = pool(state.memory, state.memory_samples, pooled, samples), state.memory_samples + samples
-        state = replace(state, step=state.step + 1, memory=pooled, memory_samples=samples)
+        options, verdict = self.options, "a step is proposed"
+        place = state.x if state.proposal is None else state.x + state.proposal.step
+        fresh = problem.linearise(place, samples=state.samples, step=state.step)
+        state = replace(state, step=state.step + 1)
+        if state.proposal is None:
+            state = self._with_fresh(state, fresh)
+        else:
+            state = self._tested(state, state.proposal, fresh)
+            verdict = state.verdict
+            if state.radius < options.least_radius:
+                return replace(state, result=Result.STALLED, verdict="worse at every radius")
 
         # Add the weak prior, which is exact, to curvature and gradient but not to their noise, and eliminate the
         # instrument's errors.
-        equations = eliminate(pooled, self.domain.precision, self.domain.prior_slope(x), self.domain.tissue_count)
-        best, error_step = x + equations.error_step, equations.error_step
+        memory = state.memory
+        assert memory is not None
+        equations = eliminate(memory, self.domain.precision, self.domain.prior_slope(state.x), self.domain.tissue_count)
+        noise_gain = gain_by_noise(equations)
+        if verdict == WORSE:
+            shorter = self._proposal(state, equations, noise_gain) if state.refusals < options.max_trials else None
+            if shorter is None:
+                state = replace(state, memory=None, memory_samples=0.0)
+            return self._with_step_limit(replace(state, proposal=shorter))
         if self._is_far(equations):
             # Images are not linear in the scan's pose: go there and linearise again.
-            error_step = error_step / max(self._curved_length(error_step) / LONGEST_CURVED_STEP, 1.0)
-            return self._with_step_limit(
-                self._carry(replace(state, x=x + error_step, verdict="the scan moved"), error_step, 0.0)
-            )
-        noise_gain = gain_by_noise(equations)
+            step = equations.error_step / max(self._curved_length(equations.error_step) / LONGEST_CURVED_STEP, 1.0)
+            memory, samples = self._carried(memory, state.memory_samples, step, 0.0)
+            state = replace(state, x=state.x + step, memory=memory, memory_samples=samples, loss=None)
+            return self._with_step_limit(replace(state, verdict="the scan moved"))
 
         # Converged: nothing to gain beyond noise, and the noise itself small. Tested at full radius, so that a small
         # radius never looks like convergence.
-        _, predicted_gain = self._propose(equations, x, max(state.radius, 1.0))
+        _, predicted_gain = self._propose(equations, state.x, max(state.radius, 1.0))
         if predicted_gain <= noise_gain <= options.tolerance and not self._needs_more_samples(equations, state):
             return self._last_step(problem, replace(state, result=Result.CONVERGED, verdict="converged"), equations)
-
-        radius, is_model_wrong = state.radius, False
-        for trial in range(options.max_trials if predicted_gain > noise_gain else 0):
-            step, predicted_gain = self._propose(equations, x, radius)
-            if predicted_gain <= noise_gain:
-                break
-            new, length = best + equations.lift @ step, self._length(step)
-            # Prediction and comparison, each with its standard error; the part of the prediction that the gradient's
-            # own noise causes is subtracted.
-            model_se = math.hypot(
-                equations.step_noise(step), (options.slope_error + options.model_error * length) * predicted_gain
-            )
-            step_test = self._judged(problem, (best, new), state, trial, (noise_gain - predicted_gain, model_se))
-            if step_test.is_better(options.significance_z):
-                poor = step_test.change > 0.25 * step_test.model
-                grown = 2 * radius if length > 0.8 * radius and step_test.change < 0.5 * step_test.model else radius
-                state = replace(
-                    state,
-                    x=new,
-                    accepted=state.accepted + 1,
-                    radius=min(0.5 * length if poor and step_test.is_contradicted else grown, 4.0),
-                    verdict="accepted",
-                )
-                return self._with_step_limit(self._carry(state, error_step + equations.lift @ step, length))
-            is_model_wrong = step_test.is_worse or step_test.is_contradicted
-            if not is_model_wrong:
-                break
-            radius = 0.25 * min(length, radius)
-            if radius < options.least_radius:
-                return replace(state, result=Result.STALLED, verdict="worse at every radius")
-        if is_model_wrong:
-            return self._with_step_limit(
-                replace(state, radius=radius, memory=None, memory_samples=0.0, verdict="worse: radius reduced")
-            )
+        if verdict not in {TAKEN, LEFT}:
+            proposal = self._proposal(state, equations, noise_gain)
+            if proposal is not None:
+                return self._with_step_limit(replace(state, proposal=proposal, verdict=verdict))
         if state.samples < options.max_samples:
             return self._with_step_limit(
                 replace(state, samples=min(2 * state.samples, options.max_samples), verdict="noise: samples doubled")
             )
-        return self._last_step(
-            problem, replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit"), equations
-        )
+        ended = replace(state, result=Result.NOISE_LIMITED, verdict="noise: at the sample limit")
+        return self._last_step(problem, ended, equations, may_continue=verdict != LEFT)
 
-    def _last_step(self, problem: Problem, state: State, equations: ReducedEquations) -> State:
+    def _with_fresh(self, state: State, fresh: NormalEquations) -> State:
+        # Pool new equations at x with those of earlier steps, and losses likewise.
+        _require_finite(fresh)
+        loss = (fresh.loss, fresh.loss_variance)
+        if state.loss is not None and state.loss[1] + fresh.loss_variance > 0:
+            share = state.loss[1] / (state.loss[1] + fresh.loss_variance)
+            loss = (
+                (1 - share) * state.loss[0] + share * fresh.loss,
+                share * fresh.loss_variance,
+            )
+        return replace(self._pooled(state, fresh, float(state.samples)), loss=loss)
+
+    def _tested(self, state: State, proposal: Proposal, fresh: NormalEquations) -> State:
+        # Accept or refuse a proposal by the losses at both ends. Where noise prevails, take it if both witnesses
+        # together favour it, and otherwise carry what was rendered there back.
+        _require_finite(fresh)
+        memory = state.memory
+        assert state.loss is not None
+        assert memory is not None
+        new, z = state.x + proposal.step, self.options.significance_z
+        test = StepTest(
+            fresh.loss - state.loss[0] + self.domain.prior_change(state.x, new),
+            math.sqrt(fresh.loss_variance + state.loss[1]),
+            proposal.change,
+            proposal.change_se,
+            z,
+        )
+        is_better, length, radius = test.is_better(z), proposal.length, state.radius
+        if not is_better and (test.is_worse or test.is_contradicted):
+            return replace(
+                state,
+                proposal=None,
+                refusals=state.refusals + 1,
+                radius=0.25 * min(length, radius),
+                verdict=WORSE,
+            )
+        state = replace(state, proposal=None, refusals=0)
+        if not is_better and not test.is_better(LAST_STEP_Z):
+            back, samples = self._carried(fresh, float(state.samples), -proposal.step, length)
+            return replace(self._pooled(state, back, samples), verdict=LEFT)
+        memory, samples = self._carried(memory, state.memory_samples, proposal.step, length)
+        state = replace(state, x=new, memory=memory, memory_samples=samples, loss=(fresh.loss, fresh.loss_variance))
+        state = self._pooled(state, fresh, float(state.samples))
+        if not is_better:
+            return replace(state, verdict=TAKEN)
+        poor = test.change > 0.25 * test.model
+        grown = 2 * radius if length > 0.8 * radius and test.change < 0.5 * test.model else radius
+        radius = min(0.5 * length if poor and test.is_contradicted else grown, 4.0)
+        return replace(state, accepted=state.accepted + 1, radius=radius, verdict="accepted")
+
+    def _proposal(self, state: State, equations: ReducedEquations, noise_gain: float) -> Proposal | None:
+        # The step within the radius; None where noise alone would promise its gain.
+        step, predicted_gain = self._propose(equations, state.x, state.radius)
+        return None if predicted_gain <= noise_gain else self._with_prediction(state, equations, step, noise_gain)
+
+    def _with_prediction(self, state: State, equations: ReducedEquations, step: Array, noise_gain: float) -> Proposal:
+        # The predicted change with its standard error; the part that the gradient's own noise causes is subtracted. The
+        # instrument's errors go to their optimum too, with a gain that is as uncertain as it is large.
+        assert state.memory is not None
+        length, change = self._length(step), float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
+        slope = state.memory.gradient + self.domain.prior_slope(state.x)
+        by_errors = 0.5 * float(slope @ equations.error_step)
+        relative = self.options.slope_error + self.options.model_error * min(length, 1.0)
+        change_se = math.hypot(equations.step_noise(step), relative * change, by_errors)
+        whole = equations.error_step + equations.lift @ step
+        return Proposal(whole, length, change + noise_gain + by_errors, change_se)
+
+    def _last_step(
+        self, problem: Problem, state: State, equations: ReducedEquations, *, may_continue: bool = True
+    ) -> State:
         # Newton step along the directions that the data determine: curvature beyond its noise, and noise of the step
         # below one scale.
-        count = self.domain.tissue_count
+        memory, count = state.memory, self.domain.tissue_count
+        assert memory is not None
         scale, x, error_step = self.domain.scale[:count], state.x[:count], equations.error_step
-        if state.memory is not None and error_step.any():
-            state = replace(state, x=state.x + error_step, memory=state.memory.moved(error_step))
         eigenvalues, vectors, spread = _spread(equations, scale)
         noise = equations.eigenvalue_noise(scale[:, None] * vectors)
         determined = vectors[
@@ -287,38 +271,24 @@ class GaussNewton:
         curvature = np.einsum("ak,ab,bk->k", determined, equations.hessian * np.outer(scale, scale), determined)
         step = scale * (determined @ (-(determined.T @ (scale * equations.gradient)) / curvature))
         length = self._length(step)
-        if state.memory is None or length == 0:
-            return state
         low, high = (bound[:count] for bound in self.domain.bounds)
-        step = np.clip(x + step / max(length, 1.0), low, high) - x
-
-        new, whole = state.x + equations.lift @ step, equations.lift @ step
-        options, model = self.options, float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
-        model_se = math.hypot(
-            equations.step_noise(step), (options.slope_error + options.model_error * min(length, 1.0)) * model
-        )
-        given = (state.x, new), state, options.max_trials, (model + gain_by_noise(equations), model_se)
-        step_test = self._judged(problem, *given)
-        refused = not step_test.is_better(LAST_STEP_Z) if options.slope_error else step_test.is_worse
-        if refused:
+        step, noise_gain = np.clip(x + step / max(length, 1.0), low, high) - x, gain_by_noise(equations)
+        if length > 1 and may_continue:
+            # The step is too long for one linear model: linearise again at its end, or at the first part of it.
+            proposal = self._with_prediction(state, equations, step, noise_gain)
+            return self._with_step_limit(replace(state, result=Result.RUNNING, proposal=proposal, verdict="settling"))
+        if error_step.any():
+            memory = memory.moved(error_step)
+            state = replace(state, x=state.x + error_step, memory=memory, loss=None)
+        if length == 0 or length > 1:
             return state
-        if length > 1:
-            # The step is too long for one linear model: linearise again from its end.
-            return self._with_step_limit(
-                self._carry(replace(state, x=new, result=Result.RUNNING, verdict="settling"), whole, 1.0)
-            )
-        return replace(state, x=new, memory=state.memory.moved(whole), verdict=f"{state.verdict}, settled")
-
-    def _judged(
-        self, problem: Problem, ends: tuple[Array, Array], state: State, trial: int, model: tuple[float, float]
-    ) -> StepTest:
-        old, new = ends
-        step, prior_change = state.step - 1, self.domain.prior_change(old, new)
-
-        def compare(samples: int, number: int) -> LossChange:
-            return problem.compare(old, new, samples=samples, step=step, trial=number)
-
-        return judged(compare, state.samples, trial, prior_change, model, self.options.significance_z)
+        prediction, whole = self._with_prediction(state, equations, step, noise_gain), equations.lift @ step
+        new = state.x + whole
+        change = problem.compare(state.x, new, samples=state.samples, step=state.step - 1, trial=0)
+        test = compared(change, self.domain.prior_change(state.x, new), (prediction.change, prediction.change_se))
+        if not test.is_better(LAST_STEP_Z) if self.options.slope_error else test.is_worse:
+            return state
+        return replace(state, x=new, memory=memory.moved(whole), loss=None, verdict=f"{state.verdict}, settled")
 
     def _needs_more_samples(self, equations: ReducedEquations, state: State) -> bool:
         # Whether more samples are needed because the step's noise along a direction exceeds one scale. Instrument
@@ -350,14 +320,20 @@ class GaussNewton:
         )
         return step, -float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
 
-    def _carry(self, state: State, step: Array, length: float) -> State:
-        # Count the pooled samples as fewer after a long step, because the model's error grows with the step while its
-        # noise does not.
-        assert state.memory is not None
+    def _pooled(self, state: State, fresh: NormalEquations, samples: float) -> State:
+        # Pool equations at x, worth so many paths, with those of earlier steps.
+        if state.memory is None:
+            return replace(state, memory=fresh, memory_samples=samples)
+        pooled = pool(state.memory, state.memory_samples, fresh, samples)
+        return replace(state, memory=pooled, memory_samples=state.memory_samples + samples)
+
+    def _carried(
+        self, equations: NormalEquations, samples: float, step: Array, length: float
+    ) -> tuple[NormalEquations, float]:
+        # Carry equations over a step, and count their samples as fewer after a long one, because the model's error
+        # grows with the step while its noise does not.
         whole = math.hypot(length, CURVED_WEIGHT * self._curved_length(step))
-        return replace(
-            state, memory=state.memory.moved(step), memory_samples=state.memory_samples / (1 + (whole / 0.3) ** 2)
-        )
+        return equations.moved(step), samples / (1 + (whole / 0.3) ** 2)
 
     def _curved_length(self, step: Array) -> float:
         # Length of the part of a step (F,) that moves the scan, in scales.
@@ -371,7 +347,9 @@ class GaussNewton:
         return self._curved_length(equations.error_step) > least
 
     def _with_step_limit(self, state: State) -> State:
-        return replace(state, result=Result.MAX_STEPS) if state.step >= self.options.max_steps else state
+        # At the limit one more linearisation tests a proposal.
+        least = self.options.max_steps + (state.proposal is not None)
+        return replace(state, result=Result.MAX_STEPS) if state.step >= least else state
 
 
 def _spread(equations: ReducedEquations, scale: Array) -> tuple[Array, Array, Array]:
@@ -389,3 +367,8 @@ def gain_by_noise(equations: NormalEquations | ReducedEquations) -> float:
     floor = np.maximum(equations.eigenvalue_noise(vectors), 1e-13 * max(float(np.abs(eigenvalues).max()), 1e-300))
     spread = np.einsum("ak,ab,bk->k", vectors, equations.gradient_noise, vectors)
     return 0.5 * float(np.maximum(spread, 0.0) @ (1 / np.maximum(eigenvalues, floor)))
+
+
+def _require_finite(equations: NormalEquations) -> None:
+    if not math.isfinite(equations.loss) or not math.isfinite(equations.loss_variance):
+        raise NonFiniteError("The loss of a step is not finite; check the capture for invalid radiance.")

@@ -43,6 +43,10 @@ class NormalEquations:
     """sum w var_ref: the expectation of ``squares`` where the residuals are the measurements' noise alone."""
     carried: Array | float = 0.0
     """Step (F,) over which the gradient was carried by this curvature since it was measured, mean over its samples."""
+    loss: float = 0.0
+    """F where the residuals were rendered, by cells (``loss_change``)."""
+    loss_variance: float = 0.0
+    """Monte Carlo variance of ``loss``."""
 
     def __add__(self, other: NormalEquations) -> NormalEquations:
         return NormalEquations(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -74,6 +78,8 @@ class NormalEquations:
             self.squares * linear,
             self.expected_squares * linear,
             self.carried * linear,
+            self.loss * linear,
+            self.loss_variance * quadratic,
         )
 
     def without_noise(self, of_hessian: Array, of_data_noise: Array) -> NormalEquations:

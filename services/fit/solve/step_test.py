@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from services.core.errors import NonFiniteError
@@ -11,11 +10,8 @@ from services.fit.solve.normal_equations import LossChange
 
 SIGNIFICANCE_Z = 3.0
 """A change is significant beyond this many standard errors: a worse step passes with probability at most 1.3e-3."""
-FIRST_SHARE = 4
-"""Divisor of the paths of the first look at a step. It suffices where the step is clearly better: by the comparison far
-from the solution, and by the prediction near to it."""
-SECOND_LOOK = 1_000
-"""Added to the number of a trial, which seeds its renders, for its second look."""
+LAST_STEP_Z = 1.0
+"""Standard errors by which both estimates combined must favour a step that noise does not let decide."""
 
 
 @dataclass(frozen=True)
@@ -46,38 +42,20 @@ class StepTest:
         return total + z * total_se < 0 and not self.is_worse and not (self.is_contradicted and self.change > 0)
 
 
-def judged(
-    compare: Callable[[int, int], LossChange],
-    samples: int,
-    trial: int,
-    prior_change: float,
-    model: tuple[float, float],
-    significance_z: float = SIGNIFICANCE_Z,
-) -> StepTest:
-    """Judge a step by a comparison with a quarter of the paths, and where that is not clearly better by one with all.
-
-    The first only accepts a step, so that few paths refuse none. The second is used alone: where the noise of both
-    renders' product prevails, its variance falls with the square of the paths, and the first would add nothing.
+def compared(change: LossChange, prior_change: float, model: tuple[float, float]) -> StepTest:
+    """The test of a step whose two ends were rendered with common random numbers.
 
     Args:
-        compare: compares the data's loss at both ends with so many paths per pixel, as the trial of this number.
-        samples: paths per pixel of the second comparison.
-        trial: number of the trial.
+        change: change of the data's loss.
         prior_change: change of the prior's part of F, which is exact.
         model: the predicted change of F and its standard error.
-        significance_z: standard errors that are significant.
 
     Raises:
-        NonFiniteError: the comparison is NaN or infinite.
+        NonFiniteError: the change is NaN or infinite.
     """
-    for paths, number in ((max(samples // FIRST_SHARE, 1), trial), (samples, trial + SECOND_LOOK)):
-        found = compare(paths, number)
-        if not math.isfinite(found.change) or not math.isfinite(found.variance):
-            raise NonFiniteError("The loss of a step is not finite; check the capture for invalid radiance.")
-        test = StepTest(found.change + prior_change, found.se, *model, significance_z)
-        if test.is_better(significance_z):
-            break
-    return test
+    if not math.isfinite(change.change) or not math.isfinite(change.variance):
+        raise NonFiniteError("The loss of a step is not finite; check the capture for invalid radiance.")
+    return StepTest(change.change + prior_change, change.se, *model)
 
 
 def _combine(first: float, first_se: float, second: float, second_se: float) -> tuple[float, float]:

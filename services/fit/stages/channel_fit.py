@@ -4,7 +4,6 @@ and curvature at the end.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,13 +19,15 @@ from services.fit.measurements.observations import ChannelFiles, Level
 from services.fit.passes.evaluate import Evaluation, Shown, evaluate
 from services.fit.passes.final_uncertainty import DisplacedScene, HeldCosines, HeldShapes, measure_final_uncertainty
 from services.fit.passes.passes import Passes, StackProblem
-from services.fit.solve import adam, gauss_newton
-from services.fit.solve.covariance import FinalModel, Uncertainty, final_model, uncertainty, whitening
-from services.fit.solve.final_uncertainty import FinalSums
-from services.fit.solve.gauss_newton import LAST_STEP_Z, Options, Result, Solution, State
-from services.fit.solve.normal_equations import LossChange, NormalEquations
+from services.fit.solve import adam, gauss_newton, solver_state
+from services.fit.solve.closing import Closing
+from services.fit.solve.covariance import Uncertainty, final_model, uncertainty, whitening
+from services.fit.solve.gauss_newton import Options
+from services.fit.solve.normal_equations import NormalEquations, pool
+from services.fit.solve.outcome import Result, Solution
 from services.fit.solve.precision import samples_needed
-from services.fit.solve.step_test import judged
+from services.fit.solve.solver_state import State
+from services.fit.stages.last_step import SLOPE_ERROR, last_step
 from services.fit.stages.step_report import StepReport, history_key, message_prefix
 from services.tasks.journal import Journal
 from services.transport.optics.parameters import Mouth, Optics, Tissue
@@ -37,50 +38,13 @@ SIMILAR_TOLERANCE = 0.02
 """Relative change of the images at which a stage in similar media has converged: its next step is within Monte Carlo
 noise, and that noise in its parameters changes the images by no more. For exact media the option ``image_tolerance``
 takes this place."""
-SLOPE_ERROR = 0.5
-"""Relative error of the change that Jacobians of similar media predict for one tooth's exact images, however short the
-step; the errors of several teeth are independent."""
 FINAL_DIVISOR = 2
 """Divisor of the paths for the final uncertainty estimate, which is combined with all equations of the exact steps."""
-FINAL_TRIALS = 2
-"""Number of lengths that are tried for the step after the final uncertainty estimate."""
-FINAL_MIN_SHARE = 0.1
-"""Shortest length that is tried, as a share of the one before."""
 REPEAT_STAGES = ("again", "again.1")
-"""Names of the stages that continue a fit from its solution, where the prior of the instrument's errors moved that far,
-or where the noise of rendering is too large a part of its standard errors."""
+"""Names of the stages that continue a fit from its solution, where the prior of the instrument's errors moved that
+far."""
 MIN_SAMPLES = 4
 """Least number of paths per pixel, however many pixels there are."""
-
-
-def last_step(problem: StackProblem[Any], x: Array, model: FinalModel, part_count: int, samples: int) -> Array:
-    """The step (F,) from x by the final uncertainty estimate, possibly shortened; zeros where its predicted gain is
-    within noise or no length is better.
-
-    Args:
-        part_count: number of objects that the images tell apart; the errors of their predicted changes are independent.
-        samples: paths per pixel of a comparison.
-    """
-    step, slope_error = model.step(part_count), SLOPE_ERROR / math.sqrt(part_count)
-    for trial in range(FINAL_TRIALS):
-        predicted, predicted_se = model.predicted_change(step)
-        if predicted >= 0:
-            break
-        expected = predicted, math.hypot(predicted_se, slope_error * predicted)
-        compare = partial(_compare_last, problem, x, x + step)
-        step_test = judged(compare, samples, trial, problem.domain.prior_change(x, x + step), expected)
-        if step_test.is_better(LAST_STEP_Z):
-            return step
-        if not (step_test.is_worse or step_test.is_contradicted):
-            break
-        # Go to the minimum of the parabola through slope and comparison (Nocedal and Wright 2006, section 3.5).
-        slope = model.slope(step)
-        step = max(0.5 * slope / (slope - max(step_test.change, 0.0)), FINAL_MIN_SHARE) * step
-    return np.zeros(len(x))
-
-
-def _compare_last(problem: StackProblem[Any], x: Array, moved: Array, samples: int, trial: int) -> LossChange:
-    return problem.compare(x, moved, samples=samples, step=0, trial=trial)
 
 
 @dataclass(frozen=True)
@@ -204,7 +168,7 @@ class Stages(ABC, Generic[Optics]):
         solver = gauss_newton.GaussNewton(problem.domain, options)
         return self._run(
             solver,
-            gauss_newton,
+            solver_state,
             problem,
             solver.init(self._start_of(problem), min(samples, options.max_samples), previous),
         )
@@ -219,14 +183,14 @@ class Stages(ABC, Generic[Optics]):
             self.passes = replace(self.passes, errors=domain.errors_at(x))
 
     def _run(
-        self, solver: Any, solver_module: Any, problem: StackProblem[Optics], state: Any, steps_per_entry: int = 1
+        self, solver: Any, records: Any, problem: StackProblem[Optics], state: Any, steps_per_entry: int = 1
     ) -> tuple[Optics, Solution]:
         # Run a solver from its first state. Every ``steps_per_entry`` steps are one journal entry, written and read by
-        # ``solver_module``, and one report.
+        # ``records``, and one report.
         def advance(state: Any) -> Any:
             for _ in range(steps_per_entry):
                 state = state if solver.terminate(state) else solver.step(problem, state)
-            return solver_module.state_record(state)
+            return records.state_record(state)
 
         while not solver.terminate(state):
             self.raise_if_cancelled()
@@ -234,7 +198,7 @@ class Stages(ABC, Generic[Optics]):
                 f"{self.scope}/{problem.stage}/{state.step}", partial(advance, state)
             )
             self.steps -= state.step
-            state = solver_module.state_from(entry)
+            state = records.state_from(entry)
             self.steps += state.step
             self._apply_errors(problem.domain, state.x)
             if not self.is_reported:
@@ -248,18 +212,26 @@ class Stages(ABC, Generic[Optics]):
             solution.samples,
             self.full_image_samples(min(4 * self.spec.samples_per_pixel, self.spec.max_samples_per_pixel)),
         )
-        problem, solution, equations, known = self._with_uncertainty(problem, solution, samples)
+        equations, closing, known = self._with_uncertainty(problem, solution, samples)
         for stage in REPEAT_STAGES:
-            needed = samples
-            if known.is_full_step and self.has_usual_precision:
-                needed = samples_needed(known, samples, self.options(self.files.full).max_samples)
-            if known.is_full_step and needed == samples:
+            if known.is_full_step:
                 break
-            # The move is too long for one linear model, or renders blur the result: fit once more from its end.
-            self._apply_errors(problem.domain, solution.x)
-            again, samples = replace(problem, passes=self.passes, stage=stage), needed
-            base, solution = self._iterate(again, replace(self.options(self.files.full), max_samples=needed), samples)
-            problem, solution, equations, known = self._with_uncertainty(replace(again, base=base), solution, samples)
+            # The move is too long for one linear model: fit once more from its end.
+            self._apply_errors(problem.domain, known.x)
+            base = problem.domain.tissue_at(known.x, problem.base)
+            problem = replace(problem, base=base, passes=self.passes, stage=stage)
+            base, solution = self._iterate(
+                problem, replace(self.options(self.files.full), max_samples=samples), samples
+            )
+            problem = replace(problem, base=base)
+            equations, closing, known = self._with_uncertainty(problem, solution, samples)
+        if closing is not None and known.is_full_step and self.has_usual_precision:
+            needed = samples_needed(known, samples, self.options(self.files.full).max_samples)
+            if needed > samples:
+                equations, known = self._refined(problem, solution, equations, closing, needed - samples)
+                samples = needed
+        base = problem.domain.tissue_at(known.x, problem.base)
+        problem, solution = replace(problem, base=base), replace(solution, x=known.x)
         self._apply_errors(problem.domain, solution.x)
         samples_shown = self.full_image_samples(self.spec.max_samples_per_pixel)
         evaluation = self._evaluate("final", problem.base, samples_shown, self.files.full, by_frame=True)
@@ -295,7 +267,7 @@ class Stages(ABC, Generic[Optics]):
 
     def _with_uncertainty(
         self, problem: StackProblem[Optics], solution: Solution, samples: int
-    ) -> tuple[StackProblem[Optics], Solution, NormalEquations, Uncertainty]:
+    ) -> tuple[NormalEquations, Closing | None, Uncertainty]:
         # Uncertainty at a solution, moved where the instrument's errors use their prior in full. Curvature and noise
         # are rendered anew only where the solver ended without them.
         again, equations = f".{problem.stage}" if problem.stage in REPEAT_STAGES else "", solution.equations
@@ -307,17 +279,13 @@ class Stages(ABC, Generic[Optics]):
             )
             equations = NormalEquations.of(stored)
         if problem.jacobian_g is None or solution.result is Result.STALLED:
-            known = uncertainty(problem.domain, solution.x, equations, part_count=self.part_count)
-            if not problem.domain.errors.names:
-                return problem, solution, equations, known
-        else:
-            known = self._measure_uncertainty(f"{self.scope}/closing{again}", problem, solution.x, equations, samples)
-        base = problem.domain.tissue_at(known.x, problem.base)
-        return replace(problem, base=base), replace(solution, x=known.x), equations, known
+            return equations, None, uncertainty(problem.domain, solution.x, equations, part_count=self.part_count)
+        closing = self._closing(f"{self.scope}/closing{again}", problem, solution.x, equations, samples)
+        return equations, closing, closing.uncertainty(problem.domain, solution.x, equations, self.part_count)
 
-    def _measure_uncertainty(
+    def _closing(
         self, key: str, problem: StackProblem[Optics], x: Array, equations: NormalEquations, samples: int
-    ) -> Uncertainty:
+    ) -> Closing:
         # Measure the response of the exact images where Jacobians came from similar media. Make one more step with it
         # where the predicted gain exceeds noise, and prediction and comparison combined are better.
         domain = problem.domain
@@ -329,20 +297,44 @@ class Stages(ABC, Generic[Optics]):
             self.log(f"{prefix}: the final uncertainty estimate begins, which may take as long as all steps.")
             held, fewer = self._held_cosines(domain), max(samples // FINAL_DIVISOR, 1)
             sums = measure_final_uncertainty(problem, x, whitened.transform, held, fewer, moves, shapes, displaced)
-            return {
-                "sums": sums.record(),
-                "step": last_step(
-                    problem, x, final_model(domain, x, equations, sums), self.part_count, samples
-                ).tolist(),
-                "displacements": 0 if displaced is None else displaced.count,
-            }
+            taken = last_step(problem, x, final_model(domain, x, equations, sums), self.part_count, samples)
+            changed = len(shapes) + (0 if displaced is None else displaced.count)
+            return Closing(sums, *taken, ("shape",) * changed + tuple(move.body for move in moves)).record()
 
         self.raise_if_cancelled()
         entry, _ = self.journal.get_or_compute(key, compute)
-        step = np.array(entry["step"])
-        sums = FinalSums.of(entry["sums"])
-        sources = ["shape"] * (len(shapes) + entry["displacements"]) + [move.body for move in moves]
-        return uncertainty(domain, x + step, equations, sums, step, sources, self.part_count)
+        return Closing.of(entry)
+
+    def _refined(
+        self,
+        problem: StackProblem[Optics],
+        solution: Solution,
+        equations: NormalEquations,
+        closing: Closing,
+        samples: int,
+    ) -> tuple[NormalEquations, Uncertainty]:
+        # The gradient with so many more paths where the final uncertainty estimate was made, and the step from there
+        # anew. What that estimate measured of the response, and the curvature that its coordinates whiten, stay.
+        domain, x, refining = problem.domain, solution.x, replace(problem, stage="refined")
+        self.raise_if_cancelled()
+        stored, _ = self.journal.get_or_compute(
+            f"{self.scope}/refined", lambda: refining.linearise(x, samples=samples, step=0).record()
+        )
+        pooled = pool(equations, max(solution.equation_samples, 1.0), NormalEquations.of(stored), float(samples))
+        equations = replace(
+            equations, gradient=pooled.gradient, gradient_noise=pooled.gradient_noise, carried=pooled.carried
+        )
+
+        def compute() -> dict[str, Any]:
+            step, remaining = last_step(
+                refining, x, final_model(domain, x, equations, closing.sums), self.part_count, samples
+            )
+            return {"step": step.tolist(), "remaining": remaining}
+
+        self.raise_if_cancelled()
+        entry, _ = self.journal.get_or_compute(f"{self.scope}/refined-step", compute)
+        closing = replace(closing, step=np.array(entry["step"]), remaining=float(entry["remaining"]))
+        return equations, closing.uncertainty(domain, x, equations, self.part_count)
 
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float

@@ -49,8 +49,9 @@ from services.fit.passes.passes import StackProblem, orders_task
 from services.fit.passes.reweighting import reweighted
 from services.fit.passes.stain_passes import StainStage
 from services.fit.solve import adam, table_search
-from services.fit.solve.gauss_newton import Options, Solution
+from services.fit.solve.gauss_newton import Options
 from services.fit.solve.losses import is_reweighted
+from services.fit.solve.outcome import Solution
 from services.fit.stages.channel_fit import ChannelFit, Stages
 from services.fit.stages.tooth.first_channel import FirstChannel
 from services.transport.optics.parameters import Medium, Tissue
@@ -63,7 +64,7 @@ SIMILAR_G = 0.0
 START_RATIOS = ((0.8, 1.25), (0.5, 1.6), (0.35, 2.5))
 """Densities of enamel and dentin relative to the homogeneous tooth's: dentin scatters more in every source of the
 literature table."""
-HOMOGENEOUS_STEPS = 4
+HOMOGENEOUS_STEPS = 3
 """Largest number of steps of the homogeneous tooth before layers, and of each refit of the media but the last in the
 stain stage."""
 EXACT_SAMPLES = 4
