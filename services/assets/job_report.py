@@ -26,7 +26,7 @@ def write_job_report(
     """Write the report of a fitted job as one HTML file.
 
     Args:
-        asset: folder of its asset, which has the picture to begin with.
+        asset: folder of its asset, which has the picture to begin with where ``lead_picture`` could make one.
         provenance: what the asset comes from; None of an asset that an earlier version wrote.
         with_photographs: whether photographs, and pictures from which one could be computed, are shown.
     """

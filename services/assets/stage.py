@@ -48,6 +48,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.assets.colour.develop import CapturedColours
     from services.assets.fitted_job import read_fitted
     from services.assets.job_report import write_job_report
+    from services.assets.lead_picture import write_lead_picture
     from services.assets.provenance.made import provenance_of
     from services.core.files.meshes import read_mesh
     from services.transport.scene.rigid_moves import moved_camera, moved_light
@@ -69,12 +70,14 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         for light in prepared.lights
     )
     move = found_pose(report, teeth)
+    cameras = tuple(moved_camera(camera, move) for camera in prepared.cameras)
+    lights = tuple(moved_light(light, move) for light in lights)
     files = write_asset(
         writer.folder,
         report,
         teeth,
-        tuple(moved_camera(camera, move) for camera in prepared.cameras),
-        tuple(moved_light(light, move) for light in lights),
+        cameras,
+        lights,
         channels=channels,
         boundary=spec.boundary,
         ior=spec.ior,
@@ -84,7 +87,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
         colours=CapturedColours(prepared.channels, prepared.colour) if prepared.colour else None,
     )
     write_record(writer.folder / PROVENANCE, provenance)
-    files = tuple(sorted((*files, PROVENANCE)))
+    files = tuple(sorted((*files, PROVENANCE, *write_lead_picture(writer.folder, job, cameras, lights))))
 
     write_job_report(context.root / "report.html", job, writer.folder, provenance)
     write_atomic(context.root / "parameters.json", _json(parameters_json(report)))

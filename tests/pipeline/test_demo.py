@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import shutil
@@ -186,4 +187,5 @@ def test_the_demonstration_finds_the_optics_of_its_mouth(tmp_path: Path) -> None
     for one in told["reduced_scattering"]:
         # four standard errors; with a correct ± one run in 2,600 fails by one of six values
         assert abs(one["found"] - one["simulated"]) < 4 * one["se"]
-    assert (tmp_path / "demo" / "photograph-and-render.png").is_file()
+    picture = (tmp_path / "demo" / "asset" / "render_beside_photograph.png").read_bytes()
+    assert base64.b64encode(picture).decode() in (tmp_path / "demo" / "report.html").read_text()

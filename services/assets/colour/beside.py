@@ -1,129 +1,211 @@
-"""A photograph and the asset's render of it, side by side in colour."""
+"""Photographs of a capture beside renders of its asset, in colour: the picture with which a report begins.
+
+Light is additive, so the photographs under several lights make that under all of them, with less noise.
+"""
 
 from __future__ import annotations
 
-import json
-import runpy
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.colour.develop import ASSUMED, CapturedColours, developed, diffuser_radiance
+from services.assets.asset import tissue_of
+from services.assets.colour.develop import CapturedColours, developed, diffuser_radiance
+from services.assets.colour.smoothing import smoothed_colours
 from services.assets.colour.spaces import LINEAR_SRGB
-from services.core.errors import InputError
-from services.core.geometry import Light
-from services.core.pages.pictures import Image8, enlarge, tone_map, white_level
-from services.core.results import AssetManifest, PreparedManifest
-from services.core.store import StoredArray, open_stage
+from services.assets.content import RGB
+from services.core.geometry import Camera, Light, Tooth, Vector3
+from services.core.records import JobSpec
+from services.core.results import FitReport, PreparedManifest
+from services.core.store import StoredArray
 
 Floats = NDArray[np.float64]
-MIN_SIDE_PX = 480
-"""Least size of the larger side of either picture; a photograph with fewer pixels is shown in squares."""
-MARGIN_PX = 16
-"""Width of the border around the pictures, pixels."""
-FONT_PX = 15
-"""Size of the caption's letters, pixels."""
-DARK = 0.05
-"""Least share of the photograph's brightest value at a pixel that shows the tooth."""
-BACKGROUND, INK = (24, 24, 24), (235, 235, 235)
-"""Colours of border and caption, sRGB bytes: dark, as the photographs' own background is."""
+PATHS = 850_000
+"""Paths of a render in each channel at the default of ``samples_per_pixel``; three channels take 15 to 20 s of one
+core."""
+USUAL_SAMPLES = 64
+"""The default of ``samples_per_pixel``; jobs of fewer get fewer paths."""
+FILM_PX = 512
+"""Least size of a render's larger side, as far as the paths suffice."""
+MIN_SAMPLES = 4
+"""Paths per pixel, of all pairs together, below which the film becomes smaller."""
+MARGIN_PX = 2
+"""Pixels of the photograph around what it shows of the surface."""
+SMOOTHED_SHARE = 1 / 25
+"""Radius of the filter's squares, as a share of the picture's larger side: some 0.6 mm of a tooth."""
+SUBPIXELS = 3
+"""Rays along each side of a pixel that tell how much of it shows the surface."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A photograph and the render in the same view and lights, linear sRGB, with 1 for a perfect diffuser that faces
+    each light.
+    """
+
+    lights: tuple[str, ...]
+    """The lights, each taken as bright as the others; the pictures show their mean."""
+    held_out: bool
+    """Whether the fit has seen none of these photographs."""
+    photo: Floats
+    """Photograph (h, w, 3)."""
+    render: Floats
+    """Render (H, W, 3), larger by a whole number."""
 
 
 @dataclass(frozen=True)
 class Beside:
-    """A photograph and the render of an asset in the same view and light, linear sRGB (H, W, 3), with 1 for a perfect
-    diffuser that faces the light.
-    """
+    """Pairs of one camera."""
 
     camera: str
-    light: str
-    held_out: bool
-    """Whether the fit has not seen the photograph."""
-    photo: Floats
-    render: Floats
-    matrix: str
-    """Where the camera's colours come from, as ``rig.json`` says it."""
+    pairs: tuple[Pair, ...]
+    is_calibrated: bool
+    """Whether a calibration tells the camera's colours; else its channels are taken for linear sRGB."""
+    samples: int
+    """Paths per pixel of the renders."""
 
 
-def beside(job: Path, samples: int) -> Beside:
-    """Render a published asset as one of its photographs shows it, by the script that is shipped with it.
+@dataclass(frozen=True)
+class Shown:
+    """What is rendered: an asset's surfaces in its views and lights."""
 
-    The photograph is the brightest of those that the fit has not seen, else of all.
-
-    Args:
-        job: folder of the job.
-        samples: paths per pixel of the photograph.
-
-    Raises:
-        InputError: the asset has no red, green and blue. StoreError: the asset or the photographs are absent.
-    """
-    asset, _ = open_stage(job, "asset", AssetManifest, verify=False)
-    prepared_folder, prepared = open_stage(job, "prepared", PreparedManifest, verify=False)
-    rig = json.loads((asset / "rig.json").read_text(encoding="utf-8"))
-    if "colour" not in rig:
-        raise InputError(f"The asset in {job} has no red, green and blue; fit these channels for a picture in colour.")
-    colours = CapturedColours(tuple(rig["colour"]["channels"]), prepared.colour or {})
-    order = [prepared.channels.index(channel) for channel in colours.channels]
-    radiance = StoredArray(prepared_folder / "prepared.zarr" / "radiance")
-    views = [(c.name, k.name) for c in prepared.cameras for k in prepared.lights]
-    candidates = [view for view in views if view in prepared.held_out] or views
-    photos = {view: _photo(radiance, prepared, view)[..., order] for view in candidates}
-    camera, light = max(photos, key=lambda view: float(np.nanmean(photos[view])))
-    lamp = Light(name=light, **rig["lights"][light])
-    by_channel = {channel: lamp.intensity[k] for k, channel in enumerate(rig["channels"])}
-    lamp = lamp.model_copy(update={"intensity": tuple(by_channel[channel] for channel in colours.channels)})
-    white = diffuser_radiance(lamp, tuple(rig["colour"]["diffuser_mm"]))
-    script = runpy.run_path(str(asset / "render.py"))
-    integrator = "prbvolpath" if rig["boundary"] == "matched" else ""
-    image = script["render"](asset, camera, light, samples, integrator=integrator)
-    image = image[..., [rig["channels"].index(channel) for channel in colours.channels]]
-    own = colours.cameras.get(camera)
-    photo, render = (developed(one / white, own, LINEAR_SRGB) for one in (photos[camera, light], image))
-    matrix = rig["colour"]["cameras"][camera]["source"]
-    return Beside(camera, light, (camera, light) in prepared.held_out, photo, render, matrix)
+    teeth: tuple[Tooth, ...]
+    """With the fitted dentin."""
+    cameras: tuple[Camera, ...]
+    lights: tuple[Light, ...]
+    """``intensity`` in the order of the fitted channels."""
+    middle_mm: Vector3
+    """Where the white diffuser is."""
 
 
-def _photo(radiance: StoredArray, prepared: PreparedManifest, view: tuple[str, str]) -> Floats:
-    camera, light = view
-    number = next(k for k, one in enumerate(prepared.cameras) if one.name == camera)
-    lamp = next(k for k, one in enumerate(prepared.lights) if one.name == light)
-    width, height = prepared.cameras[number].size
-    return np.nan_to_num(radiance[number, lamp, :height, :width].astype(np.float64))
-
-
-def picture(found: Beside, made_by: str) -> Image8:
-    """Picture (H, W, 3), sRGB bytes, of the photograph at left, the render at right, and a caption of what is what.
-
-    Both have the same exposure: what is brighter than 99 % of the photographed tooth is white.
+def beside(
+    spec: JobSpec, report: FitReport, prepared: PreparedManifest, radiance: StoredArray, shown: Shown
+) -> Beside | None:
+    """Render an asset by the fit's path tracing as the camera sees it that sees most of it: under all lights together,
+    and under those together that the fit has not seen.
 
     Args:
-        found: photograph and render.
-        made_by: what the photograph is, such as "Simulated photograph".
-    """
-    from PIL import Image, ImageDraw, ImageFont
+        radiance: photographs (K, L, H, W, C) in the order of the preparation.
 
-    white = white_level(found.photo.max(axis=-1), found.photo.max(axis=-1) > DARK * found.photo.max())
-    pictures = [Image.fromarray(enlarge(tone_map(one, white), MIN_SIDE_PX)) for one in (found.photo, found.render)]
-    seen = "which the fit has not seen" if found.held_out else "which the fit has seen"
-    captions = (
-        f"{made_by}\ncamera {found.camera}, light {found.light},\n{seen}",
-        "The asset, rendered by Mitsuba\nin the same view and light",
+    Returns:
+        None of several teeth, and where red, green and blue were not all fitted.
+    """
+    channels = tuple(report.parameters)
+    if report.teeth or not set(RGB) <= set(channels):
+        return None
+    covers = [_coverage(camera, shown) for camera in shown.cameras]
+    number = int(np.argmax([float(cover.sum()) for cover in covers]))
+    camera, paths = shown.cameras[number], PATHS * min(1.0, spec.samples_per_pixel / USUAL_SAMPLES)
+    crop = _crop(covers[number])
+    larger, smaller = _scale(covers[number][crop], paths)
+    film = _resized(camera, crop, larger, smaller)
+    used = [k for k, light in enumerate(shown.lights) if light.name not in spec.left_out_lights]
+    lights = [shown.lights[k] for k in used]
+    unseen = np.array([(camera.name, light.name) in prepared.held_out for light in lights])
+    choices = [np.flatnonzero(np.ones_like(unseen))] + (
+        [np.flatnonzero(unseen)] if 0 < unseen.sum() < len(used) else []
     )
-    how = "taken for linear sRGB" if found.matrix == ASSUMED else f"brought to sRGB by {found.matrix}"
-    below = f"Linear radiance {how}; the same exposure."
-    font = ImageFont.load_default(FONT_PX)
-    width, height = pictures[0].size
-    column = max(width, *(int(font.getlength(line)) + 1 for text in captions for line in text.split("\n")))
-    line = round(1.4 * FONT_PX)
-    page_width = max(2 * column + 3 * MARGIN_PX, int(font.getlength(below)) + 1 + 2 * MARGIN_PX)
-    page = Image.new("RGB", (page_width, height + 4 * line + 4 * MARGIN_PX), BACKGROUND)
-    draw = ImageDraw.Draw(page)
-    for k, (shown, caption) in enumerate(zip(pictures, captions, strict=True)):
-        left = (page_width - 2 * column - MARGIN_PX) // 2 + k * (column + MARGIN_PX)
-        page.paste(shown, (left + (column - width) // 2, MARGIN_PX))
-        where = left + column // 2, height + 2 * MARGIN_PX
-        draw.multiline_text(where, caption, fill=INK, font=font, anchor="ma", align="center", spacing=4)
-    draw.text((page_width // 2, page.height - MARGIN_PX), below, fill=INK, font=font, anchor="ms")
-    return np.asarray(page)
+    own = [channels.index(channel) for channel in RGB]
+    white = np.array([np.broadcast_to(diffuser_radiance(one, shown.middle_mm), len(channels))[own] for one in lights])
+    order = [prepared.channels.index(channel) for channel in RGB]
+    photos = [_photo(radiance, number, k, crop, smaller)[..., order] / white[n] for n, k in enumerate(used)]
+    renders, samples = _renders(spec, report, shown, film, lights, choices, paths)
+    colours = CapturedColours(RGB, prepared.colour or {}).cameras.get(camera.name)
+    pairs = tuple(
+        Pair(
+            tuple(lights[k].name for k in choice),
+            bool(unseen[choice].all()),
+            developed(np.mean([photos[k] for k in choice], axis=0), colours, LINEAR_SRGB),
+            developed(render, colours, LINEAR_SRGB),
+        )
+        for choice, render in zip(choices, renders, strict=True)
+    )
+    return Beside(camera.name, pairs, colours is not None, samples)
+
+
+def _coverage(camera: Camera, shown: Shown) -> Floats:
+    return _surface(camera, shown)[1]
+
+
+def _surface(camera: Camera, shown: Shown) -> tuple[Floats, Floats]:
+    """Mean normals (H, W, 3) of what a camera sees of the surface, and the covered share (H, W) of each pixel."""
+    from services.transport.rays import RayScene, pixel_rays
+
+    scene, (width, height) = RayScene(*(tooth.outer for tooth in shown.teeth)), camera.size
+    normals, covered = np.zeros((width * height, 3)), np.zeros(width * height)
+    for k in range(SUBPIXELS**2):
+        offset = (k % SUBPIXELS + 0.5) / SUBPIXELS, (k // SUBPIXELS + 0.5) / SUBPIXELS
+        hits = scene.first_hits(*pixel_rays(camera, offset))
+        normals[hits.hit] += hits.normals[hits.hit]
+        covered += hits.hit / SUBPIXELS**2
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals.reshape(height, width, 3), covered.reshape(height, width)
+
+
+def _crop(covered: Floats) -> tuple[slice, slice]:
+    """Rows and columns around all that is covered; everything where nothing is."""
+    found = []
+    for axis, size in enumerate(covered.shape):
+        places = np.flatnonzero(covered.any(axis=1 - axis))
+        first, last = (places[0], places[-1] + 1) if len(places) else (0, size)
+        found.append(slice(max(0, int(first) - MARGIN_PX), min(size, int(last) + MARGIN_PX)))
+    return found[0], found[1]
+
+
+def _scale(covered: Floats, paths: float) -> tuple[int, int]:
+    """By which whole numbers the film is larger and smaller than the photograph; one of them is 1."""
+    affordable = np.sqrt(paths / MIN_SAMPLES / max(1, int((covered > 0).sum())))
+    larger = max(1, min(-(-FILM_PX // max(covered.shape)), int(affordable)))
+    return larger, max(1, int(np.ceil(1 / affordable))) if larger == 1 else 1
+
+
+def _resized(camera: Camera, crop: tuple[slice, slice], larger: int, smaller: int) -> Camera:
+    rows, columns = crop
+    k = np.array(camera.K)
+    k[:2, 2] -= columns.start, rows.start
+    k[:2] *= larger / smaller
+    size = [(part.stop - part.start) * larger // smaller for part in (columns, rows)]
+    return camera.model_copy(update={"K": tuple(tuple(row) for row in k.tolist()), "size": tuple(size)})
+
+
+def _photo(radiance: StoredArray, camera: int, light: int, crop: tuple[slice, slice], smaller: int) -> Floats:
+    photo = np.nan_to_num(radiance[camera, light, crop[0], crop[1]].astype(np.float64))
+    height, width = (size // smaller for size in photo.shape[:2])
+    blocks = photo[: height * smaller, : width * smaller].reshape(height, smaller, width, smaller, -1)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _renders(
+    spec: JobSpec,
+    report: FitReport,
+    shown: Shown,
+    film: Camera,
+    lights: Sequence[Light],
+    choices: Sequence[NDArray[np.intp]],
+    paths: float,
+) -> tuple[list[Floats], int]:
+    """Render (H, W, 3) under the mean of each choice of lights, relative to a perfect diffuser, and paths per pixel."""
+    from services.anatomy.dentin_shape import DentinShape
+    from services.transport.engine import Engine
+    from services.transport.scene.recipe import View, single_tooth
+
+    (tooth,) = shown.teeth
+    normals, covered = _surface(film, shown)
+    pixels = np.argwhere(covered > 0)[:, ::-1].astype(np.int32)
+    samples = max(1, round(paths / len(choices) / max(1, len(pixels))))
+    images = [np.zeros((*covered.shape, 3)) for _ in choices]
+    positions = np.array([light.position_mm for light in lights])
+    # A perfect diffuser that faces a light of this intensity has the radiance 1.
+    intensities = np.pi * np.sum((positions - np.array(shown.middle_mm)) ** 2, axis=1)
+    dentin = None if tooth.dentin is None else DentinShape.known(tooth.dentin)
+    for k, channel in enumerate(RGB):
+        recipe = single_tooth(tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device)
+        engine, tissue = Engine(recipe), tissue_of(report.parameters[channel])
+        for image, choice in zip(images, choices, strict=True):
+            view = View(film, pixels, tuple(choice.tolist()))
+            found = engine.images(tissue, view, seed=spec.seed, samples=samples, batches=1).mean
+            image[pixels[:, 1], pixels[:, 0], k] = found[choice].mean(axis=0)
+    radius = max(2, round(SMOOTHED_SHARE * max(film.size)))
+    return [smoothed_colours(image, normals, covered, radius) for image in images], samples

@@ -16,7 +16,7 @@ from services.core.records import JOB_FILE, JobSpec
 from services.core.store import read_record, write_record
 
 BESIDE_PHOTOGRAPH = "render_beside_photograph.png"
-"""Picture of a photograph beside a render, with which the report begins where somebody has put one into the asset."""
+"""Picture of photographs beside renders, with which the report begins; ``lead_picture`` writes it."""
 
 
 def departing(
