@@ -19,7 +19,9 @@
     errors.json                fitted and held-out image error, whether the fit converged, correlations, which
                                quantities the capture determines; for a jaw's teeth too
     provenance.json            what it was made from; ``services.core.provenance.record`` says in which form
-    render_beside_photograph.png   photographs beside renders in colour, of a tooth or object in red, green and blue
+    render_beside_photograph.png, colour_differences.json
+                               photographs beside renders, and their differences, of a tooth or object in red, green
+                               and blue
     NOT-CONVERGED.txt          only where the fit did not converge: advice on what to do
     render.py                  renders the scenes
     thin_boundary.py           surface model that Mitsuba lacks, only for the boundary model ``thin``

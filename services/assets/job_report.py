@@ -69,6 +69,7 @@ def _appearance(job: FittedJob, asset: Path, pictures: ReportPictures) -> Appear
     from services.assets.appearance.white import camera_white
     from services.assets.asset import middle_of
     from services.assets.colour.develop import diffuser_radiance
+    from services.assets.lead_picture import read_differences
 
     whites = {camera.name: camera_white(asset, camera.name) for camera in job.prepared.cameras}
     first = whites[job.prepared.cameras[0].name]
@@ -92,7 +93,7 @@ def _appearance(job: FittedJob, asset: Path, pictures: ReportPictures) -> Appear
         for one in translucencies(table, job.spec.boundary, job.spec.ior, first)
     ]
     found = [one for one in compared if one is not None]
-    return Appearance(first.source, found, layers, read_shade(asset.parent, asset))
+    return Appearance(first.source, [*read_differences(asset), *found], layers, read_shade(asset.parent, asset))
 
 
 def facts_of_fit(report: FitReport) -> Mapping[str, str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from services.assets.exporters import write_anew
 from services.assets.fitted_job import read_fitted
 from services.assets.job_report import write_job_report
-from services.assets.provenance.departing import BESIDE_PHOTOGRAPH, departing, seal
+from services.assets.provenance.departing import SHOWS_PERSON, departing, seal
 from services.core.errors import MissingStageError
 from services.core.provenance.record import PROVENANCE
 from services.core.records import JOB_FILE, JobSpec
@@ -17,7 +17,7 @@ from services.core.results import AssetManifest
 from services.core.store import MANIFEST, open_stage, read_record
 
 NAME = "without-photographs"
-LEFT_OUT = frozenset({BESIDE_PHOTOGRAPH, MANIFEST, PROVENANCE})
+LEFT_OUT = frozenset({*SHOWS_PERSON, MANIFEST, PROVENANCE})
 """Files of an asset that show a photograph or list the hash of one; provenance and hashes are written anew."""
 
 

@@ -13,10 +13,11 @@ from services.assets.colour import beside as beside_module
 from services.assets.colour.beside import Beside, Pair, Shown, beside
 from services.assets.colour.beside_picture import BACKGROUND, MARGIN_PX, picture
 from services.assets.colour.develop import developed
-from services.assets.colour.smoothing import smoothed, smoothed_colours
+from services.assets.colour.smoothing import smoothed, smoothed_colours, smoothed_halves
 from services.assets.colour.spaces import LINEAR_SRGB
 from services.assets.fitted_job import FittedJob
-from services.assets.lead_picture import write_lead_picture
+from services.assets.lead_picture import read_differences, write_lead_picture
+from services.core.errors import CorruptStoreError
 from services.core.geometry import Mesh, Tooth
 from services.core.pages.pictures import tone_map
 from services.core.records import JobSpec
@@ -89,14 +90,23 @@ def test_the_picture_is_a_file_of_the_asset(job: Path, tmp_path: Path) -> None:
     folder, prepared = open_stage(job, "prepared", PreparedManifest, verify=False)
     fitted = FittedJob(JobSpec(capture=job), job, report(), folder, prepared)
     fitted.__dict__.update(teeth=(TOOTH,), stains=None)
-    assert write_lead_picture(tmp_path, fitted, SHOWN.cameras, SHOWN.lights) == ("render_beside_photograph.png",)
+    assert write_lead_picture(tmp_path, fitted, SHOWN.cameras, SHOWN.lights) == (
+        "render_beside_photograph.png", "colour_differences.json"
+    )  # fmt: skip
+    every, unseen = read_differences(tmp_path)
+    assert (every.light, every.held_out, unseen.light, unseen.held_out) == ("2 lights together", False, "l1", True)
+    assert 0 < every.median < every.most
+    (tmp_path / "colour_differences.json").write_text("[{}]")
+    with pytest.raises(CorruptStoreError, match=r"colour_differences.json cannot be read; write it again"):
+        read_differences(tmp_path)
     assert (tmp_path / "render_beside_photograph.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_both_have_one_exposure_above_what_they_are() -> None:
     photo = np.random.default_rng(0).uniform(0.2, 0.5, (24, 20, 3))
     render = 0.5 * photo.repeat(3, axis=0).repeat(3, axis=1)
-    pairs = (Pair(("l0", "l1"), held_out=False, photo=photo, render=render),)
+    pairs = (Pair(("l0", "l1"), held_out=False, photo=photo, render=render, render_noise=np.zeros((3, 3)),
+                  compared=np.ones((24, 20), dtype=bool)),)  # fmt: skip
     shown = picture(Beside("c0", pairs, is_calibrated=True, samples=4), "Simulated photograph")
     white = np.percentile(photo.max(axis=-1), 99)
     rows = shown[MARGIN_PX : MARGIN_PX + 72]
@@ -130,6 +140,20 @@ def test_smoothing_takes_out_noise_and_leaves_the_shape() -> None:
     # 20,000 pixels of noise one: the means' standard error is 0.7 %; four of them.
     np.testing.assert_allclose(found[on].mean(axis=0), truth[on].mean(axis=0), rtol=0.028)
     assert (found[~on] == 0).all()
+
+
+def test_halves_tell_the_noise_of_the_whole() -> None:
+    truth, normals, covered = shaded_ball()
+    random, inner = np.random.default_rng(2), covered * (np.linalg.norm(normals[..., :2], axis=-1) < 0.8) > 0
+    told, real = [], []
+    for _ in range(4):
+        noisy = truth * random.exponential(1.0, truth.shape)
+        one, two = smoothed_halves(noisy, normals, covered, 8)
+        told.append((one - two)[inner] / 2 / truth[inner])
+        real.append(smoothed_colours(noisy, normals, covered, 8)[inner] / truth[inner] - 1)
+    # The disc holds some (2 · 64 ÷ 34)² = 14 independent squares for brightness; four draws give 56, so either root
+    # mean square is known to 1 / sqrt(2 · 56) = 9 %. Four standard errors of their ratio.
+    assert np.std(told) == pytest.approx(np.std(real), rel=0.52)
 
 
 def test_smoothing_leaves_what_has_no_noise() -> None:

@@ -90,3 +90,32 @@ def test_colour_differences_are_told_of_compared_pixels_alone() -> None:
     assert found.median == pytest.approx(expected)
     assert found.most == pytest.approx(expected)
     assert colour_difference(Picture("c", "l", True, photo, render, np.zeros((2, 3), bool)), np.ones(3), WHITE) is None
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.04])
+def test_maps_of_colour_differences_say_more_than_noise(shift: float) -> None:
+    random, valid = np.random.default_rng(3), np.ones((60, 50), dtype=bool)
+    render = np.full((60, 50, 3), 0.5)
+    photo = render * np.array([1 + shift, 1.0, 1.0]) * (1 + 0.04 * random.standard_normal(render.shape))
+    found = colour_difference(Picture("c0", "l0", False, photo, render, valid), np.ones(3), WHITE)
+    assert found is not None
+    assert found.edge_px > 1
+    assert found.noise <= 1
+    assert found.image.shape == (-(-60 // found.edge_px), -(-50 // found.edge_px))
+    one, two = (WHITE.lab(np.array([values])) for values in ([0.5, 0.5, 0.5], [0.5 * (1 + shift), 0.5, 0.5]))
+    expected = float(delta_e_2000(one, two)[0])
+    # At least 12 squares: a median of as many differences, each with a spread of half the noise's median, is known to
+    # 0.18 of that median. Four of these.
+    assert found.median == pytest.approx(np.hypot(expected, found.noise), abs=0.72 * found.noise)
+
+
+def test_noise_that_pixels_share_is_told_too() -> None:
+    render, valid = np.full((20, 20, 3), 0.5), np.ones((20, 20), dtype=bool)
+    shared = np.diag([0.05**2, 0.0, 0.0])
+    found = colour_difference(Picture("c0", "l0", False, render, render, valid), np.ones(3), WHITE, shared)
+    assert found is not None
+    # No square is large enough, so they stay small. |z| of a normal draw has the median 0.674.
+    assert found.edge_px == 1
+    one, two = (WHITE.lab(np.array([values])) for values in ([0.5, 0.5, 0.5], [0.5 * (1 + 0.674 * 0.05), 0.5, 0.5]))
+    # 12,800 draws: a median's standard error is 1.3 % of it; ΔE00 is curved by some 3 % between up and down.
+    assert found.noise == pytest.approx(float(delta_e_2000(one, two)[0]), rel=0.08)

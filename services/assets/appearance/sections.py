@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from services.assets.appearance.differences import ACCEPTED, JUST_SEEN, ColourDifference
 from services.assets.appearance.shade import Shade
 from services.assets.appearance.translucency import THICKNESS_MM, Translucency
@@ -40,7 +38,6 @@ def appearance_sections(appearance: Appearance, *, with_photographs: bool) -> di
         "difference_limit": f"{MAP_LIMIT:g}",
         "just_seen": f"{JUST_SEEN:g}",
         "accepted": f"{ACCEPTED:g}",
-        "difference_median": f"{np.median([one.median for one in shown]):.1f}" if shown else "",
         "translucencies": [
             (tooth, one.tissue, f"{one.tp00:.1f}", f"{one.se:.1f}") for tooth, one in appearance.translucencies
         ],
@@ -58,6 +55,8 @@ def _map(one: ColourDifference) -> dict[str, Any]:
         "image": data_uri(enlarge(image, 200)),
         "width": image.shape[1],
         "height": image.shape[0],
+        "edge": f"{one.edge_px} × {one.edge_px}" if one.edge_px > 1 else "",
+        "noise": f"{one.noise:.1f}",
         "median": f"{one.median:.1f}",
         "most": f"{one.most:.1f}",
     }

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from services.assets.asset import tissue_of
 from services.assets.colour.develop import CapturedColours, developed, diffuser_radiance
-from services.assets.colour.smoothing import smoothed_colours
+from services.assets.colour.smoothing import smoothed_colours, smoothed_halves
 from services.assets.colour.spaces import LINEAR_SRGB
 from services.assets.content import RGB
 from services.core.geometry import Camera, Light, Tooth, Vector3
@@ -23,7 +23,7 @@ from services.core.store import StoredArray
 
 Floats = NDArray[np.float64]
 PATHS = 850_000
-"""Paths of a render in each channel at the default of ``samples_per_pixel``; three channels take 15 to 20 s of one
+"""Paths of a render in each channel at the default of ``samples_per_pixel``; three channels take some 25 s of one
 core."""
 USUAL_SAMPLES = 64
 """The default of ``samples_per_pixel``; jobs of fewer get fewer paths."""
@@ -35,6 +35,8 @@ MARGIN_PX = 2
 """Pixels of the photograph around what it shows of the surface."""
 SMOOTHED_SHARE = 1 / 25
 """Radius of the filter's squares, as a share of the picture's larger side: some 0.6 mm of a tooth."""
+FILLED = 0.99
+"""Least share of a pixel that the surface covers where photograph and render are compared."""
 SUBPIXELS = 3
 """Rays along each side of a pixel that tell how much of it shows the surface."""
 
@@ -53,6 +55,15 @@ class Pair:
     """Photograph (h, w, 3)."""
     render: Floats
     """Render (H, W, 3), larger by a whole number."""
+    render_noise: Floats
+    """Covariance (3, 3) of the render's noise in red, green and blue, relative to itself."""
+    compared: NDArray[np.bool_]
+    """Pixels (h, w) of the photograph that the surface fills."""
+
+    @property
+    def lit(self) -> str:
+        """The lights in words."""
+        return self.lights[0] if len(self.lights) == 1 else f"{len(self.lights)} lights together"
 
 
 @dataclass(frozen=True)
@@ -111,18 +122,33 @@ def beside(
     white = np.array([np.broadcast_to(diffuser_radiance(one, shown.middle_mm), len(channels))[own] for one in lights])
     order = [prepared.channels.index(channel) for channel in RGB]
     photos = [_photo(radiance, number, k, crop, smaller)[..., order] / white[n] for n, k in enumerate(used)]
-    renders, samples = _renders(spec, report, shown, film, lights, choices, paths)
+    normals, covered = _surface(film, shown)
+    renders, samples = _renders(spec, report, shown, film, lights, choices, covered, paths)
     colours = CapturedColours(RGB, prepared.colour or {}).cameras.get(camera.name)
-    pairs = tuple(
-        Pair(
+    radius, times = max(2, round(SMOOTHED_SHARE * max(film.size))), film.size[1] // photos[0].shape[0]
+    filled = square_means(covered, times) > FILLED
+
+    def pair(choice: NDArray[np.intp], render: Floats) -> Pair:
+        halves = smoothed_halves(render, normals, covered, radius)
+        one, two = (developed(square_means(half, times)[filled], colours, LINEAR_SRGB) for half in halves)
+        deviation = (one - two) / np.maximum(one + two, 1e-12)
+        return Pair(
             tuple(lights[k].name for k in choice),
             bool(unseen[choice].all()),
             developed(np.mean([photos[k] for k in choice], axis=0), colours, LINEAR_SRGB),
-            developed(render, colours, LINEAR_SRGB),
+            developed(smoothed_colours(render, normals, covered, radius), colours, LINEAR_SRGB),
+            deviation.T @ deviation / max(1, len(deviation)),
+            filled,
         )
-        for choice, render in zip(choices, renders, strict=True)
-    )
+
+    pairs = tuple(pair(choice, render) for choice, render in zip(choices, renders, strict=True))
     return Beside(camera.name, pairs, colours is not None, samples)
+
+
+def square_means(values: Floats, edge: int) -> Floats:
+    """Means of an image (H, W, ...) over squares of pixels."""
+    height, width = (size // edge for size in values.shape[:2])
+    return np.asarray(values.reshape(height, edge, width, edge, *values.shape[2:]).mean(axis=(1, 3)))
 
 
 def _coverage(camera: Camera, shown: Shown) -> Floats:
@@ -173,8 +199,7 @@ def _resized(camera: Camera, crop: tuple[slice, slice], larger: int, smaller: in
 def _photo(radiance: StoredArray, camera: int, light: int, crop: tuple[slice, slice], smaller: int) -> Floats:
     photo = np.nan_to_num(radiance[camera, light, crop[0], crop[1]].astype(np.float64))
     height, width = (size // smaller for size in photo.shape[:2])
-    blocks = photo[: height * smaller, : width * smaller].reshape(height, smaller, width, smaller, -1)
-    return np.asarray(blocks.mean(axis=(1, 3)))
+    return square_means(photo[: height * smaller, : width * smaller], smaller)
 
 
 def _renders(
@@ -184,15 +209,17 @@ def _renders(
     film: Camera,
     lights: Sequence[Light],
     choices: Sequence[NDArray[np.intp]],
+    covered: Floats,
     paths: float,
 ) -> tuple[list[Floats], int]:
-    """Render (H, W, 3) under the mean of each choice of lights, relative to a perfect diffuser, and paths per pixel."""
+    """Noisy render (H, W, 3) under the mean of each choice of lights, relative to a perfect diffuser; and paths per
+    pixel.
+    """
     from services.anatomy.dentin_shape import DentinShape
     from services.transport.engine import Engine
     from services.transport.scene.recipe import View, single_tooth
 
     (tooth,) = shown.teeth
-    normals, covered = _surface(film, shown)
     pixels = np.argwhere(covered > 0)[:, ::-1].astype(np.int32)
     samples = max(1, round(paths / len(choices) / max(1, len(pixels))))
     images = [np.zeros((*covered.shape, 3)) for _ in choices]
@@ -207,5 +234,4 @@ def _renders(
             view = View(film, pixels, tuple(choice.tolist()))
             found = engine.images(tissue, view, seed=spec.seed, samples=samples, batches=1).mean
             image[pixels[:, 1], pixels[:, 0], k] = found[choice].mean(axis=0)
-    radius = max(2, round(SMOOTHED_SHARE * max(film.size)))
-    return [smoothed_colours(image, normals, covered, radius) for image in images], samples
+    return images, samples

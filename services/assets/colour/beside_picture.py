@@ -51,8 +51,7 @@ def picture(found: Beside, made_by: str) -> Image8:
 def _columns(pair: Pair, made_by: str) -> list[tuple[Image8, list[str]]]:
     white = white_level(pair.photo.max(axis=-1), pair.photo.max(axis=-1) > DARK * pair.photo.max())
     times = max(1, pair.render.shape[0] // pair.photo.shape[0])
-    count = len(pair.lights)
-    lit = f"light {pair.lights[0]}" if count == 1 else f"{count} lights together"
+    lit = f"light {pair.lit}" if len(pair.lights) == 1 else pair.lit
     unseen = "which the fit has not seen" if pair.held_out else ""
     photo = tone_map(pair.photo, white).repeat(times, axis=0).repeat(times, axis=1)
     shown = (photo, [made_by, lit, unseen]), (tone_map(pair.render, white), ["The asset in the", "same view and light"])

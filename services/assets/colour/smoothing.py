@@ -16,17 +16,30 @@ COLOUR_RADII = 4
 brightness."""
 
 
-def smoothed_colours(image: Floats, normals: Floats, covered: Floats, radius_px: int) -> Floats:
+def smoothed_colours(
+    image: Floats, normals: Floats, covered: Floats, radius_px: int, known: NDArray[np.bool_] | None = None
+) -> Floats:
     """``smoothed``, with the ratios of the channels from larger squares, because independent noise of the channels
     shows as coloured spots.
     """
-    bright = smoothed(image.mean(axis=-1, keepdims=True), normals, covered, radius_px)
-    colours = smoothed(image, normals, covered, COLOUR_RADII * radius_px)
+    bright = smoothed(image.mean(axis=-1, keepdims=True), normals, covered, radius_px, known)
+    colours = smoothed(image, normals, covered, COLOUR_RADII * radius_px, known)
     mean = colours.mean(axis=-1, keepdims=True)
     return np.asarray(bright * np.divide(colours, mean, out=np.ones_like(colours), where=mean > 0))
 
 
-def smoothed(image: Floats, normals: Floats, covered: Floats, radius_px: int) -> Floats:
+def smoothed_halves(image: Floats, normals: Floats, covered: Floats, radius_px: int) -> tuple[Floats, Floats]:
+    """``smoothed_colours`` from every second pixel in the pattern of a chessboard, and from the others. Half their
+    difference has the noise of the image from all.
+    """
+    even = np.indices(covered.shape).sum(axis=0) % 2 == 0
+    one, two = (smoothed_colours(image, normals, covered, radius_px, known) for known in (even, ~even))
+    return one, two
+
+
+def smoothed(
+    image: Floats, normals: Floats, covered: Floats, radius_px: int, known: NDArray[np.bool_] | None = None
+) -> Floats:
     """An image without its noise, by the guided filter (He, Sun & Tang, IEEE PAMI 35, 2013, eqs. 11 and 14 to 16).
 
     In a square around each pixel the image is taken for a linear function of the surface's normal, fitted by least
@@ -38,6 +51,7 @@ def smoothed(image: Floats, normals: Floats, covered: Floats, radius_px: int) ->
         normals: unit normals of the surface (H, W, 3); of no meaning where nothing is covered.
         covered: share (H, W) of each pixel that shows the surface.
         radius_px: half the side of the squares, pixels.
+        known: pixels (H, W) from which the result is made; all by default.
     """
     from scipy.ndimage import gaussian_filter, uniform_filter
 
@@ -50,16 +64,18 @@ def smoothed(image: Floats, normals: Floats, covered: Floats, radius_px: int) ->
     spread = (radius_px / 4, radius_px / 4, 0)
     guide = gaussian_filter(normals * covered[..., None], spread, mode="constant")
     guide /= np.maximum(np.linalg.norm(guide, axis=-1, keepdims=True), 1e-12)
-    weight = np.maximum(mean(covered), 1e-9)[..., None]
-    centre = mean(covered[..., None] * guide) / weight
+    used = covered if known is None else covered * known
+    image = image if known is None else image * known[..., None]
+    weight = np.maximum(mean(used), 1e-9)[..., None]
+    centre = mean(used[..., None] * guide) / weight
     level = mean(image) / weight  # what a pixel shows is its surface's radiance times its covered share
-    products = mean(covered[..., None, None] * guide[..., :, None] * guide[..., None, :]) / weight[..., None]
+    products = mean(used[..., None, None] * guide[..., :, None] * guide[..., None, :]) / weight[..., None]
     joint = mean(guide[..., :, None] * image[..., None, :]) / weight[..., None]
     variance = products - centre[..., :, None] * centre[..., None, :]
     covariance = joint - centre[..., :, None] * level[..., None, :]
     slope = np.linalg.solve(variance + SAME_SHADE * np.eye(3), covariance)
     constant = level - np.einsum("hwg,hwgc->hwc", centre, slope)
     # Each pixel lies in many squares; it takes the mean of their functions.
-    slope = mean(covered[..., None, None] * slope) / weight[..., None]
-    constant = mean(covered[..., None] * constant) / weight
+    slope = mean(used[..., None, None] * slope) / weight[..., None]
+    constant = mean(used[..., None] * constant) / weight
     return np.asarray(covered[..., None] * (np.einsum("hwg,hwgc->hwc", guide, slope) + constant))

@@ -17,6 +17,10 @@ from services.core.store import read_record, write_record
 
 BESIDE_PHOTOGRAPH = "render_beside_photograph.png"
 """Picture of photographs beside renders, with which the report begins; ``lead_picture`` writes it."""
+COLOUR_DIFFERENCES = "colour_differences.json"
+"""Differences between that picture's photographs and renders, from which photographs could be computed roughly."""
+SHOWS_PERSON = (BESIDE_PHOTOGRAPH, COLOUR_DIFFERENCES)
+"""Files of an asset that tell of a photograph."""
 
 
 def departing(
@@ -63,7 +67,8 @@ def departing(
 def seal(folder: Path, provenance: Provenance | None, exporter: str, *, with_photographs: bool) -> None:
     """Write provenance and list of hashes into an exported folder; without photographs, remove what shows one."""
     if not with_photographs:
-        (folder / BESIDE_PHOTOGRAPH).unlink(missing_ok=True)
+        for name in SHOWS_PERSON:
+            (folder / name).unlink(missing_ok=True)
     if provenance is not None:
         write_record(folder / PROVENANCE, provenance.model_copy(update={"exporter": exporter}))
     write_hash_list(folder, f"asset-{exporter}")
