@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 from services.assets.people_mesh import PeopleMesh, mapped_people_mesh, people_mesh
 from services.core.errors import CorruptStoreError, MissingStageError
 from services.core.files.meshes import fdi_numbers, read_mesh, read_teeth, read_texture_coordinates
-from services.core.geometry import Mesh, teeth_folder
+from services.core.geometry import OBJECT, Mesh, teeth_folder
 from services.core.results import AssetManifest, Estimate
 from services.core.store import open_stage
 from services.transport.optics.half_space import half_space_reflectance
@@ -36,11 +36,11 @@ class AssetPart:
     """One surface of an asset and the estimates of what it bounds."""
 
     name: str
-    """``tooth_11_enamel``, ``tooth_11_dentin``, ``gums`` or ``cavity``."""
+    """``tooth_11_enamel``, ``tooth_11_dentin``, ``gums``, ``cavity``, ``object_body`` or ``object_core``."""
     tissue: str
-    """``enamel``, ``dentin``, ``gums`` or ``cavity``."""
+    """``enamel``, ``dentin``, ``gums``, ``cavity``, ``body`` or ``core``."""
     fdi: int | None
-    """Number of the tooth; None for gums and wall."""
+    """Number of the tooth; None for all others."""
     surface: Mesh
     """The closed surface as it was fitted, mm; a wall of the mouth may be open."""
     mesh: PeopleMesh
@@ -122,13 +122,14 @@ def read_content(job: Path) -> AssetContent:
     """The content of the asset that a job has published; results of earlier versions are read too.
 
     Raises:
-        MissingStageError: no asset of a tooth or mouth is published. CorruptStoreError: a file is not as it was
+        MissingStageError: no asset of a tooth, mouth or object is published. CorruptStoreError: a file is not as it was
             published. MeshError: a surface is open or inside out.
     """
     folder, manifest = open_stage(job, "asset", AssetManifest)
-    if not fdi_numbers(folder):
+    is_object = (teeth_folder(folder, OBJECT) / "outer.ply").is_file()
+    if not (is_object or fdi_numbers(folder)):
         raise MissingStageError(
-            f"The asset in {job} holds neither tooth nor slab; export a job of kind tooth, jaw or slab."
+            f"The asset in {job} holds no tooth, object or slab; export a job of kind tooth, jaw, object or slab."
         )
     tables = read_tables(folder)
     parts: list[AssetPart] = []
@@ -153,7 +154,12 @@ def read_content(job: Path) -> AssetContent:
             mesh = mapped_people_mesh(surface, charted, _size(surface, charted, stains))
         parts.append(AssetPart(name, tissue, fdi, surface, mesh, own, stains))
 
-    for tooth in read_teeth(folder):
+    if is_object:
+        ((body, core),) = [(one.outer, one.dentin) for one in read_teeth(folder, (OBJECT,))]
+        for tissue, surface in (("body", body), ("core", core)):
+            if surface is not None:
+                add(f"object_{tissue}", tissue, surface)
+    for tooth in () if is_object else read_teeth(folder):
         for tissue, surface in (("enamel", tooth.outer), ("dentin", tooth.dentin)):
             if surface is not None:
                 add(f"tooth_{tooth.fdi}_{tissue}", tissue, surface, tooth.fdi)

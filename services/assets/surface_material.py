@@ -51,8 +51,11 @@ class Appearance:
 
 
 def appearance(content: AssetContent, part: AssetPart) -> Appearance:
-    """The appearance of a part. A tooth's mean free paths are those of its dentin, through which most light passes."""
-    dentin = content.part(part.name.replace("_enamel", "_dentin")) or part
+    """The appearance of a part. A tooth's mean free paths are those of its dentin, through which most light passes, and
+    an object's those of its core.
+    """
+    inner = part.name.replace("_enamel", "_dentin").replace("_body", "_core")
+    dentin = content.part(inner) or part
     # Light that meets nothing has no mean free path.
     total = dentin.scattering_reduced_per_mm() + dentin.absorption_per_mm()
     paths_mm = np.full(3, np.inf) if not total.all() else 1 / total

@@ -13,6 +13,7 @@ import pytest
 from services.assets.exporters import export_to
 from tests.support.clients import node_command
 from tests.unit.test_exporters import published
+from tests.unit.test_mouth_and_slab_exports import published_object
 
 SCRIPT = Path(__file__).parent / "gltf_findings.js"
 INFORMATION = 2
@@ -36,6 +37,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_validator_finds_nothing(folder: Path) -> None:
     assert [one for one in findings(folder / "asset.gltf") if one["severity"] < INFORMATION] == []
+
+
+def test_the_validator_finds_nothing_in_an_object(tmp_path: Path) -> None:
+    (written,) = export_to(published_object(tmp_path), ("gltf",))
+    assert [one for one in findings(written / "asset.gltf") if one["severity"] < INFORMATION] == []
 
 
 def wrong_bounds(document: Json) -> None:

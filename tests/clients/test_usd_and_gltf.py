@@ -17,7 +17,7 @@ from services.transport.optics.parameters import Medium
 from tests.support.clients import client_python, run_client
 from tests.support.prepared import camera, sphere
 from tests.unit.test_exporters import COEFFICIENTS, published
-from tests.unit.test_mouth_and_slab_exports import WALL, published_mouth, published_slab
+from tests.unit.test_mouth_and_slab_exports import WALL, published_mouth, published_object, published_slab
 
 HERE = Path(__file__).parent
 FILES = {"usd": "asset.usda", "gltf": "asset.gltf"}
@@ -126,7 +126,7 @@ def test_blender_gets_the_coefficients(facts: tuple[str, Facts]) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_blender_gets_a_mouth_and_a_slab(name: str, tmp_path: Path) -> None:
+def test_blender_gets_a_mouth_a_slab_and_an_object(name: str, tmp_path: Path) -> None:
     client_python("bpy")
     sizes_mm: dict[str, list[float]] = {
         "tooth_11_enamel": [8, 8, 8], "tooth_11_dentin": [6, 6, 6], "tooth_21_enamel": [8, 8, 8], "gums": [16, 9.6, 4],
@@ -145,6 +145,10 @@ def test_blender_gets_a_mouth_and_a_slab(name: str, tmp_path: Path) -> None:
     export_to(published_slab(tmp_path / "slab"), (name,))
     (plate,) = imported(tmp_path / "slab" / f"asset-{name}" / FILES[name])["meshes"].values()
     np.testing.assert_allclose(np.ptp(1000 * np.array(plate["metres"]), axis=0), [20, 20, 2], rtol=1e-3)
+    export_to(published_object(tmp_path / "object"), (name,))
+    balls = imported(tmp_path / "object" / f"asset-{name}" / FILES[name])["meshes"]
+    for part, width_mm in (("object_body", 8), ("object_core", 6)):
+        np.testing.assert_allclose(np.ptp(1000 * np.array(balls[part]["metres"]), axis=0), width_mm, rtol=1e-3)
 
 
 def test_the_script_for_blender_has_the_names_and_coordinates_of_the_textures(job: Path, tmp_path: Path) -> None:

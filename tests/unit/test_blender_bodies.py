@@ -150,7 +150,11 @@ def test_contacts_belong_to_both_neighbours(tmp_path: Path) -> None:
     ("channels", "folder", "sentence"),
     [
         (["violet"], "whole", "The asset has no channel violet; it has red, green."),
-        ([], "meshless", "has no teeth/<number>/outer.ply; put the script into an asset's folder."),
+        (
+            [],
+            "meshless",
+            "has neither teeth/<number>/outer.ply nor object/outer.ply; put the script into an asset's folder.",
+        ),
     ],
 )
 def test_bad_input_is_told(tmp_path: Path, channels: list[str], folder: str, sentence: str) -> None:

@@ -1,4 +1,4 @@
-"""A mouth and a slab written for other programs: every part by its name, at its size, with its numbers."""
+"""A mouth, a slab and an object written for other programs: every part by its name, at its size, with its numbers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.assets.blender.shipped.bodies import Asset as BlenderAsset
 from services.assets.exporters import export_to
 from services.core.errors import InputError, ReadOnlyStoreError
 from services.core.files.meshes import write_mesh
@@ -120,9 +121,48 @@ def test_a_slab_is_a_plate_with_its_wavelengths(tmp_path: Path) -> None:
     assert value(shader, "inputs:specular_ior") == pytest.approx(1.33, rel=1e-8)
     said = document["scenes"][0]["extras"]["colours"]
     assert said == "All grey: the mean over the channels 520, 650.5, which are not red, green and blue."
-    with pytest.raises(InputError, match="builds teeth; export a slab with --to usd or gltf"):
+    with pytest.raises(InputError, match="builds teeth and objects; export a slab with --to usd or gltf"):
         export_to(tmp_path, ("blender",))
     assert not [path.name for path in tmp_path.iterdir() if "blender" in path.name]
+
+
+def published_object(root: Path) -> Path:
+    """A job's folder with the asset of a ball with a core."""
+    writer = StageWriter(root, "asset", 1)
+    write_mesh(writer.folder / "object" / "outer.ply", sphere(4.0))
+    write_mesh(writer.folder / "object" / "core.ply", sphere(3.0))
+    names = (("sigma", 4.0, "1/mm"), ("alpha", 0.6, "1"), ("g1", 0.5, "1"))
+    tables = {
+        channel: {
+            f"{part}.{name}": estimate(number * k, unit)
+            for part, k in (("body", 1.0), ("core", 1.5))
+            for name, number, unit in names
+        }
+        for channel in ("red", "green", "blue")
+    }
+    (writer.folder / "parameters.json").write_text(json.dumps(tables))
+    rig = {"views": {}, "ior": 1.5, "boundary": "matched", "channels": ["red", "green", "blue"]}
+    (writer.folder / "rig.json").write_text(json.dumps(rig))
+    writer.publish(AssetManifest(files=()))
+    return root
+
+
+def test_an_object_has_its_body_and_core_in_every_format(tmp_path: Path) -> None:
+    gltf, usd, blender = export_to(published_object(tmp_path), ("gltf", "usd", "blender"))
+    document, text = json.loads((gltf / "asset.gltf").read_text()), (usd / "asset.usda").read_text()
+    assert [node["name"] for node in document["nodes"]] == ["object_body", "object_core"]
+    for name, number, width_mm in (("object_body", 4.0, 8.0), ("object_core", 6.0, 6.0)):
+        mesh = prim(text, "Mesh", name)
+        np.testing.assert_allclose(np.ptp(value(mesh, "points"), axis=0), width_mm, rtol=0.02)
+        np.testing.assert_allclose(value(mesh, "userProperties:sigma_per_mm"), [number] * 3, rtol=1e-8)
+    # The body's mean free path is the core's: sigma (1 - alpha) + sigma alpha (1 - g1), with 6, 0.9 and 0.75.
+    shader = prim(prim(text, "Material", "object_body"), "Shader", "open_pbr")
+    assert value(shader, "inputs:subsurface_radius") == pytest.approx(1 / (0.6 + 6 * 0.9 * 0.25), rel=1e-6)
+    asset = BlenderAsset(blender)
+    core, body = asset.bodies()
+    assert (core.name, body.name, len(body.sides)) == ("object_core", "object_body", 2)
+    np.testing.assert_allclose(core.medium.absorption, 0.6, rtol=1e-9)
+    assert [solid.name for solid in asset.solids()] == ["object"]
 
 
 def test_a_disk_that_cannot_be_written_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,9 +12,9 @@ from services.assets.blender.scripts import write_scripts
 from services.assets.content import AssetContent
 from services.core.errors import CorruptStoreError, InputError
 from services.core.files.meshes import write_mapped_mesh
-from services.core.geometry import Mesh, teeth_folder
+from services.core.geometry import OBJECT, Mesh, teeth_folder
 
-KEPT = ("*.json", "*.ply", "teeth/**/*", "surfaces/*")
+KEPT = ("*.json", "*.ply", "teeth/**/*", "object/*", "surfaces/*")
 """Files of an asset that the scripts read; manifests and scenes of other programs stay behind."""
 LEFT_OUT = ("asset.json", "manifest.json")
 
@@ -33,8 +33,8 @@ class BlenderExporter:
             CorruptStoreError: the asset is of an earlier version, whose rig.json says nothing of cameras.
             InputError: it is of a slab.
         """
-        if not any(part.fdi for part in content.parts):
-            raise InputError("The script for Blender builds teeth; export a slab with --to usd or gltf.")
+        if not any(part.tissue in {"enamel", "body"} for part in content.parts):
+            raise InputError("The script for Blender builds teeth and objects; export a slab with --to usd or gltf.")
         rig = content.folder / "rig.json"
         if not rig.is_file() or "views" not in json.loads(rig.read_text(encoding="utf-8")):
             raise CorruptStoreError(
@@ -48,8 +48,8 @@ class BlenderExporter:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     shutil.copyfile(source, target)
         for part in content.parts:
-            if part.tissue == "enamel" and part.fdi is not None:
-                outer = teeth_folder(folder, part.fdi) / "outer.ply"
+            if part.tissue in {"enamel", "body"}:
+                outer = teeth_folder(folder, OBJECT if part.fdi is None else part.fdi) / "outer.ply"
                 write_mapped_mesh(
                     outer, Mesh(part.mesh.vertices_mm, part.mesh.faces.astype(np.int32)), part.mesh.corners_uv
                 )

@@ -15,6 +15,10 @@ WELD_MM = 1e-5
 """Length by which two vertices at the same place may differ, mm."""
 
 
+TOOTH_PARTS, OBJECT_PARTS, OBJECT = ("enamel", "dentin"), ("body", "core"), "object"
+"""Outer and inner part of a tooth, and of an object, whose folder has this name."""
+
+
 class SceneError(RuntimeError):
     """The asset or the request does not make a scene; the message says what to do."""
 
@@ -167,10 +171,13 @@ class Asset:
         return all(np.ptp(g) == 0 for body in self.bodies() for _, g in body.medium.lobes)
 
     def bodies(self) -> list[Body]:
-        """The bodies of a tooth or of a mouth."""
-        outers = sorted(self.folder.glob("teeth/*/outer.ply"))
+        """The bodies of a tooth, of a mouth or of an object."""
+        outers = sorted([*self.folder.glob("teeth/*/outer.ply"), *self.folder.glob("object/outer.ply")])
         if not outers:
-            raise SceneError(f"{self.folder} has no teeth/<number>/outer.ply; put the script into an asset's folder.")
+            raise SceneError(
+                f"{self.folder} has neither teeth/<number>/outer.ply nor object/outer.ply; put the script into an"
+                " asset's folder."
+            )
         matched = self.rig["boundary"] == "matched"
         ior, gums_ior = (1.0, 1.0) if matched else (self.rig.get("ior", TOOTH_IOR), GUMS_IOR)
         # A mouth's surfaces are cut along each other, and each of two bodies that touch has the surface between them.
@@ -178,6 +185,8 @@ class Asset:
         found, flesh = [], [Side(cut["gums"], gums_ior, True)] if "gums" in cut else []
         for path in outers:
             number, prefix = path.parent.name, f"{path.parent.name}." if cut else ""
+            outer, inner = OBJECT_PARTS if number == OBJECT else TOOTH_PARTS
+            stem = number if number == OBJECT else f"tooth_{number}"
             shell = [] if cut else [Side(read_ply(path), ior, True)]
             for name, surface in cut.items():
                 kind, *owners = name.split("_")
@@ -190,26 +199,26 @@ class Asset:
                     flesh.append(Side(surface.turned()))
                 elif kind == "contact":
                     shell.append(Side(surface if owners[0] == number else surface.turned()))
-            if path.with_name("dentin.ply").is_file():
-                core = read_ply(path.with_name("dentin.ply"))
+            if path.with_name(f"{inner}.ply").is_file():
+                core = read_ply(path.with_name(f"{inner}.ply"))
                 shell.append(Side(core.turned()))
-                found.append(
-                    Body(f"tooth_{number}_dentin", self.medium(f"{prefix}dentin"), [Side(core)], moved=not cut)
-                )
+                found.append(Body(f"{stem}_{inner}", self.medium(f"{prefix}{inner}"), [Side(core)], moved=not cut))
             files = [path.with_name(f"stain_{channel}.png") for channel in self.channels]
             stains = [file if file.is_file() else None for file in files]
-            found.append(Body(f"tooth_{number}_enamel", self.medium(f"{prefix}enamel"), shell, bool(cut), stains))
+            found.append(Body(f"{stem}_{outer}", self.medium(f"{prefix}{outer}"), shell, bool(cut), stains))
         return found + ([Body("gums", self.medium("gums"), flesh, moved=False)] if flesh else [])
 
     def solids(self) -> list[Body]:
-        """The teeth as outer surfaces of one medium, the dentin's where there is any; gums as they are."""
+        """Teeth and objects as outer surfaces of one medium, the dentin's or core's where there is any; gums as they
+        are.
+        """
         found = self.bodies()
-        dentins = {body.name.removesuffix("_dentin"): body.medium for body in found if body.name.endswith("_dentin")}
-        solids = [body for body in found if body.name == "gums"]
+        media, solids = {body.name: body.medium for body in found}, [body for body in found if body.name == "gums"]
         for body in found:
-            name = body.name.removesuffix("_enamel")
-            if name != body.name:
-                number = name.removeprefix("tooth_")
-                outer = Side(read_ply(self.folder / "teeth" / number / "outer.ply"), outside=True)
-                solids.append(Body(name, dentins.get(name, body.medium), [outer], moved=False))
+            stem, _, part = body.name.rpartition("_")
+            for outer, inner in (TOOTH_PARTS, OBJECT_PARTS):
+                if part == outer:
+                    folder = self.folder / (stem if stem == OBJECT else stem.replace("tooth_", "teeth/"))
+                    side = Side(read_ply(folder / "outer.ply"), outside=True)
+                    solids.append(Body(stem, media.get(f"{stem}_{inner}", body.medium), [side], moved=False))
         return solids
