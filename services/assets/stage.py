@@ -49,15 +49,16 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.assets.fitted_job import read_fitted
     from services.assets.job_report import write_job_report
     from services.assets.lead_picture import write_lead_picture
-    from services.assets.provenance.made import provenance_of
     from services.core.files.meshes import read_mesh
+    from services.core.provenance.inputs import recorded_inputs
+    from services.transport.provenance import provenance_of
     from services.transport.scene.rigid_moves import moved_camera, moved_light
 
     context.report(StageEvent(stage="export", kind="started"))
     context.raise_if_cancelled()
     job = read_fitted(context.root, spec)
     report, prepared, teeth, channels = job.report, job.prepared, job.teeth, job.channels
-    provenance = provenance_of(spec, context.root, job.prepared_folder, datetime.now(UTC))
+    provenance = provenance_of(spec, context.root, recorded_inputs(job.prepared_folder), datetime.now(UTC))
     require_allowed(provenance.consent, None, datetime.now(UTC))
     writer = StageWriter(context.root, "asset", context.attempt)
     surroundings = [job.prepared_folder / name for name in ("gums.ply", "cavity.ply")]

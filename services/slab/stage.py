@@ -6,12 +6,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from services.core.errors import CaptureInputError
 from services.core.job_kinds import SLAB_OPTIONS
 from services.core.placement import WEIGHTS
+from services.core.provenance.inputs import hashed_inputs
+from services.core.provenance.record import PROVENANCE, Inputs
 from services.core.records import JobSpec
 from services.core.results import AssetManifest, Figure
 from services.core.slab.folder import Light, SlabCamera, SlabFolder, read_folder
@@ -97,8 +100,8 @@ def run(spec: JobSpec, context: StageContext) -> SlabReport:
 
 
 def export(spec: JobSpec, context: StageContext) -> AssetManifest:
-    """Write parameters.json, phase.json and its pictures, errors.json and report.html, and tables and scenes for
-    Mitsuba as the asset.
+    """Write parameters.json, phase.json and its pictures, errors.json and report.html. The asset has the numbers too,
+    with tables and scenes for Mitsuba and what it was made from.
 
     Raises:
         StoreError: the fit is missing or damaged.
@@ -110,6 +113,7 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     from services.slab.results.result import SlabReport
     from services.slab.results.stored import read_result_images
     from services.slab.results.tabphase import scene_xml, values_text
+    from services.transport.provenance import provenance_of
 
     context.report(StageEvent(stage="export", kind="started"))
     context.raise_if_cancelled()
@@ -141,6 +145,10 @@ def export(spec: JobSpec, context: StageContext) -> AssetManifest:
     for fit in report.fits:
         picture = phase_picture(f"Phase function at {fit.wavelength_nm:g} nm", fit.phase)
         write_atomic(context.root / f"phase_{fit.wavelength_nm:g}.svg", picture.encode())
+    write_results(report.fits, writer.folder)
+    inputs = Inputs(files=hashed_inputs(spec, context.root))
+    write_record(writer.folder / PROVENANCE, provenance_of(spec, context.root, inputs, datetime.now(UTC)))
+    files += ["parameters.json", "phase.json", "errors.json", PROVENANCE]
     manifest = AssetManifest(
         files=tuple(files),
         held_out_error=verdict.held_out_error,

@@ -121,4 +121,4 @@ def test_an_asset_edited_by_hand_or_without_provenance_is_one_sentence(copied: P
     (path.parent / "provenance.json").unlink()
     found = reproduce(copied / "job").exception
     assert isinstance(found, MissingStageError)
-    assert found.message.endswith("write that of a tooth or mouth again with dentine export.")
+    assert found.message.endswith("write it again with dentine export.")

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from services.api.presets import find_preset
+from services.assets.provenance.reproduction import changed_inputs, changed_results, job_again, open_asset
 from services.core.errors import CaptureInputError, JobCancelledError, SettingsError
 from services.core.provenance.asset import load_asset
-from services.core.records import JobSpec
+from services.core.records import JOB_FILE, JobSpec
 from services.core.results import AssetManifest
 from services.core.settings import job_from_tree
 from services.core.stage import CANCEL_FLAG, LocalContext, StageEvent
-from services.core.store import open_stage
+from services.core.store import open_stage, write_record
 from services.pipeline.stages import run_job, stages_of
 from services.slab.cell.dictionary import ANGLES_RAD, hg_values
 from services.slab.dictionaries.hg import COSINES
@@ -91,6 +92,31 @@ def test_the_report_opens_alone_and_shows_phase_functions_and_images(job: Path) 
     assert "shot noise of 1 % at a pixel" in page
 
 
+def test_the_asset_says_what_it_was_made_from_and_can_be_made_again(
+    job: Path, spec: JobSpec, folder: Path, tmp_path: Path
+) -> None:
+    write_record(job / JOB_FILE, spec)
+    asset = open_asset(job)
+    told = asset.provenance
+    assert (told.source, told.seeds, told.options["effort"]) == (folder.name, {"job": 4}, 0.02)
+    assert told.inputs is not None
+    assert {one.name for one in told.inputs if not one.is_photograph} == {"slab.json"}
+    assert any(one.is_photograph for one in told.inputs)
+    again = job_again(asset, None, None)
+    assert again == spec
+    assert changed_inputs(asset, again, tmp_path) == []
+    # The numbers that a second run gives are compared one by one.
+    run(again, LocalContext(tmp_path / "again"))
+    export(again, LocalContext(tmp_path / "again"))
+    count, found = changed_results(asset.folder, tmp_path / "again" / "asset")
+    assert count > 20
+    assert found == []
+    shutil.copytree(folder, tmp_path / "changed")
+    (tmp_path / "changed" / "slab.json").write_text((folder / "slab.json").read_text() + " ")
+    changed = again.model_copy(update={"capture": tmp_path / "changed"})
+    assert changed_inputs(asset, changed, tmp_path) == ["Input slab.json is another file."]
+
+
 def test_phase_functions_are_pictures_that_stand_alone(job: Path) -> None:
     picture = ElementTree.fromstring((job / "phase_532.svg").read_text())
     assert picture.tag == "{http://www.w3.org/2000/svg}svg"
@@ -125,7 +151,8 @@ def test_stock_mitsuba_loads_and_renders_the_asset(job: Path) -> None:
     import mitsuba as mi
 
     asset, manifest = open_stage(job, "asset", AssetManifest)
-    assert set(manifest.files) == {"tabphase_532.txt", "slab_532.xml"}
+    numbers = {"parameters.json", "phase.json", "errors.json", "provenance.json"}
+    assert set(manifest.files) == {"tabphase_532.txt", "slab_532.xml", *numbers}
     scene = mi.load_file(str(asset / "slab_532.xml"), optimize=False)
     image = np.array(mi.render(scene, spp=4, seed=1))
     assert np.isfinite(image).all()

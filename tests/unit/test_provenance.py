@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from services.assets.exporters import export_to
-from services.assets.provenance.made import options_of, provenance_of
 from services.core.consent import ABSENT, Consent, require_allowed
 from services.core.errors import CaptureInputError, ConsentError, CorruptStoreError, MissingStageError
 from services.core.provenance.hash_list import require_unedited, write_hash_list
@@ -20,6 +19,7 @@ from services.core.provenance.record import PROVENANCE, Provenance
 from services.core.raw.folder import parse_raw_folder
 from services.core.records import FolderCapture, JobSpec, RigSpec
 from services.core.store import read_record, write_record
+from services.transport.provenance import options_of, provenance_of
 from tests.support.folder_captures import prepare, write_folder, write_tree
 from tests.unit.test_exporters import published
 
@@ -75,7 +75,7 @@ def test_masks_and_calibrations_are_inputs_and_masks_show_the_person(tmp_path: P
 def test_provenance_tells_options_versions_and_seeds_but_no_folder_and_no_name(tmp_path: Path) -> None:
     rig = RigSpec(mouth=Path("/secret/mouth"), dome="10.0.0.7:502", assessment=None)
     (tmp_path / "subject.txt").write_text("P07\n")
-    told = provenance_of(JobSpec(rig=rig, seed=7, boundary="matched"), tmp_path, tmp_path, NOW)
+    told = provenance_of(JobSpec(rig=rig, seed=7, boundary="matched"), tmp_path, None, NOW)
     text = told.model_dump_json()
     assert "/secret" not in text
     assert "10.0.0.7" not in text
@@ -133,7 +133,9 @@ def exported(root: Path, consent: dict[str, Any] | None) -> Path:
     spec = JobSpec(capture=capture)
     write_record(job / "job.json", spec)
     prepare(capture, root / "other")
-    write_record(job / "asset" / PROVENANCE, provenance_of(spec, job, root / "other" / "prepared", NOW))
+    write_record(
+        job / "asset" / PROVENANCE, provenance_of(spec, job, recorded_inputs(root / "other" / "prepared"), NOW)
+    )
     write_hash_list(job / "asset", "asset")
     manifest = json.loads((job / "asset" / "manifest.json").read_text())
     (job / "asset" / "manifest.json").write_text(json.dumps(manifest | {"record": {"files": []}}))

@@ -11,7 +11,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from services.assets.provenance.made import machine, versions
 from services.core.errors import CaptureInputError, CorruptStoreError, MissingStageError, SettingsError
 from services.core.files.validation import fault_of, first_error
 from services.core.provenance.hash_list import require_unedited
@@ -19,6 +18,7 @@ from services.core.provenance.inputs import hashed_inputs
 from services.core.provenance.record import PROVENANCE, Provenance
 from services.core.records import JOB_FILE, JobSpec
 from services.core.store import read_record
+from services.transport.provenance import machine, versions
 
 NUMBERS = ("parameters.json", "errors.json")
 """Files of an asset whose values are compared one by one."""
@@ -45,8 +45,8 @@ def open_asset(place: Path) -> Asset:
     folder = place / "asset" if (place / "asset").is_dir() else place
     if not (folder / PROVENANCE).is_file():
         raise MissingStageError(
-            f"{folder} holds no {PROVENANCE}, as assets of slabs and of earlier versions, so what it was made from is"
-            " unknown; write that of a tooth or mouth again with dentine export."
+            f"{folder} holds no {PROVENANCE}, as assets of earlier versions, so what it was made from is unknown;"
+            " write it again with dentine export."
         )
     require_unedited(folder)
     try:

@@ -26,7 +26,7 @@ class InputPath:
 
 
 def paths_of_inputs(spec: JobSpec, root: Path) -> tuple[InputPath, ...]:
-    """The files from which a job's preparation is made, photographs first.
+    """The files from which a job's preparation is made, or all files of a slab's folder, photographs first.
 
     Args:
         root: folder of the job, which holds masks by hand and the capture of a rig.
@@ -74,7 +74,15 @@ def stated_by(capture: Path | None) -> RawFolder | FolderCapture | None:
     return read_description(capture) if is_there else None
 
 
+NO_IMAGES = frozenset({".json", ".csv", ".txt"})
+"""Endings of a slab's files that hold no image."""
+
+
 def _of_capture(spec: JobSpec, root: Path) -> Iterator[InputPath]:
+    if spec.kind == "slab" and spec.capture is not None:
+        for path in sorted(path for path in spec.capture.rglob("*") if path.is_file()):
+            yield InputPath(path.relative_to(spec.capture).as_posix(), path, path.suffix.lower() not in NO_IMAGES)
+        return
     published = (root, "capture") if spec.capture is None else published_capture(spec.capture)
     if published is not None:
         folder = published[0] / published[1]

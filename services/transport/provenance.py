@@ -1,4 +1,4 @@
-"""Collects what an asset comes from when it is exported."""
+"""Collects what an asset comes from when it is exported: an asset of a fit, or of a slab."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from services.core.consent import ABSENT
-from services.core.provenance.inputs import recorded_inputs, stated_by
-from services.core.provenance.record import SUBJECT_FILE, Provenance
+from services.core.provenance.inputs import stated_by
+from services.core.provenance.record import SUBJECT_FILE, Inputs, Provenance
 from services.core.records import JobSpec
 from services.transport.numerics import NUMERICS
 from services.transport.platform import import_renderer
@@ -31,7 +31,7 @@ PACKAGES = (
 """Packages whose version may change a number or a surface."""
 
 
-def provenance_of(spec: JobSpec, job: Path, prepared: Path, now: datetime) -> Provenance:
+def provenance_of(spec: JobSpec, job: Path, inputs: Inputs | None, now: datetime) -> Provenance:
     """What the asset of a job comes from.
 
     Subject and consent are those that the capture states at present, if it is still there, because a person may give or
@@ -39,13 +39,12 @@ def provenance_of(spec: JobSpec, job: Path, prepared: Path, now: datetime) -> Pr
 
     Args:
         job: the job's folder.
-        prepared: folder of its preparation, which has recorded the inputs.
+        inputs: what its preparation has recorded, or what a slab was fitted to; None where that was not recorded.
         now: the present, with its time zone.
 
     Raises:
         CaptureInputError: what the capture states cannot be read.
     """
-    inputs = recorded_inputs(prepared)
     stated = stated_by(spec.capture) or inputs
     consent = None if stated is None else stated.consent
     seeds = {"job": spec.seed} | ({} if spec.rig is None else {"simulated cameras": spec.rig.simulation.seed})
