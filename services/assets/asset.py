@@ -5,6 +5,7 @@
     scene_<channel>.xml        one scene per colour channel; light and its intensity are parameters of the file
     scene.xml                  for ``mitsuba scene.xml``: of red, green and blue in one where the channels have these
                                names, else the first channel's; not for the boundary model ``thin``
+    scene_dielectric.xml       of the boundary model ``thin`` in its place: rough dielectrics under an even sky
     teeth/<FDI>/*.ply          enamel's outer surface and dentin, mm
     gums.ply, cavity.ply       of a jaw
     surfaces/*.ply             of a jaw: its surfaces cut along each other, as the scenes need them
@@ -41,6 +42,7 @@ from services.assets.colour.develop import CapturedColours, rig_colours
 from services.assets.colour.tables import colour_tables, coloured_media
 from services.assets.content import RGB
 from services.assets.mitsuba.coloured import spectral_scene, srgb_scene
+from services.assets.mitsuba.dielectric import DIELECTRIC_SCENE, as_dielectric
 from services.assets.mitsuba.mouth_scene import mouth_scene, write_mouth_surfaces
 from services.assets.mitsuba.rgb import colour_scene
 from services.assets.mitsuba.scene import (
@@ -143,7 +145,11 @@ def write_asset(
             )
         scenes[channel] = scene | _large_cameras(shown, samples) | {"integrator": shell_integrator()}
         write_scene(folder / f"scene_{channel}.xml", scenes[channel])
-    colour = "none" if boundary == "thin" else write_shell_scene(folder / "scene.xml", scenes)
+    if boundary == "thin":
+        colour = "none"
+        write_shell_scene(folder / DIELECTRIC_SCENE, {name: as_dielectric(scene) for name, scene in scenes.items()})
+    else:
+        colour = write_shell_scene(folder / "scene.xml", scenes)
 
     names = tuple(camera.name for camera in cameras)
     known = colours or CapturedColours()

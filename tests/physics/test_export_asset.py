@@ -139,7 +139,7 @@ def test_the_folder_is_complete_and_self_contained(rig: Rig, tmp_path: Path) -> 
     files = rig.write(tmp_path / "thin", "thin")
     assert set(files) == {
         "scene_red.xml", "scene_green.xml", "teeth/11/outer.ply", "teeth/11/dentin.ply", "rig.json",
-        "parameters.json", "errors.json", "render.py", "thin_boundary.py",
+        "parameters.json", "errors.json", "render.py", "thin_boundary.py", "scene_dielectric.xml",
     }  # fmt: skip
     assert "thin_boundary.py" not in rig.write(tmp_path / "matched", "matched")
     for name in ("render.py", "thin_boundary.py"):

@@ -21,6 +21,7 @@ TAGS = {
     "thin_boundary": "bsdf",
     "diffuse": "bsdf",
     "twosided": "bsdf",
+    "roughdielectric": "bsdf",
     "mask": "bsdf",
     "bitmap": "texture",
     "uniform": "spectrum",
@@ -36,6 +37,7 @@ TAGS = {
     "volpath": "integrator",
     "volpathmis": "integrator",
     "point": "emitter",
+    "constant": "emitter",
 }
 """Kind of object of each plug-in that the scenes use."""
 VALUE_TAGS = {bool: "boolean", int: "integer", float: "float", str: "string"}

@@ -223,7 +223,9 @@ def notes(asset: Any, look: Any) -> list[str]:
     if asset.rig["boundary"] == "thin" and look.surface == "glass":
         told.append(
             "The fit's thin boundary lets light pass straight on; this surface of glass refracts it, so the picture"
-            " differs from the photographs. A lamp without size does not shine through glass: use --sky."
+            " differs from the photographs: stock Mitsuba's of an incisor were 14 to 28 % darker under a sky (ΔE00 6 to"
+            " 7), and 18 to 37 % under a lamp from the front. A lamp without size does not shine through glass: use"
+            " --sky."
         )
     if look.subsurface:
         told.append("Front light, distant shots: subsurface scattering with the dentin's values stands for the media.")
