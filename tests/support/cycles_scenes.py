@@ -116,9 +116,21 @@ def cycles_image(folder: Path, case: Case, samples: int, seed: int, *words: str)
     return np.array(mi.Bitmap(str(picture)), dtype=np.float64)[..., : len(case.tissues)]
 
 
-def mitsuba_image(folder: Path, case: Case, samples: int, seed: int) -> Array:
-    """Radiance (H, W, C) by stock Mitsuba's ``prbvolpath``; channels with the same numbers are rendered once."""
+def engine_image(folder: Path, case: Case, samples: int, seed: int) -> Array:
+    """Radiance (H, W, C) by the fit's path tracing, as the integrator that stock Mitsuba's scenes can take."""
+    from services.transport.plugin.integrator import register_integrator
+
+    register_integrator()
+    return mitsuba_image(folder, case, samples, seed, fits=True)
+
+
+def mitsuba_image(folder: Path, case: Case, samples: int, seed: int, *, fits: bool = False) -> Array:
+    """Radiance (H, W, C) by stock Mitsuba's ``prbvolpath``, or by the fit's integrator; channels with the same numbers
+    are rendered once.
+    """
     import mitsuba as mi
+
+    from services.transport.plugin.integrator import medium_properties
 
     if case.boundary == "thin":
         runpy.run_path(str(folder / "thin_boundary.py"))["register"]()
@@ -140,6 +152,13 @@ def mitsuba_image(folder: Path, case: Case, samples: int, seed: int) -> Array:
                 scene["light"] = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}
             if case.glass is not None:
                 scene["outer_11"]["bsdf"] = case.glass
+            if fits:
+                media = {"enamel": tissue.enamel} | ({} if case.dentin is None else {"dentin": tissue.dentin})
+                numbers = [medium_properties(part, (medium,)) for part, medium in media.items()]
+                ids = {"enamel": "outer_11"} | ({} if case.dentin is None else {"dentin": "dentin_11"})
+                scene["integrator"] = {"type": "dentine", "boundary": case.boundary, "ior": IOR} | ids
+                for own in numbers:
+                    scene["integrator"] |= own
             found[tissue] = np.array(mi.render(load_scene(scene), spp=samples, seed=17 * seed + k))[..., 0]
     return np.stack([found[tissue] for tissue in case.tissues], axis=-1).astype(np.float64)
 
