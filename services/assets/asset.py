@@ -14,7 +14,7 @@
     scene_srgb.xml             of a tooth without stains, boundary ``matched``: its media in linear sRGB, a white light
     scene_spectral.xml         the same as upsampled spectra under daylight D65
     colour.json                media in linear sRGB, in ACEScg and as spectra
-    rig.json                   cameras, lights and channels by name; colours of the cameras
+    rig.json                   cameras, lights and channels by name; colours of the cameras; the surface
     parameters.json            per channel: value, se, unit, determined; a jaw's teeth carry their number,
                                ``11.enamel.sigma``
     errors.json                fitted and held-out image error, whether the fit converged, correlations, which
@@ -62,6 +62,7 @@ from services.core.pages.object_words import PARTS
 from services.core.records import Boundary
 from services.core.results import Estimate, FitReport
 from services.core.store import write_atomic
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 from services.core.verdict import VERDICT, verdict_of
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.transport.scene.stain_uv import ToothStains
@@ -126,7 +127,7 @@ def write_asset(
             for channel, path in write_textures(teeth_folder(folder, tooth.fdi), stains).items()
         }
 
-    first, scenes = lights[0], dict[str, SceneDict]()
+    first, scenes, rough = lights[0], dict[str, SceneDict](), report.surface
     shown = tuple(with_square_pixels(camera) for camera in cameras)
     position = [SceneParameter(f"light_{axis}", value) for axis, value in zip("xyz", first.position_mm, strict=True)]
     for index, channel in enumerate(channels):
@@ -141,8 +142,9 @@ def write_asset(
             tissue = tissue_of(report.parameters[channel])
             stained = dict.fromkeys(files, textures[channel]) if channel in textures else {}
             scene = nested_scene(
-                files, tissue, shown, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained
-            )
+                files, tissue, shown, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained,
+                roughness=DEFAULT_ROUGHNESS if rough is None else rough.roughness.value,
+            )  # fmt: skip
         scenes[channel] = scene | _large_cameras(shown, samples) | {"integrator": shell_integrator()}
         write_scene(folder / f"scene_{channel}.xml", scenes[channel])
     if boundary == "thin":
@@ -171,6 +173,8 @@ def write_asset(
         "views": {camera.name: camera.model_dump(exclude={"name"}) for camera in shown},
         "lights": {light.name: {"position_mm": light.position_mm, "intensity": light.intensity} for light in lights},
     }
+    if rough is not None:
+        rig |= {"roughness": rough.roughness.value, "multiple_scattering": rough.multiple_scattering}
     told = rig_colours(known, channels, names, middle_of(teeth))
     _write_json(folder / "rig.json", rig if told is None else rig | {"colour": told})
     _write_json(folder / "parameters.json", parameters_json(report))
@@ -247,8 +251,8 @@ def _medium_of(table: dict[str, Estimate], part: str) -> Medium:
 
 
 def parameters_json(report: FitReport) -> dict[str, Any]:
-    """Estimates per channel and name as JSON values: value, se, unit, determined, se_parts; the instrument's errors are
-    included.
+    """Estimates per channel and name as JSON values: value, se, unit, determined, se_parts; the instrument's errors and
+    a rough surface are included.
     """
     tables = {channel: dict(table) | report.instrument.get(channel, {}) for channel, table in report.parameters.items()}
     for fdi, tooth in report.teeth.items():
@@ -259,6 +263,9 @@ def parameters_json(report: FitReport) -> dict[str, Any]:
     if report.enamel_thickness is not None:
         for table in tables.values():
             table["enamel.thickness"] = report.enamel_thickness
+    if report.surface is not None:
+        for table in tables.values():
+            table.update(report.surface.estimates())
     return {channel: {name: _plain(estimate) for name, estimate in table.items()} for channel, table in tables.items()}
 
 

@@ -97,8 +97,14 @@ def _appearance(job: FittedJob, asset: Path, pictures: ReportPictures) -> Appear
 
 
 def facts_of_fit(report: FitReport) -> Mapping[str, str]:
-    """What the fit compared and what its time was for, by label."""
+    """Which surface the fit held, what it compared and what its time was for, by label."""
     told = {}
+    if (rough := report.surface) is not None:
+        se = "" if rough.roughness.se is None else f" ± {rough.roughness.se:.3f}"
+        told["surface"] = (
+            f"rough dielectric, index {rough.ior:g}, GGX roughness {rough.roughness.value:.3g}{se}; light that meets"
+            f" several facets is {'given back' if rough.multiple_scattering else 'lost'}"
+        )
     if report.pixel_edge_mm is not None:
         told["squares"] = f"{report.pixel_step} × {report.pixel_step} pixels, {report.pixel_edge_mm:.2f} mm wide"
     if total := sum(report.seconds_by_purpose.values()):

@@ -23,6 +23,14 @@ class BoundaryName(StrEnum):
 
     MATCHED = "matched"
     THIN = "thin"
+    ROUGH = "rough"
+
+
+class SwitchName(StrEnum):
+    """Whether something is done."""
+
+    ON = "on"
+    OFF = "off"
 
 
 def phantom(
@@ -54,8 +62,14 @@ def phantom(
     ] = None,
     channels: Annotated[int, typer.Option(min=1, max=3, help="1 (green) or 3 (red, green, blue).")] = 1,
     boundary: Annotated[BoundaryName, typer.Option(help="Model of the enamel surface.")] = BoundaryName.MATCHED,
+    ior: Annotated[float, typer.Option(help="Index of refraction of enamel, or of the object.")] = 1.631,
+    roughness: Annotated[float, typer.Option(help="GGX roughness of a rough boundary, 0.02 to 1.")] = 0.15,
+    multiple_scattering: Annotated[
+        SwitchName, typer.Option(help="Of a rough boundary: give back light that meets several facets.")
+    ] = SwitchName.ON,
     renderer: Annotated[
-        RendererName, typer.Option(help="The project's engine, or stock Mitsuba for a matched boundary.")
+        RendererName,
+        typer.Option(help="The project's engine, or stock Mitsuba for a matched boundary or a rough one."),
     ] = RendererName.ENGINE,
     samples: Annotated[int, typer.Option(min=1, help="Paths per pixel.")] = 1024,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
@@ -106,6 +120,9 @@ def phantom(
     rig |= {"boundary": boundary.value, "renderer": renderer.value} | (
         {} if pixel_mm is None else {"pixel_mm": pixel_mm}
     )
+    if not jaw:
+        whether = multiple_scattering is SwitchName.ON
+        rig |= {"ior": ior, "roughness": roughness, "multiple_scattering": whether}
     if shape is not None:
         from services.phantom.object import write_object_phantom
 

@@ -26,6 +26,7 @@ from services.core.light.safety import (
 )
 from services.core.pages.object_words import PARTS
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
+from services.core.surface.rough import DEFAULT_ROUGHNESS, MultipleScattering, Roughness, require_rough_alone
 from services.core.values import AUTO, Number, PixelStep, Positive, Unit, Whole
 
 JobName = Annotated[
@@ -33,7 +34,7 @@ JobName = Annotated[
 ]
 """A label that a person gives a job: one line, as long as a list of jobs can show."""
 Device = Literal["llvm", "cuda"]
-Boundary = Literal["matched", "thin"]
+Boundary = Literal["matched", "thin", "rough"]
 KindName = Annotated[str, AfterValidator(known_kind), WithJsonSchema({"type": "string", "enum": list(JOB_KINDS)})]
 """Name of a kind of job: one of ``JOB_KINDS``, or of an installed package."""
 DictionaryName = Annotated[
@@ -174,11 +175,8 @@ HELD_RANGES = MappingProxyType(
 )
 """Parameter -> open interval of the values that ``JobSpec.held`` may give it; sigma in 1/mm."""
 
-
 MAX_HELD = 1000
 """Largest number of parameters that a job may hold: more than any model has."""
-
-
 JOB_FILE = "job.json"
 """Name of the file in a job's folder that holds its options."""
 
@@ -213,7 +211,11 @@ class JobSpec(Record):
         ),
     )
     boundary: Boundary = Field(default="thin", description="model of the surface of enamel, or of an object")
-    ior: Number = Field(default=1.631, ge=1, le=3, description="index of refraction of enamel, used by boundary = thin")
+    ior: Number = Field(
+        default=1.631, ge=1, le=3, description="index of refraction of enamel or object, unused by boundary = matched"
+    )
+    roughness: Roughness = DEFAULT_ROUGHNESS
+    multiple_scattering: MultipleScattering = "on"
     dentin: Literal["known", "fit", "none"] = Field(
         default="fit",
         description="dentin surface: given by the capture, fitted as blend shape (in a jaw an average one), or absent",
@@ -371,8 +373,10 @@ class JobSpec(Record):
         return self
 
     @model_validator(mode="after")
-    def _particles_of_mie(self) -> JobSpec:
+    def _particles_and_surface(self) -> JobSpec:
         require_particles(self.dictionary, self.particle_index, self.particle_absorption)
+        if self.boundary == "rough":
+            require_rough_alone(self.kind, self.ior, surroundings=self.surroundings, stains=self.stains)
         return self
 
     @model_validator(mode="after")

@@ -64,6 +64,22 @@ class Correlation(Record):
     matrix: tuple[tuple[float, ...], ...]
 
 
+class RoughSurface(Record):
+    """The rough dielectric surface that a fit has held."""
+
+    roughness: Estimate = Field(description="GGX roughness; without a standard error where the job gave it")
+    ior: float = Field(description="index of refraction")
+    multiple_scattering: bool = Field(description="whether light that meets several facets was given back")
+
+    def estimates(self) -> dict[str, Estimate]:
+        """What a table of estimates says of the surface, by name; ``multiple_scattering`` is 1 where light that meets
+        several facets was given back, else 0.
+        """
+        given = {"ior": self.ior, "multiple_scattering": float(self.multiple_scattering)}
+        held = {name: Estimate(value=value, se=None, unit="1", determined=False) for name, value in given.items()}
+        return {f"surface.{name}": one for name, one in ({"roughness": self.roughness} | held).items()}
+
+
 class FitReport(Record):
     """Report of a fit, published by the fit stage, and by export as parameters.json and errors.json."""
 
@@ -89,6 +105,9 @@ class FitReport(Record):
     enamel_thickness: Estimate | None = Field(
         default=None,
         description="mean over what the first camera sees of the tooth; null if nothing, or without dentin",
+    )
+    surface: RoughSurface | None = Field(
+        default=None, description="of boundary = rough: the surface that was held; null for the others"
     )
     teeth: dict[str, ToothReport] = Field(
         default={}, description="of a jaw by FDI number; parameters then holds gums and cavity alone"

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from services.core.calibration.cameras_and_lights import CameraColour
 from services.core.errors import InputError
 from services.core.geometry import Camera, Light
-from services.core.records import Boundary, FolderCapture, ImageEntry
+from services.core.records import FolderCapture, ImageEntry
 from services.core.store import write_atomic, write_record
+from services.phantom.surface import PhantomSurface
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium
 
 CHANNELS = {1: ("green",), 3: ("red", "green", "blue")}
@@ -35,7 +36,7 @@ def require_rig(
     channels: int,
     samples: int,
     held_out: int | None,
-    boundary: Boundary,
+    surface: PhantomSurface,
     renderer: Renderer,
 ) -> None:
     """Refuse options with which no phantom can be rendered.
@@ -52,8 +53,7 @@ def require_rig(
         raise InputError(f"A phantom has 1 or 3 channels, not {channels}; choose one of these.")
     if held_out is not None and not 0 <= held_out < lights:
         raise InputError(f"Of {lights} lights {held_out} cannot be held out; leave at least one to the fit.")
-    if renderer == "mitsuba" and boundary != "matched":
-        raise InputError(f"Stock Mitsuba has no {boundary} boundary; choose renderer engine or boundary matched.")
+    surface.require_renderer(renderer)
 
 
 def held_out_lights(lights: int, held_out: int | None) -> frozenset[int]:

@@ -16,7 +16,7 @@ from services.anatomy.scans.scan import read_scan
 from services.anatomy.scans.scanned_jaw import jaw_from_scan
 from services.anatomy.templates.dimensions import upper_tooth
 from services.anatomy.templates.jaw import build_jaw
-from services.core.errors import MeshError
+from services.core.errors import InputError, MeshError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, teeth_folder
 from services.core.records import Boundary
@@ -33,7 +33,7 @@ from services.phantom.files import (
 from services.phantom.jaw_optics import GUMS_IOR, jaw_mouth
 from services.phantom.lips import joined, lips_and_retractor
 from services.phantom.render import Stack, render_engine, render_mitsuba
-from services.phantom.tooth import IOR
+from services.phantom.surface import IOR, PhantomSurface
 from services.transport.optics.parameters import Mouth
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
@@ -160,7 +160,9 @@ def write_jaw_phantom(
         InputError: the combination of options is impossible. CaptureInputError: the scan cannot be read. MeshError: a
             surface cannot bound a medium.
     """
-    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
+    if boundary == "rough":
+        raise InputError("A jaw has no rough surface yet; choose boundary thin, or leave out --jaw.")
+    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, PhantomSurface(boundary), renderer)
     jaw, names = jaw_surfaces(subject, scan), CHANNELS[channels]
     if lips:
         jaw = replace(jaw, lips=lips_and_retractor([tooth.outer for tooth in jaw.teeth]))

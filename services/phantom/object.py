@@ -10,6 +10,7 @@ from services.core.errors import InputError
 from services.core.files.meshes import OBJECT_EXTENT_MM, read_mesh
 from services.core.geometry import OBJECT, Mesh, Tooth
 from services.core.records import Boundary
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import (
     CHANNELS,
@@ -21,6 +22,7 @@ from services.phantom.files import (
     write_images,
 )
 from services.phantom.reflection import reflect
+from services.phantom.surface import IOR, PhantomSurface
 from services.phantom.tooth import render_tooth, write_meshes
 from services.transport.optics.parameters import Medium, Tissue
 
@@ -53,6 +55,9 @@ def write_object_phantom(
     lights: int = 3,
     channels: int = 1,
     boundary: Boundary = "matched",
+    ior: float = IOR,
+    roughness: float = DEFAULT_ROUGHNESS,
+    multiple_scattering: bool = True,
     seed: int = 1,
     samples: int = 1024,
     renderer: Renderer = "engine",
@@ -68,15 +73,18 @@ def write_object_phantom(
         cameras, lights: numbers of cameras and lights.
         channels: 1 (green) or 3 (red, green, blue).
         boundary: model of the object's surface.
+        ior, roughness, multiple_scattering: of the surface, see ``PhantomSurface``.
         seed: seed of the rendering and of the lights' brightness.
         samples: paths per pixel.
-        renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
+        renderer: the project's engine, or stock Mitsuba for boundary ``matched`` or a ``rough`` one without
+            ``multiple_scattering``.
         held_out: number of lights that are marked as held out; default every fourth.
 
     Raises:
         InputError: the combination of options is impossible. MeshError: a surface is open or inside out.
     """
-    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
+    face = PhantomSurface(boundary, ior, roughness, multiple_scattering)
+    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, face, renderer)
     solid = object_surfaces(shape, core)
     names = CHANNELS[channels]
     rig_lights = dome_lights(lights, names, seed)
@@ -87,7 +95,7 @@ def write_object_phantom(
         surface = reflect(solid.outer, None, camera, rig_lights, names, 1.0)
         stacks = [
             render_tooth(
-                out, solid, camera, rig_lights, c, Tissue(TRUE_BODY[name], TRUE_CORE[name]), surface, boundary,
+                out, solid, camera, rig_lights, c, Tissue(TRUE_BODY[name], TRUE_CORE[name]), surface, face,
                 renderer, samples, seed + 7919 * number,
             )
             for c, name in enumerate(names)
@@ -99,8 +107,8 @@ def write_object_phantom(
         | ({} if core is None else {"core": medium_truth(TRUE_CORE[name])})
         for name in names
     }
-    truth = {"boundary": boundary, "channels": media, "renderer": renderer, "samples_per_pixel": samples, "seed": seed}
-    write_description(out, names, rig_cameras, rig_lights, entries, truth)
+    settings = {"channels": media, "renderer": renderer, "samples_per_pixel": samples, "seed": seed}
+    write_description(out, names, rig_cameras, rig_lights, entries, face.truth() | settings)
 
 
 def object_surfaces(shape: str, core: Path | None) -> Tooth:

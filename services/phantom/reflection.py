@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light, Mesh
+from services.phantom.surface import ENAMEL_ROUGHNESS
 from services.transport.rays import RayScene, pixel_rays
 
-ROUGHNESS = 0.12
-"""GGX roughness of wet enamel at the scale of a pixel."""
 SUBPIXELS = 4
 """Number of rays along each side of a pixel."""
 GUM_REFLECTANCE = {"red": 0.50, "green": 0.24, "blue": 0.22}
@@ -37,7 +36,13 @@ class Reflection:
 
 
 def reflect(
-    outer: Mesh, gums: Mesh | None, camera: Camera, lights: tuple[Light, ...], channels: tuple[str, ...], ior: float
+    outer: Mesh,
+    gums: Mesh | None,
+    camera: Camera,
+    lights: tuple[Light, ...],
+    channels: tuple[str, ...],
+    ior: float,
+    roughness: float = ENAMEL_ROUGHNESS,
 ) -> Reflection:
     """Shade each pixel on a 4 × 4 grid of rays, with shadows of tooth and gums.
 
@@ -46,6 +51,7 @@ def reflect(
         gums: surface of the gums; None without gums.
         camera: the camera. lights: point lights. channels: names of the channels.
         ior: refractive index of enamel.
+        roughness: GGX roughness of enamel.
     """
     width, height = camera.size
     normals_at = [_SmoothNormals(mesh) for mesh in (outer, gums) if mesh is not None]
@@ -77,7 +83,7 @@ def reflect(
                 lit[lit] = ~everything.first_hits(points[lit] + SHADOW_OFFSET_MM * flat[lit], to_light[lit]).hit
                 irradiance = np.where(lit, cosine, 0.0)[:, None] / distance[:, None] ** 2 * np.asarray(light.intensity)
                 if part == 0:
-                    highlight[n, rows] += irradiance * ggx_reflection(normals, to_light, view, ROUGHNESS, ior)[:, None]
+                    highlight[n, rows] += irradiance * ggx_reflection(normals, to_light, view, roughness, ior)[:, None]
                 else:
                     diffuse[n, rows] += irradiance * gum_colour / np.pi
 

@@ -31,18 +31,32 @@ def render_engine(
     return images[0], images[1]
 
 
-def render_mitsuba(scene: SceneDict, lights: tuple[Light, ...], channel: int, samples: int, seed: int) -> Stack:
-    """Render a scene with one camera by stock Mitsuba; its point light ``light`` becomes each light in turn."""
+def render_mitsuba(
+    scene: SceneDict, lights: tuple[Light, ...], channel: int, samples: int, seed: int, dark: SceneDict | None = None
+) -> Stack:
+    """Render a scene with one camera by stock Mitsuba; its point light ``light`` becomes each light in turn.
+
+    Args:
+        dark: the same scene with media that give no light back, whose image is subtracted: what is left was inside.
+    """
     import mitsuba as mi
 
     from services.assets.mitsuba.scene import load_scene, render_batches
 
-    loaded = load_scene(scene)
-    params = mi.traverse(loaded)
-    images = []
-    for n, light in enumerate(lights):
-        params["light.position"] = mi.Point3f(*light.position_mm)
-        params["light.intensity.value"] = mi.Float(light.intensity[channel])
-        params.update()
-        images.append(render_batches(loaded, 0, samples, seed + n))
-    return np.stack([image[0] for image in images]), np.stack([image[1] for image in images])
+    def stacked(scene: SceneDict) -> Stack:
+        loaded = load_scene(scene)
+        params = mi.traverse(loaded)
+        images = []
+        for n, light in enumerate(lights):
+            params["light.position"] = mi.Point3f(*light.position_mm)
+            params["light.intensity.value"] = mi.Float(light.intensity[channel])
+            params.update()
+            images.append(render_batches(loaded, 0, samples, seed + n))
+        return np.stack([image[0] for image in images]), np.stack([image[1] for image in images])
+
+    mean, variance = stacked(scene)
+    if dark is None:
+        return mean, variance
+    reflected, noise = stacked(dark)
+    # Clip at zero, as in ``render_engine``.
+    return np.maximum(mean - reflected, 0.0), variance + noise

@@ -16,6 +16,7 @@ from services.core.errors import InputError
 from services.core.files.meshes import read_mesh, write_mapped_mesh, write_mesh
 from services.core.geometry import Camera, Light, Mesh, Tooth, inner_file, teeth_folder
 from services.core.records import Boundary
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import (
     CHANNELS,
@@ -27,10 +28,11 @@ from services.phantom.files import (
     write_image,
     write_images,
 )
-from services.phantom.reflection import ROUGHNESS, Reflection, reflect
+from services.phantom.reflection import Reflection, reflect
 from services.phantom.render import Stack, render_engine, render_mitsuba
 from services.phantom.stain_paint import painted_stains
 from services.phantom.subjects import subject_tissues
+from services.phantom.surface import IOR, PhantomSurface
 from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import single_tooth
@@ -40,8 +42,6 @@ FDI = 11
 """FDI number of the procedural incisor."""
 FDI_NUMBERS = tuple(10 * quadrant + place for quadrant in range(1, 5) for place in range(1, 9))
 """FDI numbers of all permanent teeth."""
-IOR = 1.631
-"""Refractive index of enamel."""
 TRUE_TISSUE = {
     "red": Tissue(Medium(4.2, 0.9980, g1=0.80), Medium(11.0, 0.9965, g1=0.75)),
     "green": Tissue(Medium(4.5, 0.9970, g1=0.80), Medium(12.0, 0.9945, g1=0.75)),
@@ -49,6 +49,9 @@ TRUE_TISSUE = {
 }
 """True media by channel, within the literature's spread. Absorption increases towards blue, in dentin more than in
 enamel, which gives the yellow colour of teeth."""
+
+INK = Tissue(Medium(1e4, 1e-6), Medium(1e4, 1e-6))
+"""Media that give no light back, so that an image of them shows the surface's reflection alone."""
 
 
 def write_phantom(
@@ -59,6 +62,9 @@ def write_phantom(
     lights: int = 8,
     channels: int = 1,
     boundary: Boundary = "matched",
+    ior: float = IOR,
+    roughness: float = DEFAULT_ROUGHNESS,
+    multiple_scattering: bool = True,
     seed: int = 1,
     samples: int = 1024,
     outer: Path | None = None,
@@ -80,13 +86,15 @@ def write_phantom(
         cameras, lights: numbers of cameras and lights.
         channels: 1 (green) or 3 (red, green, blue).
         boundary: model of the tooth's outer boundary.
+        ior, roughness, multiple_scattering: of the surface, see ``PhantomSurface``.
         seed: seed of the rendering, of the lights' brightness and of stains.
         samples: paths per pixel.
         outer: enamel surface of another tooth, in the canonical frame (x mesial, y buccal, z occlusal) or near it;
             default the procedural incisor.
         dentin: dentin surface of the other tooth, given with ``outer``.
         fdi: FDI number of the other tooth, given with ``outer``; default ``FDI``.
-        renderer: the project's engine, or stock Mitsuba for boundary ``matched``.
+        renderer: the project's engine, or stock Mitsuba for boundary ``matched`` or a ``rough`` one without
+            ``multiple_scattering``.
         highlights: add the surface's reflection of each light; it is also written alone to
             ``highlights/<camera>_<light>.npy``.
         gums: cover the root with gums, an opaque diffuse surface that exchanges no light with the tooth; it is also
@@ -98,8 +106,9 @@ def write_phantom(
     Raises:
         InputError: the combination of options is impossible.
     """
-    _require_possible(boundary, outer, dentin, fdi, highlights, gums)
-    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, boundary, renderer)
+    _require_possible(boundary, outer, dentin, fdi, highlights, gums, stains)
+    face = PhantomSurface(boundary, ior, roughness, multiple_scattering)
+    require_rig(pixel_mm, cameras, lights, channels, samples, held_out, face, renderer)
     tooth, collar = _tooth(outer, dentin, FDI if fdi is None else fdi)
     shown_gums = collar if gums else None
     names = CHANNELS[channels]
@@ -117,10 +126,10 @@ def write_phantom(
 
     entries, held_out_indices = [], held_out_lights(lights, held_out)
     for number, camera in enumerate(rig_cameras):
-        surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, IOR)
+        surface = reflect(tooth.outer, shown_gums, camera, rig_lights, names, ior, face.shine)
         stacks = [
             render_tooth(
-                out, tooth, camera, rig_lights, c, stained[name], surface, boundary, renderer, samples,
+                out, tooth, camera, rig_lights, c, stained[name], surface, face, renderer, samples,
                 seed + 7919 * number, painted,
             )
             for c, name in enumerate(names)
@@ -134,14 +143,20 @@ def write_phantom(
         if highlights:
             for n, light in enumerate(rig_lights):
                 write_image(out / "highlights" / f"{camera.name}_{light.name}.npy", surface.highlight[n])
-    truth = _truth({name: tissues[name] for name in names}, boundary, renderer, samples, seed, highlights, gums) | {
+    truth = _truth({name: tissues[name] for name in names}, face, renderer, samples, seed, highlights, gums) | {
         "stains": stains
     }
     write_description(out, names, rig_cameras, rig_lights, entries, truth)
 
 
 def _require_possible(
-    boundary: Boundary, outer: Path | None, dentin: Path | None, fdi: int | None, highlights: bool, gums: bool
+    boundary: Boundary,
+    outer: Path | None,
+    dentin: Path | None,
+    fdi: int | None,
+    highlights: bool,
+    gums: bool,
+    stains: bool,
 ) -> None:
     if dentin is not None and outer is None:
         raise InputError("A dentin mesh was given without its enamel's outer mesh; give both.")
@@ -157,6 +172,8 @@ def _require_possible(
         raise InputError(
             "An index-matched surface has no highlights; choose boundary thin or leave the highlights out."
         )
+    if stains and boundary == "rough":
+        raise InputError("A rough surface has no stains; leave them out, or choose boundary thin.")
 
 
 def _tooth(outer: Path | None, dentin: Path | None, fdi: int) -> tuple[Tooth, Mesh]:
@@ -193,7 +210,7 @@ def render_tooth(
     channel: int,
     tissue: Tissue,
     surface: Reflection,
-    boundary: Boundary,
+    face: PhantomSurface,
     renderer: Renderer,
     samples: int,
     seed: int,
@@ -211,8 +228,17 @@ def render_tooth(
             write_mapped_mesh(shell, tooth.outer, painted.corners_uv)
             stain_textures = {str(tooth.fdi): tuple(write_textures(folder, painted).values())[channel]}
         files = {str(tooth.fdi): (shell, folder / inner_file(tooth.fdi) if tooth.dentin is not None else None)}
-        scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0, stains=stain_textures)
-        return render_mitsuba(scene, lights, channel, samples, seed)
+        if not face.is_rough:
+            scene = nested_scene(files, tissue, (camera,), lights[0].position_mm, 1.0, stains=stain_textures)
+            return render_mitsuba(scene, lights, channel, samples, seed)
+        scene, dark = (
+            nested_scene(
+                files, inside, (camera,), lights[0].position_mm, 1.0, boundary="rough", ior=face.ior,
+                roughness=face.roughness,
+            )
+            for inside in (tissue, INK)
+        )  # fmt: skip
+        return render_mitsuba(scene, lights, channel, samples, seed, dark)
     from services.transport.engine import Engine
 
     recipe = single_tooth(
@@ -220,9 +246,10 @@ def render_tooth(
         dentin=None if tooth.dentin is None else DentinShape.known(tooth.dentin),
         light_positions_mm=np.array([light.position_mm for light in lights]),
         light_intensities=np.array([light.intensity[channel] for light in lights]),
-        boundary=boundary,
-        ior=IOR,
+        boundary=face.boundary,
+        ior=face.ior,
     )
+    recipe = replace(recipe, roughness=face.roughness, multiple_scattering=face.multiple_scattering)
     if painted is not None:
         recipe = replace(recipe, teeth=(replace(recipe.teeth[0], stain_uv=painted.corners_uv),))
     return render_engine(Engine(recipe), tissue, camera, surface.enamel_pixels, samples, seed)
@@ -230,7 +257,7 @@ def render_tooth(
 
 def _truth(
     tissues: Mapping[str, Tissue],
-    boundary: Boundary,
+    face: PhantomSurface,
     renderer: Renderer,
     samples: int,
     seed: int,
@@ -241,10 +268,8 @@ def _truth(
         name: {"enamel": medium_truth(tissue.enamel), "dentin": medium_truth(tissue.dentin)}
         for name, tissue in tissues.items()
     }
-    surface = {"roughness": ROUGHNESS, "model": "GGX reflection (Walter et al. 2007)"} if highlights else None
-    return {
-        "boundary": boundary,
-        "ior": IOR if boundary == "thin" else 1.0,
+    surface = {"roughness": face.shine, "model": "GGX reflection (Walter et al. 2007)"} if highlights else None
+    return face.truth() | {
         "channels": optics,
         "highlights": surface,
         "gums": gums,

@@ -1,7 +1,8 @@
-"""Table of the accuracy of jobs of kind object: shapes of known optics with a matched surface, rendered by stock
-Mitsuba and fitted with the lights' strength given. Each image is of a camera and a light of its own.
+"""Table of the accuracy of jobs of kind object: shapes of known optics with a matched or a rough surface, rendered by
+stock Mitsuba and fitted with the lights' strength given. Each image is of a camera and a light of its own. Stock
+Mitsuba loses light that meets several facets of a rough surface, so the fit does too.
 
-python -m tests.benchmarks.objects --shapes sphere,cube --lights 1,3 --json objects.json
+python -m tests.benchmarks.objects --shapes sphere,cube --lights 1,3 --boundaries matched,rough --json objects.json
 
 ``error`` and ``se`` are relative to the truth. A figure is reached when its error is below the limit, or below two
 standard errors where these exceed the limit, so that the images do not allow it.
@@ -15,9 +16,10 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 
-from services.core.records import FolderCapture, JobSpec
+from services.core.records import Boundary, FolderCapture, JobSpec
 from services.core.stage import LocalContext
 from services.core.store import read_record, write_record
 from services.fit.stage import run
@@ -28,6 +30,8 @@ from services.transport.platform import prepare_device
 LIMITS = {"sigma_s_reduced": 0.03, "sigma_a": 0.05}
 """Largest relative error of reduced scattering and of absorption."""
 SIGMAS = 2.0
+ROUGHNESS = 0.15
+"""GGX roughness of the rough surfaces."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Row:
     """One quantity of one fit; ``seconds`` is the processor time of preparation and fit."""
 
     shape: str
+    boundary: Boundary
     images: int
     quantity: str
     error: float
@@ -48,16 +53,23 @@ class Row:
 
 
 def rows(
-    folder: Path, shape: str, lights: tuple[int, ...], *, pixel_mm: float, samples: int, max_samples: int
+    folder: Path,
+    shape: str,
+    boundary: Boundary,
+    lights: tuple[int, ...],
+    *,
+    pixel_mm: float,
+    samples: int,
+    max_samples: int,
 ) -> Iterator[Row]:
     """Render a shape in as many cameras and under as many lights as the largest number asks for, and fit an image of
     each of the first ones.
     """
     prepare_device()
-    capture, most = folder / shape, max(lights)
+    capture, most = folder / f"{shape}-{boundary}", max(lights)
     write_object_phantom(
         capture, shape=shape, cameras=most, lights=most, pixel_mm=pixel_mm, samples=samples, renderer="mitsuba",
-        held_out=0,
+        held_out=0, boundary=boundary, roughness=ROUGHNESS, multiple_scattering=False,
     )  # fmt: skip
     whole = read_record(capture / "capture.json", FolderCapture)
     truth = json.loads((capture / "truth.json").read_text())["channels"]["green"]["body"]
@@ -69,22 +81,23 @@ def rows(
         part = whole.model_copy(update={"cameras": cameras, "lights": own, "images": images})
         write_record(capture / "capture.json", part)
         spec = JobSpec(
-            kind="object", capture=capture, boundary="matched", instrument="off", held_out_lights=(), advise=False,
-            max_samples_per_pixel=max_samples,
+            kind="object", capture=capture, boundary=boundary, roughness=ROUGHNESS, multiple_scattering="off",
+            instrument="off", held_out_lights=(), advise=False, max_samples_per_pixel=max_samples,
         )  # fmt: skip
-        job, begun_s = LocalContext(folder / f"{shape}-{count}"), time.process_time()
+        job, begun_s = LocalContext(folder / f"{shape}-{boundary}-{count}"), time.process_time()
         run_object(spec, job)
         table = run(spec, job).parameters["green"]
         for quantity, true in known.items():
             estimate = table[f"body.{quantity}"]
             error, se = estimate.value / true - 1, (estimate.se or 0.0) / true
-            yield Row(shape, count, quantity, error, se, time.process_time() - begun_s)
+            yield Row(shape, boundary, count, quantity, error, se, time.process_time() - begun_s)
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shapes", default="sphere,cube")
+    parser.add_argument("--boundaries", default="matched")
     parser.add_argument("--lights", default="1,3")
     parser.add_argument("--pixel-mm", type=float, default=0.8)
     parser.add_argument("--samples", type=int, default=2048)
@@ -93,12 +106,13 @@ def main() -> None:
     given = parser.parse_args()
     found: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
-        for shape in given.shapes.split(","):
-            lights = tuple(int(one) for one in given.lights.split(","))
-            options = {"pixel_mm": given.pixel_mm, "samples": given.samples, "max_samples": given.max_samples}
-            for row in rows(Path(folder), shape, lights, **options):
+        lights = tuple(int(one) for one in given.lights.split(","))
+        options = {"pixel_mm": given.pixel_mm, "samples": given.samples, "max_samples": given.max_samples}
+        for shape, boundary in product(given.shapes.split(","), given.boundaries.split(",")):
+            for row in rows(Path(folder), shape, boundary, lights, **options):
                 found.append(row)
-                print(f"{row.shape}, {row.images} images, {row.quantity}: {row.error:+.2%} ± {row.se:.2%}", flush=True)
+                told = f"{row.quantity}: {row.error:+.2%} ± {row.se:.2%}, {row.seconds:.0f} s"
+                print(f"{row.shape}, {row.boundary}, {row.images} images, {told}", flush=True)
     if given.json is not None:
         given.json.write_text(json.dumps([asdict(row) for row in found], indent=1))
 

@@ -30,7 +30,8 @@ from services.phantom.dome_rig import dome_cameras, dome_lights
 from services.phantom.files import held_out_lights, medium_truth, write_description, write_images
 from services.phantom.reflection import reflect
 from services.phantom.subjects import subject_tissues
-from services.phantom.tooth import FDI, IOR
+from services.phantom.surface import IOR
+from services.phantom.tooth import FDI
 from services.transport.engine import Engine
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import View, single_tooth

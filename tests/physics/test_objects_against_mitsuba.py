@@ -11,13 +11,13 @@ from tests.benchmarks.objects import Row, rows
 
 def test_a_figure_is_reached_by_its_limit_or_by_its_bound() -> None:
     figures = {(0.02, 0.01): True, (0.04, 0.01): False, (0.07, 0.04): True, (0.09, 0.04): False}
-    assert {key: Row("", 1, "sigma_s_reduced", *key, 0.0).is_reached for key in figures} == figures
+    assert {key: Row("", "matched", 1, "sigma_s_reduced", *key, 0.0).is_reached for key in figures} == figures
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("shape", ["sphere", "cube"])
 def test_one_image_and_three_tell_scattering_and_absorption(tmp_path: Path, shape: str) -> None:
-    found = list(rows(tmp_path, shape, (1, 3), pixel_mm=0.8, samples=2048, max_samples=4096))
+    found = list(rows(tmp_path, shape, "matched", (1, 3), pixel_mm=0.8, samples=2048, max_samples=4096))
     assert len(found) == 4
     assert [row for row in found if not row.is_reached] == []

@@ -8,9 +8,9 @@ import numpy as np
 
 from services.anatomy.dentin_shape import DentinShape
 from services.bench.stability.difficult_scenes import ellipsoid, with_slivers
+from services.core.surface.rough import MIN_ROUGH_IOR, ROUGHNESS
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium
 from services.transport.platform import prepare_device
-from services.transport.scene.checks import MIN_ROUGH_IOR, ROUGHNESS
 from services.transport.scene.recipe import single_tooth
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, camera_at, whole_view
 

@@ -22,7 +22,7 @@ from services.core.colour.cie import delta_e_2000
 from services.core.records import Boundary
 from services.core.results import Estimate
 from services.transport.optics.parameters import Medium
-from services.transport.optics.slab_totals import Optics, slab_totals
+from services.transport.optics.slab_totals import Interface, Optics, slab_totals
 
 THICKNESS_MM = 1.0
 """Thickness of the layer, mm, for which translucencies of teeth and materials are usually stated."""
@@ -54,6 +54,28 @@ class ThinFace:
 
 
 @dataclass(frozen=True)
+class PolishedFace:
+    """A face that reflects and bends light by Fresnel's and Snell's laws; it stands for a rough one of its index."""
+
+    index: float
+    index_outside: float = 1.0
+
+    def inside_sine(self, angle_deg: float) -> float:
+        """Sine of the angle in the layer of light at ``angle_deg`` outside."""
+        return math.sin(math.radians(angle_deg)) / self.index
+
+    def transmittance(self, inside_sine: float) -> float:
+        """Share of light that passes; none beyond the critical angle."""
+        outside_sine = self.index * inside_sine
+        if abs(outside_sine) >= 1:
+            return 0.0
+        near, far = math.sqrt(1 - inside_sine**2), math.sqrt(1 - outside_sine**2)
+        s = (self.index * near - far) / (self.index * near + far)
+        p = (near - self.index * far) / (near + self.index * far)
+        return 1 - 0.5 * (s * s + p * p)
+
+
+@dataclass(frozen=True)
 class Translucency:
     """TP00 of a layer of one tissue."""
 
@@ -68,7 +90,8 @@ def translucencies(
 ) -> tuple[Translucency, ...]:
     """TP00 of enamel and dentin of a table of estimates with red, green and blue."""
     found = []
-    face = ThinFace(chosen("Boundary", boundary, {"matched": 1.0, "thin": ior}))
+    faces: dict[str, Interface] = {"matched": ThinFace(1.0), "thin": ThinFace(ior), "rough": PolishedFace(ior)}
+    face = chosen("Boundary", boundary, faces)
     for part in ("enamel", "dentin"):
         names = f"{part}.sigma_s_reduced", f"{part}.sigma_a"
         if any(name not in tables[channel] for channel in RGB for name in (f"{part}.sigma", f"{part}.alpha", *names)):
@@ -90,7 +113,7 @@ def translucencies(
     return tuple(found)
 
 
-def _tp00(coefficients: NDArray[np.float64], media: list[Medium], face: ThinFace, white: CameraWhite) -> float:
+def _tp00(coefficients: NDArray[np.float64], media: list[Medium], face: Interface, white: CameraWhite) -> float:
     over = np.zeros((2, len(RGB)))
     for channel, ((scattering, absorption), medium) in enumerate(zip(coefficients, media, strict=True)):
         g = medium.mean_cosine

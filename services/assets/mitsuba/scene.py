@@ -14,6 +14,7 @@ from services.core.choices import chosen
 from services.core.errors import CaptureInputError
 from services.core.geometry import Camera
 from services.core.records import Boundary
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 from services.transport.optics.parameters import Medium, Tissue
 
 MAX_DEPTH = 5000
@@ -117,18 +118,24 @@ def shell_integrator() -> SceneDict:
     return {"type": "volpath", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH}
 
 
-def boundary_dict(boundary: Boundary, ior: float, stain: Path | None = None) -> SceneDict:
-    """BSDF of the enamel's surface, as its boundary model names it.
+def boundary_dict(
+    boundary: Boundary, ior: float, stain: Path | None = None, roughness: float = DEFAULT_ROUGHNESS
+) -> SceneDict:
+    """BSDF of the enamel's surface, as its boundary model names it. That of a rough surface loses the light that meets
+    several of its facets.
 
     Args:
         boundary: the boundary model.
         ior: refractive index of the inside relative to the outside.
         stain: picture of the absorbed share of transmitted light, 1 - a_t; without a boundary it becomes a mask before
             black.
+        roughness: GGX roughness of a rough surface.
     """
     from services.transport.boundary.models import MESH_MODELS
+    from services.transport.boundary.rough import Rough
 
-    found: SceneDict = chosen("Boundary", boundary, MESH_MODELS).mitsuba(ior, stain)
+    model = chosen("Boundary", boundary, MESH_MODELS)
+    found: SceneDict = Rough.mitsuba(ior, roughness=roughness) if model is Rough else model.mitsuba(ior, stain)
     return found
 
 
@@ -154,6 +161,7 @@ def nested_scene(
     *,
     boundary: Boundary = "matched",
     ior: float = 1.631,
+    roughness: float = DEFAULT_ROUGHNESS,
     samples: Any = 64,
     stains: Mapping[str, Path] = MappingProxyType({}),
 ) -> SceneDict:
@@ -163,6 +171,7 @@ def nested_scene(
     Enamel lies between a tooth's two surfaces, dentin inside the inner one.
 
     Args:
+        roughness: GGX roughness of a rough surface.
         stains: stain pictures by name of the tooth, as in ``boundary_dict``; the tooth's outer PLY file then has
             texture coordinates.
     """
@@ -171,7 +180,7 @@ def nested_scene(
         scene["medium_dentin"] = medium_dict(tissue.dentin)
     enamel, inner = {"type": "ref", "id": "medium_enamel"}, {"type": "ref", "id": "medium_dentin"}
     for name, (outer, dentin) in teeth.items():
-        scene[f"outer_{name}"] = surface_dict(outer, boundary_dict(boundary, ior, stains.get(name))) | {
+        scene[f"outer_{name}"] = surface_dict(outer, boundary_dict(boundary, ior, stains.get(name), roughness)) | {
             "interior": enamel
         }
         if dentin is not None:

@@ -19,6 +19,7 @@ TAGS = {
     "ply": "shape",
     "null": "bsdf",
     "thin_boundary": "bsdf",
+    "roughdielectric": "bsdf",
     "diffuse": "bsdf",
     "twosided": "bsdf",
     "roughdielectric": "bsdf",

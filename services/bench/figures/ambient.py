@@ -23,7 +23,7 @@ from services.core.files.meshes import read_mesh
 from services.core.records import FolderCapture
 from services.core.results import FitReport
 from services.core.store import read_record
-from services.phantom.reflection import ROUGHNESS
+from services.phantom.surface import ENAMEL_ROUGHNESS
 
 CHANNEL = "green"
 AMBIENT_SAMPLES = 256
@@ -81,7 +81,7 @@ def _added(source: Path, case: Case, fraction: float) -> dict[str, NDArray[np.fl
             "samples": AMBIENT_SAMPLES,
             "boundary": truth["boundary"],
             "ior": truth["ior"],
-            "roughness": ROUGHNESS,
+            "roughness": ENAMEL_ROUGHNESS,
         }
         constant = {"type": "constant", "radiance": 1.0}
         around = {

@@ -17,7 +17,7 @@ from services.bench.figures.surroundings import environment_light, read_environm
 from services.core.geometry import Camera, Mesh
 from services.core.pages.pictures import tone_map, white_level
 from services.fit.coordinates.domain import similar_tissue
-from services.phantom.reflection import ROUGHNESS
+from services.phantom.surface import ENAMEL_ROUGHNESS
 from services.transport.optics.parameters import Tissue
 
 MEMORIAL = Path("shared") / "data" / "hdr-memorial" / "memorial.hdr"
@@ -44,7 +44,7 @@ def under_an_environment(cases: FigureCases) -> Drawn:
     )
     camera = finer(fitted.observations.manifest.cameras[1], cases.effort.environment_px)
     rows = []
-    for roughness in (None, ROUGHNESS):
+    for roughness in (None, ENAMEL_ROUGHNESS):
         images = []
         for turn in TURNS_DEGREES:
             channels = []
@@ -70,7 +70,7 @@ def under_an_environment(cases: FigureCases) -> Drawn:
         mosaic(pictures, columns, ["fitted", "with GGX"], scale=1),
         f"The tooth of fig10 ({cases.tooth_name}, fitted in colour) under the light of a church, an ordinary photograph"
         " wrapped around it, turned three ways; above as a fit sees teeth, below with the mirror image in its enamel"
-        f" put back (GGX, roughness {ROUGHNESS:g}). By similar media of mean cosine {SIMILAR_G:g}.",
+        f" put back (GGX, roughness {ENAMEL_ROUGHNESS:g}). By similar media of mean cosine {SIMILAR_G:g}.",
     )
 
 

@@ -124,7 +124,12 @@ class Fitted:
         stains = read_stains(self._stage[0])
         return Engine(
             channel_scene(
-                self.observations, channel, self.dentins(), self.spec, None if stains is None else stains.corners_uv
+                self.observations,
+                channel,
+                self.dentins(),
+                self.spec,
+                None if stains is None else stains.corners_uv,
+                surface=self.report.surface,
             )
         )
 

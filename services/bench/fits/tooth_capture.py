@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from services.core.records import JobSpec
 from services.core.stage import LocalContext
 from services.core.store import is_published
-from services.fit.measurements.observations import Observations, read_channel, read_observations
+from services.fit.measurements.observations import Observations, channel_scene, read_channel, read_observations
+from services.fit.measurements.surface import held_surface
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.passes.evaluate import ErrorSums, error_sums
 from services.transport.engine import Engine
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
-from services.transport.scene.recipe import View, single_tooth
+from services.transport.scene.recipe import View
 
 REAL_TOOTH = Path("shared") / "data" / "tooth-ur1-truth"
 """Capture of a scanned incisor; a phantom replaces it where this data does not lie beside the checkout."""
@@ -144,14 +145,7 @@ def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> Prepared
     observations = read_observations(job, spec)
     (tooth,) = observations.teeth
     dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
-    recipe = single_tooth(
-        tooth.outer,
-        dentin,
-        observations.light_positions_mm,
-        observations.light_intensities(channel),
-        spec.boundary,
-        spec.ior,
-    )
+    recipe = channel_scene(observations, channel, (dentin,), spec, surface=held_surface(spec))
     return PreparedTooth(job, spec, observations, read_channel(observations, channel, spec), Engine(recipe))
 
 

@@ -15,7 +15,7 @@ from services.core.files.content_files import StoredFile
 from services.core.files.meshes import read_mesh, read_teeth
 from services.core.geometry import Mesh, Tooth
 from services.core.records import JobSpec, Loss, MaskBit
-from services.core.results import PreparedManifest
+from services.core.results import PreparedManifest, RoughSurface
 from services.core.store import open_stage
 from services.fit.coordinates.instrument_errors import NO_ERRORS, InstrumentErrors
 from services.fit.measurements.blocks import PixelBlock, split_pixels, write_block
@@ -246,9 +246,14 @@ def channel_scene(
     spec: JobSpec,
     stain_uv: Array | None = None,
     neighbours: tuple[ToothSurfaces, ...] = (),
+    surface: RoughSurface | None = None,
 ) -> SceneRecipe:
-    """Scene recipe of the capture, with the dentin of each tooth, under all lights of a channel."""
-    return SceneRecipe(
+    """Scene recipe of the capture, with the dentin of each tooth, under all lights of a channel.
+
+    Args:
+        surface: of boundary ``rough``, the surface that the fit holds.
+    """
+    scene = SceneRecipe(
         tuple(
             ToothSurfaces(tooth.outer, dentin, stain_uv)
             for tooth, dentin in zip(observations.teeth, dentins, strict=True)
@@ -262,6 +267,9 @@ def channel_scene(
         cavity=observations.cavity,
         neighbours=neighbours,
     )
+    if surface is None:
+        return scene
+    return replace(scene, roughness=surface.roughness.value, multiple_scattering=surface.multiple_scattering)
 
 
 def write_channel(

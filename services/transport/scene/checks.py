@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.core.errors import InputError, NonFiniteError
+from services.core.surface.rough import MIN_ROUGH_IOR, ROUGHNESS
 from services.transport.scene.recipe import SceneRecipe, View
 
 FARTHEST_MM = 1e12
@@ -16,11 +17,6 @@ FARTHEST_MM = 1e12
 range of single precision."""
 INTENSITIES = (1e-30, 1e30)
 """Smallest and largest intensity of a light, for the same reason."""
-ROUGHNESS = (0.02, 1.0)
-"""Least and largest GGX roughness: connections through a smoother face are hits of a needle, seldom and bright."""
-MIN_ROUGH_IOR = 1.01
-"""Least index of refraction of a rough face: below it, light is bent by less than facets of a thousandth would turn it,
-and single precision no longer finds the facet that bends it to a light."""
 MAX_TEETH = 15
 """Largest number of teeth: an enclosure is 32 bits, two for each tooth and one for gums."""
 

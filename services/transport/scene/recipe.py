@@ -5,7 +5,6 @@ process.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +12,6 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera, Mesh
 from services.core.records import Boundary, Device
-
-SceneBoundary = Boundary | Literal["rough"]
-"""Boundary models of a scene of meshes."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ class SceneRecipe:
     """(L, 3)"""
     light_intensities: NDArray[np.float64]
     """(L,) radiant intensity of this channel, mm as length unit."""
-    boundary: SceneBoundary = "matched"
+    boundary: Boundary = "matched"
     ior: float = 1.631
     device: Device | None = None
     """Device that traces the paths; None for the one that this process already uses, else the CPU."""
@@ -76,7 +72,7 @@ def single_tooth(
     dentin: DentinShape | None,
     light_positions_mm: NDArray[np.float64],
     light_intensities: NDArray[np.float64],
-    boundary: SceneBoundary = "matched",
+    boundary: Boundary = "matched",
     ior: float = 1.631,
     device: Device | None = None,
 ) -> SceneRecipe:

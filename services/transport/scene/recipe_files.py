@@ -16,7 +16,6 @@ from services.core.geometry import Mesh
 from services.core.records import Boundary, Device
 from services.transport.scene.recipe import SceneRecipe, ToothSurfaces
 
-BOUNDARIES = (*get_args(Boundary), "rough")
 SHARP_BORDER_MM = np.array(0.0)
 """Width of the borders between enamel and dentin, which are sharp. Nothing reads it: it stays in the file because fits
 find their checkpoints by the digests of the scenes."""
@@ -82,7 +81,7 @@ def read_recipe(stored: StoredFile) -> SceneRecipe:
         neighbours=tuple(tooth(k) for k in range(own, own + others)),
         light_positions_mm=a["light_positions"].astype(float),
         light_intensities=a["light_intensities"].astype(float),
-        boundary=chosen("Boundary", str(a["boundary"]), {name: name for name in BOUNDARIES}),
+        boundary=chosen("Boundary", str(a["boundary"]), {name: name for name in get_args(Boundary)}),
         ior=float(np.asarray(a["ior"], dtype=float)),
         device=chosen("Device", str(a["device"]), {"": None, **{name: name for name in get_args(Device)}}),
         gums=mesh("gums"),

@@ -31,6 +31,7 @@ from services.fit.measurements.observations import (
     read_observations,
     write_channel,
 )
+from services.fit.measurements.surface import held_surface
 from services.fit.measurements.surroundings import neighbour_surfaces, with_shape_errors
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.passes.final_uncertainty import DisplacedScene
@@ -64,10 +65,17 @@ class FitDriver:
         neighbours = neighbour_surfaces(tooth, observations.neighbours, observations.manifest.cameras, spec)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
+        surface = held_surface(spec)
         layout = stain_layout(tooth.outer, texel_edge_mm(observations.pixel_edge_mm)) if spec.stains else None
         scenes = {
             channel: channel_scene(
-                observations, channel, (dentin,), spec, None if layout is None else layout.corners_uv, neighbours
+                observations,
+                channel,
+                (dentin,),
+                spec,
+                None if layout is None else layout.corners_uv,
+                neighbours,
+                surface,
             )
             for channel in channels
         }
@@ -114,7 +122,7 @@ class FitDriver:
             store_stains(attempt.writer.folder, ToothStains(layout.corners_uv, textures))
         report = self._publish(
             observations, dentin, {c: fits[c] for c in channels}, order[0], views, journal, time.time() - begun
-        )
+        ).model_copy(update={"surface": surface})
         where = f"In {order[0]}: " if next_capture and len(order) > 1 else ""
         return report.model_copy(update={"next_capture": "" if report.doubtful else where + next_capture})
 

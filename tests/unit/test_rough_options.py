@@ -1,0 +1,115 @@
+"""Options of jobs and phantoms with a rough surface: what they default to, reach and refuse."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from services.core.errors import InputError, SettingsError
+from services.core.files.meshes import write_mesh
+from services.core.geometry import Mesh
+from services.core.raw.registration import REGISTRATION
+from services.core.records import JobSpec
+from services.core.stage import LocalContext
+from services.fit.measurements.observations import channel_scene, read_observations
+from services.fit.measurements.surface import held_surface
+from services.phantom.jaw import write_jaw_phantom
+from services.phantom.object import write_object_phantom
+from services.phantom.surface import PhantomSurface
+from services.phantom.tooth import write_phantom
+from services.preprocess.stage import run
+from tests.support.folder_captures import write_folder
+from tests.support.prepared import sphere, write_prepared
+
+
+def job(**options: Any) -> JobSpec:
+    given: dict[str, Any] = {"capture": Path("capture"), "boundary": "rough"} | options
+    return JobSpec(**given)
+
+
+def test_a_job_that_gives_nothing_has_a_compensated_surface() -> None:
+    spec = job()
+    assert (spec.roughness, spec.multiple_scattering, spec.ior) == (0.15, "on", 1.631)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"roughness": 0}, "give the GGX roughness of the surface, a number from 0.02 to 1, such as 0.15"),
+        ({"roughness": float("nan")}, "give the GGX roughness of the surface"),
+        ({"roughness": "fit"}, "give the GGX roughness of the surface"),
+        ({"roughness": True}, "give the GGX roughness of the surface"),
+        ({"ior": 1.0}, "ior = 1 is too close to that of air for boundary = rough, which needs at least 1.01"),
+        ({"ior": 0.9}, "greater than or equal to 1"),
+        ({"kind": "jaw"}, "not for a jaw; choose boundary = thin"),
+        ({"stains": True}, "has no stains; leave out stains, or choose boundary = thin"),
+        ({"surroundings": "on"}, "set surroundings to off, or choose boundary = thin"),
+        ({"multiple_scattering": True}, "'on' or 'off'"),
+    ],
+)
+def test_what_a_rough_surface_cannot_have_is_one_sentence(options: dict[str, Any], told: str) -> None:
+    with pytest.raises(ValidationError, match=re.escape(told)):
+        job(**options)
+
+
+def test_others_keep_their_surroundings_and_stains() -> None:
+    spec = job(boundary="thin", stains=True, surroundings="on", ior=1.0)
+    assert (spec.stains, spec.surroundings) == (True, "on")
+
+
+def test_the_scene_of_a_fit_has_the_jobs_surface(tmp_path: Path) -> None:
+    write_prepared(tmp_path)
+    spec = job(dentin="known", roughness=0.3, ior=1.5, multiple_scattering="off")
+    surface, observations = held_surface(spec), read_observations(tmp_path, spec)
+    scene = channel_scene(observations, "green", (None,), spec, surface=surface)
+    assert (scene.boundary, scene.roughness, scene.ior, scene.multiple_scattering) == ("rough", 0.3, 1.5, False)
+    assert surface is not None
+    assert {name: one.value for name, one in surface.estimates().items()} == {
+        "surface.roughness": 0.3, "surface.ior": 1.5, "surface.multiple_scattering": 0.0,
+    }  # fmt: skip
+    assert all(one.se is None and not one.determined for one in surface.estimates().values())
+    assert held_surface(job(boundary="thin")) is None
+
+
+def test_surroundings_of_a_registered_scan_are_refused_before_any_pixel(tmp_path: Path) -> None:
+    capture = tmp_path / "capture"
+    write_folder(capture)
+    (capture / REGISTRATION).write_text("{}")
+    neighbour = sphere(4.0)
+    write_mesh(
+        capture / "teeth" / "21" / "outer.ply", Mesh(neighbour.vertices_mm + np.array([9.0, 0, 0]), neighbour.faces)
+    )
+    with pytest.raises(SettingsError, match="this capture's registered scan has some; set surroundings to off"):
+        run(job(capture=capture, fdi=11), LocalContext(tmp_path / "job"))
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        (("rough", 1.0), "ior = 1 must lie in 1.01 to 3; correct it, or choose boundary matched."),
+        (("rough", 1.5, 0.0), "roughness = 0 must lie in 0.02 to 1; give a GGX roughness such as 0.15."),
+    ],
+)
+def test_a_phantoms_surface_is_possible(values: tuple[Any, ...], told: str) -> None:
+    with pytest.raises(InputError, match=re.escape(told)):
+        PhantomSurface(*values)
+
+
+def test_phantoms_refuse_what_a_rough_surface_cannot_have(tmp_path: Path) -> None:
+    rough: dict[str, Any] = {"boundary": "rough"}
+    with pytest.raises(InputError, match="add --multiple-scattering off, or choose renderer engine"):
+        write_object_phantom(tmp_path, renderer="mitsuba", **rough)
+    with pytest.raises(InputError, match="A jaw has no rough surface yet; choose boundary thin, or leave out --jaw"):
+        write_jaw_phantom(tmp_path, **rough)
+    with pytest.raises(InputError, match="A rough surface has no stains; leave them out, or choose boundary thin"):
+        write_phantom(tmp_path, stains=True, **rough)
+
+
+def test_a_highlight_is_as_wide_as_the_surface_is_rough() -> None:
+    assert PhantomSurface("rough", roughness=0.4).shine == 0.4
+    assert PhantomSurface("thin", roughness=0.4).shine == 0.12
