@@ -96,6 +96,8 @@ class AssetContent:
     """Folder of the published asset, whose files are as they were published."""
     ior: float
     """Refractive index of the teeth."""
+    alpha: float | None = None
+    """GGX roughness of the teeth's surface, where a fit held one."""
     textures: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """What ``textures.json`` says of each part that has textures, by its name; every exporter finds their files in its
     folder."""
@@ -168,7 +170,8 @@ def read_content(job: Path) -> AssetContent:
             surface = read_mesh(folder / f"{tissue}.ply")
             surface.require_surface(f"{tissue}.ply")
             add(tissue, tissue, surface)
-    return AssetContent(tuple(parts), tuple(tables), manifest.converged, folder, _ior(folder / "rig.json"))
+    rig = folder / "rig.json"
+    return AssetContent(tuple(parts), tuple(tables), manifest.converged, folder, _ior(rig), _alpha(rig))
 
 
 def read_tables(folder: Path) -> Tables:
@@ -203,6 +206,11 @@ def _ior(rig: Path) -> float:
     # Assets of earlier versions may lack the file or the index.
     told = json.loads(rig.read_bytes()).get("ior") if rig.is_file() else None
     return TOOTH_IOR if told is None else float(told)
+
+
+def _alpha(rig: Path) -> float | None:
+    told = json.loads(rig.read_bytes()).get("roughness") if rig.is_file() else None
+    return None if told is None else float(told)
 
 
 def in_rgb(values: Mapping[str, float | NDArray[np.float64]], unknown: float = 0.5) -> NDArray[np.float64]:

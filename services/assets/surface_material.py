@@ -16,16 +16,16 @@ from services.assets.textures.files import base_colour_file
 Colour = tuple[float, float, float]
 
 ROUGHNESS = 0.35
-"""Roughness of the highlight, whose square is the width alpha of a GGX lobe: 0.12, a wet and polished tooth. No fit
-measures it."""
+"""Roughness of the highlight where the asset has no rough surface; its square is the width alpha of a GGX lobe: 0.12, a
+wet and polished tooth."""
 GUMS_IOR = 1.33
 """Refractive index of gums, which are wet."""
 LOST = (
-    "The surfaces have the colour of their tissue under even light, and the highlight of a wet tooth, which no fit"
-    " measured. Light within the media, layers under each other, phase functions and light from behind are lost:"
-    " an incisor was 13 % too dark under even light, with a median colour difference of 4.1 by CIEDE2000, 30 % too"
-    " bright under a lamp from the front, and had 2 % of its light with the lamp behind it. The coefficients stand"
-    " beside the surfaces."
+    "The surfaces have the colour of their tissue under even light, and the highlight of the rough surface that the"
+    " fit held, else of a wet tooth. Light within the media, layers under each other, phase functions and light from"
+    " behind are lost: an incisor was 13 % too dark under even light, with a median colour difference of 4.1 by"
+    " CIEDE2000, 30 % too bright under a lamp from the front, and had 2 % of its light with the lamp behind it. The"
+    " coefficients stand beside the surfaces."
 )
 """What a surface material cannot say, for the file. The figures are those of
 ``python -m tests.benchmarks.surface_materials``, without the highlight."""
@@ -60,11 +60,12 @@ def appearance(content: AssetContent, part: AssetPart) -> Appearance:
     total = dentin.scattering_reduced_per_mm() + dentin.absorption_per_mm()
     paths_mm = np.full(3, np.inf) if not total.all() else 1 / total
     scatters = bool(np.isfinite(paths_mm).all())
+    roughness = ROUGHNESS if content.alpha is None or part.tissue == "gums" else float(np.sqrt(content.alpha))
     ior = None if part.tissue == "cavity" else GUMS_IOR if part.tissue == "gums" else content.ior
     return Appearance(
         base_colour=_colour(part.base_colour()),
         picture=base_colour_file(part.name) if part.name in content.textures else None,
-        roughness=1.0 if ior is None else ROUGHNESS,
+        roughness=1.0 if ior is None else roughness,
         ior=ior,
         radius_mm=float(paths_mm.max()) if scatters else None,
         radius_scale=_colour(paths_mm / paths_mm.max()) if scatters else (1.0, 1.0, 1.0),

@@ -82,6 +82,13 @@ def cases() -> dict[str, tuple[Callable[[], Case], int, int, float]]:
             2048,
             0.01,
         ),
+        "rough ball, sky": (lambda: replace(simple, boundary="rough", roughness=0.3), 2048, 2048, 0.01),
+        "rough ball, lamp": (
+            lambda: replace(simple, boundary="rough", roughness=0.3, lit_by="lamp"),
+            8192,
+            8192,
+            0.02,
+        ),
         "incisor, sky": (incisor, 1024, 1024, 0.01),
         "incisor, lamp": (lambda: incisor(lit_by="lamp"), 2048, 2048, 0.02),
         "incisor, RGB, sky": (lambda: incisor(tissues=RGB), 1024, 1024, 0.01),

@@ -15,7 +15,7 @@ from services.assets.blender.scripts import write_scripts
 from services.assets.mitsuba.scene import load_scene, nested_scene
 from services.core.geometry import Camera, Light, Mesh, Tooth
 from services.core.records import Boundary
-from services.core.results import Estimate, FitReport
+from services.core.results import Estimate, FitReport, RoughSurface
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Tissue
 from services.transport.scene.stain_uv import ToothStains
 from tests.support.clients import run_client
@@ -36,6 +36,8 @@ class Case:
     camera: Camera
     lit_by: Literal["sky", "lamp"] = "sky"
     boundary: Boundary = "matched"
+    roughness: float = 0.15
+    """Of boundary ``rough``, without light that meets several facets, which stock Mitsuba loses."""
     glass: dict[str, Any] | None = None
     """Mitsuba's surface that replaces the asset's, where the script is asked for glass."""
     words: tuple[str, ...] = field(default=())
@@ -57,7 +59,7 @@ class Case:
         return hits.hit.reshape(height, width)
 
 
-def report_of(tissues: dict[str, Tissue]) -> FitReport:
+def report_of(tissues: dict[str, Tissue], surface: RoughSurface | None = None) -> FitReport:
     """A fit's report with these numbers."""
     parameters = {
         channel: {
@@ -69,16 +71,21 @@ def report_of(tissues: dict[str, Tissue]) -> FitReport:
     }
     errors = dict.fromkeys(tissues, 0.03)
     return FitReport(
-        converged=True, advice="", parameters=parameters, fit_error=errors, held_out_error=errors, steps=3, seconds=1.0
-    )
+        converged=True, advice="", parameters=parameters, fit_error=errors, held_out_error=errors, steps=3, seconds=1.0,
+        surface=surface,
+    )  # fmt: skip
 
 
 def write_case(folder: Path, case: Case, stains: ToothStains | None = None) -> None:
     """Write the case's asset, with the scripts for Blender."""
+    surface = None
+    if case.boundary == "rough":
+        roughness = Estimate(value=case.roughness, se=None, unit="1", determined=False)
+        surface = RoughSurface(roughness=roughness, ior=IOR, multiple_scattering=False)
     light = case.lamp.model_copy(update={"intensity": case.lamp.intensity[: len(case.tissues)]})
     write_asset(
         folder,
-        report_of(dict(zip(case.channels, case.tissues, strict=True))),
+        report_of(dict(zip(case.channels, case.tissues, strict=True)), surface),
         (Tooth(11, case.outer, case.dentin),),
         (case.camera,),
         (light,),
@@ -147,6 +154,7 @@ def mitsuba_image(folder: Path, case: Case, samples: int, seed: int, *, fits: bo
                 case.lamp.intensity[k],
                 boundary=case.boundary,
                 ior=IOR,
+                roughness=case.roughness,
             )
             if case.lit_by == "sky":
                 scene["light"] = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}

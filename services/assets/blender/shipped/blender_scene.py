@@ -184,7 +184,8 @@ def build(asset: Any, options: argparse.Namespace) -> Any:
     scene[MARK], unit = str(asset.folder), UNITS[options.unit]
     units = scene.unit_settings
     units.system, units.scale_length, units.length_unit = "METRIC", 0.001 / unit, "MILLIMETERS"
-    look = materials.Look(options.surface, options.roughness, options.highlight, not options.flat, options.subsurface)
+    finish = asset.finish(options.surface, options.roughness)
+    look = materials.Look(*finish, options.highlight, not options.flat, options.subsurface)
     for body in asset.solids() if look.subsurface else asset.bodies():
         add_body(scene, body, unit, look)
     add_wall(scene, asset, unit)
@@ -292,7 +293,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--scale", type=float, help="pixels per pixel of the photograph; default at least 512 pixels")
     found.add_argument("--unit", choices=tuple(UNITS), default="mm", help="what one Blender unit is")
     found.add_argument("--surface", choices=("asset", "glass"), default="asset", help="the fit's boundary, or glass")
-    found.add_argument("--roughness", type=float, default=0.0, help="of a boundary that reflects")
+    found.add_argument("--roughness", type=float, help="of a boundary that reflects; default the asset's, else 0")
     found.add_argument("--highlight", type=float, help="add a GGX highlight of this roughness")
     found.add_argument("--flat", action="store_true", help="flat faces, as in the fit")
     found.add_argument("--subsurface", action="store_true", help="no media: for front light and distant shots")

@@ -165,6 +165,17 @@ class Asset:
         unset = {"sigma": 0.0, "alpha": 0.0, "beta": 1.0, "g1": 0.0, "g2": 0.0}
         return Medium(*(self.values(f"{part}.{name}", value) for name, value in unset.items()))
 
+    def finish(self, surface: str, roughness: float | None) -> tuple[str, float, str]:
+        """Surface, roughness and distribution of its facets, as Cycles names them, by options that go before the asset.
+
+        A rough boundary is glass. Cycles' roughness is the root of GGX's alpha, and its MULTI_GGX gives back the light
+        that meets several facets.
+        """
+        if surface != "asset" or self.rig["boundary"] != "rough":
+            return surface, roughness or 0.0, "GGX"
+        own = self.rig["roughness"] ** 0.5 if roughness is None else roughness
+        return "glass", own, "MULTI_GGX" if self.rig["multiple_scattering"] else "GGX"
+
     @property
     def one_phase(self) -> bool:
         """Whether every lobe has the same mean cosine in all channels."""

@@ -22,6 +22,9 @@ class Look:
 
     surface: str = "asset"
     roughness: float = 0.0
+    """Roughness as Cycles has it: its square is GGX's alpha."""
+    distribution: str = "GGX"
+    """Of a surface of glass; MULTI_GGX gives back the light that meets several facets."""
     highlight: float | None = None
     smooth: bool = True
     subsurface: bool = False
@@ -108,7 +111,7 @@ def boundary(nodes: Nodes, body: Any, look: Look) -> Any:
     if contrast and look.surface == "glass":
         inside = nodes.math("COMPARE", ior, 1.0, 1e-5)
         inputs = {"Color": white, "IOR": ior, "Roughness": look.roughness}
-        glass = nodes.add("ShaderNodeBsdfGlass", inputs, distribution="GGX")
+        glass = nodes.add("ShaderNodeBsdfGlass", inputs, distribution=look.distribution)
         surface = nodes.add("ShaderNodeMixShader", {0: inside, 1: glass, 2: through})
     elif contrast:
         # A ray from inside would get the share of the inverse index.
