@@ -25,7 +25,21 @@ const SOURCES = new Set(["capture", "rig"]);
  * missing.
  */
 const GROUPS: [string, string[]][] = [
-  ["What is fitted", ["kind", "fdi", "surroundings", "boundary", "ior", "dentin", "stains", "lobes"]],
+  [
+    "What is fitted",
+    [
+      "kind",
+      "fdi",
+      "surroundings",
+      "boundary",
+      "ior",
+      "roughness",
+      "multiple_scattering",
+      "dentin",
+      "stains",
+      "lobes",
+    ],
+  ],
   [
     "Images",
     [
