@@ -62,6 +62,7 @@ def write_object_phantom(
     samples: int = 1024,
     renderer: Renderer = "engine",
     held_out: int | None = None,
+    is_paired: bool = False,
 ) -> None:
     """Write a folder capture (``capture.json``, images with variance, ``object/``) and ``truth.json`` with its optics.
 
@@ -79,12 +80,15 @@ def write_object_phantom(
         renderer: the project's engine, or stock Mitsuba for boundary ``matched`` or a ``rough`` one without
             ``multiple_scattering``.
         held_out: number of lights that are marked as held out; default every fourth.
+        is_paired: each camera sees the light of its own number alone; there are as many of both.
 
     Raises:
         InputError: the combination of options is impossible. MeshError: a surface is open or inside out.
     """
     face = PhantomSurface(boundary, ior, roughness, multiple_scattering)
     require_rig(pixel_mm, cameras, lights, channels, samples, held_out, face, renderer)
+    if is_paired and cameras != lights:
+        raise InputError(f"{cameras} cameras and {lights} lights are no pairs; give as many of both.")
     solid = object_surfaces(shape, core)
     names = CHANNELS[channels]
     rig_lights = dome_lights(lights, names, seed)
@@ -92,16 +96,17 @@ def write_object_phantom(
     write_meshes(out, solid, None)
     entries, held_out_indices = [], held_out_lights(lights, held_out)
     for number, camera in enumerate(rig_cameras):
-        surface = reflect(solid.outer, None, camera, rig_lights, names, 1.0)
+        shown = rig_lights[number : number + 1] if is_paired else rig_lights
+        surface = reflect(solid.outer, None, camera, shown, names, 1.0)
         stacks = [
             render_tooth(
-                out, solid, camera, rig_lights, c, Tissue(TRUE_BODY[name], TRUE_CORE[name]), surface, face,
+                out, solid, camera, shown, c, Tissue(TRUE_BODY[name], TRUE_CORE[name]), surface, face,
                 renderer, samples, seed + 7919 * number,
             )
             for c, name in enumerate(names)
         ]  # fmt: skip
         mean, variance = (np.stack([stack[k] for stack in stacks], axis=-1) for k in range(2))
-        entries += write_images(out, camera, rig_lights, mean, variance, held_out_indices)
+        entries += write_images(out, camera, shown, mean, variance, held_out_indices)
     media = {
         name: {"body": medium_truth(TRUE_BODY[name])}
         | ({} if core is None else {"core": medium_truth(TRUE_CORE[name])})

@@ -69,16 +69,14 @@ def rows(
     capture, most = folder / f"{shape}-{boundary}", max(lights)
     write_object_phantom(
         capture, shape=shape, cameras=most, lights=most, pixel_mm=pixel_mm, samples=samples, renderer="mitsuba",
-        held_out=0, boundary=boundary, roughness=ROUGHNESS, multiple_scattering=False,
+        held_out=0, is_paired=True, boundary=boundary, roughness=ROUGHNESS, multiple_scattering=False,
     )  # fmt: skip
     whole = read_record(capture / "capture.json", FolderCapture)
     truth = json.loads((capture / "truth.json").read_text())["channels"]["green"]["body"]
     known = {"sigma_s_reduced": truth["sigma_s_reduced"], "sigma_a": (1 - truth["alpha"]) * truth["sigma"]}
     for count in lights:
         cameras, own = whole.cameras[:count], whole.lights[:count]
-        pairs = {(camera.name, light.name) for camera, light in zip(cameras, own, strict=True)}
-        images = tuple(image for image in whole.images if (image.camera, image.light) in pairs)
-        part = whole.model_copy(update={"cameras": cameras, "lights": own, "images": images})
+        part = whole.model_copy(update={"cameras": cameras, "lights": own, "images": whole.images[:count]})
         write_record(capture / "capture.json", part)
         spec = JobSpec(
             kind="object", capture=capture, boundary=boundary, roughness=ROUGHNESS, multiple_scattering="off",

@@ -72,6 +72,19 @@ def test_one_image_of_a_sphere_becomes_an_asset_without_teeth(sphere: Path, tmp_
     assert not re.findall(r"(?i)\b(?:tooth|teeth|enamel|dentin)\b", text)
 
 
+def test_paired_cameras_see_a_light_each(tmp_path: Path) -> None:
+    write_object_phantom(tmp_path, is_paired=True, **SMALL | {"cameras": 2, "lights": 2})
+    images = read_record(tmp_path / "capture.json", FolderCapture).images
+    assert [(image.camera, image.light) for image in images] == [("c0", "l0"), ("c1", "l1")]
+    # The second camera's image is that of its own light.
+    both = tmp_path / "both"
+    write_object_phantom(both, **SMALL | {"cameras": 2, "lights": 2})
+    own, all_lights = (np.load(folder / "c1_l1.npy") for folder in (tmp_path, both))
+    assert own.sum() == pytest.approx(all_lights.sum(), rel=0.3)
+    with pytest.raises(InputError, match="1 cameras and 2 lights are no pairs; give as many of both"):
+        write_object_phantom(tmp_path, is_paired=True, **SMALL | {"lights": 2})
+
+
 def test_a_core_keeps_its_place_in_its_shape(tmp_path: Path) -> None:
     shift, off = np.array([30.0, -20.0, 10.0]), np.array([1.0, 0.0, 0.0])
     for name, mesh, place in (("outer", ball(5.0), shift), ("core", ball(3.0), shift + off)):
