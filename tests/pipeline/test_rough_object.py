@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from services.core.stage import LocalContext
 from services.fit.stage import run
 from services.phantom.object import write_object_phantom
 from services.preprocess.stage import run_object
+from services.transport.platform import prepare_device
 from tests.support.command_line import dentine
 from tests.support.computed_once import folder_once
 from tests.support.prepared import FAKE
@@ -73,6 +75,19 @@ def test_scenes_have_mitsubas_own_surface(made: Path) -> None:
         values = dict(re.findall(r'name="([a-z_]+)" value="([^"]+)"', surface[0]))
         assert values == {"distribution": "ggx", "alpha": "0.3", "int_ior": "1.4", "ext_ior": "1.0"}
     assert not (asset / "thin_boundary.py").exists()
+
+
+def test_the_assets_own_script_renders_it(made: Path) -> None:
+    prepare_device()
+    render = runpy.run_path(str(made / "job" / "asset" / "render.py"))["render"]
+    image = render(made / "job" / "asset", "c0", "l0", 64, integrator="prbvolpath")
+    photo = np.load(made / "capture" / "c0_l0.npy")
+    assert image.shape == photo.shape
+    # The photograph lacks the highlight, and the fake engine's media are not the ball's; both shine where the ball is.
+    shown = photo > 0.2 * photo.max()
+    assert np.isfinite(image).all()
+    assert image[shown].min() > 0
+    assert image[photo == 0].max() < 0.2 * image.max()
 
 
 def test_a_phantom_takes_its_surface_from_the_command_line(tmp_path: Path) -> None:
