@@ -84,7 +84,7 @@ def cases() -> dict[str, tuple[Callable[[], Case], int, int, float]]:
         ),
         "rough ball, sky": (lambda: replace(simple, boundary="rough", roughness=0.3), 2048, 2048, 0.01),
         "rough ball, lamp": (
-            lambda: replace(simple, boundary="rough", roughness=0.3, lit_by="lamp"),
+            lambda: replace(simple, boundary="rough", roughness=0.1, lit_by="lamp"),
             8192,
             8192,
             0.02,

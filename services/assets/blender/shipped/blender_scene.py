@@ -228,6 +228,11 @@ def notes(asset: Any, look: Any) -> list[str]:
             " 7), and 18 to 37 % under a lamp from the front. A lamp without size does not shine through glass: use"
             " --sky."
         )
+    if asset.rig["boundary"] == "rough" and look.surface == "glass":
+        told.append(
+            "Cycles' facets hide each other less than those of the fit: light out of the tooth is 0.6, 8 and 29 % too"
+            " bright under a lamp at a GGX alpha of 0.1, 0.3 and 0.6; under a sky 0.8 % at 0.3."
+        )
     if look.subsurface:
         told.append("Front light, distant shots: subsurface scattering with the dentin's values stands for the media.")
     if not asset.one_phase and not look.subsurface:
