@@ -144,6 +144,7 @@ def write_asset(
             scene = nested_scene(
                 files, tissue, shown, position, intensity, boundary=boundary, ior=ior, samples=samples, stains=stained,
                 roughness=DEFAULT_ROUGHNESS if rough is None else rough.roughness.value,
+                compensated=rough is not None and rough.multiple_scattering,
             )  # fmt: skip
         scenes[channel] = scene | _large_cameras(shown, samples) | {"integrator": shell_integrator()}
         write_scene(folder / f"scene_{channel}.xml", scenes[channel])

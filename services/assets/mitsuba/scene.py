@@ -119,23 +119,29 @@ def shell_integrator() -> SceneDict:
 
 
 def boundary_dict(
-    boundary: Boundary, ior: float, stain: Path | None = None, roughness: float = DEFAULT_ROUGHNESS
+    boundary: Boundary,
+    ior: float,
+    stain: Path | None = None,
+    roughness: float = DEFAULT_ROUGHNESS,
+    *,
+    compensated: bool = False,
 ) -> SceneDict:
-    """BSDF of the enamel's surface, as its boundary model names it. That of a rough surface loses the light that meets
-    several of its facets.
+    """BSDF of the enamel's surface, as its boundary model names it.
 
     Args:
         boundary: the boundary model.
         ior: refractive index of the inside relative to the outside.
         stain: picture of the absorbed share of transmitted light, 1 - a_t; without a boundary it becomes a mask before
             black.
-        roughness: GGX roughness of a rough surface.
+        roughness, compensated: of a rough surface, see ``rough_surface``.
     """
+    from services.assets.mitsuba.rough_surface import rough_surface
     from services.transport.boundary.models import MESH_MODELS
-    from services.transport.boundary.rough import Rough
 
     model = chosen("Boundary", boundary, MESH_MODELS)
-    found: SceneDict = Rough.mitsuba(ior, roughness=roughness) if model is Rough else model.mitsuba(ior, stain)
+    if boundary == "rough":
+        return rough_surface(ior, roughness, compensated=compensated)
+    found: SceneDict = model.mitsuba(ior, stain)
     return found
 
 
@@ -162,6 +168,7 @@ def nested_scene(
     boundary: Boundary = "matched",
     ior: float = 1.631,
     roughness: float = DEFAULT_ROUGHNESS,
+    compensated: bool = False,
     samples: Any = 64,
     stains: Mapping[str, Path] = MappingProxyType({}),
 ) -> SceneDict:
@@ -171,7 +178,7 @@ def nested_scene(
     Enamel lies between a tooth's two surfaces, dentin inside the inner one.
 
     Args:
-        roughness: GGX roughness of a rough surface.
+        roughness, compensated: of a rough surface, see ``rough_surface``.
         stains: stain pictures by name of the tooth, as in ``boundary_dict``; the tooth's outer PLY file then has
             texture coordinates.
     """
@@ -180,9 +187,9 @@ def nested_scene(
         scene["medium_dentin"] = medium_dict(tissue.dentin)
     enamel, inner = {"type": "ref", "id": "medium_enamel"}, {"type": "ref", "id": "medium_dentin"}
     for name, (outer, dentin) in teeth.items():
-        scene[f"outer_{name}"] = surface_dict(outer, boundary_dict(boundary, ior, stains.get(name), roughness)) | {
-            "interior": enamel
-        }
+        scene[f"outer_{name}"] = surface_dict(
+            outer, boundary_dict(boundary, ior, stains.get(name), roughness, compensated=compensated)
+        ) | {"interior": enamel}
         if dentin is not None:
             scene[f"dentin_{name}"] = surface_dict(dentin, {"type": "null"}) | {"interior": inner, "exterior": enamel}
     return scene | {f"camera_{camera.name}": sensor_dict(camera, samples) for camera in cameras}
