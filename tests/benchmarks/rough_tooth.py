@@ -77,6 +77,7 @@ def main() -> None:
     parser.add_argument("--roughness", type=float, default=0.15)
     parser.add_argument("--cameras", type=int, default=3)
     parser.add_argument("--lights", type=int, default=5)
+    parser.add_argument("--held-out", type=int, default=1, help="number of lights that are kept from the fit")
     parser.add_argument("--pixel-mm", type=float, default=1.0)
     parser.add_argument("--samples", type=int, default=8192)
     parser.add_argument("--max-samples", type=int, default=4096)
@@ -88,7 +89,8 @@ def main() -> None:
         capture = Path(folder) / "capture"
         write_phantom(
             capture, cameras=given.cameras, lights=given.lights, pixel_mm=given.pixel_mm, samples=given.samples,
-            renderer="mitsuba", held_out=1, boundary="rough", roughness=given.roughness, multiple_scattering=False,
+            renderer="mitsuba", held_out=given.held_out, boundary="rough", roughness=given.roughness,
+            multiple_scattering=False,
         )  # fmt: skip
         for boundary in given.boundaries.split(","):
             options = {"roughness": given.roughness, "max_samples": given.max_samples}
