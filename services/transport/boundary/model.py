@@ -80,6 +80,12 @@ class Boundary(Protocol):
 class BendingBoundary(Boundary, Protocol):
     """A model whose faces change the direction of light that crosses them."""
 
+    ior: mi.Float
+    roughness: mi.Float
+
+    def aims(self, lights: int) -> bool:
+        """Whether images under so many lights cost less with connections that are aimed from scattering vertices."""
+
     def towards(self, omega: mi.Vector3f, normal: mi.Vector3f, direction: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
         """What a walk along ``omega`` that meets a face receives from a light in
         ``direction`` outside, over the light's irradiance, 1/sr; and the derivative of its logarithm to the roughness.

@@ -74,6 +74,12 @@ class PointLights:
         chosen.total = total
         return chosen
 
+    def seen_from(self, light: mi.UInt32, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
+        """Unit direction to a light, and its intensity over the squared distance."""
+        towards = dr.gather(mi.Point3f, self.positions, light, active) - point
+        inverse = dr.rsqrt(dr.squared_norm(towards))
+        return mi.Vector3f(towards * inverse), dr.gather(mi.Float, self.intensities, light, active) * dr.square(inverse)
+
 
 @dataclass
 class ChosenLight:

@@ -16,10 +16,12 @@ import mitsuba as mi
 from services.transport.boundary.model import Boundary
 from services.transport.lighting.light_maps import LightView
 from services.transport.lighting.lights import DARKEST_CHANCE, ROULETTE_GAIN, PointLights, shadow
-from services.transport.paths.scores import Plan, Scatterings, Scores
+from services.transport.paths.scores import Plan, Scores
 from services.transport.paths.stain_tally import StainTally
 from services.transport.paths.tally import Tally
-from services.transport.scene.geometry import Geometry
+from services.transport.paths.vertex import Facing, Vertex
+from services.transport.paths.walker import Flight, Walker
+from services.transport.scene.geometry import Geometry, facing
 from services.transport.scene.media import Media, PhaseFunction
 from services.transport.scene.stain_textures import FaceCrossing
 
@@ -32,50 +34,6 @@ unchecked."""
 FAINTEST = 1e-20
 """Contribution of a vertex, as a share of the lights' mean irradiance, below which it is not worth a shadow ray: it is
 below float32 resolution of any sum, and deep in a dense medium the quotient of such numbers is 0 / 0 in float32."""
-
-
-@dataclass
-class Facing:
-    """An outer face that bends light, at the vertex from which a path connects through it."""
-
-    normal: mi.Vector3f
-    """Outward unit normal."""
-    primitive: mi.UInt32
-    """Number of the triangle."""
-
-
-@dataclass
-class Vertex:
-    """One scattering vertex of each lane, kept by reservoir sampling, with all the scores that its path had there."""
-
-    point: mi.Point3f
-    omega: mi.Vector3f
-    """Propagation direction of the path before the vertex scatters it."""
-    enclosure: mi.UInt32
-    throughput: mi.Float
-    """Throughput of the path, albedos included."""
-    max_transmittance: mi.Float
-    """Transmittance over the distance in which no surface lies: an upper bound of the transmittance to any light."""
-    scatterings: Scatterings
-    sums: list[mi.Float]
-    border_sums: list[mi.Float]
-    secondary: list[mi.Bool]
-    """Whether the path is a border crossing's secondary walk; empty unless shape derivatives are computed."""
-    shape_factor: list[mi.Float]
-    wall: list[mi.Bool]
-    """Whether the vertex lies on an opaque surface, whose normal ``omega`` then is; empty in scenes without such
-    surfaces."""
-    facing: list[Facing]
-    """The outer face that the vertex lies on; empty unless that face bends light."""
-    stains: list[FaceCrossing]
-    """One of the stained faces that the path crossed; empty unless stain derivatives are computed."""
-    total: mi.Float
-    """Sum of ``throughput * max_transmittance`` over the vertices offered; 0 when there was none."""
-
-    @property
-    def primary(self) -> mi.Bool:
-        """Lanes whose path is not a secondary walk."""
-        return ~self.secondary[0] if self.secondary else mi.Bool(True)
 
 
 @dataclass
@@ -126,10 +84,24 @@ class Connections:
         return Vertex(
             mi.Point3f(0), mi.Vector3f(0, 0, 1), mi.UInt32(0), mi.Float(0), mi.Float(1), self.scores.unscattered(),
             zeros(len(self.plan.scores)), zeros(self.modes), [mi.Bool(False)] * (self.plan.shape is not None),
-            zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque,
-            [Facing(mi.Vector3f(0, 0, 1), mi.UInt32(0)) for _ in range(self.boundary.bends)],
+            zeros(self.modes), [mi.Bool(False)] * self.geometry.opaque, self._no_facing(),
             [FaceCrossing.none(mi.Float(0))] * self.plan.stains, mi.Float(0),
         )  # fmt: skip
+
+    def _no_facing(self) -> list[Facing]:
+        return []
+
+    def found(self, walker: Walker, flight: Flight, throughput: mi.Float) -> tuple[Vertex, mi.Bool]:
+        """The vertex of walks that have just moved, and the lanes that offer it."""
+        bound = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
+        omega, wall = walker.omega, []
+        if self.geometry.opaque:
+            omega, wall = dr.select(flight.bounces, facing(omega, flight.hit), omega), [flight.bounces]
+        vertex = Vertex(
+            walker.origin, omega, walker.enclosure, throughput, bound, walker.scatterings, walker.sums,
+            walker.border_sums, walker.secondary, walker.shape_factor, wall, [], walker.stains, mi.Float(0),
+        )  # fmt: skip
+        return vertex, flight.scatters | flight.bounces
 
     def offer(self, reservoir: Vertex, found: Vertex, u: mi.Float, active: mi.Bool) -> Vertex:
         """Offer ``found`` to ``reservoir``, with a uniform random number ``u``; ``found.total`` is ignored."""
@@ -143,6 +115,7 @@ class Connections:
         """Add the contributions of all lights at the kept vertex to the tally; returns the advanced generator."""
 
         def to_lights(vertex: Vertex, row: mi.UInt32, rng: mi.PCG32, active: mi.Bool) -> mi.PCG32:
+            vertex = self._prepared(vertex, active)
             check, rng = self._connect_by_maps(vertex, row, rng, active, tally)
 
             # Correct the maps' transmittance to one light by a shadow ray, cast with a probability proportional to the
@@ -214,6 +187,10 @@ class Connections:
         return dr.if_stmt(
             (vertex, row, rng, active), active, to_lights, lambda _v, _l, rng, _a: rng, label="connection"
         )
+
+    def _prepared(self, vertex: Vertex, active: mi.Bool) -> Vertex:  # noqa: ARG002 - some connections need the mask
+        """The vertex with what all its connections have in common."""
+        return vertex
 
     def _connect_by_maps(
         self, vertex: Vertex, row: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally

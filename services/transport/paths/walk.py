@@ -12,16 +12,18 @@ import mitsuba as mi
 from services.transport.boundary.model import Boundary, FlatBoundary
 from services.transport.lighting.lights import PointLights, shadow
 from services.transport.optics.free_flight import minus_log1m, one_minus_exp
-from services.transport.paths.connections import Connections, Vertex
+from services.transport.paths.aimed_connections import AimedConnections
+from services.transport.paths.connections import Connections
 from services.transport.paths.exit_connections import ExitConnections
 from services.transport.paths.exits import Exits
 from services.transport.paths.rows import Rows
 from services.transport.paths.scores import Plan, Scores
 from services.transport.paths.starts import CameraStart, LightStart, SlabStart, no_stream
 from services.transport.paths.tally import Tally
+from services.transport.paths.vertex import Leg
 from services.transport.paths.walker import Arrival, Flight, Walker
 from services.transport.scene.border import BorderScattering, inverse_cosine, no_crossing, offer
-from services.transport.scene.geometry import Geometry, SlabGeometry
+from services.transport.scene.geometry import Geometry, SlabGeometry, facing
 from services.transport.scene.media import Media, PhaseFunction
 from services.transport.scene.stain_textures import FaceCrossing
 
@@ -46,9 +48,12 @@ class Walk:
         media.two_lobes |= any(score.field == "beta" for score in plan.scores)
         self.scores = Scores(plan, media)
         self.connections: Connections | None = None
+        self.aiming: list[AimedConnections] = []
         if lights is not None:
             kind = ExitConnections if boundary.bends else Connections
             self.connections = kind(geometry, media, lights, plan, self.scores, boundary)
+            if isinstance(self.connections, ExitConnections) and self.connections.aims:
+                self.aiming = [AimedConnections(geometry, media, lights, plan, self.scores, boundary)]
         self.modes = 0 if plan.shape is None else geometry.modes_of[plan.shape]
         self.limited = int(plan.most_steps is not None)
         self.slots = 2 + self.limited if lights is None else lights.count * max(len(plan.order_edges) - 1, 1)
@@ -92,6 +97,8 @@ class Walk:
             border_crossing=[no_crossing(self.modes)] * (self.plan.shape is not None),
             stains=[FaceCrossing.none(mi.Float(0)) for _ in range(self.plan.stains)],
             vertex=None if self.connections is None else self.connections.no_vertex(),
+            aimed=[aiming.no_vertex() for aiming in self.aiming],
+            leg=[Leg.none() for _ in self.aiming],
             connection_step=mi.UInt32(0 if self.connections is None else self.connections.period - 1),
             secondary=[mi.Bool(False)] * (self.plan.shape is not None),
             shape_factor=zeros(self.modes),
@@ -242,29 +249,20 @@ class Walk:
         walker.scatterings = self.scores.scatter(walker.scatterings, scattered_in, flight.scatters | flight.bounces)
 
     def _connect(self, walker: Walker, flight: Flight, before: mi.UInt64, tally: Tally) -> None:
-        assert self.connections is not None
-        assert walker.vertex is not None
-        if isinstance(self.connections, ExitConnections):
-            found = self.connections.exit_of(walker, flight, self.geometry)
-            self._offer(walker, found, flight.arrival[0].connects, before, tally)
-            return
-        bound = dr.exp(-flight.sigma * dr.maximum(self.geometry.clearance(walker.origin, flight.scatters), 0))
-        omega, wall = walker.omega, []
-        if self.geometry.opaque:
-            omega, wall = dr.select(flight.bounces, self._facing(walker, flight), omega), [flight.bounces]
-        found = Vertex(
-            walker.origin, omega, walker.enclosure, self._throughput(walker), bound, walker.scatterings, walker.sums,
-            walker.border_sums, walker.secondary, walker.shape_factor, wall, [], walker.stains, mi.Float(0),
-        )  # fmt: skip
-        self._offer(walker, found, flight.scatters | flight.bounces, before, tally)
-
-    def _offer(self, walker: Walker, found: Vertex, offered: mi.Bool, before: mi.UInt64, tally: Tally) -> None:
-        """Offer a vertex to the lane's reservoir, and connect what it holds where that is due."""
-        assert self.connections is not None
-        assert walker.vertex is not None
-        walker.vertex = self.connections.offer(walker.vertex, found, walker.rng.next_float32(), offered)
+        """Offer vertices to the lane's reservoirs, and connect what these hold where that is due."""
+        assert self.connections is not None and walker.vertex is not None  # noqa: PT018
+        throughput, rng = self._throughput(walker), walker.rng
+        vertex, offered = self.connections.found(walker, flight, throughput)
+        walker.vertex = self.connections.offer(walker.vertex, vertex, rng.next_float32(), offered)
+        for aiming in self.aiming:
+            vertex, offered = aiming.found(walker, flight, throughput)
+            walker.aimed = [aiming.offer(walker.aimed[0], vertex, rng.next_float32(), offered)]
         self._keep_stream(walker, before)
         walker.connection_step += 1
+        for aiming in self.aiming:
+            due = walker.working & (walker.connection_step % aiming.period == 0) & (walker.aimed[0].total > 0)
+            walker.rng = aiming.connect(walker.aimed[0], walker.row, walker.rng, due, tally)
+            walker.aimed[0].total = dr.select(due, 0, walker.aimed[0].total)
         due = walker.working & (walker.connection_step == self.connections.period) & (walker.vertex.total > 0)
         walker.rng = self.connections.connect(walker.vertex, walker.row, walker.rng, due, tally)
         walker.vertex.total = dr.select(due, 0, walker.vertex.total)
@@ -280,15 +278,15 @@ class Walk:
         )
         walker.sums = self.scores.boundary(walker.sums, flight.roughness_score)
         if self.geometry.opaque:
-            diffuse = mi.Frame3f(self._facing(walker, flight)).to_world(
+            diffuse = mi.Frame3f(facing(walker.omega, flight.hit)).to_world(
                 mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
             )
             walker.omega = dr.select(flight.bounces, diffuse, walker.omega)
+        if walker.leg:
+            turns = flight.scatters | (flight.meets & flight.hit.outer)
+            leg = Leg(walker.origin, walker.omega, flight.medium, flight.scatters)
+            walker.leg = [dr.select(turns, leg, walker.leg[0])]
         walker.omega = dr.select(flight.scatters, onward, walker.omega)
-
-    def _facing(self, walker: Walker, flight: Flight) -> mi.Vector3f:
-        """The surface's normal on the side that the walker came from."""
-        return -dr.mulsign(mi.Vector3f(flight.hit.normal), dr.dot(walker.omega, flight.hit.normal))
 
     def _end(self, walker: Walker, flight: Flight) -> mi.Bool:
         # Let faded paths survive in proportion to their throughput; end those that met nothing.
@@ -390,6 +388,8 @@ class Walk:
             walker.border_sums = [mi.Float(0) for _ in walker.border_sums]
             for crossing in walker.border_crossing:
                 crossing.total = mi.Float(0)
+            for leg in walker.leg:
+                leg.scattered = mi.Bool(False)
             walker.stains = [FaceCrossing.none(walker.rng.next_float32()) for _ in walker.stains]
             walker.secondary = [mi.Bool(False) for _ in walker.secondary]
             walker.active = walker.working & (walker.sample < rows.samples)

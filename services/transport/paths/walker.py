@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import mitsuba as mi
 
-from services.transport.paths.connections import Vertex
 from services.transport.paths.scores import Scatterings
+from services.transport.paths.vertex import Leg, Vertex
 from services.transport.scene.border import Crossing
 from services.transport.scene.geometry import Hit
 from services.transport.scene.stain_textures import FaceCrossing
@@ -40,6 +40,10 @@ class Walker:
     """One of the stained faces crossed; empty unless stain derivatives are computed."""
     vertex: Vertex | None
     """Scattering vertex that waits for its connection to the lights."""
+    aimed: list[Vertex]
+    """Scattering vertex that waits for its connection aimed through the nearest face; empty unless there are any."""
+    leg: list[Leg]
+    """The flight under way; empty likewise."""
     connection_step: mi.UInt32
     """Steps since the last connection."""
     secondary: list[mi.Bool]

@@ -45,6 +45,11 @@ class Hit:
     """Barycentric weights of the triangle's second and third corner."""
 
 
+def facing(omega: mi.Vector3f, hit: Hit) -> mi.Vector3f:
+    """The normal of a surface on the side from which ``omega`` comes."""
+    return -dr.mulsign(mi.Vector3f(hit.normal), dr.dot(omega, hit.normal))
+
+
 class Geometry(Protocol):
     """Interface of a geometry of nested media."""
 

@@ -7,6 +7,8 @@ surface n bounds, so solids may overlap. Code for features that a scene lacks is
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -20,6 +22,7 @@ from services.transport.scene.clearance import Clearance
 from services.transport.scene.geometry import RAY_EPSILON, Hit
 from services.transport.scene.mitsuba_mesh import move_vertices, new_mesh
 from services.transport.scene.names import media_numbers
+from services.transport.scene.nearest_face import NearestFace
 from services.transport.scene.nesting import require_nested
 from services.transport.scene.recipe import SceneRecipe
 from services.transport.scene.stain_textures import StainTextures
@@ -169,6 +172,14 @@ class MeshGeometry:
     def clearance(self, point: mi.Point3f, active: mi.Bool) -> mi.Float:
         """Distance in mm within which no surface lies; not positive where that is not known."""
         return self._clearance(point, active)
+
+    def nearest_face(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
+        """Outward normal of the nearest part of a single tooth's outer face, and the depth below it in mm."""
+        return self._nearest_face(point, active)
+
+    @cached_property
+    def _nearest_face(self) -> NearestFace:
+        return NearestFace(self.recipe.teeth[0].outer)
 
     def inside(self, enclosure: mi.UInt32) -> mi.UInt32:
         """Number of the tooth whose tissue fills an enclosure; the number of teeth for gums, and one more outside of

@@ -1,0 +1,96 @@
+"""A grid that tells for every place in a solid which way its surface is nearest: a normal, and the depth below it.
+
+Connections aim through that part of the surface (``paths.aimed_connections``). They need no exact answer, but every
+question at one place must have the same one.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+
+from services.core.geometry import Mesh
+
+CELL_MM = 0.2
+"""Smallest size of a grid cell, mm."""
+MAX_CELLS = 1_000_000
+"""Largest number of grid cells; larger scenes have larger cells."""
+SPACING_MM = 0.2
+"""Largest distance between samples of the surface, mm."""
+MAX_BEND = 0.7
+"""Cosine of the angle between neighbouring faces below which a normal is not smoothed over their common edge."""
+
+
+class NearestFace:
+    """Smoothed normal of the nearest part of a closed surface, and the depth below the plane through that part."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        from scipy.spatial import cKDTree
+
+        low, extent = mesh.vertices_mm.min(axis=0), np.ptp(mesh.vertices_mm, axis=0)
+        self._cell_mm = max(CELL_MM, float(np.cbrt(extent.prod() / MAX_CELLS)))
+        self._shape = np.ceil(extent / self._cell_mm).astype(int) + 1
+        points, owners = _samples(mesh, SPACING_MM * self._cell_mm / CELL_MM)
+
+        # Measure in the cells next to the surface; all others take over the answer of the nearest of these.
+        near = np.zeros(self._shape, dtype=bool)
+        near[tuple(np.floor((points - low) / self._cell_mm).astype(int).T)] = True
+        near = ndimage.binary_dilation(near, iterations=2)
+        places = np.stack(np.nonzero(near), axis=1)
+        found = np.zeros(near.shape, dtype=np.int64)
+        found[near] = cKDTree(points).query(low + self._cell_mm * (places + 0.5))[1]
+        source = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)
+        sample = found[tuple(source)].reshape(-1)
+        normals = _smoothed_normals(mesh)[owners]
+        offsets = np.einsum("nk,nk->n", normals, points)
+        columns = np.concatenate([normals, offsets[:, None]], axis=1)[sample]
+        self._table = mi.Float(columns.astype(np.float32).reshape(-1))
+        self._low = dr.opaque(mi.Point3f, low.tolist())
+        dr.eval(self._table)
+
+    def __call__(self, point: mi.Point3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Float]:
+        """Outward unit normal, and depth in mm, not negative."""
+        place = mi.Point3f(point - self._low) * (1 / self._cell_mm)
+        x, y, z = (mi.UInt32(dr.clip(place[k], 0, int(self._shape[k]) - 1)) for k in range(3))
+        cell = (x * int(self._shape[1]) + y) * int(self._shape[2]) + z
+        plane = dr.gather(mi.Vector4f, self._table, cell, active)
+        normal = mi.Vector3f(plane.x, plane.y, plane.z)
+        return normal, dr.maximum(plane.w - dr.dot(normal, mi.Vector3f(point)), 0)
+
+
+def _samples(mesh: Mesh, spacing_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points (S, 3) of a regular lattice in each triangle, and their triangles (S,)."""
+    corners = mesh.vertices_mm[mesh.faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
+    parts = np.maximum(1, np.ceil(longest / spacing_mm)).astype(int)
+    points, owners = [], []
+    for count in np.unique(parts):
+        chosen = np.flatnonzero(parts == count)
+        i, j = (index.reshape(-1) for index in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
+        kept = i + j < count
+        u, v = (i[kept] + 1 / 3) / count, (j[kept] + 1 / 3) / count
+        weights = np.stack([1 - u - v, u, v], axis=-1)
+        points.append(np.einsum("sk,fkx->fsx", weights, corners[chosen]).reshape(-1, 3))
+        owners.append(np.repeat(chosen, len(u)))
+    return np.concatenate(points), np.concatenate(owners)
+
+
+def _smoothed_normals(mesh: Mesh) -> NDArray[np.float64]:
+    """Unit normals (F, 3) of faces, averaged by area with those neighbours that do not bend away much."""
+    corners = mesh.vertices_mm[mesh.faces]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-30)
+    count = len(mesh.faces)
+    touches = sparse.csr_matrix(
+        (np.ones(3 * count), (np.repeat(np.arange(count), 3), mesh.faces.reshape(-1))),
+        shape=(count, len(mesh.vertices_mm)),
+    )
+    pairs = (touches @ touches.T).tocoo()
+    alike = np.einsum("nk,nk->n", normals[pairs.row], normals[pairs.col]) > MAX_BEND
+    neighbours = sparse.csr_matrix((alike[alike], (pairs.row[alike], pairs.col[alike])), shape=(count, count))
+    total = neighbours @ areas
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray(np.where(length > 0, total / np.maximum(length, 1e-30), normals))
