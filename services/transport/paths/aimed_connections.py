@@ -17,23 +17,28 @@ from services.transport.boundary import aiming
 from services.transport.boundary.model import BendingBoundary, Boundary
 from services.transport.lighting.light_maps import DARK_DEPTH
 from services.transport.lighting.lights import PointLights, shadow
-from services.transport.optics import fresnel
+from services.transport.optics import fresnel, phase
 from services.transport.paths.connections import FAINTEST, Connections
 from services.transport.paths.exit_connections import WALKS_PER_AIM, aim_of, aimed_share
 from services.transport.paths.scores import Plan, Scores
 from services.transport.paths.tally import Tally
 from services.transport.paths.vertex import Aim, Vertex
+from services.transport.paths.walker import Flight, Walker
 from services.transport.scene.geometry import DENTIN, Geometry
 from services.transport.scene.media import Media
 from services.transport.scene.mesh_geometry import MeshGeometry
 
-STEPS_PER_AIM = 4
+STEPS_PER_AIM = 8
 """Steps of the walk per connection; it divides those of ``exit_connections``."""
 ROULETTE_GAIN = 2.0
 DARKEST_CHANCE = 0.03
 """A direction is followed with probability clip(``ROULETTE_GAIN`` x expected contribution, ``DARKEST_CHANCE``, 1)."""
 UNEXPECTED = 0.005
 """Share of the largest possible contribution with which lights are drawn that the nearest face does not promise."""
+BLUNTED = 0.6
+"""Factor of a mean cosine, by which a lobe is widened to stand for light from many directions."""
+MAX_DEPTH = 30.0
+"""Largest optical depth that decides which vertex is kept."""
 CLEARANCE_ERROR_MM = 0.1
 """Usual distance in mm by which the clearance falls short of the distance to the next surface."""
 
@@ -101,6 +106,19 @@ class AimedConnections(Connections):
         self.faces, self.mesh = boundary, geometry
         self.period = STEPS_PER_AIM
 
+    def found(self, walker: Walker, flight: Flight, throughput: mi.Float) -> tuple[Vertex, mi.Bool]:
+        """Scattering vertices; they are kept in proportion to what may come through the nearest face, which is more
+        where they scatter towards it.
+        """
+        vertex, offered = super().found(walker, flight, throughput)
+        normal, depth_mm = self.mesh.nearest_face(vertex.point, offered)
+        medium = self._medium(vertex)
+        depth = self._optical_depth(self._lengths(vertex, depth_mm, offered))
+        g = BLUNTED * self.media.pick(self.media.g1, medium)
+        towards = phase.density(g, phase.deviation(g, vertex.omega, normal))
+        bound = dr.exp(-dr.minimum(depth, MAX_DEPTH)) * towards
+        return replace(vertex, max_transmittance=bound), offered
+
     def connect(self, vertex: Vertex, row: mi.UInt32, rng: mi.PCG32, active: mi.Bool, tally: Tally) -> mi.PCG32:
         """Add the contributions of all lights at the kept vertex to the tally; returns the advanced generator."""
 
@@ -132,13 +150,20 @@ class AimedConnections(Connections):
     def _place(self, vertex: Vertex, active: mi.Bool) -> Place:
         aim = aim_of(self, vertex.point, active)
         _, depth_mm = self.mesh.nearest_face(vertex.point, active)
-        medium = self._medium(vertex)
-        # Above dentin lies enamel, and the next surface is the border.
+        lengths = self._lengths(vertex, depth_mm, active)
+        floor = UNEXPECTED * vertex.max_transmittance
+        return Place(aim, lengths, self._optical_depth(lengths), floor)
+
+    def _lengths(self, vertex: Vertex, depth_mm: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        """Length in mm in each medium from a vertex to the nearest face: above dentin lies enamel, and the next surface
+        is the border.
+        """
         to_border = dr.maximum(self.geometry.clearance(vertex.point, active), 0) + CLEARANCE_ERROR_MM
-        below = dr.select(medium == DENTIN, dr.minimum(to_border, depth_mm), 0)
-        lengths = [depth_mm - below, below][: self.media.count]
-        depth = sum((s * length for s, length in zip(self.media.sigma, lengths, strict=True)), start=mi.Float(0))
-        return Place(aim, lengths, depth, UNEXPECTED * dr.inv_four_pi * vertex.max_transmittance)
+        below = dr.select(self._medium(vertex) == DENTIN, dr.minimum(to_border, depth_mm), 0)
+        return [depth_mm - below, below][: self.media.count]
+
+    def _optical_depth(self, lengths_mm: list[mi.Float]) -> mi.Float:
+        return sum((s * length for s, length in zip(self.media.sigma, lengths_mm, strict=True)), start=mi.Float(0))
 
     def _expected(self, vertex: Vertex, place: Place, direction: mi.Vector3f) -> tuple[mi.Float, mi.Vector3f]:
         """Contribution over the throughput and the light's irradiance that a smooth plane promises, 1/sr, and the
@@ -147,10 +172,10 @@ class AimedConnections(Connections):
         outside = dr.dot(direction, place.aim.normal)
         inside = aiming.bent(direction, place.aim.normal, self.faces.ior)
         cosine = dr.dot(inside, place.aim.normal)
-        phase = self._density(vertex, inside)
+        scattered = self._density(vertex, inside)
         through = (1 - fresnel.reflectance(dr.clip(outside, 0, 1), self.faces.ior)) / dr.square(self.faces.ior)
-        share = dr.rcp(1 + WALKS_PER_AIM * dr.square(place.aim.roughness) * phase)
-        promised = phase * dr.exp(-place.depth / cosine) * through * outside / cosine * share
+        share = dr.rcp(1 + WALKS_PER_AIM * dr.square(place.aim.roughness) * scattered)
+        promised = scattered * dr.exp(-place.depth / cosine) * through * outside / cosine * share
         return dr.select(outside > aiming.LOWEST, promised, 0), inside
 
     def _choose(
@@ -232,10 +257,10 @@ class AimedConnections(Connections):
         drawn = aiming.density(omega, lifted, aim.normal, ior, aim.roughness)
         flown = self._fly(vertex, omega, active)
         view = self.lights.maps.look_up(target.light, flown.point, flown.primitive, flown.arrives)
-        phase = self._density(vertex, omega)
+        scattered = self._density(vertex, omega)
         passed, score = self.faces.towards(omega, flown.normal, view.direction)
-        share = aimed_share(replace(aim, walks=WALKS_PER_AIM * phase), omega, view.direction, ior)
-        value = target.throughput * inverse * phase * dr.exp(-flown.depth) * flown.stain * passed * view.falloff
+        share = aimed_share(replace(aim, walks=WALKS_PER_AIM * scattered), omega, view.direction, ior)
+        value = target.throughput * inverse * scattered * dr.exp(-flown.depth) * flown.stain * passed * view.falloff
         value = dr.select(flown.arrives & (drawn > 0), value * share / dr.maximum(drawn, 1e-30), 0)
         unknown = flown.arrives & ~view.certain & (value > 0)
 
