@@ -1,5 +1,5 @@
 """Images of rough dielectric surfaces by stock Mitsuba, stored because they take minutes;
-``python -m tests.support.rough_truths`` renders them anew: two balls, and the micro-CT incisor where it is shared.
+``python -m tests.support.rough_truths`` renders them anew: three balls, and the micro-CT incisor where it is shared.
 
 Each image is ``prbvolpath``'s, less the image of the same surface around black ink: what is left has come out of the
 object, as an engine without highlights shows it.
@@ -35,10 +35,13 @@ TISSUE = Tissue(Medium(2.0, 0.995, g1=0.3), Medium(2.0, 0.995, g1=0.3))
 INCISOR_TISSUE = Tissue(Medium(6.0, 0.99, g1=0.8), Medium(11.0, 0.98, g1=0.7))
 INK = Tissue(Medium(1e4, 1e-6), Medium(1e4, 1e-6))
 CASES = ((0.15, 1.63), (0.3, 1.33))
-"""Roughness and index of refraction of the balls. Smoother ones have images with rare bright paths."""
+"""Roughness and index of refraction of the balls."""
+NARROW_CASE = (0.05, 1.63)
+"""The same of a ball whose images have rare bright paths in stock Mitsuba, so that they take many more."""
 INCISOR_CASE = (0.3, 1.63)
 LIGHTS = LIGHTS_MM[[1, 3]]
 SAMPLES = 4096
+NARROW_SAMPLES = 65_536
 INCISOR_SAMPLES = 49_152
 COARSER = 4
 """Pixels of the incisor's view in one pixel here, along each edge: 0.5 mm become 2 mm."""
@@ -69,7 +72,8 @@ def view() -> View:
 
 def ball(roughness: float, ior: float) -> RoughTruth:
     """A ball of milk."""
-    return RoughTruth(f"ball-{roughness}", scene_recipe(roughness, ior), TISSUE, view(), SAMPLES)
+    samples = NARROW_SAMPLES if (roughness, ior) == NARROW_CASE else SAMPLES
+    return RoughTruth(f"ball-{roughness}", scene_recipe(roughness, ior), TISSUE, view(), samples)
 
 
 def incisor() -> RoughTruth:
@@ -124,7 +128,7 @@ def images(truth: RoughTruth) -> tuple[NDArray[np.float64], NDArray[np.float64]]
 
 if __name__ == "__main__":
     arrays: dict[str, Any] = {}
-    for truth in (*(ball(*case) for case in CASES), incisor()):
+    for truth in (*(ball(*case) for case in (*CASES, NARROW_CASE)), incisor()):
         mean, variance = images(truth)
         arrays |= {f"mean/{truth.name}": mean.astype(np.float32), f"variance/{truth.name}": variance.astype(np.float32)}
         sys.stderr.write(f"{truth.name}: {np.sqrt(variance.sum()) / mean.sum():.2%}\n")
