@@ -32,9 +32,9 @@ STEPS_BESIDE_AIMED = 16
 """The same where connections are aimed too, which then find most of the light."""
 WALKS_PER_AIM = 4.0
 """Weight of a walk over that of an aimed connection in the balance heuristic."""
-WIDENING_PER_MM = 0.15
-"""Roughness per mm of depth by which the face's own is widened where connections are aimed, because the face bends away
-from its nearest normal."""
+WIDENING, WIDENING_PER_MM = 0.05, 0.3
+"""Roughnesses, the latter per mm of depth, by which the face's own is widened where connections are aimed, because
+facets of a mesh differ from the smoothed normal, and the face bends away from it."""
 
 
 class ExitConnections(Connections):
@@ -102,8 +102,8 @@ def aim_of(connections: Connections, point: mi.Point3f, active: mi.Bool) -> Aim:
     assert isinstance(connections.geometry, MeshGeometry)
     assert isinstance(connections.boundary, BendingBoundary)
     normal, depth = connections.geometry.nearest_face(point, active)
-    roughness = dr.sqrt(dr.square(connections.boundary.roughness) + dr.square(WIDENING_PER_MM * depth))
-    return Aim(normal, dr.minimum(roughness, 1), mi.Float(0))
+    widened = dr.square(connections.boundary.roughness) + WIDENING**2 + dr.square(WIDENING_PER_MM * depth)
+    return Aim(normal, dr.sqrt(dr.minimum(widened, 1)), mi.Float(0))
 
 
 def aimed_share(aim: Aim, omega: mi.Vector3f, direction: mi.Vector3f, ior: mi.Float) -> mi.Float:

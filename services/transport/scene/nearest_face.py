@@ -14,11 +14,11 @@ from scipy import ndimage, sparse
 
 from services.core.geometry import Mesh
 
-CELL_MM = 0.2
+CELL_MM = 0.15
 """Smallest size of a grid cell, mm."""
-MAX_CELLS = 1_000_000
+MAX_CELLS = 2_000_000
 """Largest number of grid cells; larger scenes have larger cells."""
-SPACING_MM = 0.2
+SPACING_MM = 0.15
 """Largest distance between samples of the surface, mm."""
 MAX_BEND = 0.7
 """Cosine of the angle between neighbouring faces below which a normal is not smoothed over their common edge."""
