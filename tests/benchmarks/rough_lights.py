@@ -46,8 +46,8 @@ NAMES = ("enamel.sigma", "enamel.alpha", "enamel.g1", "dentin.sigma", "dentin.al
 PEER_LIGHTS = 4
 MAX_HIGHLIGHT = 0.01
 """Largest share of a pixel's light that the surface may mirror for the pixel to count."""
-HIGHLIGHT_SAMPLES = 512
-FIRST_SAMPLES = 256
+HIGHLIGHT_SAMPLES = 64
+FIRST_SAMPLES = 64
 """Paths per pixel of the first render of stock Mitsuba, whose time tells how many the stated seconds allow."""
 
 

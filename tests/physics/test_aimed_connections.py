@@ -19,6 +19,7 @@ from services.transport.platform import prepare_device
 from services.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, ellipsoid, sphere, whole_view
+from tests.support.stained_tooth import stain, texture_coordinates
 from tests.support.z_scores import require_unbiased, student_to_normal
 
 LAYERED = Tissue(Medium(4.0, 0.99, 0.9, 0.7, -0.2), Medium(8.0, 0.98, g1=0.6))
@@ -75,6 +76,34 @@ def test_they_give_the_derivatives_of_walks_alone(monkeypatch: pytest.MonkeyPatc
     require_unbiased(z, independent=len(NAMES))
     # Each derivative is far from zero under some light.
     assert np.max(np.abs(plain.jacobian.sum(axis=2)) / error, axis=1).min() > 2
+
+
+def test_they_see_stains_and_count_scatterings_by_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = whole_view(camera_at((0.5, 1, 0.3), size=4))
+    (tooth,) = recipe(0.3).teeth
+    scene = replace(recipe(0.3), teeth=(replace(tooth, stain_uv=texture_coordinates()[tooth.outer.faces]),))
+    tissue, edges = replace(CLEAR, stain=stain()), np.array([0, 2, 1000])
+
+    def totals(seed: int, samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        engine = Engine(scene, 2)
+        stained = engine.images(tissue, view, samples=samples, seed=seed, batches=BATCHES)
+        orders = [
+            engine.order_images(CLEAR, view, bin_edges=edges, samples=samples // 8, seed=seed + k)[0] for k in range(8)
+        ]
+        one = np.stack([order.sum() for order in orders])
+        return (
+            np.append(stained.mean.sum(axis=1), one.mean()),
+            np.append(stained.variance.sum(axis=1), one.var(ddof=1) / 8),
+        )
+
+    aimed = totals(1, 4096)
+    by_walks_alone(monkeypatch)
+    plain = totals(11, 16384)
+    z = (aimed[0] - plain[0]) / np.sqrt(aimed[1] + plain[1])
+    # Student's t of few batches exceeds 5 about once in 1,000.
+    assert np.abs(z).max() < 5
+    # A stain is crossed twice and lets half of the light through, so that one crossing left out would be seen.
+    assert (plain[0] / np.sqrt(aimed[1] + plain[1])).min() > 10
 
 
 @pytest.mark.parametrize("cosine", [-0.3, 0.02, 0.2, 0.9])
