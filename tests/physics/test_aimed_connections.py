@@ -18,6 +18,7 @@ from services.transport.optics.parameters import Medium, Tissue
 from services.transport.platform import prepare_device
 from services.transport.scene.recipe import JacobianEstimate, SceneRecipe, StackEstimate, single_tooth
 from tests.support.pictures import BATCHES, pixel_scores, require_same_pictures
+from tests.support.rough_truths import scene_recipe
 from tests.support.small_tooth import INTENSITY, LIGHTS_MM, SEMI_AXES_MM, camera_at, ellipsoid, sphere, whole_view
 from tests.support.stained_tooth import stain, texture_coordinates
 from tests.support.z_scores import require_unbiased, student_to_normal
@@ -76,6 +77,15 @@ def test_they_give_the_derivatives_of_walks_alone(monkeypatch: pytest.MonkeyPatc
     require_unbiased(z, independent=len(NAMES))
     # Each derivative is far from zero under some light.
     assert np.max(np.abs(plain.jacobian.sum(axis=2)) / error, axis=1).min() > 2
+
+
+def test_scenes_of_one_tooth_share_its_grid() -> None:
+    from services.transport.scene.mesh_geometry import MeshGeometry
+
+    prepare_device()
+    one, other, ball = (MeshGeometry(scene) for scene in (recipe(0.1), recipe(0.3), scene_recipe(0.1, 1.5)))
+    assert one._nearest_face is other._nearest_face
+    assert one._nearest_face is not ball._nearest_face
 
 
 def test_they_see_stains_and_count_scatterings_by_order(monkeypatch: pytest.MonkeyPatch) -> None:

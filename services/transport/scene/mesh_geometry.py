@@ -22,7 +22,7 @@ from services.transport.scene.clearance import Clearance
 from services.transport.scene.geometry import RAY_EPSILON, Hit
 from services.transport.scene.mitsuba_mesh import move_vertices, new_mesh
 from services.transport.scene.names import media_numbers
-from services.transport.scene.nearest_face import NearestFace
+from services.transport.scene.nearest_face import NearestFace, nearest_face_of
 from services.transport.scene.nesting import require_nested
 from services.transport.scene.recipe import SceneRecipe
 from services.transport.scene.stain_textures import StainTextures
@@ -179,7 +179,7 @@ class MeshGeometry:
 
     @cached_property
     def _nearest_face(self) -> NearestFace:
-        return NearestFace(self.recipe.teeth[0].outer)
+        return nearest_face_of(self.recipe.teeth[0].outer)
 
     def inside(self, enclosure: mi.UInt32) -> mi.UInt32:
         """Number of the tooth whose tissue fills an enclosure; the number of teeth for gums, and one more outside of

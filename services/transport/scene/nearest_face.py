@@ -2,9 +2,14 @@
 
 Connections aim through that part of the surface (``paths.aimed_connections``). They need no exact answer, but every
 question at one place must have the same one.
+
+The scenes of one tooth that a process builds share a grid, which takes most of a second to make.
 """
 
 from __future__ import annotations
+
+from hashlib import blake2b
+from weakref import WeakValueDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +27,20 @@ SPACING_MM = 0.15
 """Largest distance between samples of the surface, mm."""
 MAX_BEND = 0.7
 """Cosine of the angle between neighbouring faces below which a normal is not smoothed over their common edge."""
+
+_held: WeakValueDictionary[bytes, NearestFace] = WeakValueDictionary()
+"""Grids of the scenes that this process holds, by content of the surface."""
+
+
+def nearest_face_of(mesh: Mesh) -> NearestFace:
+    """The grid of a surface, made unless another scene holds it."""
+    content = blake2b(repr((mesh.vertices_mm.shape, mesh.vertices_mm.dtype, mesh.faces.dtype)).encode())
+    for array in (mesh.vertices_mm, mesh.faces):
+        content.update(array.tobytes())
+    found = _held.get(content.digest())
+    if found is None:
+        found = _held[content.digest()] = NearestFace(mesh)
+    return found
 
 
 class NearestFace:
