@@ -65,6 +65,8 @@ class Row:
     ratio: float
     """Efficiency over that of the other method."""
     pairs: int
+    by_light: tuple[float, ...] = ()
+    """The ratio of each of stock Mitsuba's lights alone."""
 
 
 class WalksAlone(Engine):
@@ -128,28 +130,33 @@ def _spread(variances: NDArray[np.float64]) -> float:
     return float(np.exp(np.log(variances.sum(axis=(1, 2))).mean()))
 
 
-def against_stock(lights: int, roughness: float, *, samples: int, stock_seconds: float) -> Iterator[Row]:
+def against_stock(lights: int, roughness: float, *, samples: int, stock_seconds: float, seed: int) -> Iterator[Row]:
     """One row for this engine as it chooses, and one for walks alone."""
     recipe, camera = scene(lights, roughness, compensated=False)
     engines = {"stock": Engine(recipe, 2), "stock, walks alone": WalksAlone(recipe, 2)}
     view = tooth_view(engines["stock"], camera)
     chosen = np.linspace(0, lights - 1, PEER_LIGHTS).astype(int)
-    theirs = [_stock(recipe, camera, view, int(light), stock_seconds) for light in chosen]
-    counts = np.array([highlight for *_, highlight in theirs]) == 0
-    peer_variance = float(np.array([variance for _, variance, _, _ in theirs])[counts].sum())
-    peer_seconds = sum(seconds for *_, seconds, _ in theirs) * lights / PEER_LIGHTS
+    theirs = [_stock(recipe, camera, view, int(light), stock_seconds, seed) for light in chosen]
+    counts = np.array([~highlight for *_, highlight in theirs])
+    spread = np.array([variance for _, variance, _, _ in theirs])
+    peers = np.array([float(one[kept].sum()) for one, kept in zip(spread, counts, strict=True)])
+    scaled = np.array([seconds for *_, seconds, _ in theirs]) * lights
     for what, engine in engines.items():
         engine.images(TISSUE, view, samples=16, seed=1)
         begun = time.process_time()
-        estimate = engine.images(TISSUE, view, samples=samples, seed=2)
+        estimate = engine.images(TISSUE, view, samples=samples, seed=1 + seed)
         seconds = time.process_time() - begun
-        variance, squares = estimate.variance[chosen][counts].sum(), float((estimate.mean[chosen][counts] ** 2).sum())
-        ratio = peer_variance * peer_seconds / (float(variance) * seconds)
-        yield Row(what, lights, roughness, seconds, float(variance) / squares, ratio, 1)
+        ours = np.array([estimate.variance[light][kept].sum() for light, kept in zip(chosen, counts, strict=True)])
+        squares = sum(
+            float((estimate.mean[light][kept] ** 2).sum()) for light, kept in zip(chosen, counts, strict=True)
+        )
+        by_light = tuple((peers * scaled / (ours * seconds)).tolist())
+        ratio = float(peers.sum() * scaled.mean() / (ours.sum() * seconds))
+        yield Row(what, lights, roughness, seconds, float(ours.sum()) / squares, ratio, 1, by_light)
 
 
 def _stock(
-    recipe: SceneRecipe, camera: Camera, view: View, light: int, limit_s: float
+    recipe: SceneRecipe, camera: Camera, view: View, light: int, limit_s: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.bool_]]:
     """Mean, variance, processor time, and whether the surface's mirror image of the light matters, by pixel."""
     prepare_device()
@@ -174,7 +181,7 @@ def _stock(
     render_batches(scenes[0], 0, FIRST_SAMPLES, 3, 1)
     samples = int(FIRST_SAMPLES * limit_s / (time.process_time() - begun)) // 16 * 16
     begun = time.process_time()
-    mean, variance = render_batches(scenes[0], 0, max(samples, 64), 4)
+    mean, variance = render_batches(scenes[0], 0, max(samples, 64), 3 + seed)
     seconds = time.process_time() - begun
     return mean[y, x], variance[y, x], seconds, highlight[y, x] > MAX_HIGHLIGHT * mean[y, x]
 
@@ -187,13 +194,16 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--stock-seconds", type=float, default=0.0, help="processor time for each of stock's lights")
+    parser.add_argument("--seed", type=int, default=1, help="of the comparison with stock")
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
     rows: list[Row] = []
     for lights in map(int, options.lights.split(",")):
         for roughness in map(float, options.roughness.split(",")):
             if options.stock_seconds:
-                found = against_stock(lights, roughness, samples=options.samples, stock_seconds=options.stock_seconds)
+                found = against_stock(
+                    lights, roughness, samples=options.samples, stock_seconds=options.stock_seconds, seed=options.seed
+                )
             else:
                 found = against_walks(lights, roughness, samples=options.samples, pairs=options.pairs)
             for row in found:
