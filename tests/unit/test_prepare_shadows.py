@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.anatomy.shadow_map import is_unoccluded
 from services.preprocess.masking.shadows import shadow_confidence
-from services.preprocess.views.direct_light import expected_irradiance, is_unoccluded
+from services.preprocess.views.direct_light import expected_irradiance
 from services.preprocess.views.projection import Footprint, project
 from tests.support.shadowed_ball import BALL_MM, albedo, ball, before_ball, behind_ball, camera, lights_mm
 

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.anatomy.shadow_map import is_unoccluded
 from services.core.geometry import Camera, Light
 from services.core.records import MaskBit
 from services.core.stage import StageContext
 from services.preprocess.masking.shadows import shadow_confidence
 from services.preprocess.quality.images import assess, write_picture
 from services.preprocess.tasks.attempt_files import AttemptFiles
-from services.preprocess.views.direct_light import expected_irradiance, is_unoccluded
+from services.preprocess.views.direct_light import expected_irradiance
 from services.preprocess.views.projection import Footprint
 from services.preprocess.views.source import Image, Source, View
 from services.preprocess.views.subject import Subject

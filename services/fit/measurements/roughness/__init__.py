@@ -1,0 +1,1 @@
+"""The roughness of a surface, measured by the highlights of photographs."""
