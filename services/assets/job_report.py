@@ -105,6 +105,12 @@ def facts_of_fit(report: FitReport) -> Mapping[str, str]:
             f"rough dielectric, index {rough.ior:g}, GGX roughness {rough.roughness.value:.3g}{se}; light that meets"
             f" several facets is {'given back' if rough.multiple_scattering else 'lost'}"
         )
+        if (seen := rough.highlights) is not None:
+            told["highlights"] = (
+                f"{seen.photographs} photographs under {seen.lights} lights tell the roughness; they are"
+                f" {seen.brightness:.2f} ± {seen.brightness_se:.2f} times as bright as predicted, as with an index of"
+                f" {seen.index:.2f} ± {seen.index_se:.2f} or with other lights"
+            )
     if report.pixel_edge_mm is not None:
         told["squares"] = f"{report.pixel_step} × {report.pixel_step} pixels, {report.pixel_edge_mm:.2f} mm wide"
     if total := sum(report.seconds_by_purpose.values()):

@@ -26,7 +26,7 @@ from services.core.light.safety import (
 )
 from services.core.pages.object_words import PARTS
 from services.core.slab.dictionaries import DEFAULT_DICTIONARY, DICTIONARIES, known_dictionary, require_particles
-from services.core.surface.rough import DEFAULT_ROUGHNESS, MultipleScattering, Roughness, require_rough_alone
+from services.core.surface.rough import FIT, MultipleScattering, Roughness, require_rough_alone
 from services.core.values import AUTO, Number, PixelStep, Positive, Unit, Whole
 
 JobName = Annotated[
@@ -214,7 +214,7 @@ class JobSpec(Record):
     ior: Number = Field(
         default=1.631, ge=1, le=3, description="index of refraction of enamel or object, unused by boundary = matched"
     )
-    roughness: Roughness = DEFAULT_ROUGHNESS
+    roughness: Roughness = FIT
     multiple_scattering: MultipleScattering = "on"
     dentin: Literal["known", "fit", "none"] = Field(
         default="fit",

@@ -64,12 +64,36 @@ class Correlation(Record):
     matrix: tuple[tuple[float, ...], ...]
 
 
+class Highlights(Record):
+    """What the highlights of photographs tell of a surface, beside its roughness."""
+
+    photographs: int = Field(description="photographs whose highlights were fitted")
+    lights: int = Field(description="number of their lights")
+    pixels: int = Field(description="number of their pixels")
+    brightness: float = Field(description="of the highlights, over what index and calibration predict")
+    brightness_se: float
+    index: float = Field(
+        description="index of refraction by this brightness, if the lights' calibration is exact; a gain of the lights"
+        " and the index cannot be told apart"
+    )
+    index_se: float
+    surface_height_mm: float = Field(
+        description="standard deviation of the scanned surface's smooth error, as the highlights show it"
+    )
+    warnings: tuple[str, ...] = Field(description="what to know before trusting the roughness, one sentence each")
+
+
 class RoughSurface(Record):
     """The rough dielectric surface that a fit has held."""
 
     roughness: Estimate = Field(description="GGX roughness; without a standard error where the job gave it")
     ior: float = Field(description="index of refraction")
     multiple_scattering: bool = Field(description="whether light that meets several facets was given back")
+    highlights: Highlights | None = Field(
+        default=None,
+        exclude_if=is_absent,
+        description="what its roughness was measured by; null where the job gave it",
+    )
 
     def estimates(self) -> dict[str, Estimate]:
         """What a table of estimates says of the surface, by name; ``multiple_scattering`` is 1 where light that meets

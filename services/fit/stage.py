@@ -70,6 +70,8 @@ def run(spec: JobSpec, context: StageContext, *, engine: str = ENGINE) -> FitRep
     driver = chosen("Kind of fit", spec.kind, kinds)(attempt)
     notes = open_stage(context.root, "prepared", PreparedManifest, verify=False)[1].notes
     report = driver.run(time.time())
+    if report.surface is not None and report.surface.highlights is not None:
+        notes += report.surface.highlights.warnings
     report = report.model_copy(update={"notes": notes, "seconds_by_purpose": attempt.seconds_by_purpose})
     writer.publish(report)
     verdict = verdict_of(report)

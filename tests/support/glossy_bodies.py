@@ -70,7 +70,7 @@ def render(roughness: float | None, samples: int = 64) -> NDArray[np.float64]:
     images = np.zeros((len(CAMERAS), len(LIGHTS), *CAMERAS[0].size[::-1]))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "body.ply"
-        write_mesh(path, body(6))
+        write_mesh(path, body())
         for c, one in enumerate(CAMERAS):
             for k, light in enumerate(LIGHTS):
                 lamp = {"type": "point", "position": list(light.position_mm), "intensity": INTENSITY}

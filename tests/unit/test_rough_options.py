@@ -34,16 +34,16 @@ def job(**options: Any) -> JobSpec:
 
 def test_a_job_that_gives_nothing_has_a_compensated_surface() -> None:
     spec = job()
-    assert (spec.roughness, spec.multiple_scattering, spec.ior) == (0.15, "on", 1.631)
+    assert (spec.roughness, spec.multiple_scattering, spec.ior) == ("fit", "on", 1.631)
 
 
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"roughness": 0}, "give the GGX roughness of the surface, a number from 0.02 to 1, such as 0.15"),
-        ({"roughness": float("nan")}, "give the GGX roughness of the surface"),
-        ({"roughness": "fit"}, "give the GGX roughness of the surface"),
-        ({"roughness": True}, "give the GGX roughness of the surface"),
+        ({"roughness": 0}, 'give "fit", or the GGX roughness of the surface, a number from 0.02 to 1, such as 0.15'),
+        ({"roughness": float("nan")}, "the GGX roughness of the surface"),
+        ({"roughness": "fitted"}, "the GGX roughness of the surface"),
+        ({"roughness": True}, "the GGX roughness of the surface"),
         ({"ior": 1.0}, "ior = 1 is too close to that of air for boundary = rough, which needs at least 1.01"),
         ({"ior": 0.9}, "greater than or equal to 1"),
         ({"kind": "jaw"}, "not for a jaw; choose boundary = thin"),
@@ -65,7 +65,8 @@ def test_others_keep_their_surroundings_and_stains() -> None:
 def test_the_scene_of_a_fit_has_the_jobs_surface(tmp_path: Path) -> None:
     write_prepared(tmp_path)
     spec = job(dentin="known", roughness=0.3, ior=1.5, multiple_scattering="off")
-    surface, observations = held_surface(spec), read_observations(tmp_path, spec)
+    observations = read_observations(tmp_path, spec)
+    surface = held_surface(spec, observations, tmp_path, print)
     scene = channel_scene(observations, "green", (None,), spec, surface=surface)
     assert (scene.boundary, scene.roughness, scene.ior, scene.multiple_scattering) == ("rough", 0.3, 1.5, False)
     assert surface is not None
@@ -73,7 +74,7 @@ def test_the_scene_of_a_fit_has_the_jobs_surface(tmp_path: Path) -> None:
         "surface.roughness": 0.3, "surface.ior": 1.5, "surface.multiple_scattering": 0.0,
     }  # fmt: skip
     assert all(one.se is None and not one.determined for one in surface.estimates().values())
-    assert held_surface(job(boundary="thin")) is None
+    assert held_surface(job(boundary="thin"), observations, tmp_path, print) is None
 
 
 def test_surroundings_of_a_registered_scan_are_refused_before_any_pixel(tmp_path: Path) -> None:

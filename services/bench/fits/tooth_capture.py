@@ -18,6 +18,7 @@ from services.fit.measurements.observations import Observations, channel_scene, 
 from services.fit.measurements.surface import held_surface
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.passes.evaluate import ErrorSums, error_sums
+from services.fit.stages.attempt import CHECKPOINT
 from services.transport.engine import Engine
 from services.transport.optics.parameters import MEDIUM_FIELDS, Medium, Mouth, Tissue
 from services.transport.scene.recipe import View
@@ -145,7 +146,8 @@ def prepared_tooth(job: Path, spec: JobSpec, channel: str = CHANNEL) -> Prepared
     observations = read_observations(job, spec)
     (tooth,) = observations.teeth
     dentin = dentin_shape(tooth, observations.manifest.cameras, spec)
-    recipe = channel_scene(observations, channel, (dentin,), spec, surface=held_surface(spec))
+    surface = held_surface(spec, observations, job / CHECKPOINT, print)
+    recipe = channel_scene(observations, channel, (dentin,), spec, surface=surface)
     return PreparedTooth(job, spec, observations, read_channel(observations, channel, spec), Engine(recipe))
 
 

@@ -13,25 +13,40 @@ MIN_ROUGH_IOR = 1.01
 """Least index of refraction of a rough face: below it, light is bent by less than facets of a thousandth would turn it,
 and single precision no longer finds the facet that bends it to a light."""
 DEFAULT_ROUGHNESS = 0.15
-"""GGX roughness where a job gives none: that of a wet and polished tooth, about."""
+"""GGX roughness of a phantom or an asset that gives none: that of a wet and polished tooth, about."""
+FIT: Literal["fit"] = "fit"
+"""The roughness is measured by the highlights of the photographs."""
 
 
 def _roughness(value: Any) -> Any:
     low, high = ROUGHNESS
+    if value == FIT:
+        return value
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise PydanticCustomError(
-            "roughness", f"give the GGX roughness of the surface, a number from {low:g} to {high:g}, such as 0.15"
+            "roughness",
+            f'give "fit", or the GGX roughness of the surface, a number from {low:g} to {high:g}, such as 0.15',
         )
     return float(value)
 
 
 Roughness = Annotated[
-    float,
+    float | Literal["fit"],
     BeforeValidator(_roughness),
-    WithJsonSchema({"type": "number", "minimum": ROUGHNESS[0], "maximum": ROUGHNESS[1]}),
-    Field(description="of boundary = rough: GGX roughness of the surface, which the fit holds"),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string", "const": FIT},
+                {"type": "number", "minimum": ROUGHNESS[0], "maximum": ROUGHNESS[1]},
+            ]
+        }
+    ),
+    Field(
+        description="of boundary = rough: GGX roughness of the surface, which the fit holds; fit measures it first by"
+        " the highlights of the photographs"
+    ),
 ]
-"""Width of the distribution of facets' slopes, Walter's alpha."""
+"""Width of the distribution of facets' slopes, Walter's alpha, or ``fit``."""
 MultipleScattering = Annotated[
     Literal["on", "off"],
     Field(

@@ -65,7 +65,7 @@ class FitDriver:
         neighbours = neighbour_surfaces(tooth, observations.neighbours, observations.manifest.cameras, spec)
         channels = spec.channels or observations.manifest.channels
         views = {channel: read_channel(observations, channel, spec) for channel in channels}
-        surface = held_surface(spec)
+        surface = held_surface(spec, observations, attempt.inputs, attempt.log)
         layout = stain_layout(tooth.outer, texel_edge_mm(observations.pixel_edge_mm)) if spec.stains else None
         scenes = {
             channel: channel_scene(
