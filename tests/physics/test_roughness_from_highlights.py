@@ -61,10 +61,27 @@ def test_a_matte_subject_is_refused() -> None:
         roughness_from_highlights(body(4), photographed(images(None), seed=2), IOR)
 
 
-def test_saturated_highlights_are_refused() -> None:
+def test_a_highlight_may_be_saturated_in_its_core() -> None:
     glossy = images(0.1) + images(None)
-    with pytest.raises(CaptureInputError, match=r"saturated.*give roughness a number"):
-        roughness_from_highlights(body(4), photographed(glossy, seed=2, full_scale=images(None).max()), IOR)
+    found = roughness_from_highlights(body(4), photographed(glossy, seed=3, full_scale=0.7 * glossy.max()), IOR)
+    assert abs(found.value / 0.1 - 1) < min(0.1, 3 * found.standard_error / 0.1)
+
+
+@pytest.mark.parametrize(("roughness", "full_scale"), [(0.1, 0.2), (0.1, 0.1), (0.3, 0.5), (0.3, 0.1)])
+def test_saturated_highlights_are_refused(roughness: float, full_scale: float) -> None:
+    glossy = images(roughness) + images(None)
+    with pytest.raises(CaptureInputError, match=r"highlights are saturated.*give roughness a number"):
+        roughness_from_highlights(body(4), photographed(glossy, seed=3, full_scale=full_scale * glossy.max()), IOR)
+
+
+def test_wet_surfaces_are_told_by_the_brightness_and_keep_their_roughness() -> None:
+    # A film of water reflects ((1.33 - 1) / (1.33 + 1))² at normal incidence, and bare enamel by 1.63
+    film = ((IOR + 1) / (IOR - 1) * 0.33 / 2.33) ** 2
+    found = roughness_from_highlights(body(4), photographed(film * images(0.1) + images(None), seed=3), IOR)
+    assert abs(found.value / 0.1 - 1) < min(0.1, 3 * found.standard_error / 0.1)
+    assert abs(found.index - 1.33) < 3 * found.index_se
+    (warning,) = found.warnings
+    assert "check ior (by the brightness alone 1.3" in warning
 
 
 def test_photographs_without_a_mirror_direction_are_refused() -> None:

@@ -22,7 +22,6 @@ TAGS = {
     "roughdielectric": "bsdf",
     "diffuse": "bsdf",
     "twosided": "bsdf",
-    "roughdielectric": "bsdf",
     "mask": "bsdf",
     "bitmap": "texture",
     "uniform": "spectrum",

@@ -16,6 +16,10 @@ from services.fit.measurements.roughness.start import Start, first_guess
 from services.fit.measurements.roughness.surface import SurfaceError
 
 REMEDY = "give roughness a number, such as 0.15"
+SATURATED = (
+    "The highlights are saturated, and what is left of them does not tell the roughness; photograph with shorter"
+    f" exposures too, or {REMEDY}."
+)
 WIDEST = 1.2
 """Tangent of the widest angle between normal and half vector at which pixels are looked at, 50 degrees."""
 FIRST_PIXELS, PIXELS = 800, 1500
@@ -126,6 +130,8 @@ def _first(
     views = Views(outer, occluders, FIRST_ROUGHNESS)
     found = [(k, views.patch(photograph, 1.0, FIRST_PIXELS)) for k, photograph in enumerate(photographs)]
     seen = [(k, patch) for k, patch in found if patch is not None and len(patch.value) >= MIN_PIXELS]
+    if not seen and any(photograph.clipped.any() for photograph in photographs):
+        raise CaptureInputError(SATURATED)
     if not seen:
         raise CaptureInputError(
             "No photograph shows lit surface around the mirror direction of its light, so no highlight tells the"
@@ -141,18 +147,14 @@ def _chosen(start: Start, seen: Sequence[tuple[int, Patch]]) -> list[int]:
         CaptureInputError: no photograph has a highlight, or all highlights are saturated.
     """
     saturated = [_is_saturated(patch, start.roughness) for _, patch in seen]
-    if all(saturated):
-        raise CaptureInputError(
-            "The cores of all highlights are saturated, so they do not tell the roughness; photograph with shorter"
-            f" exposures too, or {REMEDY}."
-        )
     told = np.where(saturated, 0.0, start.told)
     order = [k for k in np.argsort(-told, kind="stable") if told[k] > MIN_TOLD][:MAX_PHOTOGRAPHS]
     if start.brightness < MIN_BRIGHTNESS or not order:
-        clipped = f" ({sum(saturated)} are left out as saturated)" if any(saturated) else ""
+        if any(len(patch.clipped) for _, patch in seen):
+            raise CaptureInputError(SATURATED)
         raise CaptureInputError(
-            f"No photograph shows a highlight{clipped}, as of a matte subject or behind a polariser, so none tells the"
-            f" roughness; {REMEDY}."
+            "No photograph shows a highlight, as of a matte subject or behind a polariser, so none tells the roughness;"
+            f" {REMEDY}."
         )
     return sorted(seen[k][0] for k in order)
 

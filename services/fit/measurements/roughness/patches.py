@@ -25,6 +25,8 @@ MIN_COSINE = 0.15
 """Smallest cosine of a normal to the camera and to the light. Beyond, the surface's error moves outline and shadow."""
 EDGE_PX = 2
 """Pixels along the outline and along shadows that are left out, in which other surfaces may be."""
+NEIGHBOURS = np.ones((2 * EDGE_PX + 1,) * 2, dtype=bool)
+"""Those within that distance of a pixel."""
 
 
 @dataclass(frozen=True)
@@ -143,21 +145,20 @@ class Views:
     def _look(self, camera: Camera) -> None:
         if self._camera == camera:
             return
-        import cv2
+        from scipy.ndimage import binary_erosion
 
         self._camera = camera
         meshes = (self._outer, *self._occluders)
         seen = visible_surfaces(camera, meshes, with_normals=True)
         self._normal = seen.normal
-        inside = (seen.mesh == 0).astype(np.uint8)
-        kernel = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
-        self._inside = cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1) > 0
+        inside = seen.mesh == 0
+        self._inside = binary_erosion(inside, NEIGHBOURS, border_value=1)
         pose = np.asarray(camera.camera_from_world)
         self._camera_mm = -pose[:3, :3].T @ pose[:3, 3]
         width, height = camera.size
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         local = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
-        depth = np.where(inside > 0, seen.depth_mm, 0.0)
+        depth = np.where(inside, seen.depth_mm, 0.0)
         self._points = (local * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
         centre_mm = self._outer.vertices_mm.mean(axis=0)
         self._rays = int(np.clip(np.ceil(camera.pixel_mm(centre_mm) * RAYS_PER_MM / self._roughness), 1, MAX_RAYS))
@@ -175,13 +176,12 @@ class Views:
 
     def _lit(self, light_mm: Array) -> BoolArray:
         """Pixels (H, W) that the light reaches, apart from the edges of shadows."""
-        import cv2
+        from scipy.ndimage import binary_dilation
 
         place = (float(light_mm[0]), float(light_mm[1]), float(light_mm[2]))
         meshes = (self._outer, *self._occluders)
         lit = is_unoccluded(self._points.astype(np.float32), self._normal, place, meshes)
-        shadow = (self._inside & ~lit).astype(np.uint8)
-        return np.asarray(cv2.dilate(shadow, np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)) == 0)
+        return np.asarray(~binary_dilation(self._inside & ~lit, NEIGHBOURS))
 
 
 def _thinned(tangent: Array, most: int) -> NDArray[np.intp]:
