@@ -19,8 +19,9 @@ BoolArray = NDArray[np.bool_]
 RAYS_PER_MM = 1.25
 """Places within a pixel at which normals are averaged, along a millimetre and for a roughness of 1: with them
 a highlight's half-width on a surface of 4 mm radius has five."""
-MAX_RAYS = 6
-"""Largest number of these places along each edge of a pixel."""
+MIN_RAYS, MAX_RAYS = 3, 6
+"""Least and largest number of these places along each edge of a pixel. With one the grooves of an incisor made
+roughnesses of 0.15, at 0.1 mm a pixel, 2 % too large."""
 MIN_COSINE = 0.15
 """Smallest cosine of a normal to the camera and to the light. Beyond, the surface's error moves outline and shadow."""
 EDGE_PX = 2
@@ -161,7 +162,9 @@ class Views:
         depth = np.where(inside, seen.depth_mm, 0.0)
         self._points = (local * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
         centre_mm = self._outer.vertices_mm.mean(axis=0)
-        self._rays = int(np.clip(np.ceil(camera.pixel_mm(centre_mm) * RAYS_PER_MM / self._roughness), 1, MAX_RAYS))
+        self._rays = int(
+            np.clip(np.ceil(camera.pixel_mm(centre_mm) * RAYS_PER_MM / self._roughness), MIN_RAYS, MAX_RAYS)
+        )
         self._fine = visible_surfaces(_finer(camera, self._rays), meshes, with_normals=True)
 
     def _fine_normals(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
