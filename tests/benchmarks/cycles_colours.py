@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,6 +37,8 @@ SIZE = (64, 80)
 """Width and height, pixels."""
 DIRECTIONS = ((0.2, 1.0, 0.15), (-0.9, 0.7, -0.2))
 Array = NDArray[np.float64]
+Renderer = Callable[[Path, Case, int, int], Array]
+PROGRAMS: dict[str, Renderer] = {"mitsuba": mitsuba_image, "cycles": cycles_image, "engine": engine_image}
 
 
 def case_of(view: int, light: str) -> Case:
@@ -89,7 +92,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--paths", type=int, default=512, help="paths per pixel and seed")
-    parser.add_argument("--programs", nargs="+", default=["mitsuba", "cycles", "engine"])
+    parser.add_argument("--programs", nargs="+", default=list(PROGRAMS))
     parser.add_argument("--only", nargs="+", help="names of rows")
     options = parser.parse_args()
     prepare_device()
@@ -103,14 +106,13 @@ def main() -> None:
                 continue
             case = case_of(view, light)
             renders = stored.setdefault("renders", {}).setdefault(name, {})
-            programs = {"mitsuba": mitsuba_image, "cycles": cycles_image, "engine": engine_image}
             shown = blocks(case.covered()[..., None].astype(float))[:, 0] == 1
             white = 1.0 if light == "sky" else LAMP.intensity[0] / np.sum(np.square(LAMP.position_mm)) / math.pi
             with TemporaryDirectory() as place:
                 write_case(Path(place), case)
                 for seed in range(options.seeds):
                     for program in options.programs:
-                        image = programs[program]
+                        image = PROGRAMS[program]
                         if len(renders.setdefault(program, [])) <= seed:
                             found = blocks(image(Path(place), case, options.paths, seed + 1))
                             renders[program].append(found.round(7).tolist())
