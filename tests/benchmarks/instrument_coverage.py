@@ -50,7 +50,6 @@ from tests.benchmarks.render_moves import STORED
 
 Array = NDArray[np.float64]
 
-PIXEL_STEP = 2
 INTERVAL = 1.959964
 INSTRUMENT = ("gain", "light_gain", "flare", "teeth", "dome")
 """Parts of a ± by the instrument's errors."""
@@ -63,12 +62,14 @@ class Changes:
     """
 
     stored: dict[str, Array]
+    step: int
+    """Edge of the fit's squares in pixels of 0.5 mm, 1 or 2."""
 
     @staticmethod
-    def read() -> Changes:
-        """The stored images."""
+    def read(step: int) -> Changes:
+        """The stored images, for squares of so many pixels."""
         with np.load(STORED) as file:
-            return Changes({name: np.asarray(file[name], dtype=np.float64) for name in file if name[0] == "c"})
+            return Changes({name: np.asarray(file[name], dtype=np.float64) for name in file if name[0] == "c"}, step)
 
     @property
     def moves(self) -> list[str]:
@@ -91,8 +92,10 @@ class Changes:
 
     def information(self, block: PixelBlock) -> Array:
         """What a block's photographs tell of the moves, (6, 6): products of the changes of the pixels on one diagonal
-        of each square with those on the other.
+        of each square with those on the other. NaN for squares of one pixel, which has no halves.
         """
+        if self.step == 1:
+            return np.full((len(self.moves), len(self.moves)), np.nan)
         squares = [self._squares(block, name) for name in self.moves]
         one, other = (
             np.array([0.5 * (each[0, k] + each[1, 1 - k]) for each in squares]).reshape(len(squares), -1)
@@ -105,8 +108,9 @@ class Changes:
         # Stored images at the pixels of each of the block's pixels, (rows, columns, L, N).
         camera, pixels = block.fitted_view.camera, block.fitted_view.pixels
         width, height = camera.size
-        image = self.stored[f"{camera.name}_{name}"][:, : height * PIXEL_STEP, : width * PIXEL_STEP]
-        squares = image.reshape(len(image), height, PIXEL_STEP, width, PIXEL_STEP).transpose(2, 4, 0, 1, 3)
+        step = self.step
+        image = self.stored[f"{camera.name}_{name}"][:, : height * step, : width * step]
+        squares = image.reshape(len(image), height, step, width, step).transpose(2, 4, 0, 1, 3)
         return np.asarray(squares[..., pixels[:, 1], pixels[:, 0]])
 
 
@@ -166,6 +170,8 @@ class Recorder:
     def bound(self) -> Array:
         """Cramér–Rao covariance (Q, Q) of the reported quantities without the noise of rendering."""
         assert self.solution is not None
+        if np.isnan(self.information).any():
+            return np.full((len(QUANTITIES), len(QUANTITIES)), np.nan)
         known = self.shifts[-len(self.information) :].T
         told = positive_part(self.information)
         whole = np.block([[np.eye(len(known)), known], [known.T, np.eye(len(told)) + told]])
@@ -182,7 +188,7 @@ def covered(seed: int, draws: int, changes: Changes) -> dict[str, Any]:
         patch.object(channel_fit, measure_final_uncertainty.__name__, recorder.measure),
         patch.object(covariance, "combine_with_prior", recorder.combine),
     ):
-        found = fit(Path(folder), "none", seed, instrument="on", pixel_step=PIXEL_STEP)
+        found = fit(Path(folder), "none", seed, instrument="on", pixel_step=changes.step)
     assert recorder.solution is not None
     slopes, rng = recorder.slopes, np.random.default_rng([29, seed])
     parts = {name: slopes @ part @ slopes.T for name, part in recorder.solution.parts.items()}
@@ -232,11 +238,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5, help="fits, by seeds of the sensor's noise from 1")
     parser.add_argument("--draws", type=int, default=500, help="of each fit")
+    parser.add_argument("--pixel-step", type=int, choices=(1, 2), default=2, help="squares of 0.5 or 1 mm")
     parser.add_argument("--json", type=Path, required=True, help="where results go; fits in it are not run again")
     arguments = parser.parse_args()
     prepare_device(1)
     rows: list[dict[str, Any]] = json.loads(arguments.json.read_text()) if arguments.json.exists() else []
-    changes = Changes.read()
+    changes = Changes.read(arguments.pixel_step)
     for seed in range(1 + len(rows), 1 + arguments.seeds):
         rows.append(covered(seed, arguments.draws, changes))
         print(json.dumps(rows[-1]), flush=True)
