@@ -36,17 +36,23 @@ class Picture:
     their order."""
 
 
-def picture(engine: Engine) -> Picture:
-    """Render 16 x 16 pixels of a tooth that may have stains: 4,096 lanes, which Dr.Jit splits over its threads."""
+def plain_results(engine: Engine) -> dict[str, NDArray[np.float64]]:
+    """Images, derivatives and orders of 16 x 16 pixels of a tooth, by their names in ``Picture``."""
     view = whole_view(camera_at((0.2, 1, 0.1), size=16))
     image = engine.images(TISSUE, view, samples=32, seed=5)
     jacobian = engine.jacobian(TISSUE, view, NAMES, samples=32, seed=6, batches=16)
     orders = engine.order_images(TISSUE, view, bin_edges=np.array([0, 2, 8, 64]), samples=16, seed=7, batches=16)
-    ones = np.ones(image.mean.shape)
+    return {"image": image.mean, "variance": image.variance, "jacobian": jacobian.jacobian, "orders": orders}
+
+
+def picture(engine: Engine) -> Picture:
+    """Render 16 x 16 pixels of a tooth that may have stains: 4,096 lanes, which Dr.Jit splits over its threads."""
+    view, plain = whole_view(camera_at((0.2, 1, 0.1), size=16)), plain_results(engine)
+    ones = np.ones(plain["image"].shape)
     shape = engine.shape_gradient(TISSUE, view, ones, samples=32, seed=8).gradient
     (texels,) = engine.stain_gradient(replace(TISSUE, stain=stain()), view, ones, samples=32, seed=9).gradient
     assert texels is not None
-    return Picture(image.mean, image.variance, jacobian.jacobian, orders, shape, texels)
+    return Picture(**plain, shape=shape, texels=texels)
 
 
 def render_into(connection: Connection, boundary: Boundary, thread_counts: tuple[int, ...]) -> None:

@@ -195,7 +195,7 @@ class GaussNewton:
                 (1 - share) * state.loss[0] + share * fresh.loss,
                 share * fresh.loss_variance,
             )
-        return replace(self._pooled(state, fresh, float(state.samples)), loss=loss)
+        return replace(self._pooled(state, fresh, float(state.samples)), loss=loss, refusals=0)
 
     def _tested(self, state: State, proposal: Proposal, fresh: NormalEquations) -> State:
         # Accept or refuse a proposal by the losses at both ends. Where noise prevails, take it if both witnesses
