@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from services.fit.measurements.observations import Observations, read_channel
 from services.fit.measurements.view_stack import ViewStack
 from services.fit.solve.covariance import Uncertainty, uncertainty
 from services.fit.stage import run
+from services.tasks.journal import read_entries
 from tests.support.prepared import TRUTH, write_prepared
 
 ENGINE = "tests.support.fake_engine:QuietFakeEngine"
@@ -117,6 +119,25 @@ def test_a_gain_that_is_off_moves_the_media_as_the_linear_model_predicts(tmp_pat
     for name in TRUE:
         # A distance of 0.3 is what the design allows.
         assert abs(moved[name]) == pytest.approx(predicted[name], abs=0.3), name
+
+
+def test_rendering_that_blurs_a_result_gets_more_paths_for_its_gradient(tmp_path: Path) -> None:
+    found = []
+    for largest, seed in itertools.product((1.0, 0.01), (1, 2)):
+        root = tmp_path / f"{largest}-{seed}"
+        with patch("services.fit.solve.precision.MAX_RENDERING", largest):
+            found.append(fit(root, scan_se=STILL, seed=seed, max_samples_per_pixel=8192))
+        entries = read_entries(root / "fit-checkpoint" / "journal.jsonl")
+        assert ("green/refined" in entries) == (largest < 1)
+        assert sum(key.startswith("green/closing") for key in entries) == 1
+    blurred, sharp = found[:2], found[2:]
+    for name, truth in TRUE.items():
+        for one, more in zip(blurred, sharp, strict=True):
+            before, after = (report.parameters["green"][name] for report in (one, more))
+            # Sixteen times the paths, of which the equations before and the response keep some of their noise.
+            assert after.se_parts["rendering"] < 0.6 * before.se_parts["rendering"]
+            assert after.se is not None
+            assert abs(after.value - truth) < 4.5 * after.se
 
 
 def test_every_error_says_what_it_is_made_of(brighter: tuple[Path, FitReport]) -> None:

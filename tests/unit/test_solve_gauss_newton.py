@@ -270,7 +270,7 @@ def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> N
     start = np.zeros(2)
     trusting, doubting = (GaussNewton(domain, Options(max_samples=64, slope_error=error)) for error in (0.0, 0.5))
     assert after_one_test(trusting, problem, start).accepted == 1
-    # With a model's error of 1.2 both witnesses together are 0.8 standard errors in favour.
+    # With a model's error of 1.2 both estimates together are 0.8 standard errors in favour.
     refused = after_one_test(doubting, problem, start)
     assert refused.accepted == 0
     assert refused.result is Result.NOISE_LIMITED
@@ -279,7 +279,7 @@ def test_a_short_step_that_only_borrowed_derivatives_promise_is_not_taken() -> N
     assert refused.memory_samples > 64
 
 
-def test_where_noise_prevails_a_step_goes_where_both_witnesses_together_point() -> None:
+def test_where_noise_prevails_a_step_goes_where_both_estimates_together_point() -> None:
     # The promise is 2 again, with a relative uncertainty of 0.6. A comparison of 0.4 +- 10 shows nothing, so the
     # promise stays at 1.6 standard errors: too few to be accepted, enough to be taken. A comparison of 0.4 +- 0.1
     # refutes it.

@@ -18,10 +18,10 @@ differ, the prediction is the more precise. With z = 3 standard errors:
   samples double; at their limit the fit ends, as good as its noise allows.
 
 A fit that ends by noise lies within a few standard errors of the minimum, biased towards its start. So a last Newton
-step goes to the minimum of the pooled model, along the directions whose curvature exceeds its noise, unless a
-comparison from seeds of its own is significantly worse. The solution's error is then that of the pooled gradient,
-without bias. Where derivatives are not those of the images, this step is left to the final uncertainty estimate, which
-measures how the images respond.
+step goes to the minimum of the pooled model, along the directions whose curvature exceeds its noise. It is refused
+where a comparison from seeds of its own is significantly worse, or, where derivatives are not those of the images,
+where both estimates combined are not better by one standard error. The solution's error is then that of the pooled
+gradient, without bias.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ SIGNIFICANT_MOVE = 3.0
 WORSE = "worse: radius reduced"
 """Verdict on a proposal that is refused."""
 TAKEN, LEFT = "noise: taken", "noise: left"
-"""Verdicts on a proposal of which noise does not let tell: taken where both witnesses favour it, or else left."""
+"""Verdicts on a proposal that noise leaves undecided: taken where both estimates favour it, or else left."""
 
 
 class Problem(Protocol):
@@ -78,6 +78,7 @@ class Options:
     """Limits and thresholds of the solver."""
 
     max_steps: int = 12
+    """Largest number of proposals; one more linearisation tests the last."""
     max_samples: int = 1024
     max_trials: int = 3
     """Largest number of trust radii tried with one set of normal equations."""
@@ -191,14 +192,11 @@ class GaussNewton:
         loss = (fresh.loss, fresh.loss_variance)
         if state.loss is not None and state.loss[1] + fresh.loss_variance > 0:
             share = state.loss[1] / (state.loss[1] + fresh.loss_variance)
-            loss = (
-                (1 - share) * state.loss[0] + share * fresh.loss,
-                share * fresh.loss_variance,
-            )
+            loss = (1 - share) * state.loss[0] + share * fresh.loss, share * fresh.loss_variance
         return replace(self._pooled(state, fresh, float(state.samples)), loss=loss, refusals=0)
 
     def _tested(self, state: State, proposal: Proposal, fresh: NormalEquations) -> State:
-        # Accept or refuse a proposal by the losses at both ends. Where noise prevails, take it if both witnesses
+        # Accept or refuse a proposal by the losses at both ends. Where noise prevails, take it if both estimates
         # together favour it, and otherwise carry what was rendered there back.
         _require_finite(fresh)
         memory = state.memory

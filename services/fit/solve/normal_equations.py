@@ -44,7 +44,7 @@ class NormalEquations:
     carried: Array | float = 0.0
     """Step (F,) over which the gradient was carried by this curvature since it was measured, mean over its samples."""
     loss: float = 0.0
-    """F where the residuals were rendered, by cells (``loss_change``)."""
+    """F where the residuals were rendered, by cells (``loss_change``); it does not move with the model."""
     loss_variance: float = 0.0
     """Monte Carlo variance of ``loss``."""
 

@@ -228,7 +228,7 @@ class Stages(ABC, Generic[Optics]):
         if closing is not None and known.is_full_step and self.has_usual_precision:
             needed = samples_needed(known, samples, self.options(self.files.full).max_samples)
             if needed > samples:
-                equations, known = self._refined(problem, solution, equations, closing, needed - samples)
+                equations, known = self._refined(problem, solution, equations, closing, (samples, needed))
                 samples = needed
         base = problem.domain.tissue_at(known.x, problem.base)
         problem, solution = replace(problem, base=base), replace(solution, x=known.x)
@@ -311,24 +311,25 @@ class Stages(ABC, Generic[Optics]):
         solution: Solution,
         equations: NormalEquations,
         closing: Closing,
-        samples: int,
+        samples: tuple[int, int],
     ) -> tuple[NormalEquations, Uncertainty]:
-        # The gradient with so many more paths where the final uncertainty estimate was made, and the step from there
-        # anew. What that estimate measured of the response, and the curvature that its coordinates whiten, stay.
+        # The gradient with more paths, so far and in all, where the final uncertainty estimate was made, and the step
+        # from there anew. What that estimate measured of the response, and the curvature that its coordinates whiten,
+        # stay.
+        more = samples[1] - samples[0]
         domain, x, refining = problem.domain, solution.x, replace(problem, stage="refined")
         self.raise_if_cancelled()
         stored, _ = self.journal.get_or_compute(
-            f"{self.scope}/refined", lambda: refining.linearise(x, samples=samples, step=0).record()
+            f"{self.scope}/refined", lambda: refining.linearise(x, samples=more, step=0).record()
         )
-        pooled = pool(equations, max(solution.equation_samples, 1.0), NormalEquations.of(stored), float(samples))
+        pooled = pool(equations, max(solution.equation_samples, 1.0), NormalEquations.of(stored), float(more))
         equations = replace(
             equations, gradient=pooled.gradient, gradient_noise=pooled.gradient_noise, carried=pooled.carried
         )
 
         def compute() -> dict[str, Any]:
-            step, remaining = last_step(
-                refining, x, final_model(domain, x, equations, closing.sums), self.part_count, samples
-            )
+            model = final_model(domain, x, equations, closing.sums)
+            step, remaining = last_step(refining, x, model, self.part_count, max(samples[0], more))
             return {"step": step.tolist(), "remaining": remaining}
 
         self.raise_if_cancelled()

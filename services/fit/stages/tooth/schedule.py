@@ -10,8 +10,7 @@ layered       the same                                         similar   converg
 shape         the same and the dentin's blend weights          exact     converged, or max_steps; where they are fitted
 exact         the same                                         exact     converged, or max_steps
 phase         g1, beta, g2 too                                 exact     converged, or max_steps; only with two lobes
-again, …      the same                                         exact     as before; where errors moved x far, or noise
-                                                                         is too much of a standard error
+again, …      the same                                         exact     as before; where errors moved x far
 stain.*       texture of stains, in turn with the media        exact     a fixed number of steps each; where fitted
 ============  ===============================================  ========  ===============================================
 
