@@ -177,6 +177,8 @@ def test_the_form_is_the_schema_and_submits_what_was_changed(
         page.get_by_label("Name of the job").fill("Anna")
         page.get_by_label("Dentin").select_option("known")
         page.get_by_label("Lobes").select_option("2")
+        expect(page.locator("#option-roughness-help")).to_contain_text("; 0.02 to 1.")
+        page.get_by_label("Roughness").fill("0.2")
         page.get_by_label("Held out lights").fill("l1")
         page.get_by_label("Held", exact=True).fill("enamel.sigma = 4.5\nenamel.alpha = 0.99")
         page.get_by_label("Advise").uncheck()
@@ -193,6 +195,7 @@ def test_the_form_is_the_schema_and_submits_what_was_changed(
     asked |= {
         "dentin": "known",
         "lobes": 2,
+        "roughness": 0.2,
         "held_out_lights": ["l1"],
         "held": {"enamel.sigma": 4.5, "enamel.alpha": 0.99},
         "advise": False,

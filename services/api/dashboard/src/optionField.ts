@@ -38,7 +38,8 @@ export class OptionField {
     isRequired = false,
   ) {
     this.schema = { ...schema, ...(schema.anyOf?.find((one) => one.type !== "null") ?? {}) };
-    if (this.schema.const !== undefined) this.number = schema.anyOf?.find((one) => one.type === "integer");
+    const isNumber = (one: OptionSchema) => one.type === "integer" || one.type === "number";
+    if (this.schema.const !== undefined) this.number = schema.anyOf?.find(isNumber);
     const id = `option-${name.replace(".", "-")}`;
     this.input = build(this.schema, id);
     if (isRequired) this.input.required = true;
