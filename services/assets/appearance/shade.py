@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,6 @@ from services.core.colour.cie import delta_e_2000
 from services.core.errors import InputError
 from services.core.files.meshes import read_teeth
 from services.core.geometry import Camera, Record, Tooth
-from services.core.records import Boundary
 from services.core.results import Estimate
 from services.core.store import read_record, sha256_of, write_record
 from services.transport.engine import Engine
@@ -93,8 +93,7 @@ def shade_of(asset: Path, guide: Guide, *, samples: int = SAMPLES) -> Shade:
     tables = read_tables(asset)
     eye = _mean_eye(rig)
     teeth = tuple(
-        _shade(tooth, _of_tooth(tables, tooth.fdi), rig["boundary"], rig["ior"], eye, guide, white, samples)
-        for tooth in read_teeth(asset)
+        _shade(tooth, _of_tooth(tables, tooth.fdi), rig, eye, guide, white, samples) for tooth in read_teeth(asset)
     )
     alone = " Each tooth is seen alone, without gums and neighbours." if len(teeth) > 1 else ""
     where = (
@@ -130,8 +129,7 @@ def read_shade(job: Path, asset: Path) -> Shade | None:
 def _shade(
     tooth: Tooth,
     tables: Mapping[str, Mapping[str, Estimate]],
-    boundary: Boundary,
-    ior: float,
+    rig: Mapping[str, Any],
     eye_mm: Floats,
     guide: Guide,
     white: CameraWhite,
@@ -139,8 +137,10 @@ def _shade(
 ) -> ToothShade:
     at = placed(guide.geometry, spot_towards(tooth.outer, eye_mm))
     shape = None if tooth.dentin is None else DentinShape.known(tooth.dentin)
-    recipe = single_tooth(tooth.outer, shape, at.light_positions_mm, at.light_intensities, boundary, ior)
-    engine = Engine(recipe)
+    recipe = single_tooth(tooth.outer, shape, at.light_positions_mm, at.light_intensities, rig["boundary"], rig["ior"])
+    # Only the rig of an asset with a rough surface tells these.
+    rough = {name: rig[name] for name in ("roughness", "multiple_scattering") if name in rig}
+    engine = Engine(replace(recipe, **rough))
     found = [relative_radiance(engine, dict(tables[channel]), at, samples, shape is not None) for channel in RGB]
     relative, variance = (np.array(values) for values in zip(*found, strict=True))
     draws = np.random.default_rng(SEED).normal(relative, np.sqrt(variance), (DRAWS, 3))

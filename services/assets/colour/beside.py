@@ -229,7 +229,7 @@ def _renders(
     dentin = None if tooth.dentin is None else DentinShape.known(tooth.dentin)
     for k, channel in enumerate(RGB):
         recipe = single_tooth(tooth.outer, dentin, positions, intensities, spec.boundary, spec.ior, spec.device)
-        engine, tissue = Engine(recipe), tissue_of(report.parameters[channel])
+        engine, tissue = Engine(recipe.with_surface(report.surface)), tissue_of(report.parameters[channel])
         for image, choice in zip(images, choices, strict=True):
             view = View(film, pixels, tuple(choice.tolist()))
             found = engine.images(tissue, view, seed=spec.seed, samples=samples, batches=1).mean

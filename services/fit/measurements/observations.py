@@ -253,7 +253,7 @@ def channel_scene(
     Args:
         surface: of boundary ``rough``, the surface that the fit holds.
     """
-    scene = SceneRecipe(
+    return SceneRecipe(
         tuple(
             ToothSurfaces(tooth.outer, dentin, stain_uv)
             for tooth, dentin in zip(observations.teeth, dentins, strict=True)
@@ -266,10 +266,7 @@ def channel_scene(
         gums=observations.gums,
         cavity=observations.cavity,
         neighbours=neighbours,
-    )
-    if surface is None:
-        return scene
-    return replace(scene, roughness=surface.roughness.value, multiple_scattering=surface.multiple_scattering)
+    ).with_surface(surface)
 
 
 def write_channel(

@@ -4,7 +4,7 @@ process.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from services.anatomy.dentin_shape import DentinShape
 from services.core.geometry import Camera, Mesh
 from services.core.records import Boundary, Device
+from services.core.results import RoughSurface
+from services.core.surface.rough import DEFAULT_ROUGHNESS
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class SceneRecipe:
     """The wall of the mouth behind the teeth, an opaque diffuse surface; it need not be closed."""
     neighbours: tuple[ToothSurfaces, ...] = ()
     """Further teeth around a single one, of the same media; their dentin does not move."""
-    roughness: float = 0.15
+    roughness: float = DEFAULT_ROUGHNESS
     """GGX roughness of a ``rough`` boundary."""
     multiple_scattering: bool = True
     """Whether a ``rough`` boundary gives back light that meets several of its facets; stock renderers lose it."""
@@ -57,6 +59,12 @@ class SceneRecipe:
     def all_teeth(self) -> tuple[ToothSurfaces, ...]:
         """All teeth, in the order in which they count where they overlap."""
         return self.teeth + self.neighbours
+
+    def with_surface(self, surface: RoughSurface | None) -> SceneRecipe:
+        """The scene with the rough surface that a fit has held; unchanged where it held none."""
+        if surface is None:
+            return self
+        return replace(self, roughness=surface.roughness.value, multiple_scattering=surface.multiple_scattering)
 
     def vertices_mm(self) -> NDArray[np.float64]:
         """Vertices of all outer surfaces, (V, 3)."""
