@@ -62,11 +62,16 @@ def phantom(
     ] = None,
     channels: Annotated[int, typer.Option(min=1, max=3, help="1 (green) or 3 (red, green, blue).")] = 1,
     boundary: Annotated[BoundaryName, typer.Option(help="Model of the enamel surface.")] = BoundaryName.MATCHED,
-    ior: Annotated[float, typer.Option(help="Index of refraction of enamel, or of the object.")] = 1.631,
-    roughness: Annotated[float, typer.Option(help="GGX roughness of a rough boundary, 0.02 to 1.")] = 0.15,
+    ior: Annotated[
+        float | None, typer.Option(help="Index of refraction of enamel, or of the object; default: 1.631.")
+    ] = None,
+    roughness: Annotated[
+        float | None, typer.Option(help="GGX roughness of a rough boundary, 0.02 to 1; default: 0.15.")
+    ] = None,
     multiple_scattering: Annotated[
-        SwitchName, typer.Option(help="Of a rough boundary: give back light that meets several facets.")
-    ] = SwitchName.ON,
+        SwitchName | None,
+        typer.Option(help="Of a rough boundary: give back light that meets several facets; default: on."),
+    ] = None,
     renderer: Annotated[
         RendererName,
         typer.Option(help="The project's engine, or stock Mitsuba for a matched boundary or a rough one."),
@@ -109,6 +114,15 @@ def phantom(
                 if jaw
                 else f"Option {option} is for a jaw; add --jaw."
             )
+    face: dict[str, Any] = {"ior": ior, "roughness": roughness}
+    face |= {"multiple_scattering": None if multiple_scattering is None else multiple_scattering is SwitchName.ON}
+    face = {name: value for name, value in face.items() if value is not None}
+    for name in face:
+        option = "--" + name.replace("_", "-")
+        if jaw:
+            raise InputError(f"Option {option} is for one tooth or an object; leave out either it or --jaw.")
+        if name != "ior" and boundary is not BoundaryName.ROUGH:
+            raise InputError(f"Option {option} is for a rough boundary; add --boundary rough.")
     rig: dict[str, Any] = {
         "cameras": cameras,
         "lights": lights,
@@ -120,9 +134,7 @@ def phantom(
     rig |= {"boundary": boundary.value, "renderer": renderer.value} | (
         {} if pixel_mm is None else {"pixel_mm": pixel_mm}
     )
-    if not jaw:
-        whether = multiple_scattering is SwitchName.ON
-        rig |= {"ior": ior, "roughness": roughness, "multiple_scattering": whether}
+    rig |= face
     if shape is not None:
         from services.phantom.object import write_object_phantom
 

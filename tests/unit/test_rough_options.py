@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from typer.testing import CliRunner
 
+from services.cli.app import build_app
 from services.core.errors import InputError, SettingsError
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Mesh
@@ -109,6 +111,21 @@ def test_phantoms_refuse_what_a_rough_surface_cannot_have(tmp_path: Path) -> Non
         write_jaw_phantom(tmp_path, **rough)
     with pytest.raises(InputError, match="A rough surface has no stains; leave them out, or choose boundary thin"):
         write_phantom(tmp_path, stains=True, **rough)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--jaw --ior 1.5", "Option --ior is for one tooth or an object; leave out either it or --jaw."),
+        ("--roughness 0.3", "Option --roughness is for a rough boundary; add --boundary rough."),
+        ("--boundary thin --multiple-scattering off", "Option --multiple-scattering is for a rough boundary"),
+    ],
+)
+def test_an_option_that_a_phantom_would_ignore_is_refused(words: str, told: str, tmp_path: Path) -> None:
+    refused = CliRunner().invoke(build_app(), ["phantom", "--out", str(tmp_path / "made"), *words.split()])
+    assert isinstance(refused.exception, InputError)
+    assert told in refused.exception.message
+    assert not (tmp_path / "made").exists()
 
 
 def test_a_highlight_is_as_wide_as_the_surface_is_rough() -> None:
