@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.assets.appearance.differences import colour_difference
-from services.assets.appearance.translucency import THICKNESS_MM, ThinFace, translucencies
+from services.assets.appearance.translucency import THICKNESS_MM, PolishedFace, ThinFace, translucencies
 from services.assets.appearance.white import CameraWhite
 from services.assets.colour.develop import xyz_from_assumed
 from services.assets.content import RGB
@@ -35,6 +35,20 @@ def tp00(scattering: float, absorption: float, **more: float) -> tuple[float, fl
     (found,) = translucencies(dict.fromkeys(RGB, table(scattering, absorption, **more)), "matched", 1.0, WHITE)
     assert found.tissue == "enamel"
     return found.tp00, found.se
+
+
+def test_a_polished_face_sends_back_the_tabulated_share_of_diffuse_light() -> None:
+    face = PolishedFace(1.5)
+    nodes, weights = np.polynomial.legendre.leggauss(2000)
+    cosines, weights = 0.5 * (nodes + 1), 0.5 * weights
+    inside = sum(2 * w * c * face.transmittance(np.sqrt(1 - c**2)) for c, w in zip(cosines, weights, strict=True))
+    angles_deg = np.degrees(np.arccos(cosines))
+    outside = sum(
+        2 * w * c * face.transmittance(face.inside_sine(a))
+        for a, c, w in zip(angles_deg, cosines, weights, strict=True)
+    )
+    # Index 1.5 sends back 0.0918 of diffuse light from outside and 0.5963 from inside (Orchard 1969).
+    assert (1 - outside, 1 - inside) == pytest.approx((0.0918, 0.5963), abs=2e-4)
 
 
 def test_a_grey_layer_without_absorption_is_that_of_the_slab_formula() -> None:

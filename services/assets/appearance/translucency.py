@@ -21,6 +21,7 @@ from services.core.choices import chosen
 from services.core.colour.cie import delta_e_2000
 from services.core.records import Boundary
 from services.core.results import Estimate
+from services.transport.optics.ggx_albedo import fresnel_reflectance
 from services.transport.optics.parameters import Medium
 from services.transport.optics.slab_totals import Interface, Optics, slab_totals
 
@@ -46,11 +47,7 @@ class ThinFace:
 
     def transmittance(self, inside_sine: float) -> float:
         """Share of light that passes."""
-        cosine = math.sqrt(max(1 - inside_sine**2, 0.0))
-        q = math.sqrt((self.ior - 1) * (self.ior + 1) + cosine**2)
-        s = (cosine - q) / (cosine + q)
-        p = (self.ior**2 * cosine - q) / (self.ior**2 * cosine + q)
-        return 1 - 0.5 * (s * s + p * p)
+        return _passed(inside_sine, self.ior)
 
 
 @dataclass(frozen=True)
@@ -66,13 +63,11 @@ class PolishedFace:
 
     def transmittance(self, inside_sine: float) -> float:
         """Share of light that passes; none beyond the critical angle."""
-        outside_sine = self.index * inside_sine
-        if abs(outside_sine) >= 1:
-            return 0.0
-        near, far = math.sqrt(1 - inside_sine**2), math.sqrt(1 - outside_sine**2)
-        s = (self.index * near - far) / (self.index * near + far)
-        p = (near - self.index * far) / (near + self.index * far)
-        return 1 - 0.5 * (s * s + p * p)
+        return _passed(inside_sine, self.index_outside / self.index)
+
+
+def _passed(sine: float, eta: float) -> float:
+    return 1 - float(fresnel_reflectance(np.sqrt(max(1 - sine**2, 0.0)), eta))
 
 
 @dataclass(frozen=True)
