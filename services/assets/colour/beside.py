@@ -94,8 +94,8 @@ class Shown:
 def beside(
     spec: JobSpec, report: FitReport, prepared: PreparedManifest, radiance: StoredArray, shown: Shown
 ) -> Beside | None:
-    """Render an asset by the fit's path tracing as the camera sees it that sees most of it: under all lights together,
-    and under those together that the fit has not seen.
+    """Render an asset by the fit's path tracing, in the view of the camera whose pixels show most of it: under all
+    lights together, and under those together that the fit has not seen.
 
     Args:
         radiance: photographs (K, L, H, W, C) in the order of the preparation.
@@ -106,7 +106,7 @@ def beside(
     channels = tuple(report.parameters)
     if report.teeth or not set(RGB) <= set(channels):
         return None
-    covers = [_coverage(camera, shown) for camera in shown.cameras]
+    covers = [_surface(camera, shown)[1] for camera in shown.cameras]
     number = int(np.argmax([float(cover.sum()) for cover in covers]))
     camera, paths = shown.cameras[number], PATHS * min(1.0, spec.samples_per_pixel / USUAL_SAMPLES)
     crop = _crop(covers[number])
@@ -115,9 +115,9 @@ def beside(
     used = [k for k, light in enumerate(shown.lights) if light.name not in spec.left_out_lights]
     lights = [shown.lights[k] for k in used]
     unseen = np.array([(camera.name, light.name) in prepared.held_out for light in lights])
-    choices = [np.flatnonzero(np.ones_like(unseen))] + (
-        [np.flatnonzero(unseen)] if 0 < unseen.sum() < len(used) else []
-    )
+    choices = [np.arange(len(used))]
+    if 0 < unseen.sum() < len(used):
+        choices.append(np.flatnonzero(unseen))
     own = [channels.index(channel) for channel in RGB]
     white = np.array([np.broadcast_to(diffuser_radiance(one, shown.middle_mm), len(channels))[own] for one in lights])
     order = [prepared.channels.index(channel) for channel in RGB]
@@ -149,10 +149,6 @@ def square_means(values: Floats, edge: int) -> Floats:
     """Means of an image (H, W, ...) over squares of pixels."""
     height, width = (size // edge for size in values.shape[:2])
     return np.asarray(values.reshape(height, edge, width, edge, *values.shape[2:]).mean(axis=(1, 3)))
-
-
-def _coverage(camera: Camera, shown: Shown) -> Floats:
-    return _surface(camera, shown)[1]
 
 
 def _surface(camera: Camera, shown: Shown) -> tuple[Floats, Floats]:

@@ -31,10 +31,10 @@ def picture(found: Beside, made_by: str) -> Image8:
 
     font, line = ImageFont.load_default(FONT_PX), round(1.35 * FONT_PX)
     columns = [column for pair in found.pairs for column in _columns(pair, made_by)]
-    words = [_sentence(found)]
+    sentence = _sentence(found)
     height, width = columns[0][0].shape[:2]
     wide = max(width, *(int(font.getlength(text)) + 1 for _, caption in columns for text in caption))
-    page_width = max(len(columns) * (wide + MARGIN_PX) + MARGIN_PX, int(font.getlength(words[0])) + 2 * MARGIN_PX)
+    page_width = max(len(columns) * (wide + MARGIN_PX) + MARGIN_PX, int(font.getlength(sentence)) + 2 * MARGIN_PX)
     lines = max(len(caption) for _, caption in columns)
     page = Image.new("RGB", (page_width, height + (lines + 1) * line + 4 * MARGIN_PX), BACKGROUND)
     draw = ImageDraw.Draw(page)
@@ -44,7 +44,7 @@ def picture(found: Beside, made_by: str) -> Image8:
         page.paste(Image.fromarray(image), (x + (wide - width) // 2, MARGIN_PX))
         for row, text in enumerate(caption):
             draw.text((x + wide // 2, height + 2 * MARGIN_PX + row * line), text, fill=INK, font=font, anchor="ma")
-    draw.text((page_width // 2, page.height - MARGIN_PX), words[0], fill=INK, font=font, anchor="ms")
+    draw.text((page_width // 2, page.height - MARGIN_PX), sentence, fill=INK, font=font, anchor="ms")
     return np.asarray(page)
 
 

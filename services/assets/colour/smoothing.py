@@ -9,8 +9,6 @@ Floats = NDArray[np.float64]
 
 SAME_SHADE = 3e-3
 """Variance of a normal's components below which the surface counts as flat: a tilt of some 3 degrees."""
-
-
 COLOUR_RADII = 4
 """Radius of the squares for the channels' ratios, in those for their sum: a tooth's colour changes more slowly than its
 brightness."""

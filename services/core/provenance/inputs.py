@@ -15,6 +15,9 @@ from services.core.raw.registration import REGISTRATION
 from services.core.records import FolderCapture, JobSpec
 from services.core.store import MANIFEST, read_record, sha256_of
 
+NO_IMAGES = frozenset({".json", ".csv", ".txt"})
+"""Endings of a slab's files that hold no image."""
+
 
 @dataclass(frozen=True)
 class InputPath:
@@ -72,10 +75,6 @@ def stated_by(capture: Path | None) -> RawFolder | FolderCapture | None:
         return parse_raw_folder((capture / DESCRIPTION).read_bytes(), str(capture / DESCRIPTION))
     is_there = any((capture / name).is_file() for name in ("capture.json", MANIFEST, f"capture/{MANIFEST}"))
     return read_description(capture) if is_there else None
-
-
-NO_IMAGES = frozenset({".json", ".csv", ".txt"})
-"""Endings of a slab's files that hold no image."""
 
 
 def _of_capture(spec: JobSpec, root: Path) -> Iterator[InputPath]:

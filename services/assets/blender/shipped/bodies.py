@@ -13,8 +13,6 @@ TOOTH_IOR, GUMS_IOR = 1.631, 1.33
 """Refractive indices of enamel, where the asset names none, and of the gums."""
 WELD_MM = 1e-5
 """Length by which two vertices at the same place may differ, mm."""
-
-
 TOOTH_PARTS, OBJECT_PARTS, OBJECT = ("enamel", "dentin"), ("body", "core"), "object"
 """Outer and inner part of a tooth, and of an object, whose folder has this name."""
 
