@@ -28,7 +28,7 @@ class SurfaceDistance:
 
         self.mesh, self._spacing_mm = mesh, spacing_mm
         self._corners = mesh.vertices_mm[mesh.faces]
-        samples, self._owner = _sample_triangles(self._corners, spacing_mm)
+        samples, self._owner = sample_triangles(self._corners, spacing_mm)
         self._tree = cKDTree(samples)
 
     def closest(
@@ -119,8 +119,13 @@ class SignedDistanceGrid:
         return np.stack([self._interpolate(slope, points_mm) for slope in self._slopes], axis=-1)
 
 
-def _sample_triangles(corners: NDArray[np.float64], spacing_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    # Points of a regular barycentric lattice in each triangle, fine enough for its longest edge, and their triangles.
+def sample_triangles(corners: NDArray[np.float64], spacing_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points (S, 3) of a regular lattice in each triangle, fine enough for its longest edge, and their triangles (S,).
+
+    Args:
+        corners: (F, 3, 3).
+        spacing_mm: largest distance between neighbouring points.
+    """
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
     order = np.maximum(1, np.ceil(longest / spacing_mm)).astype(int)
     points, owners = [], []

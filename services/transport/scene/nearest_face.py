@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
+from services.anatomy.distance import sample_triangles
 from services.core.geometry import Mesh
 
 CELL_MM = 0.15
@@ -52,7 +53,7 @@ class NearestFace:
         low, extent = mesh.vertices_mm.min(axis=0), np.ptp(mesh.vertices_mm, axis=0)
         self._cell_mm = max(CELL_MM, float(np.cbrt(extent.prod() / MAX_CELLS)))
         self._shape = np.ceil(extent / self._cell_mm).astype(int) + 1
-        points, owners = _samples(mesh, SPACING_MM * self._cell_mm / CELL_MM)
+        points, owners = sample_triangles(mesh.vertices_mm[mesh.faces], SPACING_MM * self._cell_mm / CELL_MM)
 
         # Measure in the cells next to the surface; all others take over the answer of the nearest of these.
         near = np.zeros(self._shape, dtype=bool)
@@ -78,23 +79,6 @@ class NearestFace:
         plane = dr.gather(mi.Vector4f, self._table, cell, active)
         normal = mi.Vector3f(plane.x, plane.y, plane.z)
         return normal, dr.maximum(plane.w - dr.dot(normal, mi.Vector3f(point)), 0)
-
-
-def _samples(mesh: Mesh, spacing_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (S, 3) of a regular lattice in each triangle, and their triangles (S,)."""
-    corners = mesh.vertices_mm[mesh.faces]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
-    parts = np.maximum(1, np.ceil(longest / spacing_mm)).astype(int)
-    points, owners = [], []
-    for count in np.unique(parts):
-        chosen = np.flatnonzero(parts == count)
-        i, j = (index.reshape(-1) for index in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
-        kept = i + j < count
-        u, v = (i[kept] + 1 / 3) / count, (j[kept] + 1 / 3) / count
-        weights = np.stack([1 - u - v, u, v], axis=-1)
-        points.append(np.einsum("sk,fkx->fsx", weights, corners[chosen]).reshape(-1, 3))
-        owners.append(np.repeat(chosen, len(u)))
-    return np.concatenate(points), np.concatenate(owners)
 
 
 def _smoothed_normals(mesh: Mesh) -> NDArray[np.float64]:
