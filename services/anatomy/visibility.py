@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,14 @@ class VisibleSurfaces:
     """Depth along the camera's axis (H, W), infinite where there is none."""
     normal: NDArray[np.float32]
     """Unit normal in world axes (H, W, 3), zero where there is none; (0, 0, 3) where normals were not asked for."""
+
+
+def points_at(camera: Camera, depth_mm: NDArray[Any], y: NDArray[np.intp], x: NDArray[np.intp]) -> Floats:
+    """World positions (..., 3) in mm of what the centres of pixels at rows y and columns x see at depths (...)."""
+    pose = np.asarray(camera.camera_from_world)
+    local = np.stack([x + 0.5, y + 0.5, np.ones(x.shape)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
+    local *= depth_mm[..., None]
+    return np.asarray((local - pose[:3, 3]) @ pose[:3, :3], dtype=np.float64)
 
 
 def visible_surfaces(

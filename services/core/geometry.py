@@ -84,6 +84,16 @@ class Camera(Record):
         """Edge length of a pixel's footprint at a world point (3,), mm."""
         return float(self.project(point_mm[None])[1][0] / self.K[0][0])
 
+    def cropped(self, rows: slice, columns: slice) -> Camera:
+        """Camera whose whole image is a window of this one's; the slices have a start and a stop, in pixels."""
+        first, second, last = self.K
+        K = (
+            (first[0], first[1], first[2] - columns.start),
+            (second[0], second[1], second[2] - rows.start),
+            last,
+        )
+        return self.model_copy(update={"size": (columns.stop - columns.start, rows.stop - rows.start), "K": K})
+
     def rays(
         self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from services.assets.mitsuba.scene import load_scene, sensor_dict
 from services.core.files.meshes import read_mesh
-from services.core.geometry import Camera, Mesh
+from services.core.geometry import Mesh
 from services.core.records import FolderCapture
 from services.core.store import read_record
+from services.fit.measurements.levels import finer_camera
 from services.fit.measurements.roughness.measure import Roughness, roughness_from_highlights
 from services.fit.measurements.roughness.patches import Photograph
 from services.transport.platform import prepare_device
@@ -108,13 +109,6 @@ def capture() -> FolderCapture:
     return read_record(shared_path("data/tooth-ur1-truth") / "capture.json", FolderCapture)
 
 
-def finer(camera: Camera) -> Camera:
-    K = np.array(camera.K)
-    K[:2] *= FINER
-    rows: Any = tuple(map(tuple, K.tolist()))
-    return camera.model_copy(update={"size": (camera.size[0] * FINER, camera.size[1] * FINER), "K": rows})
-
-
 @cache
 def images(roughness: float) -> NDArray[np.float64]:
     """Radiance (cameras, lights, H, W) of the incisor: its highlights and the light beneath."""
@@ -125,7 +119,7 @@ def images(roughness: float) -> NDArray[np.float64]:
 
     root, found = shared_path("data/tooth-ur1-truth"), []
     for c, coarse in enumerate(capture().cameras):
-        camera = finer(coarse)
+        camera = finer_camera(coarse, FINER)
         for k, light in enumerate(capture().lights):
             surface = {
                 "type": "roughdielectric", "distribution": "ggx", "alpha": roughness, "int_ior": IOR, "ext_ior": 1.0
@@ -159,7 +153,7 @@ def drawn(roughness: float, seed: int) -> list[Photograph]:
         value = image + random.normal(size=image.shape) * np.sqrt(variance)
         intensity = light.intensity[0]
         every = np.ones(image.shape, dtype=bool)
-        camera = finer(capture().cameras[c])
+        camera = finer_camera(capture().cameras[c], FINER)
         found.append(Photograph(camera, light, value / intensity, variance / intensity**2, every, ~every))
     return found
 

@@ -32,6 +32,18 @@ def reduced_camera(camera: Camera, step: int) -> Camera:
     )
 
 
+def finer_camera(camera: Camera, count: int) -> Camera:
+    """Camera with ``count`` by ``count`` pixels in place of each."""
+    first, second, last = camera.K
+    width, height = camera.size
+    return camera.model_copy(
+        update={
+            "size": (width * count, height * count),
+            "K": (tuple(one * count for one in first), tuple(one * count for one in second), last),
+        }
+    )
+
+
 def averaged(values: NDArray[Any], step: int) -> Array:
     """Means (height // step, width // step) over squares of an image (height, width)."""
     height, width = (n // step for n in values.shape)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.anatomy.visibility import NOTHING, visible_surfaces
+from services.anatomy.visibility import NOTHING, points_at, visible_surfaces
 from services.core.geometry import Camera, Mesh
 
 FloatArray = NDArray[np.float64]
@@ -42,10 +42,7 @@ class Footprint:
 
     def points_at(self, camera: Camera, y: NDArray[np.intp], x: NDArray[np.intp]) -> FloatArray:
         """World positions (..., 3) in mm of the surface that the pixels at rows y and columns x (...) see."""
-        pose = np.asarray(camera.camera_from_world)
-        local = np.stack([x + 0.5, y + 0.5, np.ones(x.shape)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
-        local *= np.where(self.mesh[y, x] >= 0, self.depth_mm[y, x], 0)[..., None]
-        return np.asarray((local - pose[:3, 3]) @ pose[:3, :3], dtype=np.float64)
+        return points_at(camera, np.where(self.mesh[y, x] >= 0, self.depth_mm[y, x], 0), y, x)
 
 
 def project(camera: Camera, teeth: Sequence[Mesh], occluders: Sequence[Mesh] = ()) -> Footprint:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.core.geometry import Camera, Mesh, Vector3
+from services.core.geometry import Camera, Mesh
 
 MARGIN_PX = 32
 """Smallest margin around the fitted surfaces, pixels: the checks of the pose read pixels outside their outline."""
@@ -62,13 +62,7 @@ class Window:
 
     def cropped(self, camera: Camera) -> Camera:
         """Camera whose whole image is this window of the given camera's image."""
-        first, second, last = camera.K
-        K: tuple[Vector3, Vector3, Vector3] = (
-            (first[0], first[1], first[2] - self.left),
-            (second[0], second[1], second[2] - self.top),
-            last,
-        )
-        return camera.model_copy(update={"size": self.shape[::-1], "K": K})
+        return camera.cropped(self.rows, self.columns)
 
 
 def window_of(camera: Camera, meshes: Sequence[Mesh]) -> Window:

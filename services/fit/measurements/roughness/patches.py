@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.anatomy.shadow_map import is_unoccluded
-from services.anatomy.visibility import visible_surfaces
+from services.anatomy.visibility import points_at, visible_surfaces
 from services.core.geometry import Camera, Light, Mesh
+from services.fit.measurements.levels import finer_camera
 from services.fit.measurements.roughness.lobe import reflected
 
 Array = NDArray[np.float64]
@@ -156,16 +157,12 @@ class Views:
         self._inside = binary_erosion(inside, NEIGHBOURS, border_value=1)
         pose = np.asarray(camera.camera_from_world)
         self._camera_mm = -pose[:3, :3].T @ pose[:3, 3]
-        width, height = camera.size
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        local = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(np.asarray(camera.K)).T
-        depth = np.where(inside, seen.depth_mm, 0.0)
-        self._points = (local * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
+        self._points = points_at(camera, np.where(inside, seen.depth_mm, 0.0), *np.indices(inside.shape))
         centre_mm = self._outer.vertices_mm.mean(axis=0)
         self._rays = int(
             np.clip(np.ceil(camera.pixel_mm(centre_mm) * RAYS_PER_MM / self._roughness), MIN_RAYS, MAX_RAYS)
         )
-        self._fine = visible_surfaces(_finer(camera, self._rays), meshes, with_normals=True)
+        self._fine = visible_surfaces(finer_camera(camera, self._rays), meshes, with_normals=True)
 
     def _fine_normals(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
         """Normals (N, S, 3) at places in pixels; the pixel's own where another surface is seen."""
@@ -195,17 +192,6 @@ def _thinned(tangent: Array, most: int) -> NDArray[np.intp]:
     near, far = order[: most // 2], np.sort(order[most // 2 :])
     even = np.unique(np.linspace(0, len(far) - 1, most - len(near)).astype(np.intp))
     return np.sort(np.concatenate([near, far[even]]))
-
-
-def _finer(camera: Camera, count: int) -> Camera:
-    """A camera with ``count`` pixels in place of one along each edge."""
-    first, second, last = camera.K
-    return camera.model_copy(
-        update={
-            "size": (camera.size[0] * count, camera.size[1] * count),
-            "K": (tuple(one * count for one in first), tuple(one * count for one in second), last),
-        }
-    )
 
 
 def _directions(vectors: Array) -> tuple[Array, Array]:

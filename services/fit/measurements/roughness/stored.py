@@ -72,9 +72,8 @@ class StoredPhotographs(Sequence[Photograph]):
         is_finite = np.isfinite(radiance) & np.isfinite(variance) & (variance > 0)
         usable = inside & whole_squares(bits & np.uint16(NOT_MEASURED) == 0, step) & is_finite
         clipped = inside & ~whole_squares(bits & np.uint16(MaskBit.SATURATED) == 0, step)
-        return Photograph(
-            reduced_camera(_cropped(whole, rows, columns), step), light, radiance, variance, usable, clipped
-        )
+        camera = reduced_camera(whole.cropped(rows, columns), step)
+        return Photograph(camera, light, radiance, variance, usable, clipped)
 
 
 def _window(camera: Camera, vertices_mm: NDArray[np.float64]) -> tuple[slice, slice]:
@@ -83,12 +82,3 @@ def _window(camera: Camera, vertices_mm: NDArray[np.float64]) -> tuple[slice, sl
     first = np.clip(np.floor(image.min(axis=0)) - MARGIN_PX, 0, np.array(camera.size) - 1).astype(int)
     last = np.clip(np.ceil(image.max(axis=0)) + MARGIN_PX, first + 1, camera.size).astype(int)
     return slice(int(first[1]), int(last[1])), slice(int(first[0]), int(last[0]))
-
-
-def _cropped(camera: Camera, rows: slice, columns: slice) -> Camera:
-    """The camera of a window of its image."""
-    (fx, skew, cx), (below, fy, cy), last = camera.K
-    size = (columns.stop - columns.start, rows.stop - rows.start)
-    return camera.model_copy(
-        update={"size": size, "K": ((fx, skew, cx - columns.start), (below, fy, cy - rows.start), last)}
-    )
