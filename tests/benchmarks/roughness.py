@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.assets.mitsuba.scene import load_scene, sensor_dict
 from services.core.files.meshes import read_mesh
 from services.core.geometry import Mesh
 from services.core.records import FolderCapture
@@ -28,8 +27,7 @@ from services.core.store import read_record
 from services.fit.measurements.levels import finer_camera
 from services.fit.measurements.roughness.measure import Roughness, roughness_from_highlights
 from services.fit.measurements.roughness.patches import Photograph
-from services.transport.platform import prepare_device
-from tests.support.glossy_bodies import IOR, body, photographed, render, scanned
+from tests.support.glossy_bodies import IOR, body, photograph, photographed, reflected_once, render, scanned
 from tests.support.shared_data import shared_path
 
 ROUGHNESS = (0.05, 0.1, 0.15, 0.3)
@@ -114,31 +112,18 @@ def images(roughness: float) -> NDArray[np.float64]:
     """Radiance (cameras, lights, H, W) of the incisor: its highlights and the light beneath."""
     from scipy.ndimage import gaussian_filter, zoom
 
-    prepare_device()
-    import mitsuba as mi
-
     root, found = shared_path("data/tooth-ur1-truth"), []
     for c, coarse in enumerate(capture().cameras):
         camera = finer_camera(coarse, FINER)
         for k, light in enumerate(capture().lights):
-            surface = {
-                "type": "roughdielectric", "distribution": "ggx", "alpha": roughness, "int_ior": IOR, "ext_ior": 1.0
-            }  # fmt: skip
-            path = str(root / "teeth" / "11" / "outer.ply")
-            scene = {
-                "type": "scene",
-                "integrator": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
-                "sensor": sensor_dict(camera, SAMPLES),
-                "tooth": {"type": "ply", "filename": path, "face_normals": False, "bsdf": surface},
-                "light": {"type": "point", "position": list(light.position_mm), "intensity": light.intensity[0]},
-            }
-            highlight = np.array(mi.render(load_scene(scene), spp=SAMPLES, seed=10 * c + k))
+            path = root / "teeth" / "11" / "outer.ply"
+            highlight = reflected_once(path, camera, light, roughness, SAMPLES, seed=10 * c + k)
             beneath = np.load(root / f"c{c}_l{k}.npy").squeeze()
             # Take out the capture's noise, and spread its values beyond the outline, before they are enlarged
             seen = (beneath > 1e-6 * beneath.max()).astype(float)
             smooth = gaussian_filter(beneath * seen, 0.8) / np.maximum(gaussian_filter(seen, 0.8), 1e-3)
             large = np.maximum(zoom(smooth, FINER, order=3, mode="nearest", grid_mode=True), 0)
-            found.append(highlight.reshape(*camera.size[::-1], -1)[..., 0] + large)
+            found.append(highlight + large)
     return np.array(found).reshape(len(capture().cameras), len(capture().lights), *found[0].shape)
 
 
@@ -148,13 +133,8 @@ def drawn(roughness: float, seed: int) -> list[Photograph]:
     whole = images(roughness)
     chosen = random.choice(whole.shape[0] * whole.shape[1], PHOTOGRAPHS, replace=False)
     for c, k in (divmod(int(number), whole.shape[1]) for number in np.sort(chosen)):
-        image, light = whole[c, k], capture().lights[k]
-        variance = 1e-4 * image * image.mean() + (2e-3 * np.quantile(image, 0.99)) ** 2
-        value = image + random.normal(size=image.shape) * np.sqrt(variance)
-        intensity = light.intensity[0]
-        every = np.ones(image.shape, dtype=bool)
         camera = finer_camera(capture().cameras[c], FINER)
-        found.append(Photograph(camera, light, value / intensity, variance / intensity**2, every, ~every))
+        found.append(photograph(whole[c, k], camera, capture().lights[k], random))
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -86,7 +87,6 @@ def test_wet_surfaces_are_told_by_the_brightness_and_keep_their_roughness() -> N
 
 def test_photographs_without_a_mirror_direction_are_refused() -> None:
     photographs = photographed(images(0.1), seed=2)
-    dark = [type(one)(one.camera, one.light, one.radiance, one.variance, one.usable & False, one.clipped)
-            for one in photographs]  # fmt: skip
+    dark = [replace(one, usable=np.zeros_like(one.usable)) for one in photographs]
     with pytest.raises(CaptureInputError, match="No photograph shows lit surface around the mirror direction"):
         roughness_from_highlights(body(4), dark, IOR)

@@ -14,6 +14,7 @@ from services.assets.mitsuba.scene import load_scene, sensor_dict
 from services.core.files.meshes import write_mesh
 from services.core.geometry import Camera, Light, Mesh
 from services.fit.measurements.roughness.patches import Photograph
+from services.transport.boundary.rough import Rough
 from services.transport.platform import prepare_device
 
 IOR = 1.63
@@ -59,35 +60,34 @@ def scanned(mesh: Mesh, height_mm: float, length_mm: float, seed: int) -> Mesh:
 
 def render(roughness: float | None, samples: int = 64) -> NDArray[np.float64]:
     """Radiance (cameras, lights, H, W) that the body reflects once: glossy, or matte where no roughness is given."""
-    prepare_device()
-    import mitsuba as mi
-
-    surface = {"type": "diffuse", "reflectance": 0.4}
-    if roughness is not None:
-        surface = {
-            "type": "roughdielectric", "distribution": "ggx", "alpha": roughness, "int_ior": IOR, "ext_ior": 1.0
-        }  # fmt: skip
     images = np.zeros((len(CAMERAS), len(LIGHTS), *CAMERAS[0].size[::-1]))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "body.ply"
         write_mesh(path, body())
         for c, one in enumerate(CAMERAS):
             for k, light in enumerate(LIGHTS):
-                lamp = {"type": "point", "position": list(light.position_mm), "intensity": INTENSITY}
-                integrator = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
-                shape = {"type": "ply", "filename": str(path), "face_normals": False, "bsdf": surface}
-                scene = load_scene(
-                    {
-                        "type": "scene",
-                        "integrator": integrator,
-                        "sensor": sensor_dict(one, samples),
-                        "body": shape,
-                        "lamp": lamp,
-                    }
-                )
-                image = np.array(mi.render(scene, spp=samples, seed=10 * c + k))
-                images[c, k] = image.reshape(*one.size[::-1], -1)[..., 0]
+                images[c, k] = reflected_once(path, one, light, roughness, samples, seed=10 * c + k)
     return images
+
+
+def reflected_once(
+    mesh: Path, camera: Camera, light: Light, roughness: float | None, samples: int, seed: int
+) -> NDArray[np.float64]:
+    """Radiance (H, W) that a surface reflects once: glossy, or matte where no roughness is given."""
+    prepare_device()
+    import mitsuba as mi
+
+    matte = {"type": "diffuse", "reflectance": 0.4}
+    surface = matte if roughness is None else Rough.mitsuba(IOR, roughness=roughness)
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
+        "sensor": sensor_dict(camera, samples),
+        "body": {"type": "ply", "filename": str(mesh), "face_normals": False, "bsdf": surface},
+        "lamp": {"type": "point", "position": list(light.position_mm), "intensity": light.intensity[0]},
+    }
+    image = np.array(mi.render(load_scene(scene), spp=samples, seed=seed), dtype=np.float64)
+    return image.reshape(*camera.size[::-1], -1)[..., 0]
 
 
 def photographed(images: NDArray[np.float64], seed: int, full_scale: float = np.inf) -> list[Photograph]:
@@ -95,9 +95,15 @@ def photographed(images: NDArray[np.float64], seed: int, full_scale: float = np.
     random, found = np.random.default_rng(seed), []
     for c, one in enumerate(CAMERAS):
         for k, light in enumerate(LIGHTS):
-            image = images[c, k]
-            variance = 1e-4 * image * image.mean() + (2e-3 * np.quantile(image, 0.99)) ** 2
-            value = image + random.normal(size=image.shape) * np.sqrt(variance)
-            clipped = value > full_scale
-            found.append(Photograph(one, light, value / INTENSITY, variance / INTENSITY**2, ~clipped, clipped))
+            found.append(photograph(images[c, k], one, light, random, full_scale))
     return found
+
+
+def photograph(
+    image: NDArray[np.float64], camera: Camera, light: Light, random: np.random.Generator, full_scale: float = np.inf
+) -> Photograph:
+    """A photograph of radiance (H, W) with 1 % of noise at its mean; values above ``full_scale`` are saturated."""
+    variance = 1e-4 * image * image.mean() + (2e-3 * np.quantile(image, 0.99)) ** 2
+    value = image + random.normal(size=image.shape) * np.sqrt(variance)
+    clipped, (intensity,) = value > full_scale, light.intensity
+    return Photograph(camera, light, value / intensity, variance / intensity**2, ~clipped, clipped)

@@ -30,6 +30,10 @@ MIN_PIXELS = 60
 """Least number of pixels of a photograph that is used: the background has two dozen unknowns there."""
 MAX_PHOTOGRAPHS = 24
 """Largest number of photographs that are fitted, those that tell most."""
+MAX_WINDOWS = 3
+"""Largest number of fits, each to the pixels that the roughness before it reaches."""
+SAME_WINDOW = 0.3
+"""Change of the roughness' logarithm below which these pixels are kept."""
 MIN_TOLD = 25.0
 """Least squared ratio of a photograph's highlight to its noise."""
 MIN_BRIGHTNESS = 0.1
@@ -111,13 +115,12 @@ def roughness_from_highlights(
     error = error or SurfaceError()
     start, seen = _first(outer, photographs, ior, occluders)
     chosen = _chosen(start, seen)
-    roughness, fits = start.roughness, list[LobeFit]()
-    patches: list[Patch] = []
-    for _ in range(3):
+    roughness = start.roughness
+    for _ in range(MAX_WINDOWS):
         patches = _patches(outer, [photographs[k] for k in chosen], roughness, occluders)
         fit = fit_lobe(patches, ior, roughness, error, LENGTHS_MM[0])
-        width, roughness = roughness, float(np.exp(fit.ln_roughness))
-        if abs(np.log(roughness / width)) < 0.3:
+        change, roughness = fit.ln_roughness - np.log(roughness), float(np.exp(fit.ln_roughness))
+        if abs(change) < SAME_WINDOW:
             break
     fits = [fit, *(fit_lobe(patches, ior, roughness, error, length) for length in LENGTHS_MM[1:])]
     return _judged(fits, patches, ior, error)
