@@ -69,13 +69,13 @@ class Row:
     """The ratio of each of stock Mitsuba's lights alone."""
 
 
-class WalksAlone(Engine):
-    """An engine whose rough surface connects to lights from the surface alone."""
+class FixedEngine(Engine):
+    """An engine that aims connections from inside a rough surface always, or never, whatever they cost."""
 
-    def __init__(self, recipe: SceneRecipe, threads: int | None = None) -> None:
+    def __init__(self, recipe: SceneRecipe, threads: int, *, aims: bool) -> None:
         super().__init__(recipe, threads)
         assert isinstance(self._boundary, Rough)
-        self._boundary.aims = lambda lights: False  # type: ignore[method-assign]  # noqa: ARG005
+        self._boundary.aims = lambda lights: aims  # type: ignore[method-assign]  # noqa: ARG005
 
 
 def scene(lights: int, roughness: float, *, compensated: bool) -> tuple[SceneRecipe, Camera]:
@@ -100,9 +100,9 @@ def tooth_view(engine: Engine, camera: Camera) -> View:
 
 
 def against_walks(lights: int, roughness: float, *, samples: int, pairs: int) -> Iterator[Row]:
-    """Rows of images and of Jacobians."""
+    """Rows of images and of Jacobians, also where the engine would not aim (``Rough.aims`` follows from these)."""
     recipe, camera = scene(lights, roughness, compensated=True)
-    engines = Engine(recipe, 1), WalksAlone(recipe, 1)
+    engines = FixedEngine(recipe, 1, aims=True), FixedEngine(recipe, 1, aims=False)
     view = tooth_view(engines[1], camera)
     for what in ("images", "jacobian"):
         seconds, variances = np.zeros((pairs, 2)), np.zeros((pairs, 2))
@@ -133,7 +133,7 @@ def _spread(variances: NDArray[np.float64]) -> float:
 def against_stock(lights: int, roughness: float, *, samples: int, stock_seconds: float, seed: int) -> Iterator[Row]:
     """One row for this engine as it chooses, and one for walks alone."""
     recipe, camera = scene(lights, roughness, compensated=False)
-    engines = {"stock": Engine(recipe, 2), "stock, walks alone": WalksAlone(recipe, 2)}
+    engines = {"stock": Engine(recipe, 2), "stock, walks alone": FixedEngine(recipe, 2, aims=False)}
     view = tooth_view(engines["stock"], camera)
     chosen = np.linspace(0, lights - 1, PEER_LIGHTS).astype(int)
     theirs = [_stock(recipe, camera, view, int(light), stock_seconds, seed) for light in chosen]
