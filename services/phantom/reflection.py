@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from services.core.geometry import Camera, Light, Mesh
 from services.phantom.surface import ENAMEL_ROUGHNESS
+from services.transport.optics.ggx_albedo import fresnel_reflectance
 from services.transport.rays import RayScene, pixel_rays
 
 SUBPIXELS = 4
@@ -118,15 +119,11 @@ def ggx_reflection(
     distribution = a2 / (np.pi * (n_h**2 * (a2 - 1) + 1) ** 2)
     shadowing = np.prod([2 * c / (c + np.sqrt(a2 + (1 - a2) * c**2)) for c in (n_l, n_v)], axis=0)
     return np.asarray(
-        distribution * shadowing * fresnel(np.clip((half * towards_light).sum(axis=-1), 0, 1), ior) / (4 * n_l * n_v)
+        distribution
+        * shadowing
+        * fresnel_reflectance(np.clip((half * towards_light).sum(axis=-1), 0, 1), ior)
+        / (4 * n_l * n_v)
     )
-
-
-def fresnel(cosine: NDArray[np.float64], ior: float) -> NDArray[np.float64]:
-    """Unpolarised Fresnel reflectance of a dielectric in air at the given cosines of incidence."""
-    inside = np.sqrt(1 - (1 - cosine**2) / ior**2)
-    s, p = (cosine - ior * inside) / (cosine + ior * inside), (ior * cosine - inside) / (ior * cosine + inside)
-    return np.asarray((s**2 + p**2) / 2)
 
 
 class _SmoothNormals:

@@ -7,7 +7,8 @@ import pytest
 
 from services.anatomy.templates.incisor import build_incisor
 from services.phantom.dome_rig import dome_cameras, dome_lights
-from services.phantom.reflection import fresnel, ggx_reflection, reflect
+from services.phantom.reflection import ggx_reflection, reflect
+from services.transport.optics.ggx_albedo import fresnel_reflectance
 from services.transport.platform import prepare_device
 from services.transport.rays import RayScene
 
@@ -42,8 +43,8 @@ def test_reflection_equals_mitsubas_rough_dielectric(roughness: float) -> None:
 
 
 def test_normal_incidence_reflects_the_textbook_share() -> None:
-    assert fresnel(np.array([1.0]), 1.631)[0] == pytest.approx((0.631 / 2.631) ** 2)
-    assert fresnel(np.array([0.0]), 1.631)[0] == pytest.approx(1.0)
+    assert fresnel_reflectance(np.array([1.0]), 1.631)[0] == pytest.approx((0.631 / 2.631) ** 2)
+    assert fresnel_reflectance(np.array([0.0]), 1.631)[0] == pytest.approx(1.0)
 
 
 def test_pixels_off_the_tooth_reflect_nothing_and_shadow_side_is_dark() -> None:

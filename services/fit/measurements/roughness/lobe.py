@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from services.transport.optics.ggx_albedo import fresnel_reflectance
+
 Array = NDArray[np.float64]
 
 
@@ -25,20 +27,8 @@ def reflected(normal: Array, to_light: Array, to_camera: Array, roughness: float
         2 / (cosine + np.sqrt(squared + (1 - squared) * cosine**2))
         for cosine in (np.maximum(n_l, 0), np.maximum(n_v, 0))
     )
-    radiance = facets * fresnel(np.clip(_dot(half, to_light), 0, 1), ior) * lit * n_l * seen / 4
+    radiance = facets * fresnel_reflectance(np.clip(_dot(half, to_light), 0, 1), ior) * lit * n_l * seen / 4
     return np.where((n_l > 0) & (n_v > 0), radiance, 0.0)
-
-
-def fresnel(cosine: Array, ior: float) -> Array:
-    """Unpolarised Fresnel reflectance of a dielectric at the given cosines of incidence, from the outside; 1 where
-    light is reflected totally.
-    """
-    squared = 1 - (1 - cosine**2) / ior**2
-    inside = np.sqrt(np.maximum(squared, 0))
-    # At grazing incidence on a surface without contrast both numerator and denominator vanish
-    s = (cosine - ior * inside) / np.maximum(cosine + ior * inside, 1e-12)
-    p = (ior * cosine - inside) / np.maximum(ior * cosine + inside, 1e-12)
-    return np.asarray(np.where(squared > 0, (s**2 + p**2) / 2, 1.0))
 
 
 def _dot(one: Array, other: Array) -> Array:

@@ -41,8 +41,9 @@ LIGHT_SE = 0.05
 PRIOR_COUNT = 8.0
 """Number of coefficients by which the assumed size of the surface's and of the backgrounds' errors counts."""
 MAX_STEPS = 40
+"""Largest number of steps, refused ones included."""
 MAX_STEP = 0.3
-"""Largest change of the roughness' logarithm in a step."""
+"""Largest change of the logarithms of roughness and brightness in a step."""
 CONVERGED = 1e-3
 """Change of the roughness' logarithm, in a step, that ends the fit: a hundredth of what is asked of it."""
 SETTLED = 0.02

@@ -27,7 +27,7 @@ FIRST_PIXELS, PIXELS = 800, 1500
 FIRST_ROUGHNESS = 0.1
 """Roughness whose highlights the first guess resolves."""
 MIN_PIXELS = 60
-"""Least number of pixels of a photograph that is used: the background has two dozen unknowns there."""
+"""Least number of pixels of a photograph that is used: the background has 18 free terms there, and its bumps."""
 MAX_PHOTOGRAPHS = 24
 """Largest number of photographs that are fitted, those that tell most."""
 MAX_WINDOWS = 3

@@ -63,7 +63,7 @@ class Patch:
         to_light, to_camera: (N, 3) unit directions.
         irradiance: (N,) of a surface at right angles to the light, over its intensity, 1/mm².
         tangent: (N,) tangent of the angle between the normal and the half vector.
-        clipped: tangents (M,) of those saturated pixels.
+        clipped: (M,) the same tangent at the saturated pixels.
     """
 
     photograph: tuple[str, str]

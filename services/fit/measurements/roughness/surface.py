@@ -38,11 +38,6 @@ class SurfaceError:
         """Standard deviation of a bump, mm."""
         return self.length_mm / math.sqrt(2)
 
-    @property
-    def slope(self) -> float:
-        """Standard deviation of the surface's slope along one axis: how far a normal is tilted, rad."""
-        return self.height_mm / self.length_mm
-
 
 def spread_centres(points_mm: Array, spacing_mm: float) -> Array:
     """Points (K, 3) of a cloud (N, 3) so that no two are closer than ``spacing_mm`` and each point has one so close."""
