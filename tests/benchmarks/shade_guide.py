@@ -7,6 +7,7 @@ ring of lights at 45 degrees to the normal, a view along it, and a spot of 3 mm.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import sys
 import tempfile
@@ -67,6 +68,7 @@ def relative(folder: Path, name: str, channel: int) -> tuple[float, float]:
 
 def main() -> None:
     """Render all tabs and write the guide."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     mi.set_variant("llvm_ad_mono")
     white = CameraWhite(None)
     OUT.parent.mkdir(parents=True, exist_ok=True)
