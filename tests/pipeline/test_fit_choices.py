@@ -68,7 +68,7 @@ def test_a_tighter_tolerance_goes_on_to_smaller_errors(tmp_path: Path) -> None:
     asked: dict[str, dict[str, Any]] = {"default": {}, "tight": {"image_tolerance": 0.0001}}
     for name, options in asked.items():
         write_prepared(tmp_path / name)
-        reports.append(fit(tmp_path / name, seed=3, advise=False, max_samples_per_pixel=4096, max_steps=20, **options))
+        reports.append(fit(tmp_path / name, seed=4, advise=False, max_samples_per_pixel=16384, max_steps=20, **options))
     usual, tight = reports
     assert usual.converged
     assert tight.steps > usual.steps

@@ -80,7 +80,8 @@ def covariance_if_known(uncertainty: Uncertainty, kind: str) -> Array:
     count = domain.tissue_count
     better = np.asarray(np.linalg.inv(domain.errors.precision + added[count:, count:]), dtype=np.float64)
     with_prior = replace(uncertainty, sandwich=replace(uncertainty.sandwich, prior=better))
-    return covariance_after(with_prior, AddedInformation(whitened, whitened))
+    weight = domain.errors.weight
+    return covariance_after(with_prior, AddedInformation(weight * whitened, weight**2 * whitened))
 
 
 def _target_precision(uncertainty: Uncertainty, kind: str) -> str:

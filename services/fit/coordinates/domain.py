@@ -208,16 +208,23 @@ class Domain:
 
     @property
     def precision(self) -> NDArray[np.float64]:
-        """Precision of the prior of all of x, (F, F)."""
+        """Precision of the prior of all of x, (F, F), as a fit weighs it."""
         matrix = np.diag(self.prior[1])
-        matrix[self.tissue_count :, self.tissue_count :] = self.errors.precision
+        matrix[self.tissue_count :, self.tissue_count :] = self.errors.weight * self.errors.precision
+        return matrix
+
+    @property
+    def prior_noise(self) -> NDArray[np.float64]:
+        """Covariance (F, F) of the prior's part of the gradient by the error of the prior's mean."""
+        matrix = self.precision
+        matrix[self.tissue_count :, self.tissue_count :] *= self.errors.weight
         return matrix
 
     def prior_slope(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Slope of 1/2 (x - mean)' precision (x - mean) at x, (F,)."""
         mean, precision = self.prior
         slope = precision * (x - mean)
-        slope[self.tissue_count :] = self.errors.precision @ x[self.tissue_count :]
+        slope[self.tissue_count :] = self.errors.weight * self.errors.precision @ x[self.tissue_count :]
         return slope
 
     def prior_change(self, x_old: NDArray[np.float64], x_new: NDArray[np.float64]) -> float:
@@ -226,7 +233,7 @@ class Domain:
         change = 0.5 * float(precision @ ((x_new - mean) ** 2 - (x_old - mean) ** 2))
         if self.errors.names:
             old, new = x_old[self.tissue_count :], x_new[self.tissue_count :]
-            change += 0.5 * float((new + old) @ self.errors.precision @ (new - old))
+            change += 0.5 * self.errors.weight * float((new + old) @ self.errors.precision @ (new - old))
         return change
 
     def errors_at(self, x: NDArray[np.float64]) -> tuple[tuple[str, float], ...]:

@@ -70,10 +70,13 @@ class InstrumentErrors:
     covariance: tuple[tuple[float, ...], ...] = ()
     assumed: frozenset[str] = frozenset()
     """Names of the errors whose covariance is a default and not the calibration's."""
+    weight: float = 1.0
+    """Factor by which a fit multiplies the prior, because its renders are noisier than the photographs
+    (``solve.elimination``)."""
 
     @property
     def precision(self) -> Array:
-        """Inverse of the covariance, (K, K)."""
+        """Inverse of the covariance, (K, K), without the weight."""
         return np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
 
     @property

@@ -1,4 +1,4 @@
-"""What a fit knows after its final uncertainty estimate: the sums of that estimate, and the step that followed."""
+"""What a fit knows after its final uncertainty estimate: the sums of that estimate, and the step that follows."""
 
 from __future__ import annotations
 
@@ -21,23 +21,22 @@ class Closing:
     """A final uncertainty estimate at one x, in coordinates that the equations there whiten."""
 
     sums: FinalSums
-    step: Array
-    """The step (F,) from x that followed."""
-    remaining: float
-    """Share of the step that remains after it that may be true: less than 1 where comparisons refuted the whole."""
     sources: tuple[str, ...]
     """Kind of each of the last changes in ``sums`` (``covariance.uncertainty``)."""
+    step: Array
+    """The step (F,) from x that follows; zeros before it is made."""
+    remaining: float = 1.0
+    """Share of the step that remains after it that may be true: less than 1 where comparisons refuted the whole."""
 
     def record(self) -> dict[str, Any]:
-        """The estimate as JSON values."""
-        own = {"step": self.step.tolist(), "remaining": self.remaining, "sources": list(self.sources)}
-        return {"sums": self.sums.record()} | own
+        """The estimate without its step as JSON values."""
+        return {"sums": self.sums.record(), "sources": list(self.sources)}
 
     @staticmethod
     def of(record: dict[str, Any]) -> Closing:
-        """The estimate of a record."""
-        step, remaining = np.array(record["step"], dtype=np.float64), float(record["remaining"])
-        return Closing(FinalSums.of(record["sums"]), step, remaining, tuple(record["sources"]))
+        """The estimate of a record, without a step."""
+        sums = FinalSums.of(record["sums"])
+        return Closing(sums, tuple(record["sources"]), np.zeros(len(sums.gradient)))
 
     def uncertainty(self, domain: Domain, x: Array, equations: NormalEquations, part_count: int) -> Uncertainty:
         """The uncertainty after the step from x, the point of this estimate, whose equations these are."""

@@ -284,7 +284,7 @@ def uncertainty(
     t, count = whitened.transform, len(x)
     prior = t.T @ domain.precision @ t
     parts = {"photographs": misfit * positive_part(t.T @ equations.data_noise @ t)} | _prior_parts(domain, t)
-    meat, weighing = parts["photographs"] + prior, np.zeros_like(prior)
+    meat, weighing = parts["photographs"] + t.T @ domain.prior_noise @ t, np.zeros_like(prior)
     if sums is None:
         inverse = np.eye(count)
         parts["rendering"] = positive_part(t.T @ equations.gradient_noise @ t)
@@ -334,10 +334,10 @@ def uncertainty(
 
 
 def _prior_parts(domain: Domain, t: Array) -> dict[str, Array]:
-    # The whitened prior, split into that of the tissue and of each kind of instrument error. The columns of a Cholesky
-    # factor give positive semidefinite parts that add up; where kinds are correlated, their common part counts for the
-    # first of them.
-    count, precision = domain.tissue_count, domain.precision
+    # The whitened noise of the prior, split into that of the tissue and of each kind of instrument error. The columns
+    # of a Cholesky factor give positive semidefinite parts that add up; where kinds are correlated, their common part
+    # counts for the first of them.
+    count, precision = domain.tissue_count, domain.prior_noise
     parts = {"prior": t[:count].T @ precision[:count, :count] @ t[:count]}
     kinds = np.array([kind_of_error(name) for name in domain.errors.names])
     factor = np.linalg.cholesky(precision[count:, count:])

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from services.core.errors import NonFiniteError
 from services.fit.coordinates.domain import Domain
-from services.fit.solve.elimination import ReducedEquations, eliminate
+from services.fit.solve.elimination import ReducedEquations, eliminate, weighed
 from services.fit.solve.normal_equations import LossChange, NormalEquations, pool
 from services.fit.solve.outcome import ADVICE, Result, Solution
 from services.fit.solve.solver_state import Proposal, State
@@ -156,7 +156,8 @@ class GaussNewton:
         # instrument's errors.
         memory = state.memory
         assert memory is not None
-        equations = eliminate(memory, self.domain.precision, self.domain.prior_slope(state.x), self.domain.tissue_count)
+        domain = weighed(self.domain, memory)
+        equations = eliminate(memory, domain.precision, domain.prior_slope(state.x), domain.tissue_count)
         noise_gain = gain_by_noise(equations)
         if verdict == WORSE:
             shorter = self._proposal(state, equations, noise_gain) if state.refusals < options.max_trials else None
@@ -204,7 +205,7 @@ class GaussNewton:
         assert memory is not None
         new, z = state.x + proposal.step, self.options.significance_z
         test = StepTest(
-            fresh.loss - state.loss[0] + self.domain.prior_change(state.x, new),
+            fresh.loss - state.loss[0] + weighed(self.domain, memory).prior_change(state.x, new),
             math.sqrt(fresh.loss_variance + state.loss[1]),
             proposal.change,
             proposal.change_se,
@@ -243,7 +244,7 @@ class GaussNewton:
         # instrument's errors go to their optimum too, with a gain that is as uncertain as it is large.
         assert state.memory is not None
         length, change = self._length(step), float(equations.gradient @ step + 0.5 * step @ equations.hessian @ step)
-        slope = state.memory.gradient + self.domain.prior_slope(state.x)
+        slope = state.memory.gradient + weighed(self.domain, state.memory).prior_slope(state.x)
         by_errors = 0.5 * float(slope @ equations.error_step)
         relative = self.options.slope_error + self.options.model_error * min(length, 1.0)
         change_se = math.hypot(equations.step_noise(step), relative * change, by_errors)
@@ -283,7 +284,8 @@ class GaussNewton:
         prediction, whole = self._with_prediction(state, equations, step, noise_gain), equations.lift @ step
         new = state.x + whole
         change = problem.compare(state.x, new, samples=state.samples, step=state.step - 1, trial=0)
-        test = compared(change, self.domain.prior_change(state.x, new), (prediction.change, prediction.change_se))
+        prior_change = weighed(self.domain, memory).prior_change(state.x, new)
+        test = compared(change, prior_change, (prediction.change, prediction.change_se))
         if not test.is_better(LAST_STEP_Z) if self.options.slope_error else test.is_worse:
             return state
         return replace(state, x=new, memory=memory.moved(whole), loss=None, verdict=f"{state.verdict}, settled")

@@ -31,6 +31,8 @@ class Sandwich:
     (``FinalSums.expected_shift_covariance``)."""
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     """Covariance V (K, K) of the prior of the instrument's errors."""
+    prior_weight: float = 1.0
+    """Factor by which the fit multiplied that prior (``elimination.weighed``)."""
     rejected: tuple[int, ...] = ()
     """Indices of the instrument's errors whose prior is rejected as a fault."""
 
@@ -56,7 +58,7 @@ class Sandwich:
     def response(self, inverse: Array) -> Array:
         """Response B = dx / dm (F, K) of the solution to the mean of the errors' prior."""
         own = self.transform[len(self.transform) - len(self.prior) :]
-        return np.asarray(self.transform @ inverse @ own.T @ np.linalg.inv(self.prior))
+        return np.asarray(self.transform @ inverse @ own.T @ (self.prior_weight * np.linalg.inv(self.prior)))
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ def combine_with_prior(
     parts_before["unfinished"] = unfinished
     if not domain.errors.names:
         return CombinedSolution(x, whole, parts_before, sandwich, ())
-    sandwich = replace(sandwich, prior=domain.errors.matrix)
+    sandwich = replace(sandwich, prior=domain.errors.matrix, prior_weight=domain.errors.weight)
     response = sandwich.response(sandwich.inverse)
     found = Recombination(whole, response, sandwich.prior)
     weighed = Recombination(whole + sandwich.product(sandwich.inverse, sandwich.weighing), response, sandwich.prior)

@@ -22,6 +22,7 @@ from services.fit.passes.passes import Passes, StackProblem
 from services.fit.solve import adam, gauss_newton, solver_state
 from services.fit.solve.closing import Closing
 from services.fit.solve.covariance import Uncertainty, final_model, uncertainty, whitening
+from services.fit.solve.elimination import weighed
 from services.fit.solve.gauss_newton import Options
 from services.fit.solve.normal_equations import NormalEquations, pool
 from services.fit.solve.outcome import Result, Solution
@@ -225,11 +226,17 @@ class Stages(ABC, Generic[Optics]):
             )
             problem = replace(problem, base=base)
             equations, closing, known = self._with_uncertainty(problem, solution, samples)
-        if closing is not None and known.is_full_step and self.has_usual_precision:
-            needed = samples_needed(known, samples, self.options(self.files.full).max_samples)
-            if needed > samples:
-                equations, known = self._refined(problem, solution, equations, closing, (samples, needed))
-                samples = needed
+        problem = replace(problem, domain=known.domain)
+        if closing is not None:
+            ending, more = problem, 0
+            if known.is_full_step and self.has_usual_precision:
+                more = samples_needed(known, samples, self.options(self.files.full).max_samples) - samples
+            if more:
+                ending = replace(problem, stage="refined")
+                equations = self._refined(ending, solution, equations, more)
+            closing = self._with_last_step(ending, solution.x, equations, closing, max(samples, more))
+            samples += more
+            known = closing.uncertainty(problem.domain, solution.x, equations, self.part_count)
         base = problem.domain.tissue_at(known.x, problem.base)
         problem, solution = replace(problem, base=base), replace(solution, x=known.x)
         self._apply_errors(problem.domain, solution.x)
@@ -278,6 +285,7 @@ class Stages(ABC, Generic[Optics]):
                 lambda: problem.linearise(solution.x, samples=samples, step=0).record(),
             )
             equations = NormalEquations.of(stored)
+        problem = replace(problem, domain=weighed(problem.domain, equations))
         if problem.jacobian_g is None or solution.result is Result.STALLED:
             return equations, None, uncertainty(problem.domain, solution.x, equations, part_count=self.part_count)
         closing = self._closing(f"{self.scope}/closing{again}", problem, solution.x, equations, samples)
@@ -286,8 +294,7 @@ class Stages(ABC, Generic[Optics]):
     def _closing(
         self, key: str, problem: StackProblem[Optics], x: Array, equations: NormalEquations, samples: int
     ) -> Closing:
-        # Measure the response of the exact images where Jacobians came from similar media. Make one more step with it
-        # where the predicted gain exceeds noise, and prediction and comparison combined are better.
+        # Measure the response of the exact images where Jacobians came from similar media.
         domain = problem.domain
         whitened, moves, shapes = whitening(domain, equations), self.files.moves, self._held_shapes()
 
@@ -297,45 +304,41 @@ class Stages(ABC, Generic[Optics]):
             self.log(f"{prefix}: the final uncertainty estimate begins, which may take as long as all steps.")
             held, fewer = self._held_cosines(domain), max(samples // FINAL_DIVISOR, 1)
             sums = measure_final_uncertainty(problem, x, whitened.transform, held, fewer, moves, shapes, displaced)
-            taken = last_step(problem, x, final_model(domain, x, equations, sums), self.part_count, samples)
             changed = len(shapes) + (0 if displaced is None else displaced.count)
-            return Closing(sums, *taken, ("shape",) * changed + tuple(move.body for move in moves)).record()
+            sources = ("shape",) * changed + tuple(move.body for move in moves)
+            return Closing(sums, sources, np.zeros(len(x))).record()
 
         self.raise_if_cancelled()
         entry, _ = self.journal.get_or_compute(key, compute)
         return Closing.of(entry)
 
     def _refined(
-        self,
-        problem: StackProblem[Optics],
-        solution: Solution,
-        equations: NormalEquations,
-        closing: Closing,
-        samples: tuple[int, int],
-    ) -> tuple[NormalEquations, Uncertainty]:
-        # The gradient with more paths, so far and in all, where the final uncertainty estimate was made, and the step
-        # from there anew. What that estimate measured of the response, and the curvature that its coordinates whiten,
-        # stay.
-        more = samples[1] - samples[0]
-        domain, x, refining = problem.domain, solution.x, replace(problem, stage="refined")
+        self, problem: StackProblem[Optics], solution: Solution, equations: NormalEquations, more: int
+    ) -> NormalEquations:
+        # The gradient with so many more paths, where the final uncertainty estimate was made. What that estimate
+        # measured of the response, and the curvature that its coordinates whiten, stay.
         self.raise_if_cancelled()
         stored, _ = self.journal.get_or_compute(
-            f"{self.scope}/refined", lambda: refining.linearise(x, samples=more, step=0).record()
+            f"{self.scope}/refined", lambda: problem.linearise(solution.x, samples=more, step=0).record()
         )
         pooled = pool(equations, max(solution.equation_samples, 1.0), NormalEquations.of(stored), float(more))
-        equations = replace(
+        return replace(
             equations, gradient=pooled.gradient, gradient_noise=pooled.gradient_noise, carried=pooled.carried
         )
 
+    def _with_last_step(
+        self, problem: StackProblem[Optics], x: Array, equations: NormalEquations, closing: Closing, samples: int
+    ) -> Closing:
+        # One more step by the measured response, where the predicted gain exceeds noise, and prediction and comparison
+        # combined are better.
         def compute() -> dict[str, Any]:
-            model = final_model(domain, x, equations, closing.sums)
-            step, remaining = last_step(refining, x, model, self.part_count, max(samples[0], more))
+            model = final_model(problem.domain, x, equations, closing.sums)
+            step, remaining = last_step(problem, x, model, self.part_count, samples)
             return {"step": step.tolist(), "remaining": remaining}
 
         self.raise_if_cancelled()
-        entry, _ = self.journal.get_or_compute(f"{self.scope}/refined-step", compute)
-        closing = replace(closing, step=np.array(entry["step"]), remaining=float(entry["remaining"]))
-        return equations, closing.uncertainty(domain, x, equations, self.part_count)
+        entry, _ = self.journal.get_or_compute(f"{self.scope}/last-step", compute)
+        return replace(closing, step=np.array(entry["step"]), remaining=float(entry["remaining"]))
 
     def _solve(
         self, stage: str, domain: Domain, tissue: Optics, options: Options, samples: int, similar_g: float

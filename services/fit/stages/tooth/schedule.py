@@ -5,9 +5,9 @@ stage         free                                             media     ends
 ============  ===============================================  ========  ===============================================
 search        table over albedo x density x anisotropy         exact     best point
 homogeneous   sigma, alpha shared by both media                similar   converged, or a few steps
-start.k       sigma, alpha of both media, from several ratios  similar   two steps each; the least loss continues
+start.k       sigma of both, alpha of dentin, several ratios   similar   two steps each; the least loss continues
 layered       the same                                         similar   converged, or max_steps
-shape         the same and the dentin's blend weights          exact     converged, or max_steps; where they are fitted
+shape         alpha of both, and the dentin's blend weights    exact     converged, or max_steps; where they are fitted
 exact         the same                                         exact     converged, or max_steps
 phase         g1, beta, g2 too                                 exact     converged, or max_steps; only with two lobes
 again, …      the same                                         exact     as before; where errors moved x far
@@ -25,7 +25,9 @@ turns back after few scatterings. With two lobes g1, beta and g2 are free under 
 errors become coordinates in the first exact stage: in similar media they would only compensate the bias of these. So
 does the albedo of the gums around the tooth, where the scene has them.
 The other channels start in the exact stage, from what the first one found (``first_channel``).
-Absorption of a thin enamel cap is nearly invisible, so its exponent has a prior that is two decades wide.
+Absorption of a thin enamel cap is nearly invisible, so its exponent has a prior that is two decades wide. In similar
+media it stays at the homogeneous tooth's: their bias would drive it towards 0, where derivatives to its exponent vanish
+and exact stages are slow to bring it back.
 """
 
 from __future__ import annotations
@@ -211,7 +213,9 @@ class ChannelSchedule(Stages[Tissue]):
         # Run the stages in similar media; returns the tissue and the last number of paths per pixel.
         tissue = self.start()
         if self.has_dentin:
-            tissue = self._best_start(tissue, self.preparatory_options(START_STEPS))
+            kept = tuple(c for c in domain.coordinates if c.name != "enamel.alpha")
+            domain = Domain(kept or domain.coordinates)
+            tissue = self._best_start(tissue, domain, self.preparatory_options(START_STEPS))
         stage = "layered" if self.has_dentin else "homogeneous"
         tissue, solution = self._solve(
             stage, domain, tissue.with_values(self.spec.held), options, 2 * self.spec.samples_per_pixel, SIMILAR_G
@@ -357,10 +361,10 @@ class ChannelSchedule(Stages[Tissue]):
         best, _ = self.journal.get_or_compute(f"{self.scope}/search", compute)
         return table_search.Candidate(**best[0])
 
-    def _best_start(self, tissue: Tissue, options: Options) -> Tissue:
+    def _best_start(self, tissue: Tissue, domain: Domain, options: Options) -> Tissue:
         # Improve several density ratios by a few steps each and compare their losses with the same seeds: with few
         # samples a single start may end with enamel and dentin exchanged.
-        domain, ends = self._domain(("sigma", "alpha")), list[Tissue]()
+        ends = list[Tissue]()
         for k, (thin, dense) in enumerate(START_RATIOS):
             start = tissue.with_values(
                 {"enamel.sigma": thin * tissue.enamel.sigma, "dentin.sigma": dense * tissue.dentin.sigma}
